@@ -1,0 +1,1 @@
+"""Better seeds for 3D Gaussian Splatting."""

@@ -1,0 +1,202 @@
+"""Camera: a posed pinhole camera, and the COLMAP camera records it comes from.
+
+Notation: ``cam_from_world`` [4, 4] maps homogeneous world points to OpenCV camera axes (x right,
+y down, z forward); ``K`` [3, 3] maps camera rays to pixels. The centre of the top-left pixel is at
+(0.5, 0.5), as in COLMAP. Quaternions are wxyz. Promise: everything here is float64 and exact up to
+rounding; lens distortion is kept in ``Intrinsics.params`` for writing but ignored by ``Camera``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from splatseed.errors import SceneFormatError
+
+__all__ = [
+    "CAMERA_MODELS",
+    "Camera",
+    "CameraModel",
+    "Intrinsics",
+    "quat_from_rotation",
+    "rotation_from_quat",
+]
+
+
+class CameraModel(NamedTuple):
+    """One of COLMAP's camera models."""
+
+    model_id: int
+    name: str
+    num_params: int
+    num_focal: int
+    """1 if fx = fy is stored once, 2 if apart; the principal point follows."""
+
+
+CAMERA_MODELS: dict[str, CameraModel] = {
+    model.name: model
+    for model in (
+        CameraModel(0, "SIMPLE_PINHOLE", 3, 1),
+        CameraModel(1, "PINHOLE", 4, 2),
+        CameraModel(2, "SIMPLE_RADIAL", 4, 1),
+        CameraModel(3, "RADIAL", 5, 1),
+        CameraModel(4, "OPENCV", 8, 2),
+        CameraModel(5, "OPENCV_FISHEYE", 8, 2),
+        CameraModel(6, "FULL_OPENCV", 12, 2),
+        CameraModel(7, "FOV", 5, 2),
+        CameraModel(8, "SIMPLE_RADIAL_FISHEYE", 4, 1),
+        CameraModel(9, "RADIAL_FISHEYE", 5, 1),
+        CameraModel(10, "THIN_PRISM_FISHEYE", 12, 2),
+        CameraModel(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16, 2),
+    )
+}
+"""COLMAP's camera models by name; ids and parameter counts as in its models.h."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A COLMAP camera record: everything but the pose.
+
+    Args:
+        camera_id: The id that images refer to.
+        model: A key of ``CAMERA_MODELS``.
+        width: Image width in pixels.
+        height: Image height in pixels.
+        params: The model's parameters in COLMAP's order, pixels for focal lengths and centre.
+
+    Raises:
+        SceneFormatError: The model is unknown, or the number of parameters is not the model's.
+    """
+
+    camera_id: int
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        model = CAMERA_MODELS.get(self.model)
+        if model is None:
+            raise SceneFormatError(
+                f"camera {self.camera_id} to have one of COLMAP's models "
+                f"({', '.join(CAMERA_MODELS)})",
+                found=f"{self.model!r}",
+                fix="Undistort the scene to PINHOLE (colmap image_undistorter) and try again.",
+            )
+        if len(self.params) != model.num_params:
+            raise SceneFormatError(
+                f"camera {self.camera_id} ({self.model}) to have {model.num_params} parameters",
+                found=f"{len(self.params)}",
+                fix="Write the model again with COLMAP.",
+            )
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether the camera is free of distortion, as 3DGS trainers need it."""
+        return self.model in {"PINHOLE", "SIMPLE_PINHOLE"}
+
+    @property
+    def K(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (the field's name)
+        """The pinhole matrix in pixels, [3, 3]; distortion is left out."""
+        num_focal = CAMERA_MODELS[self.model].num_focal
+        fx, fy = self.params[0], self.params[num_focal - 1]
+        cx, cy = self.params[num_focal : num_focal + 2]
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera with its pose.
+
+    Args:
+        K: Pinhole matrix in pixels, [3, 3].
+        width: Image width in pixels.
+        height: Image height in pixels.
+        cam_from_world: World to OpenCV camera axes, [4, 4].
+
+    Example:
+        >>> import numpy as np
+        >>> K = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
+        >>> camera = Camera(K, 100, 80, np.eye(4))
+        >>> uv, depth = camera.project(np.array([[0.0, 0.0, 2.0]]))
+        >>> uv.tolist(), depth.tolist()
+        ([[50.0, 40.0]], [2.0])
+    """
+
+    K: Float64[np.ndarray, "3 3"]
+    width: int
+    height: int
+    cam_from_world: Float64[np.ndarray, "4 4"]
+
+    @property
+    def world_from_cam(self) -> Float64[np.ndarray, "4 4"]:
+        """The inverse of ``cam_from_world``, by the rigid formula."""
+        inverse = np.eye(4)
+        inverse[:3, :3] = self.cam_from_world[:3, :3].T
+        inverse[:3, 3] = -inverse[:3, :3] @ self.cam_from_world[:3, 3]
+        return inverse
+
+    @property
+    def center(self) -> Float64[np.ndarray, " 3"]:
+        """The camera's position in the world, [3]."""
+        return self.world_from_cam[:3, 3]
+
+    def project(
+        self, xyz: Float[np.ndarray, "N 3"]
+    ) -> tuple[Float64[np.ndarray, "N 2"], Float64[np.ndarray, " N"]]:
+        """Pixel coordinates [N, 2] and planar z-depths [N] of world points.
+
+        Points at or behind the camera plane (depth <= 0) get NaN pixel coordinates.
+        """
+        rotation, translation = self.cam_from_world[:3, :3], self.cam_from_world[:3, 3]
+        cam = np.asarray(xyz, np.float64) @ rotation.T + translation
+        depth = cam[:, 2]
+        safe = np.where(depth > 0, depth, np.nan)
+        uv = (cam / safe[:, None]) @ self.K[:2].T
+        return uv, depth
+
+    def unproject(
+        self, uv: Float[np.ndarray, "N 2"], depth: Float[np.ndarray, " N"]
+    ) -> Float64[np.ndarray, "N 3"]:
+        """World points [N, 3] at pixel coordinates ``uv`` and planar z-depths ``depth``."""
+        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ np.linalg.inv(self.K).T
+        cam = rays * np.asarray(depth, np.float64)[:, None]
+        world_from_cam = self.world_from_cam
+        return np.asarray(cam @ world_from_cam[:3, :3].T + world_from_cam[:3, 3])
+
+
+def rotation_from_quat(quat: Float[np.ndarray, " 4"]) -> Float64[np.ndarray, "3 3"]:
+    """The rotation matrix [3, 3] of a wxyz quaternion, which need not have unit length."""
+    w, x, y, z = np.asarray(quat, np.float64) / np.linalg.norm(quat)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def quat_from_rotation(rotation: Float[np.ndarray, "3 3"]) -> Float64[np.ndarray, " 4"]:
+    """The unit wxyz quaternion, w >= 0, of a rotation matrix [3, 3]."""
+    m = np.asarray(rotation, np.float64)
+    # The symmetric 4x4 form has the quaternion as its top eigenvector: no branch on the trace,
+    # and the nearest rotation when the matrix is not quite orthonormal.
+    form = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], 0, 0, 0],
+            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], 0, 0],
+            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0],
+            [
+                m[1, 0] - m[0, 1],
+                m[0, 2] + m[2, 0],
+                m[1, 2] + m[2, 1],
+                m[2, 2] - m[0, 0] - m[1, 1],
+            ],
+        ]
+    )
+    quat = np.linalg.eigh(form)[1][:, -1]  # eigh reads the lower triangle
+    return np.asarray(-quat if quat[0] < 0 else quat)

@@ -1,0 +1,78 @@
+"""The errors that splatseed raises on purpose.
+
+Each says what was expected, what was found and how to mend it, in one line a user can act on::
+
+    SplatseedError
+    ├── InputError                 the user's data or options; the command line exits with code 2
+    │   ├── SceneNotFoundError     no scene, model, image or file where one was named
+    │   ├── SceneFormatError       a file is there but is not what its format promises
+    │   ├── PointCloudError        arrays of the wrong shape or type, too few usable points
+    │   ├── ParameterError         an option or a method's parameter out of its range
+    │   └── OutputError            the output cannot or must not be written
+    ├── ReconstructionError        Structure-from-Motion ran and did not succeed
+    └── MissingDependencyError     an optional package is needed and absent
+
+Anything else that escapes is a bug of ours.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "InputError",
+    "MissingDependencyError",
+    "OutputError",
+    "ParameterError",
+    "PointCloudError",
+    "ReconstructionError",
+    "SceneFormatError",
+    "SceneNotFoundError",
+    "SplatseedError",
+]
+
+
+class SplatseedError(Exception):
+    """Base of every error raised on purpose.
+
+    Args:
+        expected: What should have been there, naming the file, line or record.
+        found: What was there instead.
+        fix: What the user can do about it.
+    """
+
+    def __init__(self, expected: str, *, found: str, fix: str) -> None:
+        super().__init__(f"expected {expected}; found {found}. {fix}")
+        self.expected = expected
+        self.found = found
+        self.fix = fix
+
+
+class InputError(SplatseedError):
+    """The user's data or options are at fault."""
+
+
+class SceneNotFoundError(InputError):
+    """There is no scene, model, image or file where one was named."""
+
+
+class SceneFormatError(InputError):
+    """A file is there but is not what its format promises."""
+
+
+class PointCloudError(InputError):
+    """Point arrays of the wrong shape or type, or too few usable points."""
+
+
+class ParameterError(InputError):
+    """An option or a method's parameter is out of its range."""
+
+
+class OutputError(InputError):
+    """The output cannot, or must not, be written where it was asked for."""
+
+
+class ReconstructionError(SplatseedError):
+    """Structure-from-Motion ran and did not succeed."""
+
+
+class MissingDependencyError(SplatseedError):
+    """An optional package is needed and absent."""

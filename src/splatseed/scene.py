@@ -1,0 +1,165 @@
+"""Scene: cameras, images, points and tracks, as read from a capture.
+
+Notation: an ``_id`` comes from a file and may have gaps, an ``_idx`` is contiguous. ``tracks``
+belong to the first ``len(tracks)`` points, which are the originals in file order. Promise: a Scene
+is frozen; ``replace`` returns a copy; nothing here reads or writes files.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace as dataclass_replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64, Int64, UInt32
+
+from splatseed.camera import Camera, Intrinsics, rotation_from_quat
+from splatseed.pointcloud import PointCloud
+
+__all__ = ["Image", "Observations", "Scene", "SceneFormat", "SceneSource", "Tracks"]
+
+SceneFormat = Literal["colmap", "transforms", "ply"]
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """The features of one image.
+
+    Args:
+        xy: Pixel coordinates, float64 [M, 2].
+        point_ids: Id of the 3D point each feature belongs to, int64 [M]; -1 = none.
+    """
+
+    xy: Float64[np.ndarray, "M 2"]
+    point_ids: Int64[np.ndarray, " M"]
+
+    def __len__(self) -> int:
+        return len(self.point_ids)
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One posed photograph.
+
+    The pose is kept as the quaternion and translation of the file, so that it is written back
+    bit for bit.
+
+    Args:
+        name: Path relative to the images folder, with forward slashes.
+        image_id: The id that tracks refer to.
+        intrinsics: The camera record that took it.
+        quat: wxyz rotation of ``cam_from_world``, float64 [4], as in the file.
+        translation: Translation of ``cam_from_world``, float64 [3].
+        observations: Its features; None where the format has none.
+    """
+
+    name: str
+    image_id: int
+    intrinsics: Intrinsics
+    quat: Float64[np.ndarray, " 4"]
+    translation: Float64[np.ndarray, " 3"]
+    observations: Observations | None = None
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The posed pinhole camera (distortion left out)."""
+        cam_from_world = np.eye(4)
+        cam_from_world[:3, :3] = rotation_from_quat(self.quat)
+        cam_from_world[:3, 3] = self.translation
+        return Camera(
+            self.intrinsics.K, self.intrinsics.width, self.intrinsics.height, cam_from_world
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Tracks:
+    """What Structure-from-Motion knows of its points beyond position and colour.
+
+    The observations of point i are ``image_ids[offsets[i]:offsets[i + 1]]`` and the features
+    ``point2d_idx`` of those images.
+
+    Args:
+        point_ids: The file's point ids, int64 [N].
+        xyz: The file's float64 positions, [N, 3]: a PointCloud holds float32, and the originals
+            are written back exactly.
+        errors: Mean reprojection error in px, float64 [N]; -1 where unknown.
+        offsets: int64 [N + 1], rising from 0 to T.
+        image_ids: uint32 [T].
+        point2d_idx: uint32 [T].
+    """
+
+    point_ids: Int64[np.ndarray, " N"]
+    xyz: Float64[np.ndarray, "N 3"]
+    errors: Float64[np.ndarray, " N"]
+    offsets: Int64[np.ndarray, " N+1"]
+    image_ids: UInt32[np.ndarray, " T"]
+    point2d_idx: UInt32[np.ndarray, " T"]
+
+    def __len__(self) -> int:
+        return len(self.point_ids)
+
+    @property
+    def lengths(self) -> Int64[np.ndarray, " N"]:
+        """Observations per point, int64 [N]."""
+        return np.diff(self.offsets)
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """Where a scene was read from.
+
+    Args:
+        format: Which reader read it.
+        root: The scene's folder (for a bare PLY, the folder it lies in).
+        points_path: The file the points came from.
+        model_dir: The COLMAP model folder, if there is one.
+        image_dir: The folder that ``Image.name`` is relative to, if there is one.
+    """
+
+    format: SceneFormat
+    root: Path
+    points_path: Path
+    model_dir: Path | None = None
+    image_dir: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A capture: points, and the images and cameras that saw them.
+
+    Args:
+        points: The cloud.
+        images: The posed images, in file order; empty for a bare cloud.
+        intrinsics: All camera records of the file, also unused ones.
+        tracks: Tracks of the first ``len(tracks)`` points, which are the originals.
+        source: Where it was read from; None for a scene made in memory.
+        warnings: What the reader repaired or found odd, one sentence each.
+    """
+
+    points: PointCloud
+    images: tuple[Image, ...] = ()
+    intrinsics: tuple[Intrinsics, ...] = ()
+    tracks: Tracks | None = None
+    source: SceneSource | None = None
+    warnings: tuple[str, ...] = field(default=())
+
+    def replace(self, **changes: Any) -> Scene:
+        """A copy with some fields replaced.
+
+        When ``points`` are replaced and ``tracks`` are not, the tracks stay only if the new cloud
+        still begins with the very points they belong to; otherwise they are dropped.
+        """
+        tracks = self.tracks
+        if "points" in changes and "tracks" not in changes and tracks is not None:
+            kept = changes["points"].xyz[: len(tracks)]
+            if not np.array_equal(kept, self.points.xyz[: len(tracks)], equal_nan=True):
+                changes["tracks"] = None
+        return dataclass_replace(self, **changes)
+
+    def split(self, test_every: int = 8) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
+        """Training and test images: names sorted, every ``test_every``-th is a test image."""
+        ordered = sorted(self.images, key=lambda image: image.name)
+        train = tuple(image for i, image in enumerate(ordered) if i % test_every)
+        return train, tuple(ordered[::test_every])
