@@ -1,1 +1,22 @@
-"""Better seeds for 3D Gaussian Splatting."""
+"""splatseed: better seeds for 3D Gaussian Splatting.
+
+>>> import splatseed as ss
+>>> sorted(ss.METHODS)[:3]
+['linear', 'mls', 'random']
+"""
+
+from splatseed.camera import Camera
+from splatseed.errors import SplatseedError
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+from splatseed.upsample import METHODS, upsample, upsample_points
+
+__all__ = [
+    "METHODS",
+    "Camera",
+    "PointCloud",
+    "Scene",
+    "SplatseedError",
+    "upsample",
+    "upsample_points",
+]

@@ -1,1 +1,185 @@
-"""Upsampling."""
+"""Upsampling: more points from the ones there are.
+
+``upsample`` takes a scene or a cloud, ``upsample_points`` bare arrays; ``METHODS`` has the methods.
+Promise: the originals come first and unchanged; the same seed gives the same bytes whatever the
+number of threads; new points are finite.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+
+from splatseed.errors import ParameterError, PointCloudError
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
+from splatseed.upsample.method import NewPoints, Upsampler
+from splatseed.upsample.registry import METHODS, source_code
+
+__all__ = [
+    "METHODS",
+    "NewPoints",
+    "Profile",
+    "Upsampler",
+    "configure",
+    "upsample",
+    "upsample_points",
+]
+
+Profile = Literal["default", "paper"]
+
+
+def configure(method: str, profile: Profile = "default", **parameters: Any) -> Upsampler:
+    """An upsampling method with its parameters.
+
+    Args:
+        method: A key of ``METHODS``.
+        profile: "default" treats the paper's traps, "paper" follows its text to the letter.
+        parameters: Fields of the method that differ from the profile's.
+
+    Raises:
+        ParameterError: No such method, profile or parameter, or a value out of range.
+
+    Example:
+        >>> configure("mls", "paper").k, configure("mls", k=12).k
+        (10, 12)
+    """
+    kind = METHODS[method]
+    if profile not in {"default", "paper"}:
+        raise ParameterError(
+            "the profile 'default' or 'paper'", found=repr(profile), fix="Choose one of these."
+        )
+    chosen = kind.paper() if profile == "paper" else kind()
+    known = [f.name for f in dataclasses.fields(chosen)]  # type: ignore[arg-type]
+    for name in parameters:
+        if name not in known:
+            raise ParameterError(
+                f"a parameter of {method} ({', '.join(known) or 'it has none'})",
+                found=repr(name),
+                fix="Check its spelling.",
+            )
+    return dataclasses.replace(chosen, **parameters)  # type: ignore[type-var]
+
+
+def upsample(
+    scene: Scene | PointCloud,
+    method: str | Upsampler = "mls",
+    *,
+    ratio: float | None = None,
+    num_points: int | None = None,
+    seed: int = 0,
+    profile: Profile = "default",
+    progress: Progress = silent,
+    **parameters: Any,
+) -> PointCloud:
+    """Upsample the points of a scene.
+
+    Args:
+        scene: A scene, or a bare cloud. Points with ``source`` other than 0 are put aside: new
+            points are made from originals only, and replace earlier new ones.
+        method: A key of ``METHODS``, or a method with its parameters.
+        ratio: Points in all, as a multiple of the originals (r N); 4 when neither is given.
+        num_points: Points in all, instead of ``ratio``.
+        seed: The same seed gives the same bytes, whatever the number of threads.
+        profile: "default", or "paper" for the paper's text to the letter.
+        progress: Told each stage and the fraction done.
+        parameters: Fields of the method, such as ``k=12``.
+
+    Returns:
+        The N originals, first and unchanged, then the new points; ``source`` tells them apart.
+
+    Raises:
+        ParameterError: An unknown method, profile or parameter, or a size below the originals'.
+        PointCloudError: Too few distinct finite points for the method.
+
+    Example:
+        >>> import numpy as np, splatseed as ss
+        >>> rng = np.random.default_rng(0)
+        >>> xyz, rgb = rng.random((100, 3)), rng.integers(0, 255, (100, 3), np.uint8)
+        >>> seeds = ss.upsample(ss.PointCloud(xyz, rgb), method="mls", ratio=8, seed=0)
+        >>> len(seeds), seeds.num_original
+        (800, 100)
+    """
+    from splatseed.upsample.neighbors import prepare  # noqa: PLC0415  (loads SciPy and Numba)
+
+    points = scene.points if isinstance(scene, Scene) else scene
+    originals = points.originals
+    num_new = _num_new(len(originals), ratio, num_points)
+    name = method if isinstance(method, str) else ""
+    chosen = configure(method, profile, **parameters) if isinstance(method, str) else method
+    if num_new == 0:
+        return originals
+    cloud = prepare(originals, progress=progress)
+    new = chosen(cloud, num_new, np.random.default_rng(seed), progress)
+    _check_finite(new)
+    source = np.full(num_new, source_code(name or _name_of(chosen)), np.uint8)
+    return PointCloud.concatenate(originals, PointCloud(new.xyz, new.rgb, source))
+
+
+def upsample_points(
+    xyz: Float[np.ndarray, "N 3"],
+    rgb: UInt8[np.ndarray, "N 3"],
+    method: str | Upsampler = "mls",
+    **options: Any,
+) -> tuple[Float32[np.ndarray, "M 3"], UInt8[np.ndarray, "M 3"]]:
+    """Arrays in, arrays out: ``upsample`` without a cloud around them.
+
+    Args:
+        xyz: Positions, [N, 3].
+        rgb: Colours, uint8 [N, 3].
+        method: As in ``upsample``.
+        options: As in ``upsample``: ratio, num_points, seed, profile, parameters of the method.
+
+    Returns:
+        xyz float32 [M, 3] and rgb uint8 [M, 3]; the first N rows are the input.
+
+    Raises:
+        PointCloudError: The arrays' shapes or types do not fit, or there are too few points.
+        ParameterError: As in ``upsample``.
+    """
+    seeds = upsample(PointCloud(xyz, rgb), method, **options)
+    return seeds.xyz, seeds.rgb
+
+
+def _num_new(num_original: int, ratio: float | None, num_points: int | None) -> int:
+    """How many points are to be made."""
+    if ratio is not None and num_points is not None:
+        raise ParameterError(
+            "either a ratio or a number of points", found="both", fix="Leave one of them out."
+        )
+    if num_points is None:
+        ratio = 4.0 if ratio is None else ratio
+        if not 1 <= ratio < np.inf:
+            raise ParameterError(
+                "a ratio of at least 1 (points in all, per original)",
+                found=f"{ratio:g}",
+                fix="Give --ratio 8 for eight times as many points.",
+            )
+        num_points = round(ratio * num_original)
+    if num_points < num_original:
+        raise ParameterError(
+            f"a number of points of at least the {num_original:,} originals",
+            found=f"{num_points:,}",
+            fix="Upsampling only adds points; ask for more.",
+        )
+    return num_points - num_original
+
+
+def _check_finite(new: NewPoints) -> None:
+    """Hold every method, also a third party's, to the promise of finite points."""
+    if not np.isfinite(new.xyz).all():
+        bad = int(np.flatnonzero(~np.isfinite(new.xyz).all(axis=1))[0])
+        raise PointCloudError(
+            "finite new points",
+            found=f"{new.xyz[bad].tolist()} at new point {bad}",
+            fix="Report this with the scene; float32 may be too small for its coordinates.",
+        )
+
+
+def _name_of(method: Upsampler) -> str:
+    """The registered name of a method instance, or its class name."""
+    return next((n for n in METHODS if METHODS[n] is type(method)), type(method).__name__)

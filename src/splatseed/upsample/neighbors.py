@@ -1,0 +1,227 @@
+"""The originals, prepared once for every method: clean, centred, in spatial order, with neighbours.
+
+Notation: n distinct finite originals in *rows* (kd-tree leaf order: neighbouring rows are
+neighbours in space, which keeps every later pass in cache); ``rank`` is a row's place among them
+in file order; k neighbours a row, nearest first, never the row itself; h = ``spacing`` = mean
+distance to the 6 nearest.
+Promise: random draws are assigned by rank, not by row, so that results do not depend on how the
+kd-tree happened to cut space.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int32, Int64, UInt8
+from scipy.spatial import cKDTree
+
+from splatseed.errors import PointCloudError
+from splatseed.jit import inline, kernel, parallel_range
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Progress, blocks, silent
+
+__all__ = ["Bases", "Neighbors", "PreparedCloud", "draw_bases", "prepare", "sound_bases"]
+
+SPACING_NEIGHBORS = 6
+OUTLIER_NEIGHBORS = 16
+OUTLIER_FACTOR = 3.0
+QUERY_BLOCK = 1 << 16
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbors:
+    """The k nearest other originals of every row.
+
+    Args:
+        idx: Rows of the neighbours, int32 [n, k], nearest first.
+        distance: Their distances, float64 [n, k], scene units.
+    """
+
+    idx: Int32[np.ndarray, "n k"]
+    distance: Float64[np.ndarray, "n k"]
+
+    @property
+    def k(self) -> int:
+        """Neighbours per row."""
+        return self.idx.shape[1]
+
+    @cached_property
+    def spacing(self) -> Float64[np.ndarray, " n"]:
+        """h of every row: mean distance to the 6 nearest (fewer where there are fewer)."""
+        return np.asarray(self.distance[:, :SPACING_NEIGHBORS].mean(axis=1))
+
+    def nearest(self, k: int) -> Neighbors:
+        """The first ``k`` of the neighbours."""
+        if k >= self.k:
+            return self
+        return Neighbors(
+            np.ascontiguousarray(self.idx[:, :k]), np.ascontiguousarray(self.distance[:, :k])
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedCloud:
+    """Distinct finite originals in spatial order.
+
+    Args:
+        xyz: Positions relative to ``center``, float64 [n, 3], scene units.
+        rgb: Colours, uint8 [n, 3].
+        rank: Place of each row in file order, int64 [n].
+        trusted: Rows that may serve as bases, bool [n].
+        center: Centroid in the world, float64 [3].
+        tree: kd-tree over the positions in file order.
+        progress: Told how far the neighbour query is.
+    """
+
+    xyz: Float64[np.ndarray, "n 3"]
+    rgb: UInt8[np.ndarray, "n 3"]
+    rank: Int64[np.ndarray, " n"]
+    trusted: Bool[np.ndarray, " n"]
+    center: Float64[np.ndarray, " 3"]
+    tree: cKDTree
+    progress: Progress = silent
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def neighbors(self, k: int) -> Neighbors:
+        """The ``k`` nearest other rows of every row (all of them where there are fewer).
+
+        Raises:
+            PointCloudError: There is only one point, which has no neighbour.
+        """
+        k = min(k, len(self) - 1)
+        if k < 1:
+            raise PointCloudError(
+                "at least 2 distinct finite points",
+                found=f"{len(self)}",
+                fix="Check that the scene holds the point cloud you meant.",
+            )
+        idx = np.empty((len(self), k), np.int32)
+        distance = np.empty((len(self), k))
+        row_of_rank = np.empty(len(self), np.int32)
+        row_of_rank[self.rank] = np.arange(len(self), dtype=np.int32)
+        for start, stop in blocks(len(self), QUERY_BLOCK, "neighbours", self.progress):
+            found, ranks = self.tree.query(self.xyz[start:stop], k + 1, workers=-1)
+            # Column 0 is the row itself: rows are distinct, so nothing else is at distance 0.
+            idx[start:stop] = row_of_rank[ranks[:, 1:]]
+            distance[start:stop] = found[:, 1:]
+        return Neighbors(idx, distance)
+
+
+def prepare(
+    points: PointCloud, trusted: Bool[np.ndarray, " N"] | None = None, progress: Progress = silent
+) -> PreparedCloud:
+    """Mask, de-duplicate, centre and sort the originals of a cloud.
+
+    Args:
+        points: The cloud; only points with ``source`` 0 take part.
+        trusted: Which of the N points may serve as bases; all when left out.
+        progress: Called with the stage "neighbours" while neighbours are sought.
+
+    Raises:
+        PointCloudError: No finite original is left.
+    """
+    keep = points.finite & (points.source == 0)
+    if not keep.any():
+        raise PointCloudError(
+            "at least one original point with finite coordinates",
+            found=f"{len(points)} points, none of them finite and original",
+            fix="Check that the scene holds the point cloud you meant.",
+        )
+    keep_idx = np.flatnonzero(keep)
+    keep_idx = keep_idx[_first_of_equals(points.xyz[keep_idx])]
+    center = points.xyz[keep_idx].mean(axis=0, dtype=np.float64)
+    xyz = points.xyz[keep_idx].astype(np.float64) - center
+    tree = cKDTree(xyz, balanced_tree=False)
+    rank = np.asarray(tree.indices, np.int64)
+    rows = keep_idx[rank]
+    trusted_rows = np.ones(len(rows), bool) if trusted is None else trusted[rows]
+    return PreparedCloud(xyz[rank], points.rgb[rows], rank, trusted_rows, center, tree, progress)
+
+
+def _first_of_equals(xyz: np.ndarray) -> np.ndarray:
+    """Sorted indices [M] of the first point of each set of exactly equal ones."""
+    xyz = np.ascontiguousarray(xyz + np.float32(0))  # -0.0 and 0.0 are the same place
+    suspects = np.flatnonzero(_hash_collides(xyz))
+    rows = xyz[suspects].view(np.dtype((np.void, xyz.itemsize * 3))).ravel()
+    first = np.ones(len(xyz), bool)
+    first[suspects] = False
+    first[suspects[np.unique(rows, return_index=True)[1]]] = True
+    return np.flatnonzero(first)
+
+
+def _hash_collides(xyz: np.ndarray) -> np.ndarray:
+    """Which points share a 64-bit hash with another, bool [N]: ten times faster than sorting rows."""
+    bits = xyz.view(np.uint32).astype(np.uint64)
+    odd = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+    mixed = bits * odd
+    hashes = mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(17)) ^ (mixed[:, 2] << np.uint64(13))
+    ordered = np.sort(hashes)
+    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
+    if repeated.size == 0:
+        return np.zeros(len(xyz), bool)
+    return np.isin(hashes, repeated)
+
+
+@dataclass(frozen=True, eq=False)
+class Bases:
+    """How many new points each row makes, and where they go (a CSR layout).
+
+    Row i makes outputs ``start[i] : start[i] + count[i]``. Outputs are ordered by rank.
+
+    Args:
+        start: First output of each row, int64 [n].
+        count: Outputs of each row, int64 [n].
+        total: All outputs, M.
+    """
+
+    start: Int64[np.ndarray, " n"]
+    count: Int64[np.ndarray, " n"]
+    total: int
+
+
+def draw_bases(
+    cloud: PreparedCloud,
+    num_new: int,
+    rng: np.random.Generator,
+    *,
+    weight: Float64[np.ndarray, " n"],
+) -> Bases:
+    """Draw ``num_new`` bases with probability proportional to ``weight`` [n], with replacement.
+
+    When no row has weight, every row is as likely as any other.
+    """
+    by_rank = np.empty(len(cloud))
+    by_rank[cloud.rank] = weight if weight.any() else 1.0
+    counts = rng.multinomial(num_new, by_rank / by_rank.sum())
+    starts = np.cumsum(counts) - counts
+    return Bases(starts[cloud.rank], counts[cloud.rank].astype(np.int64), num_new)
+
+
+def sound_bases(cloud: PreparedCloud, neighbors: Neighbors) -> Float64[np.ndarray, " n"]:
+    """Weight 1 for rows that may serve as bases and are not isolated, else 0, float64 [n].
+
+    A row is isolated when its spacing is over 3 times the lower quartile of its neighbours'
+    spacings: local, so that a sparse background is not taken for noise as a global filter would.
+    """
+    lonely = _isolated(neighbors.idx, neighbors.spacing, OUTLIER_FACTOR, OUTLIER_NEIGHBORS)
+    return (cloud.trusted & ~lonely).astype(np.float64)
+
+
+@kernel
+def _isolated(idx, spacing, factor, max_neighbors):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Rows whose spacing exceeds ``factor`` times the lower quartile of their neighbours'."""
+    n, k = idx.shape
+    k = min(k, max_neighbors)
+    isolated = np.empty(n, np.bool_)
+    for i in parallel_range(n):
+        isolated[i] = spacing[i] > factor * _lower_quartile(idx[i, :k], spacing)
+    return isolated
+
+
+@inline
+def _lower_quartile(rows, spacing):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    return np.sort(spacing[rows])[rows.size // 4]

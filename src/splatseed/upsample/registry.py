@@ -1,0 +1,71 @@
+"""METHODS: every upsampling method by name, imported when first looked up.
+
+Built-in methods come first, then what installed packages register under the entry-point group
+``splatseed.methods`` (``name = "package.module:Class"``). A built-in name cannot be taken over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import cast
+
+from splatseed.errors import ParameterError
+from splatseed.upsample.method import Upsampler
+
+__all__ = ["METHODS", "source_code"]
+
+GROUP = "splatseed.methods"
+PLUGIN_SOURCE = 255
+
+BUILT_IN = {
+    "linear": "splatseed.upsample.linear:Linear",
+    "triangle": "splatseed.upsample.triangle:Triangle",
+    "spline": "splatseed.upsample.spline:Spline",
+    "mls": "splatseed.upsample.mls:Mls",
+    "voronoi": "splatseed.upsample.voronoi:Voronoi",
+    "random": "splatseed.upsample.bounding_box:BoundingBox",
+}
+
+SOURCE_CODES = {"linear": 1, "triangle": 2, "spline": 3, "mls": 4, "voronoi": 5, "random": 7}
+"""What ``PointCloud.source`` holds for the points of each built-in method; 6 is kept for depth."""
+
+
+class MethodRegistry(Mapping[str, type[Upsampler]]):
+    """The methods by name; a class is imported when it is first looked up."""
+
+    def __getitem__(self, name: str) -> type[Upsampler]:
+        if name in BUILT_IN:
+            module, _, attribute = BUILT_IN[name].partition(":")
+            return cast("type[Upsampler]", getattr(import_module(module), attribute))
+        if name in self._plugins:
+            return cast("type[Upsampler]", self._plugins[name].load())
+        raise ParameterError(
+            f"one of the methods {', '.join(self)}", found=repr(name), fix="Choose one of these."
+        )
+
+    def __contains__(self, name: object) -> bool:
+        return name in BUILT_IN or name in self._plugins
+
+    def __iter__(self) -> Iterator[str]:
+        yield from BUILT_IN
+        yield from self._plugins
+
+    def __len__(self) -> int:
+        return len(BUILT_IN) + len(self._plugins)
+
+    @cached_property
+    def _plugins(self) -> dict[str, EntryPoint]:
+        return {
+            entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in BUILT_IN
+        }
+
+
+METHODS = MethodRegistry()
+
+
+def source_code(name: str) -> int:
+    """The ``PointCloud.source`` code of a method; 255 for every method of a third party."""
+    return SOURCE_CODES.get(name, PLUGIN_SOURCE)
