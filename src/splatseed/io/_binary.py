@@ -26,6 +26,7 @@ class ByteReader:
 
     Args:
         path: The file; it is read whole.
+        fix: What errors advise.
 
     Attributes:
         data: Its bytes.
@@ -37,8 +38,9 @@ class ByteReader:
         SceneFormatError: It cannot be read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, fix: str = EXPORT_AGAIN) -> None:
         self.path = path
+        self.fix = fix
         self.data = read_bytes(path)
         self.offset = 0
         self.record = "header"
@@ -96,7 +98,7 @@ class ByteReader:
 
     def error(self, expected: str, found: str) -> SceneFormatError:
         """An error at the current place."""
-        return SceneFormatError(f"{expected} in {self.where}", found=found, fix=EXPORT_AGAIN)
+        return SceneFormatError(f"{expected} in {self.where}", found=found, fix=self.fix)
 
     def _require(self, size: int) -> None:
         if size > self.remaining:
