@@ -20,7 +20,7 @@ from splatseed.pointcloud import PointCloud
 
 __all__ = ["Image", "Observations", "Scene", "SceneFormat", "SceneSource", "Tracks"]
 
-SceneFormat = Literal["colmap", "transforms", "ply"]
+SceneFormat = Literal["colmap", "transforms", "ply", "rgbd"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +113,11 @@ class SceneSource:
     Args:
         format: Which reader read it.
         root: The scene's folder (for a bare PLY, the folder it lies in).
-        points_path: The file the points came from.
+        points_path: The file the points came from; for an RGB-D capture, which has none, the
+            trajectory.
         model_dir: The COLMAP model folder, if there is one.
         image_dir: The folder that ``Image.name`` is relative to, if there is one.
+        transforms_path: The ``transforms.json`` that was read, if it was one.
     """
 
     format: SceneFormat
@@ -123,6 +125,7 @@ class SceneSource:
     points_path: Path
     model_dir: Path | None = None
     image_dir: Path | None = None
+    transforms_path: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)

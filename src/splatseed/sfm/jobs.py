@@ -1,0 +1,106 @@
+"""Jobs: what the worker process is asked to do, and what it finds.
+
+A job is plain data that travels to the worker; ``run`` is called there. It works in ``staging`` and
+leaves the scene there, with its scratch files in ``staging/.work``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatseed.scene import Image
+from splatseed.sfm.cameras import guess_cameras, known_cameras
+from splatseed.sfm.export import export_scene
+from splatseed.sfm.features import Run, find_features, match_features, write_database
+from splatseed.sfm.mapping import map_images, triangulate_points
+from splatseed.sfm.photos import Photo
+from splatseed.sfm.settings import Settings
+from splatseed.sfm.stages import Stages
+
+__all__ = ["Found", "ReconstructJob", "TriangulateJob"]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a job found; see ``SfmReport`` for the fields."""
+
+    registered: frozenset[str]
+    num_points: int
+    mean_track_length: float
+    mean_reprojection_error: float
+    seconds: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class ReconstructJob:
+    """Poses, lenses and points from photographs.
+
+    Args:
+        image_dir: The photographs.
+        staging: Where the scene is made.
+        settings: How.
+        photos: Which photographs.
+        camera_model: COLMAP's model of the lens.
+        shared_camera: One lens for all photographs of a size, or one for each.
+    """
+
+    image_dir: Path
+    staging: Path
+    settings: Settings
+    photos: tuple[Photo, ...]
+    camera_model: str
+    shared_camera: bool
+
+    def run(self, stages: Stages) -> Found:
+        """Do it, in this process."""
+        run = Run(stages, self.settings, self.image_dir, self.staging / ".work")
+        write_database(
+            run, *guess_cameras(run, self.photos, self.camera_model, shared=self.shared_camera)
+        )
+        names = [photo.name for photo in self.photos]
+        find_features(run, names)
+        match_features(run)
+        export_scene(run, map_images(run, names), self.staging)
+        return _found(run, self.staging)
+
+
+@dataclass(frozen=True)
+class TriangulateJob:
+    """Points from photographs with known poses.
+
+    Args:
+        image_dir: The photographs.
+        staging: Where the scene is made.
+        settings: How.
+        pairs: The photographs, each with its pose and intrinsics.
+    """
+
+    image_dir: Path
+    staging: Path
+    settings: Settings
+    pairs: tuple[tuple[Photo, Image], ...]
+
+    def run(self, stages: Stages) -> Found:
+        """Do it, in this process."""
+        run = Run(stages, self.settings, self.image_dir, self.staging / ".work")
+        cameras, images = known_cameras(run, self.pairs)
+        write_database(run, cameras, images)
+        find_features(run, [photo.name for photo, _ in self.pairs])
+        match_features(run)
+        model_dir = triangulate_points(run, cameras, images, [image for _, image in self.pairs])
+        export_scene(run, model_dir, self.staging)
+        return _found(run, self.staging)
+
+
+def _found(run: Run, scene: Path) -> Found:
+    """What the scene holds, read back from its files."""
+    model = run.pycolmap.Reconstruction(scene / "sparse" / "0")
+    return Found(
+        registered=frozenset(image.name for image in model.images.values() if image.has_pose),
+        num_points=model.num_points3D(),
+        mean_track_length=float(model.compute_mean_track_length()),
+        mean_reprojection_error=float(model.compute_mean_reprojection_error()),
+        seconds=dict(run.stages.seconds),
+    )

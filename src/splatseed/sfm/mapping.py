@@ -1,0 +1,140 @@
+"""Mapping: from verified matches to a model, with poses unknown or known.
+
+Both functions return the folder of a COLMAP model in the run's scratch folder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatseed.errors import ReconstructionError
+from splatseed.scene import Image
+from splatseed.sfm.features import Run
+from splatseed.sfm.photos import name_some
+
+__all__ = ["map_images", "triangulate_points"]
+
+_ADVICE = (
+    "Take more overlapping photographs, take out those of other places, try the exhaustive "
+    "matcher, a simpler camera_model such as SIMPLE_RADIAL, or a larger max_image_size."
+)
+
+
+def map_images(run: Run, names: Sequence[str]) -> Path:
+    """Solve for poses, lenses and points, and keep the model with most images.
+
+    Raises:
+        ReconstructionError: No model came out, or its images are fewer than half of ``names``.
+    """
+    models_dir = run.work / "models"
+    models_dir.mkdir()
+    models = _incremental_mapping(run, models_dir, len(names))
+    if not models:
+        raise ReconstructionError(
+            f"a model of the {len(names)} images in {run.image_dir}",
+            found="no two images that match well enough to begin one",
+            fix=_ADVICE,
+        )
+    best = max(models, key=lambda i: (models[i].num_reg_images(), models[i].num_points3D()))
+    _check_registered(run, models[best], len(models), names)
+    return models_dir / str(best)
+
+
+def _incremental_mapping(run: Run, models_dir: Path, num_images: int) -> dict[int, Any]:
+    pycolmap = run.pycolmap
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = run.settings.threads
+    options.random_seed = run.settings.seed
+    registered: list[None] = []  # of the model being built; mapping may begin several
+
+    def restart() -> None:
+        registered[:] = [None, None]
+
+    return dict(
+        run.stages.run(
+            "mapping",
+            lambda: pycolmap.incremental_mapping(
+                run.database,
+                run.image_dir,
+                models_dir,
+                options,
+                initial_image_pair_callback=restart,
+                next_image_callback=lambda: registered.append(None),
+            ),
+            lambda: len(registered),
+            num_images,
+        )
+    )
+
+
+def _check_registered(run: Run, model: Any, num_models: int, names: Sequence[str]) -> None:
+    registered = {image.name for image in model.images.values() if image.has_pose}
+    if 2 * len(registered) >= len(names):
+        return
+    missing = [name for name in names if name not in registered]
+    raise ReconstructionError(
+        f"at least half of the {len(names)} images in {run.image_dir} to register",
+        found=f"{len(registered)} in the largest of {num_models} models; "
+        f"without a pose: {name_some(missing)}",
+        fix=_ADVICE,
+    )
+
+
+def triangulate_points(
+    run: Run, cameras: Sequence[Any], images: Sequence[Any], poses: Sequence[Image]
+) -> Path:
+    """Triangulate points with the poses and cameras held fixed.
+
+    Args:
+        run: The run.
+        cameras: The cameras of the database.
+        images: The images of the database.
+        poses: Their poses, in the same order.
+
+    Raises:
+        ReconstructionError: Not one point came out.
+    """
+    pycolmap = run.pycolmap
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = run.settings.threads
+    options.random_seed = run.settings.seed
+    model_dir = run.work / "model"
+    model_dir.mkdir()
+    posed = _posed_model(pycolmap, cameras, images, poses)
+    model = run.stages.run(
+        "triangulation",
+        lambda: pycolmap.triangulate_points(
+            posed,
+            run.database,
+            run.image_dir,
+            model_dir,
+            options=options,
+        ),
+        posed.num_points3D,
+        0,
+    )
+    if model.num_points3D() == 0:
+        raise ReconstructionError(
+            f"points from the {len(images)} posed images in {run.image_dir}",
+            found="none on which two matching rays meet",
+            fix="Check that the poses belong to these images, in the same order and convention; "
+            "a capture without sideways motion has no depth to triangulate.",
+        )
+    return model_dir
+
+
+def _posed_model(
+    pycolmap: Any, cameras: Sequence[Any], images: Sequence[Any], poses: Sequence[Image]
+) -> Any:
+    model = pycolmap.Reconstruction()
+    for camera in cameras:
+        model.add_camera_with_trivial_rig(camera)
+    for image, pose in zip(images, poses, strict=True):
+        rotation = pycolmap.Rotation3d(np.roll(pose.quat, -1))  # wxyz to xyzw
+        cam_from_world = pycolmap.Rigid3d(rotation, pose.translation)
+        model.add_image_with_trivial_frame(image, cam_from_world)
+    return model

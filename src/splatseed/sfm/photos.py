@@ -1,0 +1,136 @@
+"""Photographs: which images a folder holds, whether they can be read, and which have a pose.
+
+Promise: every ``Photo`` returned was decoded to its last byte. pycolmap itself takes a truncated
+JPEG for a picture with a grey lower half, and passes over a file that it cannot read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from PIL import Image as PilImage
+
+from splatseed.camera import Intrinsics
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.scene import Image, Scene
+
+__all__ = ["Photo", "find_photos", "match_poses", "name_some"]
+
+_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+_SHOWN = 8
+
+
+@dataclass(frozen=True)
+class Photo:
+    """An image file.
+
+    Args:
+        name: Path relative to the images folder, with forward slashes.
+        width: Width in pixels as stored, before any EXIF rotation.
+        height: Height in pixels as stored.
+    """
+
+    name: str
+    width: int
+    height: int
+
+
+def find_photos(image_dir: Path, *, at_least: int) -> tuple[Photo, ...]:
+    """The images below ``image_dir``, hidden files left out, sorted by name.
+
+    Raises:
+        SceneNotFoundError: The folder is missing or holds fewer images than ``at_least``.
+        SceneFormatError: An image cannot be decoded.
+    """
+    names = _image_names(image_dir)
+    if len(names) < at_least:
+        raise SceneNotFoundError(
+            f"at least {at_least} images in {image_dir}",
+            found=f"{len(names)}",
+            fix="Add photographs of the same scene from other places.",
+        )
+    with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
+        return tuple(pool.map(lambda name: _read_photo(image_dir, name), names))
+
+
+def match_poses(
+    photos: Sequence[Photo], scene: Scene, image_dir: Path
+) -> tuple[tuple[Photo, Image], ...]:
+    """The photographs that ``scene`` has a pose for, with that pose.
+
+    Raises:
+        SceneNotFoundError: Fewer than two names are in both.
+        SceneFormatError: A photograph has another size than its camera.
+    """
+    posed = {image.name: image for image in scene.images}
+    pairs = tuple(
+        (photo, replace(posed[photo.name], observations=None))  # they would travel for nothing
+        for photo in photos
+        if photo.name in posed
+    )
+    if len(pairs) < 2:
+        raise SceneNotFoundError(
+            f"two or more images of {image_dir} among the {len(posed)} posed images "
+            f"({name_some(sorted(posed)[:3])}, ...)",
+            found=f"{len(pairs)} of {len(photos)} ({name_some([p.name for p in photos[:3]])}, ...)",
+            fix="Names must be equal, relative to the images folder, suffix included.",
+        )
+    for photo, image in pairs:
+        _check_size(photo, image.intrinsics, image_dir)
+    return pairs
+
+
+def _check_size(photo: Photo, intrinsics: Intrinsics, image_dir: Path) -> None:
+    if (photo.width, photo.height) != (intrinsics.width, intrinsics.height):
+        raise SceneFormatError(
+            f"{image_dir / photo.name} to have the size of its camera {intrinsics.camera_id}, "
+            f"{intrinsics.width}x{intrinsics.height}",
+            found=f"{photo.width}x{photo.height}",
+            fix="Give the images that the poses were made for, at the same scale.",
+        )
+
+
+def name_some(names: Sequence[str]) -> str:
+    """The first few of ``names``, and how many more there are."""
+    shown = ", ".join(names[:_SHOWN])
+    more = len(names) - _SHOWN
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+def _image_names(image_dir: Path) -> list[str]:
+    if not image_dir.is_dir():
+        raise SceneNotFoundError(
+            f"a folder of images at {image_dir}",
+            found="a file" if image_dir.exists() else "nothing",
+            fix="Give the folder that holds the photographs.",
+        )
+    relative = [path.relative_to(image_dir) for path in image_dir.rglob("*") if path.is_file()]
+    files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]
+    names = sorted(path.as_posix() for path in files if path.suffix.lower() in _SUFFIXES)
+    if not names:
+        kinds = sorted({path.suffix.lower() or "(no suffix)" for path in files})
+        raise SceneNotFoundError(
+            f"images ({' '.join(sorted(_SUFFIXES))}) in {image_dir}",
+            found=f"{len(files)} files of other kinds: {name_some(kinds)}" if files else "no files",
+            fix="Give the folder that holds the photographs, as JPEG or PNG.",
+        )
+    return names
+
+
+def _read_photo(image_dir: Path, name: str) -> Photo:
+    path = image_dir / name
+    try:
+        with PilImage.open(path) as image:
+            width, height = image.size
+            image.draft("L", (1, 1))  # an eighth of the JPEG's size: checks all bytes, cheaply
+            image.load()
+    except (OSError, SyntaxError, ValueError, PilImage.DecompressionBombError) as error:
+        raise SceneFormatError(
+            f"{path} to be a readable image",
+            found=str(error),
+            fix="Export it again, or take it out of the folder.",
+        ) from error
+    return Photo(name, width, height)

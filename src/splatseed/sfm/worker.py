@@ -1,0 +1,122 @@
+"""The worker: pycolmap in a process of its own.
+
+A failure deep in COLMAP (a full disk under SQLite, a broken image codec) aborts the process it
+happens in, and nothing but a kill stops some of its loops. So ``run_job`` starts an interpreter
+that runs ``serve``, hands it a pickled job, and reads pickled messages back until
+``("found", Found)`` or ``("failed", error class, expected, found, fix)``; in between come
+``("progress", stage, fraction)``. An abort becomes a ``ReconstructionError``, an interrupt a kill.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+from splatseed import errors
+from splatseed.errors import ReconstructionError, SplatseedError
+from splatseed.progress import Progress
+from splatseed.sfm.jobs import Found, ReconstructJob, TriangulateJob
+from splatseed.sfm.settings import check_cuda, require_pycolmap
+from splatseed.sfm.stages import Stages
+
+__all__ = ["run_job", "serve"]
+
+_CHILD = "from splatseed.sfm.worker import serve; serve()"
+_REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
+
+
+def run_job(
+    job: ReconstructJob | TriangulateJob, log: Path, *, verbose: bool, on_progress: Progress
+) -> Found:
+    """Run ``job`` in a child process and wait for it.
+
+    Args:
+        job: What to do.
+        log: Where pycolmap's log goes.
+        verbose: Let the log through to the terminal instead.
+        on_progress: Told the stage and its progress, 0 to 1.
+
+    Raises:
+        SplatseedError: The job failed; the class and the text are the child's.
+        ReconstructionError: The child died.
+    """
+    with (
+        log.open("wb") as sink,
+        subprocess.Popen(  # noqa: S603  (our own interpreter and module)
+            [sys.executable, "-c", _CHILD, str(int(verbose))],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=None if verbose else sink,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            process_group=0,  # Ctrl-C comes to us alone, and we end the child
+        ) as child,
+    ):
+        try:
+            return _converse(child, job, on_progress)
+        except (EOFError, BrokenPipeError, pickle.UnpicklingError) as error:
+            raise _death(child.wait(), log) from error
+        finally:
+            child.kill()
+
+
+def _converse(
+    child: subprocess.Popen[bytes], job: ReconstructJob | TriangulateJob, on_progress: Progress
+) -> Found:
+    commands, replies = cast("BinaryIO", child.stdin), cast("BinaryIO", child.stdout)
+    pickle.dump(job, commands)
+    commands.flush()
+    while True:
+        match pickle.load(replies):  # noqa: S301  (our own child)
+            case "progress", stage, fraction:
+                on_progress(stage, fraction)
+            case "found", Found() as found:
+                return found
+            case "failed", name, expected, found_text, fix:
+                raise getattr(errors, name)(expected, found=found_text, fix=fix)
+
+
+def _death(code: int, log: Path) -> ReconstructionError:
+    cause = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    text = log.read_text(errors="replace")
+    reasons = [" ".join(filter(None, groups)) for groups in _REASON.findall(text)]
+    reason = "".join(f": {line}" for line in (reasons or text.splitlines())[-1:])
+    return ReconstructionError(
+        "pycolmap to finish",
+        found=f"its process ended by {cause}{reason}",
+        fix="Check disk space and memory; verbose=True shows pycolmap's own log.",
+    )
+
+
+def _serve(commands: BinaryIO, replies: BinaryIO, *, verbose: bool) -> None:
+    """The child's side: read one job, do it, and tell how it went."""
+
+    def reply(*message: Any) -> None:
+        pickle.dump(message, replies)
+        replies.flush()
+
+    try:
+        pycolmap = require_pycolmap()
+        job = pickle.load(commands)  # noqa: S301  (our own parent)
+        check_cuda(pycolmap, job.settings.device)
+        pycolmap.logging.minloglevel = int(
+            pycolmap.logging.Level.INFO if verbose else pycolmap.logging.Level.ERROR
+        )
+        stages = Stages(
+            pycolmap, job.settings.seed, lambda stage, done: reply("progress", stage, done)
+        )
+        reply("found", job.run(stages))
+    except SplatseedError as error:
+        reply("failed", type(error).__name__, error.expected, error.found, error.fix)
+
+
+def serve() -> None:
+    """Be the child: talk over the process's standard input and output."""
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # whatever the C++ libraries print belongs to the log
+    _serve(sys.stdin.buffer, replies, verbose=sys.argv[1] == "1")
