@@ -1,0 +1,194 @@
+"""make_capture: the demo's photographs, depth and points, from nothing but a seed.
+
+Notation: V views of H x W pixels; depth is planar z in metres, 0 where nothing was hit. Promise: a
+seed gives the same capture everywhere; the scene has a COLMAP model's parts (poses, features,
+tracks, reprojection errors) and its surfaces are known, so that any method can be measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+from PIL import Image as PillowImage
+
+from splatseed.camera import Camera, Intrinsics, quat_from_rotation
+from splatseed.errors import ParameterError
+from splatseed.io.staging import output_folder
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Observations, Scene, Tracks
+from splatseed.synthetic.raycast import render_views, visible
+from splatseed.synthetic.room import Room, build_room, orbit_cameras
+from splatseed.synthetic.surfaces import Union
+from splatseed.synthetic.tracks import TrackedPoints, track_points
+
+__all__ = ["DEPTH_SCALE", "Capture", "make_capture", "write_capture"]
+
+DEPTH_SCALE = 5000
+"""Depth PNGs hold metres times this, rounded to 16 bits (as TUM's); 0 = no depth."""
+
+CAMERA_ID = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A made-up capture and the truth behind it.
+
+    Args:
+        scene: Cameras, images with their features, points and tracks; ``source`` is None.
+        images: The photographs, uint8 sRGB [V, H, W, 3].
+        depths: Planar z-depth in metres, float32 [V, H, W]; 0 = nothing there.
+        room: The surfaces and their textures.
+        outliers: Which of the scene's points are mismatches, bool [N].
+    """
+
+    scene: Scene
+    images: UInt8[np.ndarray, "V H W 3"]
+    depths: Float32[np.ndarray, "V H W"]
+    room: Room
+    outliers: Bool[np.ndarray, " N"]
+
+    @property
+    def surfaces(self) -> Union:
+        """All surfaces as one: ``surfaces.distance(xyz)`` is exact, [N, 3] to [N]."""
+        return self.room.surfaces
+
+    def sample_visible(self, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "num 3"]:
+        """Points uniform by area on the parts of the surfaces that some camera sees, [num, 3].
+
+        Coverage is asked of these alone: no method can know the inside of the flower pot.
+        """
+        batches: list[np.ndarray] = []
+        while sum(len(batch) for batch in batches) < num:
+            xyz = self.surfaces.sample(num, rng)
+            batches.append(xyz[self._seen_by_any(xyz)])
+        # Union samples part by part; the order must not matter to who takes the first few.
+        return np.asarray(rng.permutation(np.concatenate(batches))[:num])
+
+    def _seen_by_any(self, xyz: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+        seen = np.zeros(len(xyz), bool)
+        for image in self.scene.images:
+            rest = np.flatnonzero(~seen)
+            seen[rest] = visible(self.surfaces, image.camera, xyz[rest])
+        return seen
+
+
+def make_capture(
+    seed: int = 0, num_views: int = 40, width: int = 400, height: int = 300
+) -> Capture:
+    """Build the demo room, photograph it, and find points in the photographs.
+
+    Args:
+        seed: Places the leaves and draws the points' noise.
+        num_views: Photographs, at least 3.
+        width: Their width in pixels, at least 32.
+        height: Their height in pixels, at least 32.
+
+    Raises:
+        ParameterError: Too few views or pixels.
+    """
+    if num_views < 3 or min(width, height) < 32:
+        raise ParameterError(
+            "at least 3 views of at least 32 x 32 pixels",
+            found=f"{num_views} of {width} x {height}",
+            fix="Ask for more.",
+        )
+    rng = np.random.default_rng(seed)
+    room = build_room(rng)
+    cameras = orbit_cameras(num_views, width, height)
+    images, depths = render_views(room, cameras)
+    found = track_points(room.surfaces, cameras, images, depths, rng)
+    return Capture(_scene(cameras, images, found), images, depths, room, found.outliers)
+
+
+def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False) -> Path:
+    """Write a COLMAP scene: ``images/*.png``, ``sparse/0`` and, extra, ``depths/*.png``.
+
+    A depth PNG has 16 bits and holds metres times ``DEPTH_SCALE``; 0 = none.
+
+    Args:
+        capture: What to write.
+        path: The folder to make.
+        overwrite: Whether to replace a folder that splatseed wrote before.
+
+    Returns:
+        The folder.
+
+    Raises:
+        OutputError: The folder cannot or must not be written.
+    """
+    from splatseed.io import write_scene  # noqa: PLC0415  (lands later)
+
+    with output_folder(Path(path), overwrite=overwrite) as partial:
+        write_scene(capture.scene, partial / "scene")
+        for child in (partial / "scene").iterdir():
+            child.rename(partial / child.name)
+        (partial / "scene").rmdir()
+        scaled = np.round(capture.depths * DEPTH_SCALE).clip(0, 65535).astype(np.uint16)
+        for folder, arrays in (("images", capture.images), ("depths", scaled)):
+            (partial / folder).mkdir()
+            for image, array in zip(capture.scene.images, arrays, strict=True):
+                PillowImage.fromarray(array).save(partial / folder / image.name)
+    return Path(path)
+
+
+def _scene(
+    cameras: Sequence[Camera], images: UInt8[np.ndarray, "V H W 3"], found: TrackedPoints
+) -> Scene:
+    """The COLMAP model of the points found; point i has id i + 1, view v has id v + 1."""
+    K = cameras[0].K
+    params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    intrinsics = Intrinsics(CAMERA_ID, "PINHOLE", cameras[0].width, cameras[0].height, params)
+    points = PointCloud(found.xyz.astype(np.float32), _point_colors(images, found))
+    return Scene(
+        points,
+        tuple(_image(v, camera, intrinsics, found) for v, camera in enumerate(cameras)),
+        (intrinsics,),
+        _tracks(found),
+    )
+
+
+def _image(view: int, camera: Camera, intrinsics: Intrinsics, found: TrackedPoints) -> Image:
+    mine = found.view_idx == view
+    return Image(
+        f"view_{view:03d}.png",
+        view + 1,
+        intrinsics,
+        quat_from_rotation(camera.cam_from_world[:3, :3]),
+        camera.cam_from_world[:3, 3],
+        Observations(found.uv[mine], found.point_idx[mine] + 1),
+    )
+
+
+def _tracks(found: TrackedPoints) -> Tracks:
+    """Tracks in COLMAP's terms; a feature's index counts its image's observations in order."""
+    by_view = np.argsort(found.view_idx, kind="stable")
+    counts = np.bincount(found.view_idx)
+    first = np.repeat(np.cumsum(counts) - counts, counts)
+    point2d_idx = np.empty(len(by_view), np.uint32)
+    point2d_idx[by_view] = np.arange(len(by_view)) - first
+    num = len(found.xyz)
+    return Tracks(
+        point_ids=np.arange(1, num + 1),
+        xyz=found.xyz,
+        errors=found.errors,
+        offsets=np.searchsorted(found.point_idx, np.arange(num + 1)),
+        image_ids=(found.view_idx + 1).astype(np.uint32),
+        point2d_idx=point2d_idx,
+    )
+
+
+def _point_colors(
+    images: UInt8[np.ndarray, "V H W 3"], found: TrackedPoints
+) -> UInt8[np.ndarray, "N 3"]:
+    """Mean colour of each point over the pixels that observed it."""
+    limits = np.array(images.shape[2:0:-1]) - 1
+    column, row = np.clip(np.floor(found.uv), 0, limits).astype(np.int64).T
+    pixels = images[found.view_idx, row, column].astype(np.float64)
+    starts = np.searchsorted(found.point_idx, np.arange(len(found.xyz)))
+    sums = np.add.reduceat(pixels, starts)
+    counts = np.bincount(found.point_idx, minlength=len(found.xyz))
+    return np.round(sums / counts[:, None]).astype(np.uint8)

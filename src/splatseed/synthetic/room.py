@@ -1,0 +1,165 @@
+"""The demo's room: what stands where, and how it is painted.
+
+Notation: world axes x and y along the floor, z up, in metres; the room's corner is at (-1.6, -1.6).
+Promise: every kind of surface on which upsampling behaves differently is there: flat with texture
+(floor, brick wall, box), curved (sphere, cylinder, wavy screen), foliage, and a bare wall.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.camera import Camera
+from splatseed.synthetic.foliage import Discs
+from splatseed.synthetic.surfaces import Box, Cylinder, Rectangle, Sphere, Surface, Union, yaw_frame
+from splatseed.synthetic.texture import Mottled, Plain, Texture, Tiles
+from splatseed.synthetic.wavy import SineSheet
+
+__all__ = ["Room", "build_room", "orbit_cameras"]
+
+CORNER = -1.6
+REACH = 4.6
+WALL_HEIGHT = 2.4
+NUM_LEAVES = 300
+
+LOOK_AT = np.array([-0.15, -0.15, 0.45])
+FOCAL = 0.95
+"""Focal length in image widths: a 55 degree lens, as of a phone."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """Surfaces and, for each, its texture.
+
+    Args:
+        names: A name for each surface, such as ``"bare wall"``.
+        surfaces: The surfaces.
+        textures: Their textures, in the same order.
+    """
+
+    names: tuple[str, ...]
+    surfaces: Union
+    textures: tuple[Texture, ...]
+
+    def part(self, name: str) -> Surface:
+        """The surface of that name."""
+        return self.surfaces.parts[self.names.index(name)]
+
+
+def build_room(rng: np.random.Generator) -> Room:
+    """The room; ``rng`` places the leaves, everything else is fixed."""
+    pieces = {**_walls(), **_furniture(), **_plant(rng)}
+    return Room(
+        tuple(pieces),
+        Union(tuple(surface for surface, _ in pieces.values())),
+        tuple(texture for _, texture in pieces.values()),
+    )
+
+
+def _grain(frequency: float, seed: int, stretch: tuple[float, float, float] = (1, 1, 1)) -> Mottled:
+    """Light and dark within a tile: a palette of grey factors."""
+    x, y, z = (frequency * s for s in stretch)
+    return Mottled(((0.55,) * 3, (1.35,) * 3), (x, y, z), octaves=3, seed=seed)
+
+
+def _walls() -> dict[str, tuple[Surface, Texture]]:
+    corner = np.array([CORNER, CORNER, 0.0])
+    along_x, along_y, up = np.diag([REACH, REACH, WALL_HEIGHT])
+    oak = ((0.42, 0.27, 0.15), (0.66, 0.46, 0.28), (0.80, 0.62, 0.42))
+    brick = ((0.55, 0.24, 0.18), (0.68, 0.36, 0.26), (0.74, 0.52, 0.40), (0.60, 0.30, 0.24))
+    return {
+        "floor": (
+            Rectangle(corner, along_x, along_y),
+            Tiles(oak, (0.9, 0.16, 9.0), _grain(9.0, 1, (0.35, 1.6, 1)), joint=0.012, seed=1),
+        ),
+        "brick wall": (
+            Rectangle(corner, along_x, up),
+            Tiles(brick, (0.26, 9.0, 0.12), _grain(11.0, 2), joint=0.022, seed=2),
+        ),
+        "bare wall": (Rectangle(corner, along_y, up), Plain((0.83, 0.84, 0.82))),
+    }
+
+
+def _furniture() -> dict[str, tuple[Surface, Texture]]:
+    parcel = ((0.20, 0.36, 0.60), (0.85, 0.80, 0.66), (0.88, 0.60, 0.22), (0.30, 0.55, 0.56))
+    marble = ((0.15, 0.17, 0.28), (0.52, 0.55, 0.66), (0.93, 0.91, 0.88))
+    rust = ((0.28, 0.14, 0.12), (0.66, 0.33, 0.18), (0.86, 0.68, 0.44))
+    cloth = ((0.45, 0.12, 0.26), (0.80, 0.45, 0.42), (0.96, 0.86, 0.70))
+    # Across the room's corner: u along (1, -1), v up, w into the corner.
+    upright = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, np.sqrt(2)], [-1.0, -1.0, 0.0]]) / np.sqrt(2)
+    return {
+        "box": (
+            Box(np.array([0.25, -0.75, 0.3]), np.array([0.38, 0.28, 0.3]), yaw_frame(24)),
+            Tiles(parcel, (0.14, 0.14, 0.14), _grain(14.0, 3), seed=3),
+        ),
+        "sphere": (
+            Sphere(np.array([0.30, 0.35, 0.32]), 0.32),
+            Mottled(marble, (4.5, 4.5, 4.5), octaves=4, contrast=2.8, seed=4),
+        ),
+        "cylinder": (
+            Cylinder(np.array([-0.62, 0.10, 0.24]), yaw_frame(0), 0.21, 0.48),
+            Mottled(rust, (5.0, 5.0, 9.0), octaves=4, contrast=2.6, seed=5),
+        ),
+        "wavy screen": (
+            SineSheet(np.array([-1.5, -0.4, 0.0]), upright, np.array([1.54, 1.25]), 0.07, 0.44),
+            Mottled(cloth, (7.0, 7.0, 3.5), octaves=4, contrast=2.8, seed=6),
+        ),
+    }
+
+
+def _plant(rng: np.random.Generator) -> dict[str, tuple[Surface, Texture]]:
+    """Leaves in a ball above the cylinder, which is their pot; each turned at random."""
+    direction = rng.normal(size=(NUM_LEAVES, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    # The cube root fills the ball evenly; starting at 0.5 leaves the middle to the stem.
+    reach = 0.36 * np.cbrt(rng.uniform(0.15, 1.0, NUM_LEAVES))
+    axes = direction + 0.8 * rng.normal(size=(NUM_LEAVES, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    centers = np.array([-0.62, 0.10, 0.86]) + direction * reach[:, None]
+    leaves = Discs(centers, axes, rng.uniform(0.035, 0.065, NUM_LEAVES))
+    green = ((0.07, 0.20, 0.06), (0.22, 0.45, 0.12), (0.55, 0.70, 0.25), (0.85, 0.85, 0.45))
+    return {"leaves": (leaves, Mottled(green, (14.0, 14.0, 14.0), octaves=3, contrast=2.4, seed=7))}
+
+
+def orbit_cameras(num_views: int, width: int, height: int) -> tuple[Camera, ...]:
+    """Cameras on an arc around the open side of the room, low and high by turns.
+
+    Each looks at the middle of the room with its y axis down.
+    """
+    K = np.array([[FOCAL * width, 0.0, width / 2], [0.0, FOCAL * width, height / 2], [0, 0, 1.0]])
+    share = (np.arange(num_views) + 0.5) / num_views
+    azimuth = np.radians(-15.0 + 120.0 * share)
+    elevation = np.radians(30.0 + 17.0 * np.sin(2.0 * np.pi * 3.0 * share))
+    radius = 2.75 + 0.25 * np.cos(2.0 * np.pi * 5.0 * share)
+    outward = np.stack(
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ],
+        axis=1,
+    )
+    eyes = LOOK_AT + radius[:, None] * outward
+    return tuple(Camera(K, width, height, look_at(eye, LOOK_AT)) for eye in eyes)
+
+
+def look_at(
+    eye: Float64[np.ndarray, " 3"],
+    target: Float64[np.ndarray, " 3"],
+    up: Float64[np.ndarray, " 3"] | None = None,
+) -> Float64[np.ndarray, "4 4"]:
+    """``cam_from_world`` [4, 4] of an OpenCV camera at ``eye`` that sees ``target`` upright.
+
+    ``up`` is the world direction that is upward in the image, z where left out.
+    """
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, np.array([0.0, 0.0, 1.0]) if up is None else up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    cam_from_world = np.eye(4)
+    cam_from_world[:3, :3] = rotation
+    cam_from_world[:3, 3] = -rotation @ eye
+    return cam_from_world

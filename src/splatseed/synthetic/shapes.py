@@ -1,0 +1,76 @@
+"""Simple known shapes, on which a method's errors have a name.
+
+Notation: each shape is a ``Surface`` of about unit size, centred near the origin and tilted off the
+world's axes where it is flat, since a method that works in world axes shows it there. Promise: fixed,
+nothing random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import MappingProxyType
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.synthetic.surfaces import Cylinder, Rectangle, Sphere, Surface, Union, yaw_frame
+from splatseed.synthetic.wavy import SineSheet
+
+__all__ = [
+    "SHAPES",
+    "box_corner",
+    "cylinder",
+    "parallel_plates",
+    "plane",
+    "sine_sheet",
+    "sphere",
+]
+
+
+def plane(tilt: float = 35.0, center: Float64[np.ndarray, " 3"] | None = None) -> Rectangle:
+    """A 2 x 2 square turned by ``tilt`` degrees about the x axis; 90 makes it a wall."""
+    c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+    edge_u, edge_v = np.array([2.0, 0.0, 0.0]), np.array([0.0, 2.0 * c, 2.0 * s])
+    middle = np.zeros(3) if center is None else center
+    return Rectangle(middle - (edge_u + edge_v) / 2, edge_u, edge_v)
+
+
+def sphere() -> Sphere:
+    """The unit sphere."""
+    return Sphere(np.zeros(3), 1.0)
+
+
+def cylinder() -> Cylinder:
+    """An upright open cylinder of radius 0.5 and height 2."""
+    return Cylinder(np.zeros(3), yaw_frame(0.0), 0.5, 2.0)
+
+
+def sine_sheet() -> SineSheet:
+    """A 2 x 2 sheet of three and a third waves, 0.1 up and down."""
+    return SineSheet(np.array([-1.0, -1.0, 0.0]), np.eye(3), np.array([2.0, 2.0]), 0.1, 0.6)
+
+
+def parallel_plates(gap: float = 0.1) -> Union:
+    """Two tilted 2 x 2 plates ``gap`` apart: neighbours on one must not mix with the other's."""
+    lower = plane()
+    return Union((lower, plane(center=gap * lower.frame[2])))
+
+
+def box_corner() -> Union:
+    """Three unit squares that meet at right angles: a corner and three edges."""
+    x, y, z = yaw_frame(30.0)
+    origin = np.zeros(3)
+    return Union((Rectangle(origin, x, y), Rectangle(origin, y, z), Rectangle(origin, z, x)))
+
+
+SHAPES: MappingProxyType[str, Callable[[], Surface]] = MappingProxyType(
+    {
+        "plane": plane,
+        "sphere": sphere,
+        "cylinder": cylinder,
+        "sine sheet": sine_sheet,
+        "parallel plates": parallel_plates,
+        "box corner": box_corner,
+    }
+)
+"""A maker for each shape, by name."""

@@ -1,0 +1,164 @@
+"""Solid textures: colour as a function of the position in the world.
+
+Notation: a texture maps points [N, 3] to colours [N, 3], 0..1, as they would be displayed. Palettes
+are [C, 3] and are read with a value in 0..1. Promise: the same point has the same colour from every
+view, so that what is a corner in one image is one in the next; details end near a few pixels of the
+demo's photographs, so that they do not flicker.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float, Float64
+from numba import njit
+
+__all__ = ["Mottled", "Plain", "Texture", "Tiles", "value_noise"]
+
+Color = tuple[float, float, float]
+
+
+class Texture(Protocol):
+    """A colour for every point."""
+
+    def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        """Colours in 0..1 of points, [N, 3]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Plain:
+    """One colour everywhere: the surface on which no feature can be found.
+
+    Args:
+        color: The colour, 0..1.
+    """
+
+    color: Color
+
+    def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        """Colours in 0..1 of points, [N, 3]."""
+        return np.broadcast_to(np.array(self.color), np.shape(xyz))
+
+
+@dataclass(frozen=True)
+class Mottled:
+    """Noise of several octaves, through a palette.
+
+    Args:
+        palette: Colours for noise from low to high, each 0..1.
+        frequency: Cells a scene unit of the coarsest octave along x, y and z.
+        octaves: How many octaves, each twice as fine and 0.7 times as strong as the one before.
+        contrast: Noise is spread by this factor about its mean before the palette is read.
+        seed: Which noise.
+    """
+
+    palette: tuple[Color, ...]
+    frequency: Color
+    octaves: int = 4
+    contrast: float = 2.2
+    seed: int = 0
+
+    def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        """Colours in 0..1 of points, [N, 3]."""
+        noise = value_noise(xyz * np.array(self.frequency), self.octaves, self.seed)
+        return _read_palette(self.palette, (noise - 0.5) * self.contrast + 0.5)
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Bricks, boards or checks: cells of one colour each, joints between them, grain on top.
+
+    Args:
+        palette: A cell's colour is read from it at random, each 0..1.
+        cell: Size of a cell along x, y and z in scene units.
+        grain: Noise that darkens and lightens the cells; its palette is a factor on the colour.
+        joint: Width of the dark joints in scene units.
+        seed: Which colours.
+    """
+
+    palette: tuple[Color, ...]
+    cell: Color
+    grain: Mottled
+    joint: float = 0.0
+    seed: int = 0
+
+    def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        """Colours in 0..1 of points, [N, 3]."""
+        size = np.array(self.cell)
+        # Off the origin by a fraction of a cell, lest a wall at a round coordinate is a joint.
+        position = xyz / size + 0.37
+        colors = _read_palette(self.palette, _lattice_values(np.floor(position), self.seed))
+        from_joint = np.abs(position - np.round(position)) * size
+        colors[(from_joint < self.joint / 2).any(axis=1)] *= 0.35
+        return np.asarray(np.clip(colors * self.grain(xyz), 0.0, 1.0))
+
+
+def _read_palette(palette: tuple[Color, ...], values: np.ndarray) -> np.ndarray:
+    colors = np.array(palette)
+    stops = np.linspace(0.0, 1.0, len(colors))
+    return np.stack([np.interp(values, stops, channel) for channel in colors.T], axis=1)
+
+
+def _lattice_values(cells: np.ndarray, seed: int) -> np.ndarray:
+    """One random value in 0..1 for each integer cell, [N]."""
+    return value_noise(cells, 1, seed)
+
+
+def value_noise(
+    xyz: Float[np.ndarray, "N 3"], octaves: int, seed: int
+) -> Float64[np.ndarray, " N"]:
+    """Smooth noise in 0..1 with cells of size 1, 1/2, 1/4 ..., [N].
+
+    Random values sit at integer lattice points and are joined by smoothstep interpolation; each
+    octave is 0.7 times as strong as the one before.
+    """
+    return np.asarray(_noise_sum(np.ascontiguousarray(xyz, np.float64), octaves, seed))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lattice(x: int, y: int, z: int, seed: int) -> float:
+    """A value in 0..1 hashed from a lattice point (multiply-xorshift rounds on 64 bits)."""
+    h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed)
+    h = (h ^ (h >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9) + np.uint64(y)
+    h = (h ^ (h >> np.uint64(32))) * np.uint64(0x94D049BB133111EB) + np.uint64(z)
+    h = (h ^ (h >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)
+    return float((h ^ (h >> np.uint64(32))) >> np.uint64(11)) * 2.0**-53
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _octave(x: float, y: float, z: float, seed: int) -> float:
+    """Value noise of one octave at one point: a smoothed trilinear blend of 8 lattice values."""
+    fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
+    ix, iy, iz = int(fx), int(fy), int(fz)
+    u, v, w = x - fx, y - fy, z - fz
+    u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
+    total = 0.0
+    for corner in range(8):
+        i, j, k = corner & 1, (corner >> 1) & 1, corner >> 2
+        weight = (u if i else 1 - u) * (v if j else 1 - v) * (w if k else 1 - w)
+        if weight > 0.0:
+            total += weight * _lattice(ix + i, iy + j, iz + k, seed)
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _noise_sum(
+    xyz: np.ndarray,  # float64 [N, 3]
+    octaves: int,
+    seed: int,
+) -> np.ndarray:  # float64 [N]
+    """The weighted mean of ``octaves`` octaves at each point."""
+    result = np.zeros(len(xyz))
+    for i in range(len(xyz)):
+        scale, strength, total = 1.0, 1.0, 0.0
+        for octave in range(octaves):
+            value = _octave(xyz[i, 0] * scale, xyz[i, 1] * scale, xyz[i, 2] * scale, seed + octave)
+            result[i] += strength * value
+            total += strength
+            scale *= 2.0
+            strength *= 0.7
+        result[i] /= total
+    return result

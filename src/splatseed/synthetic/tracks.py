@@ -1,0 +1,285 @@
+"""Points as Structure-from-Motion would have found them in rendered photographs.
+
+Notation: V views, N points, T observations; observation t says that view ``view_idx[t]`` saw point
+``point_idx[t]`` at pixel ``uv[t]``, and observations are sorted by point, then view. Promise:
+candidates are corners of the images, so texture decides where points are; positions are the
+least-squares triangulation of noisy observations, so that errors are longest along the viewing
+rays and for short tracks, as in a real model, and the reprojection errors are those of the
+observations given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+from scipy import ndimage
+
+from splatseed.camera import Camera
+from splatseed.synthetic.raycast import visible
+from splatseed.synthetic.surfaces import Surface
+
+__all__ = ["TrackNoise", "TrackedPoints", "corner_strength", "find_corners", "track_points"]
+
+MIN_STRENGTH = 2.5e-4
+"""Least corner strength of a feature, for grey values 0..1: above an edge, below weak texture."""
+
+CORNERS_PER_PIXEL = 1 / 130
+"""At most this many corners a view: 900 for 400 x 300."""
+
+MIN_COSINE = 0.25
+"""A surface seen more obliquely than this does not match: 75 degrees."""
+
+MISMATCH_NOISE = 2.5
+"""Observations of a mismatch agree this much worse."""
+
+
+@dataclass(frozen=True)
+class TrackNoise:
+    """How the found points differ from the truth.
+
+    Args:
+        pixel_sigma: Typical standard deviation of an observation in pixels, each axis.
+        outlier_share: Share of points that are mismatches: wrong by 15-80% of their depth.
+        min_track: Fewest views of a point that is no mismatch.
+    """
+
+    pixel_sigma: float = 0.5
+    outlier_share: float = 0.025
+    min_track: int = 3
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPoints:
+    """Triangulated points and the observations they come from.
+
+    Args:
+        xyz: Positions, float64 [N, 3].
+        errors: Mean reprojection error of each point in px, float64 [N].
+        outliers: Which points are mismatches, bool [N].
+        point_idx: Point of each observation, ascending, int64 [T].
+        view_idx: View of each observation, int64 [T].
+        uv: Pixel of each observation, float64 [T, 2].
+    """
+
+    xyz: Float64[np.ndarray, "N 3"]
+    errors: Float64[np.ndarray, " N"]
+    outliers: Bool[np.ndarray, " N"]
+    point_idx: Int64[np.ndarray, " T"]
+    view_idx: Int64[np.ndarray, " T"]
+    uv: Float64[np.ndarray, "T 2"]
+
+
+def corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+    """The smaller eigenvalue of the structure tensor of the grey image, 0..1 a pixel, [H, W].
+
+    Source: Shi and Tomasi, Good Features to Track, 1994.
+    """
+    gray = image.astype(np.float32).mean(axis=2) / 255.0
+    gx = ndimage.gaussian_filter(gray, 0.8, order=(0, 1))
+    gy = ndimage.gaussian_filter(gray, 0.8, order=(1, 0))
+    xx, yy, xy = (ndimage.gaussian_filter(g, 1.2) for g in (gx * gx, gy * gy, gx * gy))
+    return np.asarray((xx + yy) / 2 - np.hypot((xx - yy) / 2, xy), np.float32)
+
+
+def find_corners(strength: Float32[np.ndarray, "H W"]) -> Int64[np.ndarray, "M 2"]:
+    """Row and column of the strongest local maxima, strongest first, [M, 2]."""
+    peak = (strength == ndimage.maximum_filter(strength, 3)) & (strength > MIN_STRENGTH)
+    peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = (False,) * 4  # filters see no further
+    rows, cols = np.nonzero(peak)
+    order = np.argsort(-strength[rows, cols], kind="stable")
+    return np.stack([rows, cols], axis=1)[order[: int(CORNERS_PER_PIXEL * strength.size)]]
+
+
+def track_points(
+    surfaces: Surface,
+    cameras: Sequence[Camera],
+    images: UInt8[np.ndarray, "V H W 3"],
+    depths: Float32[np.ndarray, "V H W"],
+    rng: np.random.Generator,
+    noise: TrackNoise | None = None,
+) -> TrackedPoints:
+    """Find corners, follow them through the views, and triangulate them.
+
+    Args:
+        surfaces: What the images show, for exact occlusion.
+        cameras: The V cameras.
+        images: The photographs, uint8 [V, H, W, 3].
+        depths: Their planar z-depths, float32 [V, H, W]; 0 = none.
+        rng: Decides which views see a corner, the noise and the mismatches.
+        noise: How much of the latter two.
+    """
+    noise = noise or TrackNoise()
+    strengths = np.stack([corner_strength(image) for image in images])
+    truth = _candidates(cameras, strengths, depths)
+    point_idx, view_idx = _observe(surfaces, cameras, strengths, truth, rng)
+    keep = np.bincount(point_idx, minlength=len(truth)) >= noise.min_track
+    truth, (point_idx, view_idx) = truth[keep], _renumber(keep, point_idx, view_idx)
+
+    outliers = rng.random(len(truth)) < noise.outlier_share
+    truth, kept = _displace(cameras, truth, outliers, point_idx, view_idx, rng)
+    # A mismatch that no second camera could have seen is not a point at all.
+    keep = np.bincount(point_idx[kept], minlength=len(truth)) >= 2
+    truth, outliers = truth[keep], outliers[keep]
+    point_idx, view_idx = _renumber(keep, point_idx[kept], view_idx[kept])
+    sigma = noise.pixel_sigma * rng.lognormal(-0.1, 0.45, len(truth))
+    sigma[outliers] *= MISMATCH_NOISE
+    return _reconstruct(cameras, truth, outliers, sigma, point_idx, view_idx, rng)
+
+
+def _reconstruct(
+    cameras: Sequence[Camera],
+    truth: Float64[np.ndarray, "N 3"],
+    outliers: Bool[np.ndarray, " N"],
+    sigma: Float64[np.ndarray, " N"],
+    point_idx: Int64[np.ndarray, " T"],
+    view_idx: Int64[np.ndarray, " T"],
+    rng: np.random.Generator,
+) -> TrackedPoints:
+    """Observe the true points with noise of ``sigma`` px, and triangulate what was observed."""
+    uv = _project(cameras, truth, point_idx, view_idx)
+    uv += rng.normal(size=uv.shape) * sigma[point_idx, None]
+    xyz = _triangulate(cameras, truth, point_idx, view_idx, uv)
+    residual = np.linalg.norm(uv - _project(cameras, xyz, point_idx, view_idx), axis=1)
+    errors = np.bincount(point_idx, residual) / np.bincount(point_idx)
+    return TrackedPoints(xyz, errors, outliers, point_idx, view_idx, uv)
+
+
+def _candidates(
+    cameras: Sequence[Camera],
+    strengths: Float32[np.ndarray, "V H W"],
+    depths: Float32[np.ndarray, "V H W"],
+) -> Float64[np.ndarray, "N 3"]:
+    """Exact surface points under the corners of all views, near-duplicates merged."""
+    found = [
+        _unproject_corners(camera, find_corners(strength), depth)
+        for camera, strength, depth in zip(cameras, strengths, depths, strict=True)
+    ]
+    xyz = np.concatenate([points for points, _ in found])
+    footprint = np.median(np.concatenate([size for _, size in found]))
+    # The same corner seen from two views unprojects to within about a pixel: keep one a cell.
+    cells = np.floor(xyz / (1.6 * footprint)).astype(np.int64)
+    return xyz[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+
+
+def _unproject_corners(
+    camera: Camera, corners: Int64[np.ndarray, "M 2"], depth: Float32[np.ndarray, "H W"]
+) -> tuple[Float64[np.ndarray, "K 3"], Float64[np.ndarray, " K"]]:
+    """Surface points under corners, and the size of a pixel there.
+
+    A corner on a silhouette belongs to what is in front, so each moves to the nearest surface of
+    its 5 x 5 window.
+    """
+    shift = np.mgrid[-2:3, -2:3].reshape(2, -1).T
+    window = corners[:, None] + shift  # [M, 25, 2]
+    z = depth[window[..., 0], window[..., 1]].astype(np.float64)
+    best = np.where(z > 0, z, np.inf).argmin(axis=1)
+    rows = np.arange(len(corners))
+    z, pixel = z[rows, best], window[rows, best]
+    hit = z > 0
+    return camera.unproject(pixel[hit][:, ::-1] + 0.5, z[hit]), z[hit] / camera.K[0, 0]
+
+
+def _observe(
+    surfaces: Surface,
+    cameras: Sequence[Camera],
+    strengths: Float32[np.ndarray, "V H W"],
+    xyz: Float64[np.ndarray, "N 3"],
+    rng: np.random.Generator,
+) -> tuple[Int64[np.ndarray, " T"], Int64[np.ndarray, " T"]]:
+    """Which views detect which points: (point_idx, view_idx), sorted by point, then view.
+
+    A view detects a point that it sees, not too obliquely, where its own image has a corner; and
+    then by chance, since some corners repeat well and others do not.
+    """
+    repeatability = rng.beta(1.5, 3.5, len(xyz))
+    normals = surfaces.normals(xyz)
+    detected = np.zeros((len(xyz), len(cameras)), bool)
+    for v, (camera, strength) in enumerate(zip(cameras, strengths, strict=True)):
+        seen = np.flatnonzero(visible(surfaces, camera, xyz))
+        uv, _ = camera.project(xyz[seen])
+        column, row = np.floor(uv).astype(np.int64).T
+        strong = ndimage.maximum_filter(strength, 3)[row, column] > MIN_STRENGTH
+        ray = xyz[seen] - camera.center
+        cosine = np.abs(np.einsum("ij,ij->i", ray, normals[seen])) / np.linalg.norm(ray, axis=1)
+        repeats = rng.random(len(seen)) < repeatability[seen]
+        detected[seen, v] = strong & (cosine > MIN_COSINE) & repeats
+    point_idx, view_idx = np.nonzero(detected)
+    return point_idx, view_idx
+
+
+def _renumber(
+    keep: Bool[np.ndarray, " N"], point_idx: Int64[np.ndarray, " T"], view_idx: np.ndarray
+) -> tuple[Int64[np.ndarray, " S"], Int64[np.ndarray, " S"]]:
+    """The observations of the points kept, with the points counted anew."""
+    mine = keep[point_idx]
+    return (np.cumsum(keep) - 1)[point_idx[mine]], view_idx[mine]
+
+
+def _displace(
+    cameras: Sequence[Camera],
+    xyz: Float64[np.ndarray, "N 3"],
+    outliers: Bool[np.ndarray, " N"],
+    point_idx: Int64[np.ndarray, " T"],
+    view_idx: Int64[np.ndarray, " T"],
+    rng: np.random.Generator,
+) -> tuple[Float64[np.ndarray, "N 3"], Bool[np.ndarray, " T"]]:
+    """Move mismatches along the ray of their first view, and cut their tracks to three views.
+
+    Returns the positions, and which observations remain: the moved point must lie in the image.
+    """
+    first = np.searchsorted(point_idx, np.arange(len(xyz)))
+    eyes = np.stack([camera.center for camera in cameras])[view_idx[first]]
+    factor = np.exp(rng.choice([-1.0, 1.0], len(xyz)) * rng.uniform(0.15, 0.6, len(xyz)))
+    moved = np.where(outliers[:, None], eyes + factor[:, None] * (xyz - eyes), xyz)
+    uv = _project(cameras, moved, point_idx, view_idx)
+    limits = np.array([[camera.width, camera.height] for camera in cameras])[view_idx]
+    inside = ((uv >= 0) & (uv < limits)).all(axis=1)  # NaN behind the camera compares false
+    early = np.arange(len(point_idx)) - first[point_idx] < 3
+    return moved, ~outliers[point_idx] | (inside & early)
+
+
+def _project(
+    cameras: Sequence[Camera],
+    xyz: Float64[np.ndarray, "N 3"],
+    point_idx: Int64[np.ndarray, " T"],
+    view_idx: Int64[np.ndarray, " T"],
+) -> Float64[np.ndarray, "T 2"]:
+    """Pixel of each observation's point in its view."""
+    uv = np.empty((len(point_idx), 2))
+    for v, camera in enumerate(cameras):
+        mine = view_idx == v
+        uv[mine] = camera.project(xyz[point_idx[mine]])[0]
+    return uv
+
+
+def _triangulate(
+    cameras: Sequence[Camera],
+    start: Float64[np.ndarray, "N 3"],
+    point_idx: Int64[np.ndarray, " T"],
+    view_idx: Int64[np.ndarray, " T"],
+    uv: Float64[np.ndarray, "T 2"],
+    num_steps: int = 4,
+) -> Float64[np.ndarray, "N 3"]:
+    """Least-squares positions for all points at once, by Gauss-Newton from ``start``.
+
+    With J the derivative of a pixel by the point, each step solves (sum JᵀJ) dx = sum Jᵀ r.
+    """
+    rotations = np.stack([camera.cam_from_world[:3, :3] for camera in cameras])[view_idx]
+    shifts = np.stack([camera.cam_from_world[:3, 3] for camera in cameras])[view_idx]
+    focal = np.stack([np.diag(camera.K)[:2] for camera in cameras])[view_idx]
+    center = np.stack([camera.K[:2, 2] for camera in cameras])[view_idx]
+    starts = np.searchsorted(point_idx, np.arange(len(start)))
+    xyz = start
+    for _ in range(num_steps):
+        cam = np.einsum("tij,tj->ti", rotations, xyz[point_idx]) + shifts
+        slope = cam[:, :2] / cam[:, 2:]
+        by_cam = rotations[:, :2] - slope[:, :, None] * rotations[:, 2:]
+        jacobian = focal[:, :, None] * by_cam / cam[:, 2, None, None]  # [T, 2, 3]
+        residual = uv - (focal * slope + center)
+        normal = np.add.reduceat(np.einsum("tki,tkj->tij", jacobian, jacobian), starts)
+        right = np.add.reduceat(np.einsum("tki,tk->ti", jacobian, residual), starts)
+        xyz = xyz + np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    return xyz

@@ -1,0 +1,172 @@
+"""The demo's capture must be exact where it is truth, and like SfM where it is measurement."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatseed.errors import ParameterError
+from splatseed.synthetic import make_capture
+from splatseed.synthetic.raycast import visible
+
+
+def test_depth_unprojects_onto_the_surfaces(capture):
+    for image, depth in zip(capture.scene.images, capture.depths, strict=True):
+        row, column = np.nonzero(depth)
+        uv = np.stack([column, row], axis=1) + 0.5
+        z = depth[row, column].astype(np.float64)
+        distance = capture.surfaces.distance(image.camera.unproject(uv, z))
+        assert (distance / z).max() < 1e-6
+
+
+def test_depth_is_that_of_the_first_surface(capture, rng):
+    image, depth = capture.scene.images[3], capture.depths[3]
+    row, column = (rng.integers(0, n, 300) for n in depth.shape)
+    hit = depth[row, column] > 0
+    uv = np.stack([column[hit], row[hit]], axis=1) + 0.5
+    for share in (0.3, 0.6, 0.9, 0.97):
+        between = image.camera.unproject(uv, share * depth[row, column][hit])
+        assert (capture.surfaces.distance(between) > 1e-4).all()
+
+
+def test_pictures_show_texture_everywhere_but_on_the_bare_wall(capture):
+    wall = capture.room.part("bare wall")
+    contrast = {True: [], False: []}
+    for image, picture, depth in zip(
+        capture.scene.images, capture.images, capture.depths, strict=True
+    ):
+        row, column = np.nonzero(depth[1:-1, 1:-1])
+        xyz = image.camera.unproject(
+            np.stack([column, row], axis=1) + 1.5, depth[1:-1, 1:-1][row, column]
+        )
+        bare = wall.distance(xyz) < 1e-4
+        grey = picture.astype(float).mean(axis=2)
+        step = np.abs(np.diff(grey, axis=1))[1:-1, :-1][row, column]
+        contrast[True].append(step[bare])
+        contrast[False].append(step[~bare])
+    assert np.median(np.concatenate(contrast[True])) == 0
+    assert np.mean(np.concatenate(contrast[False])) > 5
+
+
+def test_features_and_tracks_name_each_other(capture):
+    scene = capture.scene
+    tracks = scene.tracks
+    assert len(tracks) == len(scene.points) > 500
+    point_of_element = np.repeat(tracks.point_ids, tracks.lengths)
+    by_id = {image.image_id: image for image in scene.images}
+    for image_id, image in by_id.items():
+        mine = tracks.image_ids == image_id
+        named = image.observations.point_ids[tracks.point2d_idx[mine]]
+        np.testing.assert_array_equal(named, point_of_element[mine])
+        assert len(np.unique(tracks.point2d_idx[mine])) == len(image.observations)
+    assert sum(len(image.observations) for image in scene.images) == len(tracks.image_ids)
+
+
+def test_reprojection_errors_are_those_of_the_observations(capture):
+    tracks = capture.scene.tracks
+    point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
+    residual = np.empty(len(point_idx))
+    for image in capture.scene.images:
+        mine = tracks.image_ids == image.image_id
+        uv, depth = image.camera.project(tracks.xyz[point_idx[mine]])
+        assert (depth > 0).all()
+        observed = image.observations.xy[tracks.point2d_idx[mine]]
+        residual[mine] = np.linalg.norm(uv - observed, axis=1)
+    mean = np.bincount(point_idx, residual) / tracks.lengths
+    np.testing.assert_allclose(mean, tracks.errors, atol=1e-9)
+    assert 0.3 < np.median(mean) < 0.9
+
+
+def test_points_are_least_squares_solutions(capture):
+    tracks = capture.scene.tracks
+    long_enough = np.flatnonzero(tracks.lengths >= 4)[:50]
+    for i in long_enough:
+        span = slice(tracks.offsets[i], tracks.offsets[i + 1])
+        images = [capture.scene.images[j - 1] for j in tracks.image_ids[span]]
+        seen = [
+            image.observations.xy[k]
+            for image, k in zip(images, tracks.point2d_idx[span], strict=True)
+        ]
+
+        def cost(xyz, images=images, seen=seen):
+            return sum(
+                ((image.camera.project(xyz[None])[0][0] - uv) ** 2).sum()
+                for image, uv in zip(images, seen, strict=True)
+            )
+
+        best = cost(tracks.xyz[i])
+        for axis in np.eye(3) * 1e-3:
+            assert best <= min(cost(tracks.xyz[i] + axis), cost(tracks.xyz[i] - axis)) + 1e-9
+
+
+def test_inliers_are_near_the_surfaces_and_mismatches_are_not(capture):
+    distance = capture.surfaces.distance(capture.scene.tracks.xyz)
+    errors, lengths = capture.scene.tracks.errors, capture.scene.tracks.lengths
+    bad = capture.outliers
+    assert 0.01 < bad.mean() < 0.05
+    assert np.median(distance[~bad]) < 0.01
+    assert np.median(distance[bad]) > 10 * np.median(distance[~bad])
+    assert errors[bad].mean() > 1.3 * errors[~bad].mean()
+    assert lengths[bad].max() <= 3 <= lengths[~bad].min()
+
+
+def test_noise_is_longest_for_short_tracks(capture):
+    distance = capture.surfaces.distance(capture.scene.tracks.xyz)
+    lengths, good = capture.scene.tracks.lengths, ~capture.outliers
+    assert distance[good & (lengths == 3)].mean() > 1.3 * distance[good & (lengths >= 6)].mean()
+
+
+def test_the_bare_wall_is_nearly_empty(capture):
+    xyz = capture.scene.tracks.xyz
+    density = {}
+    for name in ("bare wall", "brick wall"):
+        part = capture.room.part(name)
+        others = np.min([p.distance(xyz) for p in capture.surfaces.parts if p is not part], axis=0)
+        density[name] = ((part.distance(xyz) < 0.02) & (others > 0.1)).sum() / part.area
+    assert density["bare wall"] < 0.05 * density["brick wall"]
+
+
+def test_every_textured_surface_has_points(capture):
+    xyz = capture.scene.tracks.xyz[~capture.outliers]
+    nearest = np.argmin([part.distance(xyz) for part in capture.surfaces.parts], axis=0)
+    counts = dict(zip(capture.room.names, np.bincount(nearest, minlength=8), strict=True))
+    assert min(count for name, count in counts.items() if name != "bare wall") >= 5
+
+
+def test_colours_come_from_the_pictures(capture):
+    scene = capture.scene
+    pixels = np.zeros((len(scene.points), 3))
+    tracks = scene.tracks
+    point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
+    for picture, image in zip(capture.images, scene.images, strict=True):
+        mine = tracks.image_ids == image.image_id
+        uv = np.floor(image.observations.xy[tracks.point2d_idx[mine]]).astype(int)
+        uv = np.clip(uv, 0, [picture.shape[1] - 1, picture.shape[0] - 1])
+        np.add.at(pixels, point_idx[mine], picture[uv[:, 1], uv[:, 0]])
+    np.testing.assert_allclose(scene.points.rgb, pixels / tracks.lengths[:, None], atol=0.51)
+
+
+def test_a_seed_gives_the_same_capture_and_another_seed_another():
+    first, again, other = (make_capture(seed, 4, 64, 48) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(first.images, again.images)
+    np.testing.assert_array_equal(first.depths, again.depths)
+    np.testing.assert_array_equal(first.scene.tracks.xyz, again.scene.tracks.xyz)
+    assert (first.images != other.images).any()
+
+
+def test_visible_samples_are_on_surfaces_and_seen(capture, rng):
+    samples = capture.sample_visible(3000, rng)
+    assert samples.shape == (3000, 3)
+    assert capture.surfaces.distance(samples).max() < 1e-9
+    seen = np.any(
+        [visible(capture.surfaces, i.camera, samples) for i in capture.scene.images], axis=0
+    )
+    assert seen.all()
+    inside_pot = np.hypot(samples[:, 0] + 0.62, samples[:, 1] - 0.10) < 0.2
+    assert not (inside_pot & (samples[:, 2] < 0.01)).any()  # the floor under the flower pot
+
+
+@pytest.mark.parametrize("size", [(2, 64, 64), (5, 8, 64)])
+def test_too_small_a_capture_is_refused(size):
+    with pytest.raises(ParameterError, match="at least 3 views"):
+        make_capture(0, *size)

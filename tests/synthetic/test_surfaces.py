@@ -1,0 +1,117 @@
+"""Every surface: distance, samples and rays must agree with each other and with brute force."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from splatseed.synthetic import SHAPES
+from splatseed.synthetic.foliage import Discs
+from splatseed.synthetic.surfaces import Box, Rectangle, Sphere, Union, yaw_frame
+from splatseed.synthetic.wavy import SineSheet
+
+
+def _discs() -> Discs:
+    rng = np.random.default_rng(5)
+    axes = rng.normal(size=(12, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return Discs(rng.uniform(-0.7, 0.7, (12, 3)), axes, rng.uniform(0.1, 0.4, 12))
+
+
+MAKERS = {
+    **SHAPES,
+    "box": lambda: Box(np.array([0.1, -0.2, 0.3]), np.array([0.4, 0.3, 0.6]), yaw_frame(25)),
+    "discs": _discs,
+}
+
+
+@pytest.fixture(params=sorted(MAKERS))
+def surface(request):
+    return MAKERS[request.param]()
+
+
+def test_samples_lie_on_the_surface(surface, rng):
+    assert surface.distance(surface.sample(2000, rng)).max() < 1e-9
+
+
+def test_distance_agrees_with_a_dense_sampling(surface, rng):
+    points = rng.uniform(-1.6, 1.6, (3000, 3))
+    samples = surface.sample(150_000, rng)
+    brute, _ = cKDTree(samples).query(points)
+    gap = np.sqrt(surface.area / len(samples))
+    exact = surface.distance(points)
+    assert (exact <= brute + 1e-9).all()  # no sample may be nearer than the surface
+    assert (brute - exact).max() < 6 * gap  # and the dense samples come near it everywhere
+
+
+def test_samples_are_uniform_by_area(surface, rng):
+    samples = surface.sample(60_000, rng)
+    centers = samples[:40]
+    # Around interior points the density is samples per area; edges can only lower the count.
+    radius = 0.08
+    counts = np.array([len(hit) for hit in cKDTree(samples).query_ball_point(centers, radius)])
+    expected = len(samples) * np.pi * radius**2 / surface.area
+    assert 0.7 < np.percentile(counts, 75) / expected < 2.1
+
+
+def test_rays_stop_at_the_first_surface(surface, rng):
+    origin = np.array([2.5, 1.7, 2.1])
+    directions = surface.sample(1500, rng) - origin
+    t = surface.intersect(origin, directions)
+    assert (t <= 1 + 1e-9).mean() > 0.99  # grazing rays may slip past a crest of the sine sheet
+    hit = t[np.isfinite(t), None] * directions[np.isfinite(t)] + origin
+    assert surface.distance(hit).max() < 1e-9
+    # Nothing lies between: walking along each ray, the surface stays away until the hit.
+    for share in (0.25, 0.5, 0.75, 0.9):
+        before = t[np.isfinite(t), None] * share * directions[np.isfinite(t)] + origin
+        assert (surface.distance(before) > 1e-6).all()
+
+
+def test_rays_that_point_away_miss(surface):
+    origin = np.array([4.0, 0.1, 0.2])
+    directions = np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.3]])
+    assert np.isinf(surface.intersect(origin, directions)).all()
+
+
+def test_normals_are_unit_and_across_the_surface(surface, rng):
+    points = surface.sample(800, rng)
+    normals = surface.normals(points)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-9)
+    step = 1e-4
+    rise = np.minimum(
+        surface.distance(points + step * normals), surface.distance(points - step * normals)
+    )
+    assert np.median(rise) == pytest.approx(step, rel=1e-2)
+
+
+def test_rectangle_distance_beyond_its_edge():
+    square = Rectangle(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]))
+    points = np.array([[0.5, 0.5, -2.0], [4.0, 0.5, 4.0], [-3.0, -4.0, 0.0]])
+    np.testing.assert_allclose(square.distance(points), [2.0, 5.0, 5.0])
+
+
+def test_box_distance_is_unsigned_inside():
+    box = Box(np.zeros(3), np.array([1.0, 2.0, 3.0]), np.eye(3))
+    np.testing.assert_allclose(box.distance(np.array([[0.0, 0, 0], [0.75, 0, 0]])), [1.0, 0.25])
+
+
+def test_sine_sheet_distance_matches_a_fine_search(rng):
+    sheet = SineSheet(np.zeros(3), np.eye(3), np.array([2.0, 1.0]), 0.3, 0.5)  # steep: slope 3.8
+    points = np.stack(
+        [rng.uniform(-0.3, 2.3, 300), np.full(300, 0.5), rng.uniform(-0.6, 0.6, 300)], axis=1
+    )
+    u = np.linspace(0, 2, 200_001)
+    curve = np.stack([u, 0.3 * np.sin(2 * np.pi * u / 0.5)], axis=1)
+    brute, _ = cKDTree(curve).query(points[:, [0, 2]])
+    np.testing.assert_allclose(sheet.distance(points), brute, atol=3e-5)
+
+
+def test_union_takes_the_nearest_part_and_says_which():
+    near, far = Sphere(np.array([0, 0, 3.0]), 1.0), Sphere(np.array([0, 0, 8.0]), 2.0)
+    both = Union((far, near))
+    t, which = both.intersect_parts(np.zeros(3), np.array([[0, 0, 1.0], [0, 1.0, 0]]))
+    assert t.tolist() == [2.0, np.inf]
+    assert which.tolist() == [1, -1]
+    np.testing.assert_allclose(both.distance(np.array([[0, 0, 5.0]])), [1.0])
+    assert both.area == pytest.approx(4 * np.pi * 5)
