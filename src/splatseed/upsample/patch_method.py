@@ -20,7 +20,7 @@ from splatseed.upsample.placement import place_in_box, place_in_triangle, place_
 
 __all__ = ["PatchMethod"]
 
-BLOCK = 1 << 14
+BLOCK = 1 << 13
 MIN_NEIGHBORS = 3
 
 

@@ -1,0 +1,139 @@
+"""The paper's Voronoi cells: of the originals and the corners of an enlarged bounding box.
+
+The eight corners of the bounding box enlarged by 10% are added as sites so that the cells of the
+originals are bounded. Most of the volume then lies in the cells of a few outer points and reaches
+far outside the scene; ``docs/paper.md`` measures it. Kept to reproduce the paper, not to be used.
+
+The cells come from Qhull's Delaunay tetrahedra, whose circumcentres are the Voronoi vertices. A
+cell's volume is the signed sum, over the tetrahedra at its site i and the ways to pick an edge ij
+and a face ijk of each, of the tetrahedra (i, middle of ij, circumcentre of ijk, circumcentre).
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial import Delaunay, QhullError
+
+from splatseed.errors import PointCloudError
+from splatseed.jit import inline
+from splatseed.progress import Progress
+from splatseed.upsample.neighbors import PreparedCloud
+
+__all__ = ["box_cells"]
+
+ENLARGE = 0.1
+FLAT = 1e-14
+"""Tetrahedra flatter than this, relative to their edges, have no usable circumcentre."""
+
+
+def box_cells(
+    cloud: PreparedCloud, progress: Progress
+) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Centre relative to the site [n, 3], radius [n] and volume [n] of each original's cell.
+
+    The centre is the mean of the cell's vertices, the radius the largest distance of a vertex from
+    it.
+
+    Raises:
+        PointCloudError: Qhull fails, as it can on coplanar input.
+    """
+    progress("voronoi", 0.0)
+    sites = np.concatenate([cloud.xyz, _corners(cloud.xyz)])
+    try:
+        tetrahedra = Delaunay(sites).simplices
+    except QhullError as error:
+        raise PointCloudError(
+            "a cloud that Qhull can build a Voronoi diagram of",
+            found=str(error).splitlines()[0],
+            fix='Use the default profile (voronoi.cells "clamped"), which has no such limit.',
+        ) from error
+    progress("voronoi", 0.6)
+    center, radius, volume = _cells(sites, tetrahedra)
+    progress("voronoi", 1.0)
+    n = len(cloud)
+    return center[:n] - cloud.xyz, radius[:n], np.maximum(volume[:n], 0.0)
+
+
+def _corners(xyz: np.ndarray) -> np.ndarray:
+    """Corners [8, 3] of the bounding box enlarged by 10% about its middle."""
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    # A flat cloud gets a box of some thickness, or the corners would coincide.
+    half = np.maximum((high - low) / 2, 1e-3 * (high - low).max()) * (1 + ENLARGE)
+    signs = np.array(list(itertools.product((-1, 1), repeat=3)))
+    return np.asarray((low + high) / 2 + signs * half)
+
+
+@inline
+def _cells(sites, tetrahedra):  # type: ignore[no-untyped-def]
+    """Centre, radius and volume of every site's cell, in one serial (so deterministic) pass."""
+    n = len(sites)
+    center, count = np.zeros((n, 3)), np.zeros(n)
+    radius, volume = np.zeros(n), np.zeros(n)
+    vertex = np.empty((len(tetrahedra), 3))
+    usable = np.empty(len(tetrahedra), np.bool_)
+    for t in range(len(tetrahedra)):
+        usable[t] = _circumcenter(sites, tetrahedra[t], vertex[t])
+        if usable[t]:
+            for i in tetrahedra[t]:
+                center[i] += vertex[t]
+                count[i] += 1.0
+            _add_volumes(sites, tetrahedra[t], vertex[t], volume)
+    for i in range(n):
+        center[i] /= max(count[i], 1.0)
+    for t in range(len(tetrahedra)):
+        if usable[t]:
+            for i in tetrahedra[t]:
+                radius[i] = max(radius[i], np.sqrt(np.sum((vertex[t] - center[i]) ** 2)))
+    return center, radius, volume
+
+
+@inline
+def _cross(a, b):  # type: ignore[no-untyped-def]
+    return np.array(
+        (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    )
+
+
+@inline
+def _circumcenter(sites, corners, out):  # type: ignore[no-untyped-def]
+    """Write a tetrahedron's circumcentre; return whether it has one."""
+    a = sites[corners[1]] - sites[corners[0]]
+    b = sites[corners[2]] - sites[corners[0]]
+    c = sites[corners[3]] - sites[corners[0]]
+    aa, bb, cc = np.sum(a * a), np.sum(b * b), np.sum(c * c)
+    bc = _cross(b, c)
+    six_volumes = np.sum(a * bc)
+    if six_volumes * six_volumes <= FLAT * FLAT * aa * bb * cc:
+        return False
+    offset = (aa * bc + bb * _cross(c, a) + cc * _cross(a, b)) / (2.0 * six_volumes)
+    out[:] = sites[corners[0]] + offset
+    return True
+
+
+@inline
+def _face_center(a, b):  # type: ignore[no-untyped-def]
+    """Circumcentre of the triangle 0, a, b."""
+    normal = _cross(a, b)
+    aa, bb = np.sum(a * a), np.sum(b * b)
+    return _cross(aa * b - bb * a, normal) / (2.0 * np.sum(normal * normal))
+
+
+@inline
+def _add_volumes(sites, corners, vertex, volume):  # type: ignore[no-untyped-def]
+    """Add one tetrahedron's share to the cells of its four corners."""
+    for i in range(4):
+        origin = sites[corners[i]]
+        for j in range(4):
+            for k in range(4):
+                if i != j and i != k and j != k:
+                    edge, other = sites[corners[j]] - origin, sites[corners[k]] - origin
+                    last = sites[corners[6 - i - j - k]] - origin
+                    face = _face_center(edge, other)
+                    signed = np.sum(0.5 * edge * _cross(face, vertex - origin))
+                    inside = np.sum(edge * _cross(other, last))
+                    share = np.sign(inside) * signed / 6.0
+                    if np.isfinite(share):
+                        volume[corners[i]] += share
