@@ -1,0 +1,167 @@
+"""Whatever bytes a reader is given, it returns a result or raises one of our own errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings, strategies as st
+
+from splatseed.camera import Intrinsics
+from splatseed.errors import SplatseedError
+from splatseed.io import colmap_binary, colmap_text
+from splatseed.io.ply import read_ply, write_ply
+
+CAMERAS = (Intrinsics(7, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0)),)
+READERS: dict[str, Callable[[Path], object]] = {
+    "cameras.bin": colmap_binary.read_cameras,
+    "images.bin": lambda path: colmap_binary.read_images(path, CAMERAS),
+    "points3D.bin": colmap_binary.read_points3d,
+    "cameras.txt": colmap_text.read_cameras,
+    "images.txt": lambda path: colmap_text.read_images(path, CAMERAS),
+    "points3D.txt": colmap_text.read_points3d,
+    "little.ply": read_ply,
+    "big.ply": read_ply,
+    "ascii.ply": read_ply,
+}
+BINARY = [name for name in READERS if not name.endswith(".txt")]
+TEXT = [name for name in READERS if name.endswith((".txt", "ascii.ply"))]
+
+fuzz = settings(
+    max_examples=150,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+MESH = """ply
+format {form} 1.0
+element face 2
+property list uchar int vertex_indices
+element vertex 2
+property float x
+property list uchar short seen_by
+property float y
+property double z
+property ushort red
+property float green
+property int blue
+end_header
+"""
+MESH_BODY = [("n", "u1"), ("f", "i4", 3)]
+VERTEX_BODY = [
+    *(("x", "f4"), ("n", "u1"), ("s", "i2", 2), ("y", "f4"), ("z", "f8")),
+    *(("r", "u2"), ("g", "f4"), ("b", "i4")),
+]
+
+
+def _mesh(order: str) -> bytes:
+    faces = np.array([(3, (0, 1, 1))] * 2, np.dtype(MESH_BODY).newbyteorder(order))
+    vertices = [(1, 2, (5, 6), 2, 3, 200, 3, 4)] * 2
+    return faces.tobytes() + np.array(vertices, np.dtype(VERTEX_BODY).newbyteorder(order)).tobytes()
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory) -> dict[str, bytes]:
+    """A small valid file of each kind; reading them also loads the compiled kernels."""
+    folder = tmp_path_factory.mktemp("valid")
+    image = "3 1 0 0 0 0 0 1 7 a b.jpg\n1.5 2 -1 3 4 9\n4 .5 .5 .5 .5 0 0 1 7 c.jpg\n\n"
+    (folder / "cameras.txt").write_text(
+        "7 PINHOLE 64 48 50 50 32 24\n8 OPENCV 6 4 1 2 3 4 5 6 7 8\n"
+    )
+    (folder / "images.txt").write_text(image)
+    (folder / "points3D.txt").write_text("9 1 2 3 4 5 6 .5 3 1\n12 1 nan 3 4 5 6 -1\n")
+    points, tracks = colmap_text.read_points3d(folder / "points3D.txt")
+    cameras = colmap_text.read_cameras(folder / "cameras.txt")
+    images = colmap_text.read_images(folder / "images.txt", CAMERAS)
+    colmap_binary.write_cameras(folder / "cameras.bin", cameras)
+    colmap_binary.write_images(folder / "images.bin", images)
+    colmap_binary.write_points3d(folder / "points3D.bin", points, tracks)
+    write_ply(folder / "little.ply", points)
+    big = MESH.format(form="binary_big_endian").encode() + _mesh(">")
+    (folder / "big.ply").write_bytes(big)
+    rows = "3 0 1 1\n" * 2 + "1 2 5 6 2 3 200 3 4\n" * 2
+    (folder / "ascii.ply").write_text(MESH.format(form="ascii") + rows)
+    for name, read in READERS.items():
+        read(folder / name)
+    return {name: (folder / name).read_bytes() for name in READERS}
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("fuzz") / "file"
+
+
+def _assert_only_our_errors(name, target, data, little_memory):
+    target.write_bytes(data)
+    with little_memory():
+        try:
+            READERS[name](target)
+        except SplatseedError as error:
+            assert str(target) in str(error)  # noqa: PT017  (no error is as good as ours)
+
+
+@st.composite
+def _damage(draw, data: bytes) -> bytes:
+    """The bytes with a few overwritten, cut out, put in or repeated."""
+    damaged = bytearray(data)
+    for _ in range(draw(st.integers(1, 4))):
+        at = draw(st.integers(0, len(damaged)))
+        width = draw(st.sampled_from([1, 2, 4, 8]))
+        value = draw(st.integers(0, 2 ** (8 * width) - 1) | st.sampled_from([0, 1, 2**8 - 1]))
+        patch = value.to_bytes(width, draw(st.sampled_from(["little", "big"])))
+        match draw(st.sampled_from(["overwrite", "cut", "insert", "end", "repeat"])):
+            case "overwrite":
+                damaged[at : at + width] = patch
+            case "cut":
+                del damaged[at : at + width]
+            case "insert":
+                damaged[at:at] = patch
+            case "end":
+                del damaged[at:]
+            case "repeat":
+                damaged += damaged[at:]
+    return bytes(damaged)
+
+
+@pytest.mark.parametrize("name", BINARY)
+@fuzz
+@given(data=st.binary(max_size=300))
+def test_random_bytes(name, target, little_memory, data, valid):
+    _assert_only_our_errors(name, target, data, little_memory)
+    _assert_only_our_errors(name, target, valid[name][: len(data)] + data, little_memory)
+
+
+@pytest.mark.parametrize("name", READERS)
+@fuzz
+@given(data=st.data())
+def test_damaged_files(name, target, little_memory, data, valid):
+    _assert_only_our_errors(name, target, data.draw(_damage(valid[name])), little_memory)
+
+
+WORDS = st.sampled_from(
+    [*"0123456789", "-1", "255", "1e999", "nan", "-inf", "1_0", "0x1", "99999999999999999999", "#"]
+    + ["\n"] * 6
+    + ["\r\n", "\t", "\0", "\x1c", "\u2028", "\u0663", "PINHOLE", "OPENCV", "a b.jpg", '"']
+)
+
+
+@pytest.mark.parametrize("name", TEXT)
+@fuzz
+@given(words=st.lists(WORDS | st.text(max_size=5), max_size=60))
+def test_random_words(name, target, little_memory, words, valid):
+    text = " ".join(words).encode("utf-8", errors="replace")
+    _assert_only_our_errors(name, target, text, little_memory)
+    _assert_only_our_errors(name, target, valid[name] + text, little_memory)
+    start = valid[name].find(b"end_header\n") + len(b"end_header\n")
+    _assert_only_our_errors(name, target, valid[name][:start] + text, little_memory)
+
+
+@pytest.mark.parametrize("name", [name for name in READERS if name.endswith(".bin")])
+def test_every_other_length_of_a_binary_model_is_refused(name, target, valid):
+    size = len(valid[name])
+    for length in (*range(size), size + 1, size + 100):
+        target.write_bytes(valid[name][:length].ljust(length, b"\0"))
+        with pytest.raises(SplatseedError):
+            READERS[name](target)
