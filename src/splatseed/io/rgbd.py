@@ -111,10 +111,12 @@ def _check_rigid(
     path: Path, poses: Float64[np.ndarray, "N 4 4"], which: Bool[np.ndarray, " N"]
 ) -> None:
     rotation = poses[which, :3, :3]
-    gram = rotation @ rotation.transpose(0, 2, 1)
+    with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are not rigid either
+        gram = rotation @ rotation.transpose(0, 2, 1)
+        proper = np.linalg.det(rotation) > 0
     rigid = (
         np.isclose(gram, np.eye(3), atol=_RIGID_TOLERANCE).all(axis=(1, 2))
-        & (np.linalg.det(rotation) > 0)
+        & proper
         & np.isclose(poses[which, 3], [0, 0, 0, 1], atol=_RIGID_TOLERANCE).all(axis=1)
     )
     if not rigid.all():
