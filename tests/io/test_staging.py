@@ -145,8 +145,8 @@ def test_atomic_file_replaces_whole_and_keeps_its_suffix(tmp_path):
         assert ".partial-" in partial.name
         partial.write_text("first")
         assert not target.exists()
-    with pytest.raises(TypeError), atomic_file(target) as partial:
-        partial.write_text("half", encoding=partial.write_text("half"))
+    with pytest.raises(UnicodeEncodeError), atomic_file(target) as partial:
+        partial.write_text("half, then \ud800", encoding="utf-8")
     assert target.read_text() == "first"
     assert listing(target.parent) == ["picture.png"]
     with atomic_file(target) as partial:

@@ -1,0 +1,58 @@
+"""What a user should know of a scene's images and lenses before training.
+
+Promise: only the headers of a few image files are opened; nothing here raises for what it finds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatseed.scene import Image
+
+__all__ = ["image_warnings", "lens_warnings"]
+
+
+def image_warnings(images: Sequence[Image], image_dir: Path | None) -> list[str]:
+    """What the image files have against their records; only headers of a few are opened."""
+    if not images:
+        return []
+    if image_dir is None:
+        return ["The images folder is missing; points can be made, but nothing can be trained."]
+    missing = [im.name for im in images if not (image_dir / im.name).is_file()]
+    warnings = []
+    if missing:
+        count = f"{len(missing)} of {len(images)} images are"
+        warnings.append(f"{count} missing in {image_dir}, the first is {missing[0]}.")
+    present = {im.intrinsics.camera_id: im for im in reversed(images) if im.name not in missing[:1]}
+    wrong = [text for im in present.values() if (text := _size_warning(im, image_dir))]
+    return [*warnings, *wrong[:1]]
+
+
+def _size_warning(image: Image, image_dir: Path) -> str | None:
+    from PIL import Image as PilImage, UnidentifiedImageError  # noqa: PLC0415  (slow to import)
+
+    try:
+        with PilImage.open(image_dir / image.name) as picture:
+            size = picture.size
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, UnidentifiedImageError, PilImage.DecompressionBombError) as error:
+        return f"{image.name} cannot be read: {error}."
+    expected = (image.intrinsics.width, image.intrinsics.height)
+    if size == expected:
+        return None
+    return (
+        f"{image.name} has {size[0]} x {size[1]} pixels, its camera {image.intrinsics.camera_id}"
+        f" {expected[0]} x {expected[1]}; some trainers rescale, others fail."
+    )
+
+
+def lens_warnings(images: Sequence[Image]) -> list[str]:
+    """A sentence on lens distortion, which not every trainer takes."""
+    models = sorted({im.intrinsics.model for im in images if not im.intrinsics.is_pinhole})
+    if not models:
+        return []
+    lenses = f"Cameras have lens distortion ({', '.join(models)})"
+    trainers = "graphdeco's trainer and OpenSplat need PINHOLE"
+    return [f"{lenses}; {trainers}: undistort the images with colmap image_undistorter."]

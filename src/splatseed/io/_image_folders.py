@@ -1,0 +1,83 @@
+"""Bringing a scene's image folders into an output.
+
+Notation: ``folders`` maps a path inside the output to the folder or file it stands for. Promise:
+the photographs are linked, or copied where links are not wanted or not possible; the source is
+never written to.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path, PurePath
+
+from splatseed.scene import Scene
+
+__all__ = ["bring", "frame_folders", "image_folders"]
+
+_SIBLINGS = ("images*", "masks*", "depths*")  # also images_2, images_4, ... of other resolutions
+
+
+def image_folders(scene: Scene) -> dict[str, Path]:
+    """What stands for ``images/`` and its siblings in a scene folder.
+
+    Images that lie in the scene's own root, between other files, are linked by their first folder
+    (or one by one).
+    """
+    source = scene.source
+    if source is None or not scene.images:
+        return {}
+    folders = _siblings(source.root)
+    if source.image_dir is None:
+        return folders
+    if source.image_dir.absolute() != source.root.absolute():
+        return {**folders, "images": source.image_dir}
+    firsts = sorted({PurePath(image.name).parts[0] for image in scene.images})
+    return {
+        **{name: path for name, path in folders.items() if name != "images"},
+        **{f"images/{first}": source.image_dir / first for first in firsts},
+    }
+
+
+def frame_folders(root: Path, file_paths: Iterable[str]) -> dict[str, Path]:
+    """What makes the relative paths of a ``transforms.json`` resolve: their first folders."""
+    firsts = sorted({PurePath(path).parts[0] for path in file_paths})
+    return {**_siblings(root), **{first: root / first for first in firsts}}
+
+
+def bring(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]:
+    """Link or copy ``folders`` into ``output``; what does not exist is left out.
+
+    Returns:
+        The paths inside ``output`` that were made.
+
+    Raises:
+        OSError: Neither worked.
+    """
+    present = {name: source for name, source in folders.items() if source.exists()}
+    for name, source in present.items():
+        target = output / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if copy or not _linked(source.resolve(), target):
+            _copy(source, target)
+    return sorted(present)
+
+
+def _siblings(root: Path) -> dict[str, Path]:
+    found = (path for pattern in _SIBLINGS for path in root.glob(pattern))
+    return {path.name: path for path in found if path.is_dir()}
+
+
+def _linked(source: Path, target: Path) -> bool:
+    with suppress(OSError, NotImplementedError):  # a file system or system without links
+        target.symlink_to(source, target_is_directory=source.is_dir())
+        return True
+    return False
+
+
+def _copy(source: Path, target: Path) -> None:
+    if source.is_dir():
+        shutil.copytree(source, target)
+    else:
+        shutil.copy2(source, target)

@@ -1,0 +1,135 @@
+"""The two sets of files that trainers look for: COLMAP's, and nerfstudio's ``transforms.json``.
+
+Notation: ``keep`` [N] marks the scene's points that ``points`` is made of. Promise: every point
+file in a layout holds the same points in the same order; COLMAP's root holds no PLY, for Brush
+takes any it finds there. Writers write straight into ``folder`` and let ``OSError`` pass.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from splatseed.camera import Intrinsics
+from splatseed.io import colmap_binary
+from splatseed.io._image_folders import frame_folders, image_folders
+from splatseed.io._model_ids import Renumbered, renumber
+from splatseed.io.ply import write_ply
+from splatseed.io.transforms import (
+    NERFSTUDIO_FROM_COLMAP,
+    apply_transform,
+    frame_paths,
+    kept_json,
+    read_transforms,
+    transforms_json,
+)
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+
+__all__ = ["write_colmap", "write_json", "write_transforms"]
+
+_ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json")  # gsplat's examples read them if present
+_MODEL_EXTRAS = ("depth_params.json", "test.txt")  # graphdeco's trainer reads them if present
+_RIG_FILES = ("rigs.bin", "frames.bin", "rigs.txt", "frames.txt")
+
+
+def write_colmap(
+    scene: Scene, points: PointCloud, keep: Bool[np.ndarray, " N"], folder: Path
+) -> tuple[list[str], dict[str, Path]]:
+    """Write ``sparse/0``; returns notes for the user and the image folders that belong to it."""
+    model_dir = folder / "sparse" / "0"
+    model_dir.mkdir(parents=True)
+    model = renumber(scene, keep)
+    colmap_binary.write_cameras(model_dir / "cameras.bin", _all_cameras(scene))
+    colmap_binary.write_images(model_dir / "images.bin", model.images)
+    colmap_binary.write_points3d(model_dir / "points3D.bin", points, model.tracks)
+    write_ply(model_dir / "points3D.ply", points)
+    notes = [*_copy_extras(scene, folder, model_dir), *_model_notes(scene, model)]
+    return notes, image_folders(scene)
+
+
+def write_transforms(
+    scene: Scene, points: PointCloud, _keep: Bool[np.ndarray, " N"], folder: Path
+) -> tuple[list[str], dict[str, Path]]:
+    """Write ``transforms.json`` and its PLY; returns notes and the image folders it names."""
+    source = scene.source
+    if source is not None and source.transforms_path is not None:
+        names = {image.name for image in scene.images}
+        content = kept_json(read_transforms(source.transforms_path), names)
+        folders = frame_folders(source.root, frame_paths(content["frames"]))
+    else:
+        content = transforms_json(scene)
+        folders = image_folders(scene)
+        xyz = apply_transform(NERFSTUDIO_FROM_COLMAP, points.xyz).astype(np.float32)
+        points = points.replace(xyz=xyz)
+    write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
+    write_ply(folder / "sparse_pc.ply", points)
+    shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
+    return [], folders
+
+
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write readable JSON; paths and other foreign values become text, NumPy scalars numbers."""
+
+    def plain(value: Any) -> object:
+        return value.item() if isinstance(value, np.generic) else str(value)
+
+    path.write_text(json.dumps(content, indent=2, default=plain) + "\n", encoding="utf-8")
+
+
+def _all_cameras(scene: Scene) -> tuple[Intrinsics, ...]:
+    """The file's camera records, and those that only images know (in scenes made in memory)."""
+    cameras = {camera.camera_id: camera for camera in scene.intrinsics}
+    for image in scene.images:
+        cameras.setdefault(image.intrinsics.camera_id, image.intrinsics)
+    return tuple(cameras.values())
+
+
+def _copy_extras(scene: Scene, folder: Path, model_dir: Path) -> list[str]:
+    """Copy the small files beside the model byte for byte; returns notes."""
+    source = scene.source
+    if source is None or source.model_dir is None:
+        return []
+    extras = {source.root / name: folder / name for name in _ROOT_EXTRAS}
+    extras |= {source.model_dir / name: model_dir / name for name in _MODEL_EXTRAS}
+    rigs = [source.model_dir / name for name in _RIG_FILES]
+    notes = []
+    if _has_all_images(scene, source.model_dir):
+        extras |= {path: model_dir / path.name for path in rigs}
+    elif any(path.is_file() for path in rigs):
+        notes.append("Rigs and frames were left out: they name images that are not in the scene.")
+    for path, target in extras.items():
+        if path.is_file():
+            shutil.copyfile(path, target)
+    return notes
+
+
+def _has_all_images(scene: Scene, model_dir: Path) -> bool:
+    """Whether the scene still has as many images as its model."""
+    path = model_dir / "images.bin"
+    if not path.is_file():
+        return True  # a text model's rigs are not read beside our binary files
+    with path.open("rb") as file:
+        return file.read(8) == struct.pack("<Q", len(scene.images))
+
+
+def _model_notes(scene: Scene, model: Renumbered) -> list[str]:
+    notes = []
+    if model.num_broken:
+        notes.append(
+            f"{model.num_broken} references between features and points were taken out: the other"
+            " side did not confirm them."
+        )
+    if not scene.images:
+        notes.append(
+            "The scene has no images, so it cannot be trained as it is: copy points3D.bin and"
+            " points3D.ply from sparse/0 into sparse/0 of the full scene."
+        )
+    return notes

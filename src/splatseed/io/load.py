@@ -1,0 +1,101 @@
+"""Reading a scene, whatever it is kept in.
+
+Notation: a *model* is a folder with COLMAP's cameras, images and points3D, each as ``.bin`` or
+``.txt``. Promise: one function finds out what a path holds and reads it; what is odd but usable
+becomes a sentence in ``Scene.warnings``, what is not raises one error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io._cloud import cloud_warnings
+from splatseed.io._colmap_scene import find_model, read_colmap_scene
+from splatseed.io._transforms_scene import read_transforms_scene
+from splatseed.io.ply import read_ply
+from splatseed.scene import Scene, SceneSource
+
+__all__ = ["load_scene"]
+
+_TRANSFORMS = "transforms.json"
+_TRIANGULATE = "Make points with: splatseed sfm IMAGES --poses-from SCENE -o OUT."
+
+
+def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
+    """Read a scene.
+
+    Args:
+        path: A folder with a COLMAP model (``sparse/0``, ``sparse``, ``colmap/sparse/0`` or itself
+            the model), with ``transforms.json``, or with an RGB-D capture (``traj.txt``); or a
+            ``.json`` or ``.ply`` file. Where there are several, ``sparse`` goes before
+            ``transforms.json``, and that before ``colmap/sparse/0``.
+        require_points: Whether a scene without points is an error; else its cloud is empty.
+
+    Returns:
+        The scene in the world of its files, cameras in OpenCV axes. Points are as in the file,
+        non-finite ones and duplicates included; ``warnings`` tells of them.
+
+    Raises:
+        SceneNotFoundError: There is no scene, or it has no points.
+        SceneFormatError: A file is not what its format promises.
+    """
+    path = Path(path)
+    scene = _read(path)
+    if require_points and not len(scene.points):
+        raise SceneNotFoundError(f"points in {path}", found="none", fix=_TRIANGULATE)
+    return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
+
+
+def _read(path: Path) -> Scene:
+    if path.is_file():
+        return _read_file(path)
+    if not path.is_dir():
+        raise SceneNotFoundError(
+            f"a scene at {path}", found="no such file or folder", fix="Check the path."
+        )
+    first = find_model(path / "sparse" / "0", path / "sparse", path)
+    if first is not None:
+        return read_colmap_scene(first)
+    if (path / _TRANSFORMS).is_file():
+        return read_transforms_scene(path / _TRANSFORMS)
+    nested = find_model(path / "colmap" / "sparse" / "0")
+    if nested is not None:
+        return read_colmap_scene(nested)
+    if (path / "traj.txt").is_file():
+        from splatseed.io.rgbd import load_rgbd  # noqa: PLC0415  (keeps splatseed.io fast)
+
+        return load_rgbd(path)
+    raise _no_scene(path)
+
+
+def _read_file(path: Path) -> Scene:
+    readers: dict[str, Callable[[Path], Scene]] = {
+        ".ply": _read_bare_ply,
+        ".json": read_transforms_scene,
+    }
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise SceneFormatError(
+            f"{path} to be a scene folder, a .ply or a .json file",
+            found=f"a {path.suffix or 'nameless'} file",
+            fix="Name the scene's folder.",
+        )
+    return reader(path)
+
+
+def _no_scene(path: Path) -> SceneNotFoundError:
+    near = sorted(
+        each.name for suffix in ("*.json", "*.ply", "*/sparse") for each in path.glob(suffix)
+    )
+    return SceneNotFoundError(
+        f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS} or traj.txt in {path}",
+        found=f"only {', '.join(near[:5])}" if near else "none of them",
+        fix="Name the scene's folder, or a .ply or .json file itself. For photographs alone, run:"
+        " splatseed sfm IMAGES -o SCENE.",
+    )
+
+
+def _read_bare_ply(path: Path) -> Scene:
+    return Scene(read_ply(path), source=SceneSource("ply", path.parent, path))

@@ -1,0 +1,187 @@
+"""Writing a scene that every 3D Gaussian Splatting trainer loads unchanged.
+
+Notation: *originals* are the points that were read, with their tracks; a *layout* is the set of
+files a trainer looks for. Promise: the folder is there whole or not at all; its points are finite
+and no two coincide; all point files in it say the same; originals keep their float64 positions and
+tracks; point ids are 1..N in the cloud's order. Which trainer asks for what is in docs/formats.md.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path, PurePath
+from typing import Literal
+
+from splatseed.errors import OutputError, PointCloudError
+from splatseed.io._cloud import find_usable
+from splatseed.io._image_folders import bring
+from splatseed.io._layouts import write_colmap, write_json, write_transforms
+from splatseed.io.staging import MANIFEST, output_folder
+from splatseed.scene import Scene
+
+__all__ = ["Layout", "WriteReport", "write_scene"]
+
+Layout = Literal["colmap", "transforms"]
+
+_PACKAGES = ("splatseed", "numpy", "scipy", "numba")
+
+
+@dataclass(frozen=True)
+class WriteReport:
+    """What was written.
+
+    Args:
+        path: The output folder.
+        layout: Which set of files it holds.
+        num_points: Points written.
+        num_original: How many of them were in the input.
+        dropped_nonfinite: Points left out because a coordinate is not finite.
+        dropped_duplicates: Points left out because an earlier one has the same position.
+        files: Paths inside the folder; an image folder is named, not listed.
+        notes: What the user should know, one sentence each.
+    """
+
+    path: Path
+    layout: Layout
+    num_points: int
+    num_original: int
+    dropped_nonfinite: int
+    dropped_duplicates: int
+    files: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def write_scene(
+    scene: Scene,
+    path: str | Path,
+    *,
+    format: Literal["auto", "colmap", "transforms"] = "auto",  # noqa: A002  (the user's word)
+    overwrite: bool = False,
+    copy_images: bool = False,
+    provenance: Mapping[str, object] | None = None,
+) -> WriteReport:
+    """Write a scene folder for training.
+
+    Args:
+        scene: What to write; originals first in its cloud.
+        path: The folder to make.
+        format: The layout; ``auto`` takes the one that was read, and COLMAP's for a bare PLY, an
+            RGB-D capture or a scene made in memory.
+        overwrite: Whether an earlier output of splatseed may be replaced.
+        copy_images: Copy the image folders instead of linking them.
+        provenance: How the points came about, for ``splatseed.json``.
+
+    Returns:
+        What was written.
+
+    Raises:
+        OutputError: The folder is taken, protected or cannot be written, or the layout cannot hold
+            the scene.
+        PointCloudError: No point is finite.
+    """
+    layout = _choose_layout(scene, format)
+    usable = find_usable(scene.points)
+    points = scene.points.select(usable.keep)
+    if not len(points):
+        raise PointCloudError(
+            "at least one point with finite coordinates",
+            found=f"{len(scene.points)} points, {usable.num_nonfinite} of them not finite",
+            fix="Check the cloud.",
+        )
+    path = Path(path)
+    with output_folder(path, overwrite=overwrite, protect=_inputs(scene)) as folder:
+        write_layout = write_colmap if layout == "colmap" else write_transforms
+        notes, image_sources = write_layout(scene, points, usable.keep, folder)
+        linked = bring(image_sources, folder, copy=copy_images)
+        report = WriteReport(
+            path=path,
+            layout=layout,
+            num_points=len(points),
+            num_original=points.num_original,
+            dropped_nonfinite=usable.num_nonfinite,
+            dropped_duplicates=usable.num_duplicates,
+            files=_listing(folder, linked),
+            notes=tuple(notes),
+        )
+        write_json(folder / MANIFEST, _manifest(scene, report, provenance or {}))
+    return report
+
+
+def _choose_layout(scene: Scene, wanted: str) -> Layout:
+    if wanted == "auto":
+        read = scene.source.format if scene.source else None
+        wanted = "transforms" if read == "transforms" else "colmap"
+    if wanted == "transforms" and not scene.images:
+        raise OutputError(
+            "a scene with images for transforms.json",
+            found="none",
+            fix="Write the COLMAP layout (--format colmap).",
+        )
+    if wanted == "colmap":
+        return "colmap"
+    if wanted == "transforms":
+        return "transforms"
+    raise OutputError(
+        "a format of auto, colmap or transforms", found=repr(wanted), fix="Choose one of them."
+    )
+
+
+def _inputs(scene: Scene) -> tuple[Path, ...]:
+    """What was read, which the output must stay apart from."""
+    source = scene.source
+    if source is None:
+        return ()
+    if source.format == "ply":
+        return (source.points_path,)
+    return tuple(each for each in (source.root, source.model_dir, source.image_dir) if each)
+
+
+def _listing(folder: Path, linked: Sequence[str]) -> tuple[str, ...]:
+    """The files written, and the image folders brought in."""
+    own = [
+        file.relative_to(folder).as_posix()
+        for top in folder.iterdir()
+        if not any(PurePath(each).parts[0] == top.name for each in linked)
+        for file in ([top] if not top.is_dir() else top.rglob("*"))
+        if not file.is_dir()
+    ]
+    return tuple(sorted([*own, *linked, MANIFEST]))
+
+
+def _manifest(
+    scene: Scene, report: WriteReport, provenance: Mapping[str, object]
+) -> dict[str, object]:
+    return {
+        "source": _source_path(scene),
+        **provenance,
+        "format": report.layout,
+        "num_points": report.num_points,
+        "num_original": report.num_original,
+        "num_new": report.num_points - report.num_original,
+        "dropped_nonfinite": report.dropped_nonfinite,
+        "dropped_duplicates": report.dropped_duplicates,
+        "files": report.files,
+        "notes": report.notes,
+        "versions": {"python": platform.python_version(), **_versions()},
+    }
+
+
+def _source_path(scene: Scene) -> str | None:
+    source = scene.source
+    if source is None:
+        return None
+    if source.format == "ply":
+        return str(source.points_path)
+    return str(source.transforms_path or source.root)
+
+
+def _versions() -> dict[str, str]:
+    versions = {}
+    for package in _PACKAGES:
+        with suppress(PackageNotFoundError):  # splatseed itself, where it is not installed
+            versions[package] = version(package)
+    return versions
