@@ -222,6 +222,20 @@ def test_vertex_lists_of_several_lengths_are_refused(tmp_path, form):
         read_ply(path)
 
 
+@pytest.mark.parametrize("length", ["", "x", "-1", "9" * 5000])
+def test_list_lengths_that_are_none_are_refused(tmp_path, length):
+    path = tmp_path / "points.ply"
+    header = "element vertex 1\nproperty list char int seen_by\n" + _vertex(XYZ, 1).removeprefix(
+        "element vertex 1\n"
+    )
+    path.write_text(_header("ascii", header) + f"{length}\n" * 2)
+    with pytest.raises(SceneFormatError, match=r"the length of list seen_by|1 lines of vertices"):
+        read_ply(path)
+    path.write_bytes(_header("binary_little_endian", header).encode() + b"\xff" * 20)
+    with pytest.raises(SceneFormatError, match="a list length of 0 or more"):
+        read_ply(path)
+
+
 @forms
 def test_no_vertices_are_an_empty_cloud(tmp_path, form):
     assert len(read_ply(_write(tmp_path, form, (*XYZ, *RGB), []))) == 0

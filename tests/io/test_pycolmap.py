@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -84,6 +86,17 @@ def test_pycolmap_takes_new_points_without_tracks(form, suffix, model, tmp_path)
     assert len(reconstruction.points3D) == 20
     assert len(new) == 10
     assert {p.error for p in new} == {pycolmap.Point3D().error}
+
+
+@forms
+def test_images_without_features_are_images(form, suffix, model, tmp_path):
+    images = tuple(replace(image, observations=None) for image in model.images)
+    _write(form, suffix, tmp_path, model._replace(images=images))
+    form.write_points3d(tmp_path / f"points3D.{suffix}", model.points, None)
+    theirs = pycolmap.Reconstruction(tmp_path).images
+    assert {image.name for image in theirs.values()} == {image.name for image in images}
+    ours = form.read_images(tmp_path / f"images.{suffix}", model.intrinsics)
+    assert [len(image.observations) for image in ours] == [0] * 4
 
 
 @forms
