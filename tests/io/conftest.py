@@ -5,14 +5,17 @@ from __future__ import annotations
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from PIL import Image as PilImage
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.io import colmap_binary
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
@@ -120,6 +123,22 @@ def model(rng) -> Model:
         )
     points = PointCloud(tracks.xyz, rng.integers(0, 256, (10, 3)).astype(np.uint8))
     return Model(intrinsics, tuple(images), points, tracks)
+
+
+@pytest.fixture
+def scene_dir(tmp_path, model) -> Path:
+    """The model as a scene folder with its photographs."""
+    root = tmp_path / "scene"
+    (root / "sparse" / "0").mkdir(parents=True)
+    colmap_binary.write_cameras(root / "sparse/0/cameras.bin", model.intrinsics)
+    colmap_binary.write_images(root / "sparse/0/images.bin", model.images)
+    colmap_binary.write_points3d(root / "sparse/0/points3D.bin", model.points, model.tracks)
+    for image in model.images:
+        path = root / "images" / image.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        size = (image.intrinsics.width, image.intrinsics.height)
+        PilImage.new("RGB", size, "teal").save(path)
+    return root
 
 
 @pytest.fixture(scope="session")

@@ -72,7 +72,8 @@ class Transforms:
         json: Its content as it is.
         images: The posed images, in the file's order; OpenCV axes, the transforms' space.
         intrinsics: The different cameras among the frames, ids from 1.
-        image_dir: The deepest folder that holds all images; names are relative to it.
+        image_dir: The folder that holds all images (``images`` as a rule); names are relative
+            to it.
         applied_transform: float64 [3, 4], None if the file has none.
         warnings: What could not be taken over, one sentence each.
     """
@@ -97,7 +98,7 @@ def read_transforms(path: Path) -> Transforms:
     meta = _parse(path)
     frames = _frames(path, meta)
     files = [_image_file(path, i, frame) for i, frame in enumerate(frames)]
-    image_dir = Path(os.path.commonpath([file.parent for file in files]))
+    image_dir = _image_dir(path, files)
     names = [file.relative_to(image_dir).as_posix() for file in files]
     _check_names(path, names)
     cameras: dict[_Params, Intrinsics] = {}
@@ -211,6 +212,15 @@ def _image_file(path: Path, idx: int, frame: Mapping[str, Any]) -> Path:
         return file
     candidates = (file.with_name(file.name + suffix) for suffix in _SUFFIXES)
     return next((candidate for candidate in candidates if candidate.is_file()), file)
+
+
+def _image_dir(path: Path, files: Sequence[Path]) -> Path:
+    """The folder beside the file that holds all images, else the deepest one that does."""
+    shared = Path(os.path.commonpath([file.parent for file in files]))
+    root = path.absolute().parent
+    if root not in shared.parents:
+        return shared
+    return root / shared.relative_to(root).parts[0]  # images, so that names are as in COLMAP
 
 
 def _check_names(path: Path, names: Sequence[str]) -> None:

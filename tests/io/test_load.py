@@ -1,0 +1,235 @@
+"""A scene is found and read wherever it lies; what is odd is told, what is wrong is one error."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io import colmap_binary, colmap_text, load_scene
+from splatseed.io.ply import write_ply
+from splatseed.pointcloud import PointCloud
+
+
+def rewrite_points(scene_dir, xyz):
+    rgb = np.zeros((len(xyz), 3), np.uint8)
+    path = scene_dir / "sparse/0/points3D.bin"
+    colmap_binary.write_points3d(path, PointCloud(np.asarray(xyz, np.float64), rgb), None)
+
+
+def warnings_of(path):
+    return " ".join(load_scene(path).warnings)
+
+
+def test_import_stays_fast():
+    code = "import splatseed.io, sys; print({'numba', 'scipy', 'PIL', 'torch'} & {*sys.modules})"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "set()"
+
+
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "."])
+def test_model_is_found_in_its_usual_places(scene_dir, model, place, assert_same_points):
+    moved = scene_dir.with_name("moved")
+    shutil.copytree(scene_dir / "sparse/0", moved / place)
+    shutil.copytree(scene_dir / "images", moved / "images")
+    for named in (moved, moved / place):
+        scene = load_scene(named)
+        assert scene.source.root == moved
+        assert scene.source.model_dir == moved / place
+        assert scene.source.image_dir == moved / "images"
+        assert [im.name for im in scene.images] == [im.name for im in model.images]
+        assert_same_points((scene.points, scene.tracks), (model.points, model.tracks))
+
+
+def test_model_named_relatively_finds_its_images(scene_dir, monkeypatch):
+    for cwd, named in ((".", "sparse/0"), ("sparse", "0"), ("sparse/0", ".")):
+        monkeypatch.chdir(scene_dir / cwd)
+        image_dir = load_scene(named).source.image_dir
+        assert image_dir is not None
+        assert image_dir.resolve() == scene_dir / "images"
+
+
+def test_binary_goes_before_text_and_text_before_ply(scene_dir, model):
+    folder = scene_dir / "sparse/0"
+    text_points = model.points.replace(rgb=np.full((10, 3), 7, np.uint8))
+    colmap_text.write_points3d(folder / "points3D.txt", text_points, model.tracks)
+    write_ply(folder / "points3D.ply", model.points.replace(rgb=np.full((10, 3), 9, np.uint8)))
+    assert load_scene(scene_dir).source.points_path.suffix == ".bin"
+    (folder / "points3D.bin").unlink()
+    assert (load_scene(scene_dir).points.rgb == 7).all()
+    (folder / "points3D.txt").unlink()
+    scene = load_scene(scene_dir)
+    assert (scene.points.rgb == 9).all()
+    assert scene.tracks is None
+    assert len(scene.images) == 4
+
+
+def test_text_model_equals_binary_model(scene_dir, model, assert_same_images):
+    folder = scene_dir / "sparse/0"
+    expected = load_scene(scene_dir)
+    colmap_text.write_cameras(folder / "cameras.txt", model.intrinsics)
+    colmap_text.write_images(folder / "images.txt", model.images)
+    colmap_text.write_points3d(folder / "points3D.txt", model.points, model.tracks)
+    for path in folder.glob("*.bin"):
+        path.unlink()
+    assert_same_images(load_scene(scene_dir).images, expected.images)
+
+
+def test_sparse_goes_before_transforms_json_and_that_before_nerfstudios_colmap(scene_dir):
+    frame = {"file_path": "images/left/image000.jpg", "transform_matrix": np.eye(4).tolist()}
+    path = scene_dir / "transforms.json"
+    path.write_text(json.dumps({"fl_x": 500, "ply_file_path": "a.ply", "frames": [frame]}))
+    write_ply(scene_dir / "a.ply", load_scene(scene_dir).points)
+    assert load_scene(scene_dir).source.format == "colmap"
+    assert "transforms.json" in warnings_of(scene_dir)
+    assert load_scene(path).source.format == "transforms"
+    (scene_dir / "colmap").mkdir()
+    (scene_dir / "sparse").rename(scene_dir / "colmap/sparse")
+    assert load_scene(scene_dir).source.format == "transforms"
+    path.unlink()
+    assert load_scene(scene_dir).source.format == "colmap"
+
+
+def test_model_of_points_alone_keeps_cameras_and_drops_tracks(scene_dir, model):
+    (scene_dir / "sparse/0/images.bin").unlink()
+    scene = load_scene(scene_dir)
+    assert scene.images == ()
+    assert scene.intrinsics == model.intrinsics
+    assert scene.tracks is None
+    np.testing.assert_array_equal(scene.points.xyz, model.points.xyz)
+    assert "tracks" in " ".join(scene.warnings)
+
+
+def test_bare_ply(tmp_path, model):
+    write_ply(tmp_path / "cloud.ply", model.points)
+    scene = load_scene(tmp_path / "cloud.ply")
+    assert scene.source.format == "ply"
+    assert scene.images == ()
+    np.testing.assert_array_equal(scene.points.xyz, model.points.xyz)
+
+
+def test_missing_photographs_are_counted_and_the_first_is_named(scene_dir, model):
+    (scene_dir / "images" / model.images[1].name).unlink()
+    (scene_dir / "images" / model.images[3].name).unlink()
+    text = warnings_of(scene_dir)
+    assert "2 of 4 images are missing" in text
+    assert model.images[1].name in text
+    shutil.rmtree(scene_dir / "images")
+    assert "images folder is missing" in warnings_of(scene_dir)
+
+
+def test_photographs_of_another_size_and_broken_ones_are_told(scene_dir, model):
+    path = scene_dir / "images" / model.images[0].name
+    PilImage.new("RGB", (64, 48)).save(path)
+    assert "64 x 48" in warnings_of(scene_dir)
+    path.write_bytes(b"no picture")
+    assert "cannot be read" in warnings_of(scene_dir)
+
+
+def test_lens_distortion_is_told(scene_dir):
+    assert "OPENCV" in warnings_of(scene_dir)
+    assert "undistort" in warnings_of(scene_dir)
+
+
+def test_duplicates_and_nonfinite_points_are_counted_and_kept(scene_dir):
+    rewrite_points(scene_dir, [[0, 0, 0], [-0.0, 0, 0], [1, 2, 3], [np.nan, 0, 0], [np.inf, 0, 0]])
+    scene = load_scene(scene_dir)
+    assert len(scene.points) == 5
+    text = " ".join(scene.warnings)
+    assert "2 points are not finite" in text
+    assert "1 points repeat" in text
+
+
+def test_duplicates_are_found_exactly(scene_dir, rng):
+    xyz = rng.integers(0, 8, (3000, 3)).astype(np.float64)
+    rewrite_points(scene_dir, xyz)
+    count = 3000 - len(np.unique(xyz, axis=0))
+    assert f"{count} points repeat" in warnings_of(scene_dir)
+
+
+def test_coordinates_beyond_float32s_resolution_are_told(scene_dir, rng):
+    room = rng.uniform(-5, 5, (100, 3))
+    rewrite_points(scene_dir, room + np.array([500_000, 5_000_000, 100]))
+    assert "recentre" in warnings_of(scene_dir)
+    rewrite_points(scene_dir, 1000 * room + np.array([5000, 0, 0]))
+    assert "recentre" not in warnings_of(scene_dir)
+
+
+def test_scene_without_points_is_an_error_unless_allowed(scene_dir):
+    rewrite_points(scene_dir, np.empty((0, 3)))
+    with pytest.raises(SceneNotFoundError, match="sfm IMAGES --poses-from"):
+        load_scene(scene_dir)
+    (scene_dir / "sparse/0/points3D.bin").unlink()
+    with pytest.raises(SceneNotFoundError, match="sfm IMAGES --poses-from"):
+        load_scene(scene_dir)
+    scene = load_scene(scene_dir, require_points=False)
+    assert len(scene.points) == 0
+    assert len(scene.images) == 4
+
+
+def test_rgbd_capture_gives_poses(scenes):
+    scene = load_scene(scenes / "replica/room0", require_points=False)
+    assert len(scene.images) == 20
+    with pytest.raises(SceneNotFoundError, match="--poses-from"):
+        load_scene(scenes / "replica/room0")
+
+
+def test_what_is_no_scene_is_one_error(tmp_path, scene_dir):
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "synthetic").mkdir()
+    (tmp_path / "synthetic/transforms_train.json").touch()
+    with pytest.raises(SceneNotFoundError, match="no such file"):
+        load_scene(tmp_path / "nowhere")
+    with pytest.raises(SceneFormatError, match=r"a \.txt file"):
+        load_scene(tmp_path / "notes.txt")
+    with pytest.raises(SceneNotFoundError, match="none of them"):
+        load_scene(tmp_path / "empty")
+    with pytest.raises(SceneNotFoundError, match=r"transforms_train\.json"):
+        load_scene(tmp_path / "synthetic")
+    (scene_dir / "sparse/0/cameras.bin").unlink()
+    with pytest.raises(SceneNotFoundError, match=r"cameras\.bin or cameras\.txt"):
+        load_scene(scene_dir)
+
+
+def test_further_models_are_told(scene_dir):
+    shutil.copytree(scene_dir / "sparse/0", scene_dir / "sparse/1")
+    assert "several models" in warnings_of(scene_dir)
+
+
+def test_real_captures_have_what_their_info_says(scenes):
+    for name in ("fern", "fox", "treehill"):
+        scene = load_scene(scenes / name)
+        info = json.loads((scenes / name / "info.json").read_text())
+        assert len(scene.images) == info["reg"]
+        assert len(scene.points) == info["pts"]
+        assert not any("missing" in text for text in scene.warnings)
+
+
+def test_official_clouds_of_points_alone(scenes):
+    bicycle = load_scene(scenes / "mipnerf360_sfm/bicycle")
+    stump = load_scene(scenes / "mipnerf360_sfm/stump")
+    assert (len(bicycle.points), len(stump.points)) == (54_275, 32_049)
+    assert stump.tracks is None
+    assert bicycle.intrinsics
+
+
+def test_images_without_their_own_folder_are_found_in_the_root(scene_dir, model):
+    for image in model.images:
+        target = scene_dir / image.name
+        target.parent.mkdir(exist_ok=True)
+        (scene_dir / "images" / image.name).rename(target)
+    assert load_scene(scene_dir).source.image_dir == scene_dir
+
+
+def test_camera_with_an_unused_record_keeps_it(scene_dir, model):
+    images = [replace(im, intrinsics=model.intrinsics[0]) for im in model.images]
+    colmap_binary.write_images(scene_dir / "sparse/0/images.bin", images)
+    assert load_scene(scene_dir).intrinsics == model.intrinsics
