@@ -7,6 +7,7 @@
 
 from splatseed.camera import Camera
 from splatseed.errors import SplatseedError
+from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.upsample import METHODS, upsample, upsample_points
@@ -17,6 +18,8 @@ __all__ = [
     "PointCloud",
     "Scene",
     "SplatseedError",
+    "load_scene",
     "upsample",
     "upsample_points",
+    "write_scene",
 ]

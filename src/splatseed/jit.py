@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import config
 
 __all__ = ["inline", "kernel", "parallel_range"]
 
 # TBB, where a distribution ships it, can hang at interpreter exit; a user's own choice stands.
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-    numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
+    config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]
 
 parallel_range = numba.prange
 
@@ -28,11 +29,11 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def kernel(function: F) -> F:
     """Compile a function whose ``parallel_range`` loops run on all threads."""
-    compiled: F = numba.njit(cache=True, parallel=True, error_model="numpy", nogil=True)(function)
-    return compiled
+    compiled: Any = numba.njit(cache=True, parallel=True, error_model="numpy", nogil=True)(function)
+    return cast("F", compiled)
 
 
 def inline(function: F) -> F:
     """Compile a helper that kernels of the same file call."""
-    compiled: F = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
-    return compiled
+    compiled: Any = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
+    return cast("F", compiled)

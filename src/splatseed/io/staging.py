@@ -17,7 +17,7 @@ from pathlib import Path
 
 from splatseed.errors import OutputError
 
-__all__ = ["MANIFEST", "atomic_file", "output_folder"]
+__all__ = ["MANIFEST", "atomic_file", "check_output", "output_folder"]
 
 MANIFEST = "splatseed.json"
 """The file that marks a folder as written by splatseed: only such a folder is ever replaced."""
@@ -47,9 +47,8 @@ def output_folder(
     Raises:
         OutputError: ``path`` is taken or protected, or writing failed.
     """
+    check_output(path, overwrite=overwrite, protect=protect)
     target = Path(path).resolve()
-    _check_apart(target, protect)
-    _check_replaceable(target, overwrite=overwrite)
     partial = _partial_name(target)
     with _oserror_as_output_error(target), _parents(target.parent):
         try:
@@ -59,6 +58,17 @@ def output_folder(
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
             raise
+
+
+def check_output(path: Path, *, overwrite: bool = False, protect: Sequence[Path] = ()) -> None:
+    """Refuse what ``output_folder`` would refuse, before any work is done.
+
+    Raises:
+        OutputError: ``path`` is taken or protected.
+    """
+    target = Path(path).resolve()
+    _check_apart(target, protect)
+    _check_replaceable(target, overwrite=overwrite)
 
 
 @contextmanager

@@ -21,16 +21,19 @@ from splatseed.upsample.method import NewPoints, Upsampler
 from splatseed.upsample.registry import METHODS, source_code
 
 __all__ = [
+    "DEFAULT_RATIO",
     "METHODS",
     "NewPoints",
     "Profile",
     "Upsampler",
     "configure",
+    "planned_size",
     "upsample",
     "upsample_points",
 ]
 
 Profile = Literal["default", "paper"]
+DEFAULT_RATIO = 4.0
 
 
 def configure(method: str, profile: Profile = "default", **parameters: Any) -> Upsampler:
@@ -108,7 +111,7 @@ def upsample(
 
     points = scene.points if isinstance(scene, Scene) else scene
     originals = points.originals
-    num_new = _num_new(len(originals), ratio, num_points)
+    num_new = planned_size(len(originals), ratio, num_points) - len(originals)
     name = method if isinstance(method, str) else ""
     chosen = configure(method, profile, **parameters) if isinstance(method, str) else method
     if num_new == 0:
@@ -145,14 +148,18 @@ def upsample_points(
     return seeds.xyz, seeds.rgb
 
 
-def _num_new(num_original: int, ratio: float | None, num_points: int | None) -> int:
-    """How many points are to be made."""
+def planned_size(num_original: int, ratio: float | None, num_points: int | None) -> int:
+    """How many points there will be in all.
+
+    Raises:
+        ParameterError: Both are given, the ratio is below 1, or there are more originals.
+    """
     if ratio is not None and num_points is not None:
         raise ParameterError(
             "either a ratio or a number of points", found="both", fix="Leave one of them out."
         )
     if num_points is None:
-        ratio = 4.0 if ratio is None else ratio
+        ratio = DEFAULT_RATIO if ratio is None else ratio
         if not 1 <= ratio < np.inf:
             raise ParameterError(
                 "a ratio of at least 1 (points in all, per original)",
@@ -166,7 +173,7 @@ def _num_new(num_original: int, ratio: float | None, num_points: int | None) -> 
             found=f"{num_points:,}",
             fix="Upsampling only adds points; ask for more.",
         )
-    return num_points - num_original
+    return num_points
 
 
 def _check_finite(new: NewPoints) -> None:

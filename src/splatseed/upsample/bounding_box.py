@@ -39,6 +39,7 @@ class BoundingBox:
     def __call__(
         self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
+        """Make ``num_new`` points."""
         low, high = cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)
         progress("random", 0.0)
         xyz = rng.random((num_new, 3), dtype=np.float32)

@@ -35,6 +35,7 @@ class Linear(NearestMethod):
     def __call__(
         self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
+        """Make ``num_new`` points."""
         neighbors, weight = self.neighborhoods(cloud, 1)
         bases = draw_bases(cloud, num_new, rng, weight=weight)
         alpha = rng.random(num_new, dtype=np.float32)

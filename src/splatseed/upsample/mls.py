@@ -47,7 +47,7 @@ class Mls(PatchMethod):
 
     @classmethod
     def paper(cls) -> Self:
-        """k = 10, z = f(x, y) in world axes, positions in the neighbourhood's bounding box."""
+        """With k = 10, z = f(x, y) in world axes, positions in the neighbourhood's bounding box."""
         return cls(k=10, frame="world", placement="box", clamp=None, reject_isolated=False)
 
     def heights(

@@ -45,11 +45,11 @@ class Neighbors:
     @property
     def k(self) -> int:
         """Neighbours per row."""
-        return self.idx.shape[1]
+        return int(self.idx.shape[1])
 
     @cached_property
     def spacing(self) -> Float64[np.ndarray, " n"]:
-        """h of every row: mean distance to the 6 nearest (fewer where there are fewer)."""
+        """Local spacing h of every row: mean distance to the 6 nearest (fewer where there are fewer)."""
         return np.asarray(self.distance[:, :SPACING_NEIGHBORS].mean(axis=1))
 
     def nearest(self, k: int) -> Neighbors:
@@ -163,7 +163,7 @@ def _hash_collides(xyz: np.ndarray) -> np.ndarray:
     repeated = ordered[1:][ordered[1:] == ordered[:-1]]
     if repeated.size == 0:
         return np.zeros(len(xyz), bool)
-    return np.isin(hashes, repeated)
+    return np.asarray(np.isin(hashes, repeated))
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,11 +208,11 @@ def sound_bases(cloud: PreparedCloud, neighbors: Neighbors) -> Float64[np.ndarra
     spacings: local, so that a sparse background is not taken for noise as a global filter would.
     """
     lonely = _isolated(neighbors.idx, neighbors.spacing, OUTLIER_FACTOR, OUTLIER_NEIGHBORS)
-    return (cloud.trusted & ~lonely).astype(np.float64)
+    return np.asarray(cloud.trusted & ~lonely, np.float64)
 
 
 @kernel
-def _isolated(idx, spacing, factor, max_neighbors):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _isolated(idx, spacing, factor, max_neighbors):  # type: ignore[no-untyped-def]
     """Rows whose spacing exceeds ``factor`` times the lower quartile of their neighbours'."""
     n, k = idx.shape
     k = min(k, max_neighbors)
@@ -223,5 +223,5 @@ def _isolated(idx, spacing, factor, max_neighbors):  # type: ignore[no-untyped-d
 
 
 @inline
-def _lower_quartile(rows, spacing):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _lower_quartile(rows, spacing):  # type: ignore[no-untyped-def]
     return np.sort(spacing[rows])[rows.size // 4]

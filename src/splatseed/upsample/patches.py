@@ -62,7 +62,7 @@ def lift(
 
 @kernel
 def _lift(xyz, center, idx, frames, start, count, uv, height, margin, out):  # type: ignore[no-untyped-def]
-    """p + u e_u + v e_v + clamp(z) e_n for all outputs of all rows."""
+    """Compute p + u e_u + v e_v + clamp(z) e_n for all outputs of all rows."""
     for i in parallel_range(len(xyz)):
         if count[i] > 0:
             e_u, e_v, e_n = frames[i, 0], frames[i, 1], frames[i, 2]

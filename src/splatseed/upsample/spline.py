@@ -67,7 +67,7 @@ class Spline(PatchMethod):
 
     @classmethod
     def paper(cls) -> Self:
-        """k = 25, z = S(x, y) in world axes, positions in the neighbourhood's bounding box."""
+        """With k = 25, z = S(x, y) in world axes, positions in the neighbourhood's bounding box."""
         return cls(
             basis="bicubic", frame="world", placement="box", clamp=None, reject_isolated=False
         )
@@ -87,7 +87,7 @@ class Spline(PatchMethod):
         evaluate(patches, coefficients, basis.scale, first, last, out)
 
     def _smoothing(self, basis: PatchBasis, count: np.ndarray) -> Float64[np.ndarray, " rows"]:
-        """lambda of each row."""
+        """The penalty's weight for each row."""
         if isinstance(self.smoothing, str):
             from splatseed.upsample.spline_gcv import cross_validate  # noqa: PLC0415
 

@@ -33,7 +33,9 @@ def penalty() -> Float64[np.ndarray, "36 36"]:
     first = np.diff(identity, axis=0)
     second = np.diff(identity, n=2, axis=0)
     slopes, bends = first.T @ first, second.T @ second
-    return np.kron(bends, identity) + 2.0 * np.kron(slopes, slopes) + np.kron(identity, bends)
+    return np.asarray(
+        np.kron(bends, identity) + 2.0 * np.kron(slopes, slopes) + np.kron(identity, bends)
+    )
 
 
 class PatchBasis(NamedTuple):

@@ -107,7 +107,7 @@ def _remove_planes(planes, gram, y):  # type: ignore[no-untyped-def]
 
 @inline
 def _reflect_rows(matrix, v, first, squared):  # type: ignore[no-untyped-def]
-    """matrix <- (I - 2 v v' / v'v) matrix, v being 0 before ``first``."""
+    """Set matrix <- (I - 2 v v' / v'v) matrix, v being 0 before ``first``."""
     total = np.zeros(matrix.shape[1])
     for j in range(first, len(matrix)):
         for c in range(total.size):
@@ -120,7 +120,7 @@ def _reflect_rows(matrix, v, first, squared):  # type: ignore[no-untyped-def]
 
 @inline
 def _reflect_columns(matrix, v, first, squared):  # type: ignore[no-untyped-def]
-    """matrix <- matrix (I - 2 v v' / v'v), v being 0 before ``first``."""
+    """Set matrix <- matrix (I - 2 v v' / v'v), v being 0 before ``first``."""
     for j in range(len(matrix)):
         _reflect_vector(matrix[j], v, first, squared)
 

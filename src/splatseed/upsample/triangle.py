@@ -39,6 +39,7 @@ class Triangle(NearestMethod):
     def __call__(
         self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
+        """Make ``num_new`` points."""
         neighbors, weight = self.neighborhoods(cloud, 2)
         bases = draw_bases(cloud, num_new, rng, weight=weight)
         draws = rng.random((num_new, 2), dtype=np.float32)

@@ -128,7 +128,7 @@ def _add_volumes(sites, corners, vertex, volume):  # type: ignore[no-untyped-def
         origin = sites[corners[i]]
         for j in range(4):
             for k in range(4):
-                if i != j and i != k and j != k:
+                if len({i, j, k}) == 3:
                     edge, other = sites[corners[j]] - origin, sites[corners[k]] - origin
                     last = sites[corners[6 - i - j - k]] - origin
                     face = _face_center(edge, other)

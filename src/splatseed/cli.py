@@ -1,0 +1,74 @@
+"""The command line: finds the verb, runs it, and turns our errors into one line and exit code 2."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from importlib.metadata import version
+
+from rich.console import Console
+from rich.table import Table
+
+from splatseed.errors import SplatseedError
+
+__all__ = ["main"]
+
+VERBS = {
+    "upsample": "Add points to a scene and write it for any 3DGS trainer.",
+    "info": "Show what is in a scene, and what is wrong with it.",
+    "sfm": "Make a scene from photographs (pycolmap).",
+    "demo": "Make a small scene, upsample it by every method, and show the result.",
+}
+INTERRUPTED = 130
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
+    words = sys.argv[1:] if arguments is None else arguments
+    if not words or words[0] in {"-h", "--help"}:
+        _print_help()
+        return
+    if words[0] == "--version":
+        Console().print(f"splatseed {version('splatseed')}", highlight=False)
+        return
+    if words[0] not in VERBS:
+        _fail(
+            f"expected a verb ({', '.join(VERBS)}); found {words[0]!r}. "
+            "Run splatseed --help to see what each does."
+        )
+    _run(words[0], words[1:])
+
+
+def _run(verb: str, words: list[str]) -> None:
+    try:
+        # One verb's imports are enough: --help must not wait for Numba.
+        import_module(f"splatseed.commands.{verb}").run(words)
+    except SplatseedError as error:
+        _fail(str(error))
+    except KeyboardInterrupt:
+        Console(stderr=True).print("\ninterrupted; nothing was written")
+        sys.exit(INTERRUPTED)
+
+
+def _fail(message: str) -> None:
+    """Print one error on stderr and exit with 2."""
+    Console(stderr=True).print(
+        f"[bold red]error:[/bold red] {_plain(message)}", soft_wrap=True, highlight=False
+    )
+    sys.exit(2)
+
+
+def _plain(message: str) -> str:
+    """Keep rich from reading brackets in a message, such as a shape, as markup."""
+    return message.replace("[", r"\[")
+
+
+def _print_help() -> None:
+    table = Table(show_header=False, box=None, pad_edge=False)
+    for verb, does in VERBS.items():
+        table.add_row(f"  {verb}", does)
+    console = Console()
+    console.print("usage: splatseed VERB [options]\n", markup=False, highlight=False)
+    console.print("Better seeds for 3D Gaussian Splatting.\n")
+    console.print(table)
+    console.print("\nsplatseed VERB --help shows a verb's options.", highlight=False)

@@ -1,0 +1,102 @@
+"""``splatseed info``: what is in a scene, and what is wrong with it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from splatseed.console import OUT, print_commands, print_pairs, stage_display
+from splatseed.diagnostics import (
+    CloudStatistics,
+    EmptyRegions,
+    TrackStatistics,
+    cloud_statistics,
+    empty_regions,
+    find_problems,
+    track_statistics,
+)
+from splatseed.io import load_scene
+from splatseed.scene import Scene
+
+__all__ = ["run"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Show what is in a scene: cameras, images, points, tracks, and problems."""
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A COLMAP scene folder, a folder with transforms.json, or a .ply."""
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = tyro.cli(Options, prog="splatseed info", args=arguments)
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = load_scene(options.scene)
+        cloud = cloud_statistics(scene, clock)
+        tracks = track_statistics(scene)
+        regions = empty_regions(scene, clock)
+    rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
+    print_pairs(str(options.scene), rows)
+    problems = find_problems(scene, cloud, regions)
+    OUT.print("\n[bold]problems[/bold]" if problems else "\nno problems found")
+    for problem in problems:
+        OUT.print(f"  - {problem}", soft_wrap=True, highlight=False)
+    if cloud.num_points:
+        command = f"splatseed upsample {options.scene} --method mls --ratio 8 -o OUT"
+        print_commands("next", [("", command)])
+
+
+def _source_rows(scene: Scene) -> list[tuple[str, str]]:
+    sizes = Counter(f"{c.model} {c.width}x{c.height}" for c in scene.intrinsics)
+    cameras = ", ".join(f"{count} {kind}" for kind, count in sizes.items())
+    train, test = scene.split()
+    return [
+        ("format", scene.source.format if scene.source else "memory"),
+        ("cameras", cameras or "none"),
+        ("images", f"{len(scene.images):,} ({len(train)} to train, {len(test)} to test)"),
+    ]
+
+
+def _cloud_rows(cloud: CloudStatistics) -> list[tuple[str, str]]:
+    low, high = (" ".join(f"{x:.4g}" for x in corner) for corner in (cloud.low, cloud.high))
+    return [
+        ("points", f"{cloud.num_points:,}"),
+        ("not finite", f"{cloud.non_finite:,}"),
+        ("duplicates", f"{cloud.duplicates:,}"),
+        ("isolated", f"{cloud.isolated:,}"),
+        ("spacing 5/25/50/75/95%", " ".join(f"{x:.4g}" for x in cloud.spacing)),
+        ("bounding box", f"{low}  to  {high}"),
+        ("float32 step there", f"{cloud.resolution:.2g}"),
+    ]
+
+
+def _track_rows(tracks: TrackStatistics | None) -> list[tuple[str, str]]:
+    if tracks is None:
+        return [("tracks", "none")]
+    return [
+        ("track length, images", _spread(tracks.mean_length, tracks.length, ".3g")),
+        ("reprojection error, px", _spread(tracks.mean_error, tracks.error, ".3f")),
+    ]
+
+
+def _spread(mean: float, percentiles: tuple[float, ...], style: str) -> str:
+    spread = " ".join(f"{x:{style}}" for x in percentiles)
+    return f"mean {mean:{style}}, 5/25/50/75/95% {spread}"
+
+
+def _region_rows(regions: EmptyRegions | None) -> list[tuple[str, str]]:
+    if regions is None:
+        return []
+    return [
+        (
+            "image area without points",
+            f"{regions.mean:.0%} on average, {regions.worst:.0%} in {regions.worst_name}",
+        )
+    ]

@@ -1,0 +1,94 @@
+"""``splatseed sfm``: photographs to a scene, by pycolmap."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from splatseed.console import StageClock, print_commands, print_note, print_pairs, stage_display
+from splatseed.io import load_scene
+from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, triangulate
+
+__all__ = ["run"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Make a scene from photographs: poses and points, undistorted, ready to upsample."""
+
+    images: Annotated[Path, tyro.conf.Positional]
+    """The folder of photographs."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The scene folder to write."""
+    poses_from: Path | None = None
+    """A scene whose poses and intrinsics are kept, so that only points are triangulated."""
+    matcher: MatcherName = "exhaustive"
+    """Compare every pair of images, or (for a video) each with its successors."""
+    camera_model: str = "OPENCV"
+    """COLMAP's model of the lens; not used with --poses-from."""
+    shared_camera: bool = True
+    """One lens for all photographs of a size; not used with --poses-from."""
+    device: DeviceName = "auto"
+    """Where features are found and matched; auto takes a GPU when pycolmap can."""
+    max_image_size: int = 3200
+    """Longer sides are reduced to this many pixels to find features."""
+    seed: int = 0
+    """Seed of every random choice."""
+    threads: int = -1
+    """Worker threads; -1 = all cores."""
+    overwrite: bool = False
+    """Replace an output folder that splatseed wrote before."""
+    verbose: bool = False
+    """Show pycolmap's own log."""
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = tyro.cli(Options, prog="splatseed sfm", args=arguments)
+    with stage_display() as clock:
+        clock("prepare", 0.0)
+        report = _reconstruct(options, clock)
+    _summarise(options, report)
+
+
+def _reconstruct(options: Options, clock: StageClock) -> SfmReport:
+    common: dict[str, Any] = {
+        "matcher": options.matcher,
+        "device": options.device,
+        "max_image_size": options.max_image_size,
+        "seed": options.seed,
+        "threads": options.threads,
+        "overwrite": options.overwrite,
+        "verbose": options.verbose,
+        "on_progress": clock,
+    }
+    if options.poses_from is None:
+        return reconstruct(
+            options.images,
+            options.output,
+            camera_model=options.camera_model,
+            shared_camera=options.shared_camera,
+            **common,
+        )
+    poses = load_scene(options.poses_from, require_points=False)
+    return triangulate(options.images, poses, options.output, **common)
+
+
+def _summarise(options: Options, report: SfmReport) -> None:
+    seconds = ", ".join(f"{stage} {time:.1f}" for stage, time in report.seconds.items())
+    rows = [
+        ("images with a pose", f"{report.registered} of {report.total}"),
+        ("points", f"{report.num_points:,}"),
+        ("track length", f"mean {report.mean_track_length:.2f} images"),
+        ("reprojection error", f"mean {report.mean_reprojection_error:.3f} px"),
+        ("seconds", seconds),
+        ("output", str(report.path)),
+    ]
+    print_pairs("splatseed sfm", rows)
+    if report.unregistered:
+        print_note(f"without a pose: {', '.join(report.unregistered)}")
+    command = f"splatseed upsample {options.output} --method mls --ratio 8 -o OUT --preview"
+    print_commands("next", [("", command)])

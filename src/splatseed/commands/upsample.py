@@ -1,0 +1,207 @@
+"""``splatseed upsample``: read a scene, add points, write a scene that trainers load unchanged."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from splatseed.console import (
+    OUT,
+    StageClock,
+    print_commands,
+    print_note,
+    print_pairs,
+    stage_display,
+)
+from splatseed.geometry import far_share
+from splatseed.io import WriteReport, load_scene, write_scene
+from splatseed.io.staging import check_output
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+from splatseed.trainers import training_commands
+from splatseed.upsample import DEFAULT_RATIO, METHODS, Profile, Upsampler, planned_size, upsample
+
+__all__ = ["parse", "run"]
+
+DEFAULT_METHOD = "mls"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Upsample the points of a scene, ready for any 3DGS trainer."""
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A COLMAP scene folder, a folder with transforms.json, or a .ply."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The scene folder to write."""
+    method: str = DEFAULT_METHOD
+    """How new points are made; the flags of each method are below."""
+    ratio: float | None = None
+    """Points in all, as a multiple of the originals (4 if neither this nor --num-points)."""
+    num_points: int | None = None
+    """Points in all, instead of a ratio."""
+    seed: int = 0
+    """The same seed gives the same bytes."""
+    profile: Profile = "default"
+    """"default" treats the paper's traps; "paper" follows its text to the letter, and changes the
+    defaults of the method flags below."""
+    preview: bool = False
+    """Also write preview.png (before and after) and preview_methods.png (every method)."""
+    format: Literal["auto", "colmap", "transforms"] = "auto"
+    """Layout to write; auto keeps the input's."""
+    copy_images: bool = False
+    """Copy the images instead of linking to them."""
+    overwrite: bool = False
+    """Replace an output folder that splatseed wrote before."""
+
+
+def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
+    """The options, and every method with its parameters, from the command line's words."""
+    paper = "--profile=paper" in arguments or ("--profile", "paper") in pairwise(arguments)
+    methods = {name: METHODS[name].paper() if paper else METHODS[name]() for name in METHODS}
+    names = tuple(methods)
+    fields: list[Any] = [
+        (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
+    ]
+    full = dataclasses.make_dataclass(
+        "UpsampleOptions",
+        [("method", Literal[names], dataclasses.field(default=DEFAULT_METHOD)), *fields],
+        bases=(Options,),
+        frozen=True,
+    )
+    full.__doc__ = Options.__doc__
+    options: Any = tyro.cli(full, prog="splatseed upsample", args=arguments)
+    return options, {name: getattr(options, name) for name in methods}
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options, methods = parse(arguments)
+    method = methods[options.method]
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = load_scene(options.scene)
+        check_output(options.output, overwrite=options.overwrite, protect=(options.scene,))
+        _announce(options, scene, method)
+        seeds = _upsample(options, scene, method, clock)
+        clock("check", 0.0)
+        far = far_share(
+            scene.points.xyz, seeds.xyz[len(scene.points) :], rng=np.random.default_rng(0)
+        )
+        clock("write", 0.0)
+        report = write_scene(
+            scene.replace(points=seeds),
+            options.output,
+            format=options.format,
+            overwrite=options.overwrite,
+            copy_images=options.copy_images,
+            provenance=_provenance(options, method),
+        )
+        if options.preview:
+            _write_previews(options, scene, seeds, methods, clock)
+        seconds = clock.seconds()
+    _summarise(options, scene, report, seconds, far)
+
+
+def _announce(options: Options, scene: Scene, method: Upsampler) -> None:
+    """Say what will be done, before it is done."""
+    for warning in scene.warnings:
+        print_note(warning)
+    ratio = _ratio(options)
+    total = planned_size(len(scene.points), ratio, options.num_points)
+    kind = scene.source.format if scene.source else "memory"
+    parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]
+    OUT.print(
+        f"{options.scene} ({kind}, {len(scene.images)} images, {len(scene.points):,} points)\n"
+        f"  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n"
+        f"  -> {options.output} ({total:,} points, seed {options.seed})",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _ratio(options: Options) -> float | None:
+    if options.ratio is None and options.num_points is None:
+        return DEFAULT_RATIO
+    return options.ratio
+
+
+def _upsample(options: Options, scene: Scene, method: Upsampler, clock: StageClock) -> PointCloud:
+    return upsample(
+        scene,
+        method,
+        ratio=_ratio(options),
+        num_points=options.num_points,
+        seed=options.seed,
+        progress=clock,
+    )
+
+
+def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
+    """What made the output, for ``splatseed.json``."""
+    return {
+        "command": "upsample",
+        "method": options.method,
+        "profile": options.profile,
+        "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]
+        "ratio": _ratio(options),
+        "num_points": options.num_points,
+        "seed": options.seed,
+    }
+
+
+def _write_previews(
+    options: Options,
+    scene: Scene,
+    seeds: PointCloud,
+    methods: dict[str, Upsampler],
+    clock: StageClock,
+) -> None:
+    """Two pictures: before and after, and every method side by side."""
+    from splatseed.preview import preview_methods, preview_pair  # noqa: PLC0415  (Pillow)
+
+    clouds = {
+        name: seeds if name == options.method else _upsample(options, scene, method, clock)
+        for name, method in methods.items()
+    }
+    clock("preview", 0.0)
+    preview_pair(scene, seeds, options.output / "preview.png", title=options.method)
+    clock("preview", 0.5)
+    preview_methods(scene, clouds, options.output / "preview_methods.png")
+    clock("preview", 1.0)
+
+
+def _summarise(
+    options: Options, scene: Scene, report: WriteReport, seconds: dict[str, float], far: float
+) -> None:
+    """The closing table and the commands to go on with."""
+    dropped = report.dropped_nonfinite + report.dropped_duplicates
+    rows = [
+        ("points in", f"{len(scene.points):,}"),
+        ("points out", f"{report.num_points:,}"),
+        ("far from any original", f"{far:.2%} of the new points lie over 3 spacings away"),
+        ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
+        ("output", str(options.output)),
+    ]
+    if dropped:
+        rows.insert(
+            2,
+            (
+                "left out",
+                f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate",
+            ),
+        )
+    if options.preview:
+        rows.append(("pictures", str(options.output / "preview.png")))
+        rows.append(("", str(options.output / "preview_methods.png")))
+    print_pairs("splatseed upsample", rows)
+    for note in report.notes:
+        print_note(note)
+    if scene.images:
+        print_commands("train it with", training_commands(options.output, report.layout))

@@ -1,0 +1,112 @@
+"""The terminal: progress bars on stderr, results on stdout.
+
+Promise: nothing is drawn when stderr is not a terminal; a stage's time runs until the next begins.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeElapsedColumn
+
+__all__ = ["OUT", "StageClock", "print_commands", "print_note", "print_pairs", "stage_display"]
+
+OUT = Console()
+ERR = Console(stderr=True)
+
+
+class StageClock:
+    """A ``Progress`` that times the stages and shows them as bars.
+
+    Args:
+        bar: Where to show them; None to time only.
+    """
+
+    def __init__(self, bar: Bar | None = None) -> None:
+        self._bar = bar
+        self._tasks: dict[str, TaskID] = {}
+        self._started: list[tuple[str, float]] = []
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Note that ``fraction`` of ``stage`` is done."""
+        if not self._started or self._started[-1][0] != stage:
+            self._started.append((stage, time.perf_counter()))
+        if self._bar is not None:
+            if stage not in self._tasks:
+                self._tasks[stage] = self._bar.add_task(stage, total=1.0)
+            self._bar.update(self._tasks[stage], completed=fraction)
+
+    def seconds(self) -> dict[str, float]:
+        """Wall time of each stage so far, in order of first appearance."""
+        ends = [start for _, start in self._started[1:]] + [time.perf_counter()]
+        total: dict[str, float] = {}
+        for (stage, start), end in zip(self._started, ends, strict=True):
+            total[stage] = total.get(stage, 0.0) + end - start
+        return total
+
+    def announce_compilation(self) -> None:
+        """Say, once, that kernels are being compiled."""
+        if self._bar is not None and "compiling" not in self._tasks:
+            note = "compiling kernels (first use only, then cached)"
+            self._tasks["compiling"] = self._bar.add_task(note, total=None)
+
+    def finish_compilation(self) -> None:
+        """Take the note away again."""
+        if self._bar is not None and "compiling" in self._tasks:
+            self._bar.remove_task(self._tasks.pop("compiling"))
+
+
+@contextmanager
+def stage_display() -> Iterator[StageClock]:
+    """A clock whose bars are on stderr while the block runs."""
+    if not ERR.is_terminal:
+        yield StageClock()
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    with Bar(*columns, console=ERR, transient=True) as bar:
+        clock = StageClock(bar)
+        with _compilation_shown(clock):
+            yield clock
+
+
+@contextmanager
+def _compilation_shown(clock: StageClock) -> Iterator[None]:
+    """Show Numba's compilations, which make a first run slow, for what they are."""
+    from numba.core import event  # noqa: PLC0415  (only commands that compute pay for Numba)
+
+    class _Listener(event.Listener):
+        def on_start(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
+            clock.announce_compilation()
+
+        def on_end(self, event: object) -> None:  # noqa: ARG002
+            clock.finish_compilation()
+
+    with event.install_listener("numba:compile", _Listener()):
+        yield
+
+
+def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
+    """Print a two-column table, what and how much, unwrapped so that paths can be copied."""
+    OUT.print(f"\n[bold]{escape(title)}[/bold]", highlight=False)
+    _print_columns(rows)
+
+
+def print_note(note: str) -> None:
+    """Print one thing the user should know."""
+    OUT.print(f"[yellow]note:[/yellow] {escape(note)}", soft_wrap=True, highlight=False)
+
+
+def print_commands(title: str, commands: Sequence[tuple[str, str]]) -> None:
+    """Print commands one a line, unwrapped, so that they can be copied."""
+    OUT.print(f"\n[bold]{escape(title)}[/bold]", highlight=False)
+    _print_columns(commands)
+
+
+def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
+    width = max((len(label) for label, _ in rows), default=0)
+    for label, value in rows:
+        OUT.print(f"  {label:<{width}}  {value}", soft_wrap=True, highlight=False, markup=False)

@@ -1,0 +1,167 @@
+"""What is in a scene, and what is wrong with it: the numbers behind ``splatseed info``.
+
+Notation: the spacing of a point is its mean distance to its 6 nearest, in scene units; track
+lengths count images, reprojection errors are in px. Shares are of all points unless said otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image, Scene
+
+__all__ = ["CloudStatistics", "EmptyRegions", "TrackStatistics", "cloud_statistics", "empty_regions",
+           "find_problems", "track_statistics"]  # fmt: skip
+
+PERCENTILES = (5, 25, 50, 75, 95)
+EMPTY_CELLS = 32
+"""Empty regions are counted on a grid with this many cells along an image's longer side."""
+MANY_ISOLATED = 0.02
+MANY_EMPTY = 0.5
+
+
+@dataclass(frozen=True)
+class CloudStatistics:
+    """Facts of the points alone.
+
+    Args:
+        num_points: All points.
+        non_finite: Points with a coordinate that is NaN or infinite.
+        duplicates: Finite points at exactly the place of an earlier one.
+        isolated: Points whose spacing is over 3 times their surroundings'.
+        spacing: Percentiles 5, 25, 50, 75, 95 of the spacing, scene units; NaN for fewer than 2.
+        low: Least coordinates of the bounding box, [3].
+        high: Greatest coordinates, [3].
+        resolution: Step of float32 at the greatest coordinate, scene units.
+    """
+
+    num_points: int
+    non_finite: int
+    duplicates: int
+    isolated: int
+    spacing: tuple[float, ...]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    resolution: float
+
+
+@dataclass(frozen=True)
+class TrackStatistics:
+    """Facts of the tracks: mean, and percentiles 5, 25, 50, 75, 95."""
+
+    mean_length: float
+    length: tuple[float, ...]
+    mean_error: float
+    error: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class EmptyRegions:
+    """How much of the images no point projects to.
+
+    Args:
+        mean: Mean share of empty cells over the images.
+        worst: Share in the emptiest image.
+        worst_name: Its name.
+    """
+
+    mean: float
+    worst: float
+    worst_name: str
+
+
+def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatistics:
+    """Count, measure and check the points of a scene; an empty cloud has NaN bounds."""
+    from splatseed.upsample.neighbors import prepare, sound_bases  # noqa: PLC0415  (Numba)
+
+    xyz = scene.points.xyz
+    finite = xyz[scene.points.finite].astype(np.float64)
+    nothing = (np.nan,) * 3
+    if len(finite) == 0:
+        return CloudStatistics(
+            len(xyz), len(xyz), 0, 0, (np.nan,) * len(PERCENTILES), nothing, nothing, np.nan
+        )
+    cloud = prepare(scene.points.replace(source=np.zeros(len(xyz), np.uint8)), progress=progress)
+    spacing, isolated = np.array([np.nan]), 0
+    if len(cloud) > 1:
+        neighbors = cloud.neighbors(16)
+        spacing = neighbors.spacing
+        isolated = int((sound_bases(cloud, neighbors) == 0).sum())
+    greatest = np.abs(finite).max().astype(np.float32)
+    return CloudStatistics(
+        num_points=len(xyz),
+        non_finite=len(xyz) - len(finite),
+        duplicates=len(finite) - len(cloud),
+        isolated=isolated,
+        spacing=_percentiles(spacing),
+        low=tuple(finite.min(axis=0).tolist()),
+        high=tuple(finite.max(axis=0).tolist()),
+        resolution=float(np.spacing(greatest)),
+    )
+
+
+def track_statistics(scene: Scene) -> TrackStatistics | None:
+    """Track lengths and reprojection errors; None for a scene without tracks."""
+    if scene.tracks is None or len(scene.tracks) == 0:
+        return None
+    lengths, errors = scene.tracks.lengths, scene.tracks.errors
+    known = errors[errors >= 0]
+    if len(known) == 0:
+        known = np.array([np.nan])
+    return TrackStatistics(
+        float(lengths.mean()), _percentiles(lengths), float(known.mean()), _percentiles(known)
+    )
+
+
+def empty_regions(scene: Scene, progress: Progress = silent) -> EmptyRegions | None:
+    """Which share of the images' area has no point; None for a scene without images.
+
+    Visibility is not tested: a wall with points behind it counts as covered.
+    """
+    if not scene.images:
+        return None
+    xyz = scene.points.xyz[scene.points.finite]
+    shares = []
+    for i, image in enumerate(scene.images):
+        shares.append(_empty_share(image, xyz))
+        progress("empty regions", (i + 1) / len(scene.images))
+    worst = int(np.argmax(shares))
+    return EmptyRegions(float(np.mean(shares)), shares[worst], scene.images[worst].name)
+
+
+def find_problems(
+    scene: Scene, cloud: CloudStatistics, regions: EmptyRegions | None
+) -> tuple[str, ...]:
+    """What a user should know before training, one sentence each; the reader's warnings first."""
+    found = list(scene.warnings)
+    if cloud.isolated > MANY_ISOLATED * max(cloud.num_points, 1):
+        found.append(
+            f"{cloud.isolated:,} points ({cloud.isolated / cloud.num_points:.1%}) stand alone: "
+            "outliers or a sparse background; methods do not start from them"
+        )
+    if regions is not None and regions.mean > MANY_EMPTY:
+        found.append(
+            f"{regions.mean:.0%} of the images' area has no point: upsampling fills between "
+            "points, but only depth can fill a bare wall"
+        )
+    return tuple(found)
+
+
+def _empty_share(image: Image, xyz: Float64[np.ndarray, "N 3"]) -> float:
+    """Share of a grid's cells that no point projects into."""
+    camera = image.camera
+    size = np.array([camera.width, camera.height])
+    cell = max(camera.width, camera.height) / EMPTY_CELLS
+    shape = np.maximum(np.ceil(size / cell).astype(int), 1)
+    uv, _ = camera.project(xyz)
+    inside = ((uv >= 0) & (uv < size)).all(axis=1)
+    column, row = (uv[inside] / cell).astype(int).T
+    return 1.0 - len(np.unique(row * shape[0] + column)) / int(shape.prod())
+
+
+def _percentiles(values: np.ndarray) -> tuple[float, ...]:
+    return tuple(np.percentile(values, PERCENTILES).tolist())

@@ -1,0 +1,39 @@
+"""The commands that train a written scene with each 3DGS trainer."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+
+from splatseed.scene import SceneFormat
+
+__all__ = ["training_commands"]
+
+
+def training_commands(path: Path, written_format: SceneFormat) -> list[tuple[str, str]]:
+    """(trainer, command) for every trainer that reads the scene at ``path`` as it is.
+
+    Args:
+        path: The scene folder that was written.
+        written_format: "colmap" or "transforms": gsplat's examples and graphdeco's code read only
+            the former.
+
+    Example:
+        >>> dict(training_commands(Path("out"), "colmap"))["graphdeco"]
+        'python train.py -s out -m out-graphdeco --eval'
+    """
+    scene = shlex.quote(str(path))
+    result = shlex.quote(f"{path}-gsplat"), shlex.quote(f"{path}-graphdeco")
+    brush = ("Brush", f"brush_app {scene} --with-viewer --total-steps 30000")
+    opensplat = ("OpenSplat", f"./opensplat {scene} -n 30000")
+    if written_format == "transforms":
+        return [("nerfstudio", f"ns-train splatfacto --data {scene}"), brush, opensplat]
+    gsplat = f"--data_dir {scene} --data_factor 1 --result_dir {result[0]}"
+    nerfstudio = "colmap --colmap-path sparse/0 --downscale-factor 1"
+    return [
+        ("gsplat", f"python examples/simple_trainer.py default {gsplat}"),
+        ("graphdeco", f"python train.py -s {scene} -m {result[1]} --eval"),
+        ("nerfstudio", f"ns-train splatfacto --data {scene} {nerfstudio}"),
+        brush,
+        opensplat,
+    ]
