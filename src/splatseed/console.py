@@ -12,8 +12,17 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
-__all__ = ["OUT", "StageClock", "print_commands", "print_note", "print_pairs", "stage_display"]
+__all__ = [
+    "OUT",
+    "StageClock",
+    "print_commands",
+    "print_note",
+    "print_pairs",
+    "print_table",
+    "stage_display",
+]
 
 OUT = Console()
 ERR = Console(stderr=True)
@@ -98,6 +107,17 @@ def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
 def print_note(note: str) -> None:
     """Print one thing the user should know."""
     OUT.print(f"[yellow]note:[/yellow] {escape(note)}", soft_wrap=True, highlight=False)
+
+
+def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table whose first column names the row."""
+    table = Table(title=escape(title), title_justify="left", box=None, pad_edge=False)
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    OUT.print()
+    OUT.print(table)
 
 
 def print_commands(title: str, commands: Sequence[tuple[str, str]]) -> None:

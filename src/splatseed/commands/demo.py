@@ -1,0 +1,163 @@
+"""``splatseed demo``: the main job from end to end, on a capture whose truth is known.
+
+It photographs a made-up room, finds points as Structure-from-Motion would, writes them as a COLMAP
+scene, reads that back, upsamples it by every method, and measures how far the new points lie from
+the true surfaces and how well they cover them.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from splatseed.console import StageClock, print_commands, print_pairs, print_table, stage_display
+from splatseed.geometry import GeometryScore, measure, spacing
+from splatseed.io import load_scene, write_scene
+from splatseed.io.staging import atomic_file, output_folder
+from splatseed.pointcloud import PointCloud
+from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
+from splatseed.scene import Scene
+from splatseed.synthetic import Capture, make_capture, write_capture
+from splatseed.upsample import METHODS, upsample
+
+__all__ = ["run"]
+
+SHOWN = "mls"
+SAMPLES = 20_000
+"""Places on the surfaces at which coverage is taken."""
+MANIFEST_TEXT = '{"command": "demo"}\n'
+
+
+@dataclass(frozen=True)
+class Options:
+    """Make a small scene, upsample it by every method, and show the result."""
+
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
+    """The folder to write."""
+    ratio: float = 8.0
+    """Points in all, as a multiple of the originals."""
+    views: int = 40
+    """Photographs of the made-up room."""
+    seed: int = 0
+    """The same seed gives the same demo."""
+    preview: bool = True
+    """Write pictures."""
+    overwrite: bool = False
+    """Replace an output folder that splatseed wrote before."""
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = tyro.cli(Options, prog="splatseed demo", args=arguments)
+    with (
+        stage_display() as clock,
+        output_folder(options.output, overwrite=options.overwrite) as folder,
+    ):
+        clock("photograph", 0.0)
+        capture = make_capture(options.seed, options.views)
+        write_capture(capture, folder / "scene")
+        scene = load_scene(folder / "scene")
+        clouds = _upsample_all(options, scene, clock)
+        scores = _measure_all(capture, scene, clouds, clock)
+        clock("write", 0.0)
+        # Images are copied: a link would point into the folder's temporary place.
+        seeded = scene.replace(points=clouds[SHOWN])
+        write_scene(seeded, folder / f"scene_{SHOWN}", copy_images=True)
+        _write_table(folder / "geometry.csv", scores)
+        if options.preview:
+            _write_pictures(folder, capture, scene, clouds, clock)
+        (folder / "splatseed.json").write_text(MANIFEST_TEXT, encoding="utf-8")
+        seconds = clock.seconds()
+    _summarise(options, scene, scores, seconds)
+
+
+def _upsample_all(options: Options, scene: Scene, clock: StageClock) -> dict[str, PointCloud]:
+    """The scene upsampled by every method."""
+    clouds = {}
+    for done, name in enumerate(METHODS):
+        clock("upsample", done / len(METHODS))
+        clouds[name] = upsample(scene, name, ratio=options.ratio, seed=options.seed)
+    clock("upsample", 1.0)
+    return clouds
+
+
+def _measure_all(
+    capture: Capture, scene: Scene, clouds: Mapping[str, PointCloud], clock: StageClock
+) -> dict[str, GeometryScore]:
+    """Scores of the originals by themselves and of every method's new points."""
+    clock("measure", 0.0)
+    originals = scene.points.xyz
+    h = spacing(originals)
+    samples = capture.sample_visible(SAMPLES, np.random.default_rng(0))
+    scores = {"originals": measure(originals, originals, capture.surfaces, samples, h)}
+    for done, (name, cloud) in enumerate(clouds.items()):
+        new = cloud.xyz[len(originals) :]
+        scores[name] = measure(new, cloud.xyz, capture.surfaces, samples, h)
+        clock("measure", (done + 1) / len(clouds))
+    return scores
+
+
+def _write_table(path: Path, scores: Mapping[str, GeometryScore]) -> None:
+    """Scores as CSV, in units of the originals' spacing."""
+    with atomic_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["method", "error_h", "p95_h", "coverage_h", "share_far"])
+        for name, s in scores.items():
+            writer.writerow(
+                [name, *(f"{x:.4f}" for x in (s.error, s.p95, s.coverage, s.share_far))]
+            )
+
+
+def _write_pictures(
+    folder: Path,
+    capture: Capture,
+    scene: Scene,
+    clouds: Mapping[str, PointCloud],
+    clock: StageClock,
+) -> None:
+    """Before and after, every method, and every method's errors."""
+    clock("pictures", 0.0)
+    preview_pair(scene, clouds[SHOWN], folder / "preview.png", title=SHOWN)
+    clock("pictures", 0.2)
+    preview_methods(scene, clouds, folder / "preview_methods.png")
+    clock("pictures", 0.6)
+    h = spacing(scene.points.xyz)
+    new = {name: c.select(slice(len(scene.points), None)) for name, c in clouds.items()}
+    errors = {name: capture.surfaces.distance(c.xyz) / h for name, c in new.items()}
+    preview_errors(new, errors, choose_camera(scene), folder / "preview_errors.png")
+    clock("pictures", 1.0)
+
+
+def _summarise(
+    options: Options,
+    scene: Scene,
+    scores: Mapping[str, GeometryScore],
+    seconds: Mapping[str, float],
+) -> None:
+    print_table(
+        f"{len(scene.points):,} points, {options.ratio:g}x; distances in units of the originals' "
+        "spacing, less is better",
+        ("method", "error", "95%", "coverage", "far"),
+        [
+            (n, f"{s.error:.3f}", f"{s.p95:.3f}", f"{s.coverage:.3f}", f"{s.share_far:.2%}")
+            for n, s in scores.items()
+        ],
+    )
+    names = ["preview.png", "preview_methods.png", "preview_errors.png"] if options.preview else []
+    rows = [
+        ("error", "mean distance of new points to the true surfaces (95%: its 95th percentile)"),
+        ("coverage", "mean distance of the surfaces that cameras see to the nearest point"),
+        ("far", "share of new points over 3 spacings from any original"),
+        ("seconds", ", ".join(f"{stage} {time:.1f}" for stage, time in seconds.items())),
+        ("scene", f"{options.output / 'scene'} (COLMAP, with images and depths)"),
+        *(("pictures" if not i else "", str(options.output / n)) for i, n in enumerate(names)),
+    ]
+    print_pairs("splatseed demo", rows)
+    command = f"splatseed upsample {options.output / 'scene'} --method spline --ratio 16 -o OUT"
+    print_commands("next", [("", command)])
