@@ -205,6 +205,22 @@ def test_instant_ngp_without_extension_size_or_focal_length(tmp_path):
         load_scene(path, require_points=False)
 
 
+def test_images_beside_the_file_without_extension_are_linked(tmp_path, model):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    PilImage.new("RGB", (64, 48)).save(folder / "0001.png")
+    frame = {"file_path": "./0001", "transform_matrix": np.eye(4).tolist()}
+    path = write_json(folder / "transforms.json", {"camera_angle_x": 1.2, "frames": [frame]})
+    write_ply(folder / "sparse_pc.ply", model.points)
+    scene = load_scene(path)
+    assert scene.images[0].name == "0001.png"
+    write_scene(scene, tmp_path / "a")
+    assert (tmp_path / "a/0001.png").is_file()
+    write_scene(scene, tmp_path / "b", format="colmap")
+    assert (tmp_path / "b/images/0001.png").is_file()
+    assert [p.name for p in (tmp_path / "b/images").iterdir()] == ["0001.png"]
+
+
 @pytest.mark.parametrize(
     ("lens", "name", "terms"),
     [

@@ -12,6 +12,8 @@ from splatseed.scene import Image
 
 __all__ = ["image_warnings", "lens_warnings"]
 
+_MAX_OPENED = 32  # files whose size is compared
+
 
 def image_warnings(images: Sequence[Image], image_dir: Path | None) -> list[str]:
     """What the image files have against their records; only headers of a few are opened."""
@@ -19,13 +21,14 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None) -> list[str]
         return []
     if image_dir is None:
         return ["The images folder is missing; points can be made, but nothing can be trained."]
-    missing = [im.name for im in images if not (image_dir / im.name).is_file()]
+    missing = {im.name: None for im in images if not (image_dir / im.name).is_file()}
     warnings = []
     if missing:
-        count = f"{len(missing)} of {len(images)} images are"
-        warnings.append(f"{count} missing in {image_dir}, the first is {missing[0]}.")
-    present = {im.intrinsics.camera_id: im for im in reversed(images) if im.name not in missing[:1]}
-    wrong = [text for im in present.values() if (text := _size_warning(im, image_dir))]
+        count, first = f"{len(missing)} of {len(images)} images are", next(iter(missing))
+        warnings.append(f"{count} missing in {image_dir}, the first is {first}.")
+    present = [im for im in images if im.name not in missing]
+    sample = present[:: -(-len(present) // _MAX_OPENED) or 1]  # the first, and every so many
+    wrong = [text for im in sample if (text := _size_warning(im, image_dir))]
     return [*warnings, *wrong[:1]]
 
 

@@ -31,9 +31,9 @@ def image_folders(scene: Scene) -> dict[str, Path]:
     folders = _siblings(source.root)
     if source.image_dir is None:
         return folders
-    if source.image_dir.absolute() != source.root.absolute():
+    if source.image_dir.resolve() != source.root.resolve():
         return {**folders, "images": source.image_dir}
-    firsts = sorted({PurePath(image.name).parts[0] for image in scene.images})
+    firsts = _first_folders(image.name for image in scene.images)
     return {
         **{name: path for name, path in folders.items() if name != "images"},
         **{f"images/{first}": source.image_dir / first for first in firsts},
@@ -42,8 +42,7 @@ def image_folders(scene: Scene) -> dict[str, Path]:
 
 def frame_folders(root: Path, file_paths: Iterable[str]) -> dict[str, Path]:
     """What makes the relative paths of a ``transforms.json`` resolve: their first folders."""
-    firsts = sorted({PurePath(path).parts[0] for path in file_paths})
-    return {**_siblings(root), **{first: root / first for first in firsts}}
+    return {**_siblings(root), **{first: root / first for first in _first_folders(file_paths)}}
 
 
 def bring(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]:
@@ -62,6 +61,13 @@ def bring(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]
         if copy or not _linked(source.resolve(), target):
             _copy(source, target)
     return sorted(present)
+
+
+def _first_folders(paths: Iterable[str]) -> list[str]:
+    """The first part of each path; those that lead elsewhere (absolute, ``..``) have none."""
+    pure = (PurePath(path) for path in paths)
+    firsts = {path.parts[0] for path in pure if path.parts and not path.anchor}
+    return sorted(firsts - {".."})
 
 
 def _siblings(root: Path) -> dict[str, Path]:

@@ -63,7 +63,10 @@ def write_transforms(
     if source is not None and source.transforms_path is not None:
         names = {image.name for image in scene.images}
         content = kept_json(read_transforms(source.transforms_path), names)
-        folders = frame_folders(source.root, frame_paths(content["frames"]))
+        paths = frame_paths(content["frames"])
+        if source.image_dir is not None and source.image_dir.resolve() == source.root.resolve():
+            paths += names  # a frame's own path may lack the extension
+        folders = frame_folders(source.root, paths)
     else:
         content = transforms_json(scene)
         folders = image_folders(scene)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Int64
 
+from splatseed.errors import PointCloudError
 from splatseed.io._model import NO_POINT
 from splatseed.scene import Image, Observations, Scene, Tracks
 
@@ -42,6 +43,9 @@ def renumber(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Renumbered:
     Args:
         scene: Its tracks belong to the first ``len(scene.tracks)`` points.
         keep: Which of the scene's points are kept.
+
+    Raises:
+        PointCloudError: There are more tracks than points.
     """
     old_ids = _feature_ids(scene.images)
     if scene.tracks is None:
@@ -49,6 +53,12 @@ def renumber(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Renumbered:
         num_broken = int(np.count_nonzero(old_ids != NO_POINT))
         return Renumbered(None, _with_point_ids(scene.images, unset), num_broken)
     tracks = scene.tracks
+    if len(tracks) > len(keep):
+        raise PointCloudError(
+            "at most one track a point",
+            found=f"{len(tracks)} tracks for {len(keep)} points",
+            fix="Replace the points by Scene.replace, which drops tracks that do not fit.",
+        )
     keep = keep[: len(tracks)]
     point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
     slots = _slots(scene.images, tracks)

@@ -42,7 +42,14 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
         SceneFormatError: A file is not what its format promises.
     """
     path = Path(path)
-    scene = _read(path)
+    try:
+        scene = _read(path)
+    except OSError as error:  # from looking for files; reading them raises our own
+        raise SceneFormatError(
+            f"a scene at {path} that can be read",
+            found=f"{error.strerror or type(error).__name__} at {error.filename or path}",
+            fix="Check that you may read the folder and its files.",
+        ) from None
     if require_points and not len(scene.points):
         raise SceneNotFoundError(f"points in {path}", found="none", fix=_TRIANGULATE)
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))

@@ -217,7 +217,7 @@ def _image_file(path: Path, idx: int, frame: Mapping[str, Any]) -> Path:
 def _image_dir(path: Path, files: Sequence[Path]) -> Path:
     """The folder beside the file that holds all images, else the deepest one that does."""
     shared = Path(os.path.commonpath([file.parent for file in files]))
-    root = path.absolute().parent
+    root = Path(os.path.abspath(path)).parent  # noqa: PTH100  (as the files: links not followed)
     if root not in shared.parents:
         return shared
     return root / shared.relative_to(root).parts[0]  # images, so that names are as in COLMAP

@@ -1,0 +1,333 @@
+"""What is written is what was read plus the new points, whole, consistent, and beside the input."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatseed.errors import OutputError, PointCloudError
+from splatseed.io import _layouts, colmap_binary, load_scene, write_scene
+from splatseed.io.ply import read_ply, write_ply
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Observations, Scene, Tracks
+
+pycolmap = pytest.importorskip("pycolmap")
+
+
+def more_points(scene, rng, count=25):
+    new = PointCloud(
+        rng.normal(size=(count, 3)),
+        rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        np.full(count, 3, np.uint8),
+    )
+    return scene.replace(points=PointCloud.concatenate(scene.points, new))
+
+
+def check_consistent(folder, scene, num_points):
+    """Pycolmap opens the model; ids are contiguous; both sides of every observation agree."""
+    reconstruction = pycolmap.Reconstruction(str(folder / "sparse/0"))
+    assert sorted(reconstruction.points3D) == list(range(1, num_points + 1))
+    assert len(reconstruction.images) == len(scene.images)
+    points, tracks = colmap_binary.read_points3d(folder / "sparse/0/points3D.bin")
+    images = load_scene(folder).images
+    observed = {im.image_id: im.observations.point_ids for im in images}
+    owner = np.repeat(tracks.point_ids, tracks.lengths)
+    for image_id, ids in observed.items():
+        mine = tracks.image_ids == image_id
+        np.testing.assert_array_equal(ids[tracks.point2d_idx[mine]], owner[mine])
+    assert sum(np.count_nonzero(ids != -1) for ids in observed.values()) == len(owner)
+    cloud = read_ply(folder / "sparse/0/points3D.ply")
+    np.testing.assert_array_equal(cloud.xyz, points.xyz)
+    np.testing.assert_array_equal(cloud.rgb, points.rgb)
+    return reconstruction, tracks
+
+
+def track_set(tracks, i):
+    span = slice(tracks.offsets[i], tracks.offsets[i + 1])
+    return list(zip(tracks.image_ids[span], tracks.point2d_idx[span], strict=True))
+
+
+def test_originals_keep_everything_but_their_ids(scene_dir, tmp_path, rng, model):
+    scene = more_points(load_scene(scene_dir), rng)
+    report = write_scene(scene, tmp_path / "out")
+    assert (report.num_points, report.num_original) == (35, 10)
+    _, tracks = check_consistent(tmp_path / "out", scene, 35)
+    np.testing.assert_array_equal(tracks.point_ids, np.arange(1, 36))
+    np.testing.assert_array_equal(tracks.xyz[:10], model.tracks.xyz)
+    np.testing.assert_array_equal(tracks.errors[:10], model.tracks.errors)
+    assert [track_set(tracks, i) for i in range(10)] == [
+        track_set(model.tracks, i) for i in range(10)
+    ]
+    assert not tracks.lengths[10:].any()
+    np.testing.assert_array_equal(tracks.xyz[10:].astype(np.float32), scene.points.xyz[10:])
+
+
+def test_every_observation_follows_its_point_to_the_new_id(scene_dir, tmp_path, model):
+    scene = load_scene(scene_dir)
+    write_scene(scene, tmp_path / "out")
+    new_of_old = dict(zip(model.tracks.point_ids.tolist(), range(1, 11), strict=True)) | {-1: -1}
+    for ours, theirs in zip(load_scene(tmp_path / "out").images, scene.images, strict=True):
+        expected = [new_of_old[i] for i in theirs.observations.point_ids.tolist()]
+        assert ours.observations.point_ids.tolist() == expected
+        np.testing.assert_array_equal(ours.observations.xy, theirs.observations.xy)
+
+
+def test_contiguous_ids_are_written_back_byte_for_byte(scene_dir, tmp_path, rng):
+    write_scene(load_scene(scene_dir), tmp_path / "a")
+    write_scene(load_scene(tmp_path / "a"), tmp_path / "b")
+    for name in ("cameras.bin", "images.bin", "points3D.bin", "points3D.ply"):
+        first = (tmp_path / "a/sparse/0" / name).read_bytes()
+        assert (tmp_path / "b/sparse/0" / name).read_bytes() == first
+    write_scene(more_points(load_scene(tmp_path / "a"), rng), tmp_path / "c")
+    bytes_of = {x: (tmp_path / x / "sparse/0/points3D.bin").read_bytes() for x in "ac"}
+    assert bytes_of["c"][8:].startswith(bytes_of["a"][8:])
+    a, c = ((tmp_path / x / "sparse/0/images.bin").read_bytes() for x in "ac")
+    assert a == c
+
+
+def test_unusable_points_are_dropped_with_their_observations(scene_dir, tmp_path, model, rng):
+    xyz = model.tracks.xyz.copy()
+    xyz[2], xyz[5], xyz[7] = np.nan, xyz[1], np.inf
+    broken = replace(model.tracks, xyz=xyz)
+    points = PointCloud(xyz, model.points.rgb)
+    colmap_binary.write_points3d(scene_dir / "sparse/0/points3D.bin", points, broken)
+    scene = more_points(load_scene(scene_dir), rng, 3)
+    again = PointCloud.concatenate(scene.points, scene.points.select(np.array([10, 0])))
+    report = write_scene(scene.replace(points=again), tmp_path / "out")
+    assert (report.dropped_nonfinite, report.dropped_duplicates) == (2, 3)
+    assert (report.num_points, report.num_original) == (10, 7)
+    assert report.notes == ()
+    _, tracks = check_consistent(tmp_path / "out", scene, 10)
+    np.testing.assert_array_equal(tracks.xyz[:7], xyz[[0, 1, 3, 4, 6, 8, 9]])
+
+
+def test_references_that_nobody_confirms_are_taken_out(scene_dir, tmp_path, model):
+    scene = load_scene(scene_dir)
+    tracks = scene.tracks
+    image_ids, point2d_idx = tracks.image_ids.copy(), tracks.point2d_idx.copy()
+    image_ids[0], point2d_idx[5] = 99, 5000  # no such image, no such feature
+    observed = scene.images[2].observations
+    point_ids = observed.point_ids.copy()
+    point_ids[np.flatnonzero(point_ids == -1)[0]] = 777  # no such point
+    odd = replace(scene.images[2], observations=Observations(observed.xy, point_ids))
+    scene = scene.replace(
+        images=(*scene.images[:2], odd, scene.images[3]),
+        tracks=replace(tracks, image_ids=image_ids, point2d_idx=point2d_idx),
+    )
+    report = write_scene(scene, tmp_path / "out")
+    _, written = check_consistent(tmp_path / "out", scene, 10)
+    assert written.lengths.sum() == model.tracks.lengths.sum() - 2
+    assert "references" in " ".join(report.notes)
+
+
+def test_tracks_follow_a_choice_of_images(scene_dir, tmp_path):
+    scene = load_scene(scene_dir)
+    scene = scene.replace(images=scene.images[::2])
+    write_scene(scene, tmp_path / "out")
+    _, tracks = check_consistent(tmp_path / "out", scene, 10)
+    assert set(tracks.image_ids.tolist()) == {im.image_id for im in scene.images}
+
+
+def test_rigs_and_frames_are_copied_byte_for_byte(scene_dir, tmp_path, rng):
+    folder = scene_dir / "sparse/0"
+    pycolmap.Reconstruction(str(folder)).write(str(folder))
+    assert (folder / "frames.bin").is_file()
+    scene = more_points(load_scene(scene_dir), rng)
+    write_scene(scene, tmp_path / "out")
+    for name in ("rigs.bin", "frames.bin"):
+        assert (tmp_path / "out/sparse/0" / name).read_bytes() == (folder / name).read_bytes()
+    check_consistent(tmp_path / "out", scene, 35)
+    report = write_scene(scene.replace(images=scene.images[1:]), tmp_path / "fewer")
+    assert "Rigs" in " ".join(report.notes)
+    pycolmap.Reconstruction(str(tmp_path / "fewer/sparse/0"))
+
+
+def test_small_files_that_trainers_read_come_along(scene_dir, tmp_path):
+    (scene_dir / "poses_bounds.npy").write_bytes(b"bounds")
+    (scene_dir / "sparse/0/depth_params.json").write_text("{}")
+    write_scene(load_scene(scene_dir), tmp_path / "out")
+    assert (tmp_path / "out/poses_bounds.npy").read_bytes() == b"bounds"
+    assert (tmp_path / "out/sparse/0/depth_params.json").read_text() == "{}"
+
+
+def test_scene_without_images_opens_and_says_what_to_do_with_it(scene_dir, tmp_path, model):
+    (scene_dir / "sparse/0/images.bin").unlink()
+    report = write_scene(load_scene(scene_dir), tmp_path / "out")
+    assert "full scene" in " ".join(report.notes)
+    assert (tmp_path / "out/sparse/0/images.bin").read_bytes() == bytes(8)
+    reconstruction = pycolmap.Reconstruction(str(tmp_path / "out/sparse/0"))
+    assert len(reconstruction.points3D) == 10
+    write_ply(tmp_path / "cloud.ply", model.points)
+    bare = load_scene(tmp_path / "cloud.ply")
+    write_scene(bare, tmp_path / "from_ply")
+    assert len(pycolmap.Reconstruction(str(tmp_path / "from_ply/sparse/0")).points3D) == 10
+    with pytest.raises(OutputError, match="with images"):
+        write_scene(bare, tmp_path / "json", format="transforms")
+
+
+def test_scene_made_in_memory(tmp_path, model):
+    scene = Scene(model.points, model.images, tracks=model.tracks)
+    report = write_scene(scene, tmp_path / "out")
+    check_consistent(tmp_path / "out", scene, 10)
+    assert "images" not in report.files
+    assert json.loads((tmp_path / "out/splatseed.json").read_text())["source"] is None
+
+
+def test_points_that_replace_the_originals_lose_the_tracks(scene_dir, tmp_path):
+    scene = load_scene(scene_dir)
+    moved = scene.replace(points=scene.points.replace(xyz=scene.points.xyz + 1))
+    write_scene(moved, tmp_path / "out")
+    _, tracks = check_consistent(tmp_path / "out", moved, 10)
+    assert not tracks.lengths.any()
+
+
+def test_image_folders_are_linked_absolutely(scene_dir, tmp_path, monkeypatch):
+    for name in ("images_4", "masks", "other"):
+        (scene_dir / name).mkdir()
+    monkeypatch.chdir(scene_dir.parent)
+    report = write_scene(load_scene("scene"), "out")
+    out = tmp_path / "out"
+    assert {"images", "images_4", "masks"} <= set(report.files)
+    assert not (out / "other").exists()
+    for name in ("images", "images_4", "masks"):
+        assert (out / name).is_symlink()
+        assert Path(os.readlink(out / name)) == scene_dir / name  # noqa: PTH115  (3.11's returns str)
+    shutil.move(out, tmp_path / "elsewhere")
+    assert not any("missing" in w for w in load_scene(tmp_path / "elsewhere").warnings)
+
+
+@pytest.mark.parametrize("how", ["asked", "no links"])
+def test_images_are_copied_when_asked_or_when_links_fail(scene_dir, tmp_path, monkeypatch, how):
+    def refuse(*_args, **_options):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    if how == "no links":
+        monkeypatch.setattr(Path, "symlink_to", refuse)
+    write_scene(load_scene(scene_dir), tmp_path / "out", copy_images=how == "asked")
+    shutil.rmtree(scene_dir)
+    scene = load_scene(tmp_path / "out")
+    assert not (tmp_path / "out/images").is_symlink()
+    assert not any("missing" in text for text in scene.warnings)
+
+
+def test_images_in_the_scenes_root_are_linked_without_the_rest(scene_dir, tmp_path, model):
+    (scene_dir / "images/left").rename(scene_dir / "left")
+    (scene_dir / "images").rmdir()
+    (scene_dir / "stale.ply").touch()
+    write_scene(load_scene(scene_dir), tmp_path / "out")
+    assert sorted(p.name for p in (tmp_path / "out/images").iterdir()) == ["left"]
+    assert (tmp_path / "out/images" / model.images[0].name).is_file()
+
+
+def test_splatseed_json_tells_how_it_came_about(scene_dir, tmp_path, rng, monkeypatch):
+    monkeypatch.chdir(scene_dir.parent)
+    scene = more_points(load_scene("scene"), rng)
+    given = {"method": "mls", "seed": np.int64(3), "options": {"k": 16}, "path": Path("a")}
+    report = write_scene(scene, tmp_path / "out", provenance=given)
+    told = json.loads((tmp_path / "out/splatseed.json").read_text())
+    assert told["source"] == "scene"
+    assert (told["method"], told["seed"], told["options"]) == ("mls", 3, {"k": 16})
+    assert (told["num_points"], told["num_original"], told["num_new"]) == (35, 10, 25)
+    assert set(told["versions"]) == {"python", "splatseed", "numpy", "scipy", "numba"}
+    listed = {p.relative_to(report.path).as_posix() for p in report.path.rglob("*.[bpj]*")}
+    assert {name for name in listed if not name.startswith("images")} == set(report.files) - {
+        "images"
+    }
+
+
+@pytest.mark.parametrize(
+    "failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()]
+)
+@pytest.mark.parametrize("function", ["write_ply", "write_json"])
+def test_an_interrupted_or_full_disk_leaves_nothing(
+    scene_dir, tmp_path, monkeypatch, failure, function
+):
+    def fail(path, _content):
+        path.write_bytes(b"half")
+        raise failure
+
+    monkeypatch.setattr(_layouts, function, fail)
+    form = "transforms" if function == "write_json" else "colmap"
+    expected = OutputError if isinstance(failure, OSError) else KeyboardInterrupt
+    scene = load_scene(scene_dir)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(expected):
+        write_scene(scene, tmp_path / "deep/out", format=form)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_input_is_never_written_to(scene_dir, tmp_path):
+    scene = load_scene(scene_dir)
+    before = {p: p.stat().st_mtime_ns for p in scene_dir.rglob("*")}
+    for target in (scene_dir, scene_dir / "out", tmp_path, scene_dir / "sparse/0"):
+        with pytest.raises(OutputError, match="apart from the input"):
+            write_scene(scene, target, overwrite=True)
+    write_scene(scene, tmp_path / "out")
+    write_scene(scene, tmp_path / "out2", format="transforms", copy_images=True)
+    with pytest.raises(OutputError, match="--overwrite"):
+        write_scene(scene, tmp_path / "out")
+    write_scene(scene, tmp_path / "out", overwrite=True)
+    assert {p: p.stat().st_mtime_ns for p in scene_dir.rglob("*")} == before
+
+
+def test_read_only_input_is_no_obstacle(scene_dir, tmp_path):
+    for path in [*scene_dir.rglob("*"), scene_dir]:
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    try:
+        write_scene(load_scene(scene_dir), tmp_path / "out")
+    finally:
+        for path in [scene_dir, *scene_dir.rglob("*")]:
+            path.chmod(0o755 if path.is_dir() else 0o644)
+    assert (tmp_path / "out/sparse/0/points3D.bin").is_file()
+
+
+def test_no_usable_point_or_unknown_format_is_one_error(tmp_path, model):
+    nothing = model.points.replace(xyz=np.full((10, 3), np.nan))
+    with pytest.raises(PointCloudError, match="10 of them not finite"):
+        write_scene(Scene(nothing), tmp_path / "out")
+    with pytest.raises(OutputError, match="colmap or transforms"):
+        write_scene(Scene(model.points), tmp_path / "out", format="obj")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["fern", "fox", "treehill", "bonsai"])
+def test_real_captures(scenes, tmp_path, rng, name):
+    scene = more_points(load_scene(scenes / name), rng, 1000)
+    report = write_scene(scene, tmp_path / "out")
+    _, tracks = check_consistent(tmp_path / "out", scene, report.num_points)
+    originals = report.num_original
+    _, first = np.unique(scene.points.originals.xyz, axis=0, return_index=True)
+    kept = np.sort(first)
+    assert originals == len(kept)
+    np.testing.assert_array_equal(tracks.xyz[:originals], scene.tracks.xyz[kept])
+    np.testing.assert_array_equal(tracks.lengths[:originals], scene.tracks.lengths[kept])
+    assert report.notes == ()
+
+
+@pytest.mark.parametrize("name", ["bicycle", "stump"])
+def test_real_clouds_without_images(scenes, tmp_path, name):
+    scene = load_scene(scenes / "mipnerf360_sfm" / name)
+    report = write_scene(scene, tmp_path / "out")
+    reconstruction = pycolmap.Reconstruction(str(tmp_path / "out/sparse/0"))
+    assert len(reconstruction.points3D) == report.num_points
+    assert len(reconstruction.cameras) == len(scene.intrinsics)
+
+
+def test_tracks_of_more_points_than_there_are_cannot_slip_through(tmp_path, model):
+    long = Tracks(
+        np.arange(12),
+        np.zeros((12, 3)),
+        np.zeros(12),
+        np.zeros(13, np.int64),
+        np.empty(0, np.uint32),
+        np.empty(0, np.uint32),
+    )
+    with pytest.raises(PointCloudError, match="track"):
+        write_scene(Scene(model.points, tracks=long), tmp_path / "out")
