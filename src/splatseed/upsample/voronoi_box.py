@@ -15,6 +15,8 @@ import itertools
 
 import numpy as np
 from jaxtyping import Float64
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError
 
 from splatseed.errors import PointCloudError
@@ -27,6 +29,8 @@ __all__ = ["box_cells"]
 ENLARGE = 0.1
 FLAT = 1e-14
 """Tetrahedra flatter than this, relative to their edges, have no usable circumcentre."""
+SAME = 1e-9
+"""Circumcentres of neighbours closer than this, in circumradii, are one Voronoi vertex."""
 
 
 def box_cells(
@@ -43,7 +47,7 @@ def box_cells(
     progress("voronoi", 0.0)
     sites = np.concatenate([cloud.xyz, _corners(cloud.xyz)])
     try:
-        tetrahedra = Delaunay(sites).simplices
+        delaunay = Delaunay(sites)
     except QhullError as error:
         raise PointCloudError(
             "a cloud that Qhull can build a Voronoi diagram of",
@@ -51,7 +55,10 @@ def box_cells(
             fix='Use the default profile (voronoi.cells "clamped"), which has no such limit.',
         ) from error
     progress("voronoi", 0.6)
-    center, radius, volume = _cells(sites, tetrahedra)
+    tetrahedra = delaunay.simplices
+    vertex = _circumcenters(sites, tetrahedra)
+    once = _count_once(sites, tetrahedra, delaunay.neighbors, vertex)
+    center, radius, volume = _cells(sites, tetrahedra, vertex, once)
     progress("voronoi", 1.0)
     n = len(cloud)
     return center[:n] - cloud.xyz, radius[:n], np.maximum(volume[:n], 0.0)
@@ -66,25 +73,53 @@ def _corners(xyz: np.ndarray) -> np.ndarray:
     return np.asarray((low + high) / 2 + signs * half)
 
 
+def _count_once(
+    sites: np.ndarray, tetrahedra: np.ndarray, neighbors: np.ndarray, vertex: np.ndarray
+) -> np.ndarray:
+    """Where a cell meets a vertex for the first time, 1.0 or 0.0 for every corner [T, 4].
+
+    Qhull cuts cospherical sites, such as four corners of the box and a point, into tetrahedra that
+    share one Voronoi vertex; a cell's mean must not count it twice.
+    """
+    here, there = np.repeat(np.arange(len(vertex)), 4), neighbors.ravel()
+    gap = np.linalg.norm(vertex[here] - vertex[there], axis=1)
+    circumradius = np.linalg.norm(vertex - sites[tetrahedra[:, 0]], axis=1)
+    same = (there >= 0) & (gap <= SAME * circumradius[here])
+    links = coo_array((same[same], (here[same], there[same])), shape=(len(vertex), len(vertex)))
+    label = connected_components(links, directed=False)[1]
+    meeting = tetrahedra.astype(np.int64) * len(vertex) + label[:, None]
+    once = np.zeros(meeting.size)
+    once[np.unique(meeting, return_index=True)[1]] = 1.0
+    return once.reshape(-1, 4)
+
+
 @inline
-def _cells(sites, tetrahedra):  # type: ignore[no-untyped-def]
+def _circumcenters(sites, tetrahedra):  # type: ignore[no-untyped-def]
+    """Circumcentre of every tetrahedron [T, 3], NaN where it is too flat to have one."""
+    vertex = np.empty((len(tetrahedra), 3))
+    for t in range(len(tetrahedra)):
+        if not _circumcenter(sites, tetrahedra[t], vertex[t]):
+            vertex[t] = np.nan
+    return vertex
+
+
+@inline
+def _cells(sites, tetrahedra, vertex, once):  # type: ignore[no-untyped-def]
     """Centre, radius and volume of every site's cell, in one serial (so deterministic) pass."""
     n = len(sites)
     center, count = np.zeros((n, 3)), np.zeros(n)
     radius, volume = np.zeros(n), np.zeros(n)
-    vertex = np.empty((len(tetrahedra), 3))
-    usable = np.empty(len(tetrahedra), np.bool_)
     for t in range(len(tetrahedra)):
-        usable[t] = _circumcenter(sites, tetrahedra[t], vertex[t])
-        if usable[t]:
-            for i in tetrahedra[t]:
-                center[i] += vertex[t]
-                count[i] += 1.0
+        if np.isfinite(vertex[t, 0]):
+            for corner in range(4):
+                i = tetrahedra[t, corner]
+                center[i] += once[t, corner] * vertex[t]
+                count[i] += once[t, corner]
             _add_volumes(sites, tetrahedra[t], vertex[t], volume)
     for i in range(n):
         center[i] /= max(count[i], 1.0)
     for t in range(len(tetrahedra)):
-        if usable[t]:
+        if np.isfinite(vertex[t, 0]):
             for i in tetrahedra[t]:
                 radius[i] = max(radius[i], np.sqrt(np.sum((vertex[t] - center[i]) ** 2)))
     return center, radius, volume
