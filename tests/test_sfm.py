@@ -27,6 +27,7 @@ from splatseed.io.rgbd import load_rgbd
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.sfm import reconstruct, triangulate, worker
+from splatseed.sfm.orientation import clear_orientation
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -268,6 +269,29 @@ def test_a_truncated_photograph_is_refused(photos: Path, tmp_path: Path) -> None
     (tmp_path / "b.jpg").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(SceneFormatError, match=r"b\.jpg to be a readable image"):
         reconstruct(tmp_path, tmp_path.with_name("scene"))
+
+
+@pytest.mark.parametrize("order", ["II", "MM"])
+def test_exif_orientation_is_cleared_and_pixels_are_kept(tmp_path: Path, order: str) -> None:
+    pixels = noise_texture(np.random.default_rng(0), 64).astype(np.uint8)
+    exif = PilImage.Exif()
+    exif.endian = "<" if order == "II" else ">"
+    exif[0x0110], exif[0x0112] = "a camera", 6
+    (tmp_path / "sub").mkdir()
+    for name in ("turned.jpg", "sub/turned.JPG", "plain.jpg"):
+        extra = {} if name == "plain.jpg" else {"exif": exif}
+        PilImage.fromarray(pixels).save(tmp_path / name, format="JPEG", **extra)
+    (tmp_path / "turned.jpg").chmod(0o444)
+    before = {name: (tmp_path / name).read_bytes() for name in files_below(tmp_path)}
+    clear_orientation(tmp_path)
+    for name, old in before.items():
+        new = (tmp_path / name).read_bytes()
+        changed = sum(a != b for a, b in zip(old, new, strict=True))
+        assert changed == (0 if name == "plain.jpg" else 1)  # 6 becomes 1
+        with PilImage.open(tmp_path / name) as image:
+            tags = image.getexif()
+            assert tags.get(0x0112, 1) == 1
+            assert name == "plain.jpg" or tags[0x0110] == "a camera"
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from splatseed.errors import OutputError
 from splatseed.sfm.features import Run
+from splatseed.sfm.orientation import clear_orientation
 
 __all__ = ["export_scene"]
 
@@ -17,7 +18,8 @@ __all__ = ["export_scene"]
 def export_scene(run: Run, model_dir: Path, staging: Path) -> None:
     """Write the model of ``model_dir`` to ``staging`` with distortion removed.
 
-    Images whose camera is PINHOLE already are copied byte for byte.
+    Images whose camera is PINHOLE already are copied byte for byte, but for an EXIF
+    orientation, which is cleared: cameras are of the pixels as stored.
     """
     pycolmap = run.pycolmap
     dense = run.work / "dense"
@@ -37,6 +39,7 @@ def export_scene(run: Run, model_dir: Path, staging: Path) -> None:
     (staging / "sparse").mkdir()
     (dense / "sparse").rename(staging / "sparse" / "0")
     (dense / "images").rename(staging / "images")
+    clear_orientation(staging / "images")
     _refresh_errors(run, staging / "sparse" / "0")
 
 

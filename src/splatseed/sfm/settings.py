@@ -26,6 +26,7 @@ __all__ = [
 MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 DeviceName: TypeAlias = Literal["auto", "cpu", "cuda"]
 
+_OLDEST = 4  # the first to pose an image and its rig in one call
 _INSTALL = 'Run: pip install --upgrade "splatseed[sfm]"'
 _MAX_SEED = 2**31 - 1  # pycolmap takes an int
 
@@ -84,9 +85,9 @@ def require_pycolmap() -> Any:
         raise MissingDependencyError(
             "pycolmap to load", found=str(error).strip(), fix=_INSTALL
         ) from error
-    if not hasattr(pycolmap, "FeatureExtractionOptions"):
+    if int(pycolmap.__version__.split(".")[0]) < _OLDEST:
         raise MissingDependencyError(
-            "pycolmap 4 or newer", found=f"pycolmap {pycolmap.__version__}", fix=_INSTALL
+            f"pycolmap {_OLDEST} or newer", found=f"pycolmap {pycolmap.__version__}", fix=_INSTALL
         )
     return pycolmap
 
