@@ -1,4 +1,9 @@
-"""Reading and writing scenes."""
+"""Reading scenes and writing them, one file a format.
+
+``load_scene`` finds out what a path holds; ``write_scene`` makes a folder that every 3D Gaussian
+Splatting trainer loads unchanged. Promise: malformed input and failing output raise one error from
+``splatseed.errors``; importing this package loads neither Numba nor SciPy.
+"""
 
 from splatseed.io.load import load_scene
 from splatseed.io.write import WriteReport, write_scene

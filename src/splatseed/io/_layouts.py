@@ -21,15 +21,14 @@ from splatseed.camera import Intrinsics
 from splatseed.io import colmap_binary
 from splatseed.io._image_folders import frame_folders, image_folders
 from splatseed.io._model_ids import Renumbered, renumber
-from splatseed.io.ply import write_ply
-from splatseed.io.transforms import (
+from splatseed.io._transforms_json import (
     NERFSTUDIO_FROM_COLMAP,
-    apply_transform,
     frame_paths,
     kept_json,
-    read_transforms,
     transforms_json,
 )
+from splatseed.io.ply import write_ply
+from splatseed.io.transforms import apply_transform, read_transforms
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,42 +22,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.camera import CAMERA_MODELS, Intrinsics, quat_from_rotation
-from splatseed.errors import OutputError, SceneFormatError
+from splatseed.camera import Intrinsics, quat_from_rotation
+from splatseed.errors import SceneFormatError
 from splatseed.io._model import MAX_ID, make_intrinsics, read_bytes
-from splatseed.scene import Image, Scene
+from splatseed.scene import Image
 
-__all__ = [
-    "NERFSTUDIO_FROM_COLMAP",
-    "Transforms",
-    "apply_transform",
-    "frame_paths",
-    "kept_json",
-    "read_transforms",
-    "transforms_json",
-]
+__all__ = ["OPENCV_FROM_OPENGL", "Transforms", "apply_transform", "read_transforms"]
 
-NERFSTUDIO_FROM_COLMAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
-"""The ``applied_transform`` that nerfstudio gives a COLMAP model: (x, y, z) -> (x, z, -y)."""
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Turns camera axes from OpenGL's to OpenCV's, and back."""
 
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG")  # tried when a file_path has none
 _RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
 _PERSPECTIVE = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_OPENCV_TERMS = ("k1", "k2", "p1", "p2")  # in the order of COLMAP's parameters
-_PATH_KEYS = ("file_path", "mask_path", "depth_file_path")
-_FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
-_NERFSTUDIO_MODELS = {
-    "SIMPLE_PINHOLE",
-    "PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "OPENCV",
-    "OPENCV_FISHEYE",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
-}
 _FIX = "Correct the file, or export the scene again."
 
 _Params = tuple[str, int, int, tuple[float, ...]]
@@ -113,64 +91,6 @@ def read_transforms(path: Path) -> Transforms:
     return Transforms(
         path, meta, tuple(images), tuple(cameras.values()), image_dir, applied, warnings
     )
-
-
-def transforms_json(scene: Scene) -> dict[str, Any]:
-    """A new ``transforms.json`` for a scene in COLMAP's world, as nerfstudio writes it.
-
-    Poses are in nerfstudio's space and OpenGL axes; images are ``images/NAME``; without
-    ``ply_file_path``.
-
-    Raises:
-        OutputError: A camera model has no counterpart in nerfstudio.
-    """
-    used = {image.intrinsics.camera_id: image.intrinsics for image in scene.images}
-    cameras = {camera_id: _camera_fields(camera) for camera_id, camera in used.items()}
-    first = next(iter(cameras.values()), {})
-    shared = first if len(used) == 1 else {"camera_model": first.get("camera_model", "OPENCV")}
-    frames = []
-    for image in scene.images:
-        own = {} if len(used) == 1 else cameras[image.intrinsics.camera_id]
-        frames.append(
-            {
-                "file_path": f"images/{image.name}",
-                "transform_matrix": _opengl_pose(image).tolist(),
-                "colmap_im_id": image.image_id,
-                **own,
-            }
-        )
-    applied = NERFSTUDIO_FROM_COLMAP.tolist()
-    return {**shared, "frames": frames, "applied_transform": applied}
-
-
-def kept_json(transforms: Transforms, names: Collection[str]) -> dict[str, Any]:
-    """The file's content for use in another folder.
-
-    Paths that lead out of the file's folder become absolute; everything else stays.
-
-    Args:
-        transforms: The file as it was read.
-        names: The images to keep.
-    """
-    root = transforms.path.parent
-    pairs = zip(transforms.json["frames"], transforms.images, strict=True)
-    frames = [frame for frame, image in pairs if image.name in names]
-    return {**transforms.json, "frames": [_portable(frame, root) for frame in frames]}
-
-
-def frame_paths(frames: Iterable[Mapping[str, Any]]) -> list[str]:
-    """All paths, relative to the file, that the frames name."""
-    paths = (frame.get(key) for frame in frames for key in _PATH_KEYS)
-    return [path for path in paths if isinstance(path, str) and not Path(path).is_absolute()]
-
-
-def _portable(frame: Mapping[str, Any], root: Path) -> dict[str, Any]:
-    moved = {
-        key: os.path.abspath(root / path)  # noqa: PTH100  (resolve would follow links)
-        for key in _PATH_KEYS
-        if isinstance(path := frame.get(key), str) and os.path.normpath(path).startswith("..")
-    }
-    return {**frame, **moved}
 
 
 def apply_transform(
@@ -348,7 +268,7 @@ def _matrix(where: str, value: Any, shape: tuple[int, int]) -> Float64[np.ndarra
 
 def _pose(where: str, value: Any) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 3"]]:
     """Quaternion and translation of ``cam_from_world`` in OpenCV axes."""
-    world_from_cam = _matrix(f"{where}, transform_matrix", value, (3, 4)) @ _OPENCV_FROM_OPENGL
+    world_from_cam = _matrix(f"{where}, transform_matrix", value, (3, 4)) @ OPENCV_FROM_OPENGL
     rotation = world_from_cam[:, :3].T
     off = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if off > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
@@ -363,34 +283,3 @@ def _pose(where: str, value: Any) -> tuple[Float64[np.ndarray, " 4"], Float64[np
 def _applied_transform(path: Path, meta: Mapping[str, Any]) -> Float64[np.ndarray, "3 4"] | None:
     value = meta.get("applied_transform")
     return None if value is None else _matrix(f"{path}, applied_transform", value, (3, 4))
-
-
-def _opengl_pose(image: Image) -> Float64[np.ndarray, "4 4"]:
-    """``world_from_cam`` in OpenGL axes and nerfstudio's space."""
-    pose = image.camera.world_from_cam @ _OPENCV_FROM_OPENGL
-    pose[:3] = NERFSTUDIO_FROM_COLMAP @ pose
-    return np.asarray(pose)
-
-
-def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
-    """The fields of one camera record, under nerfstudio's names."""
-    if camera.model not in _NERFSTUDIO_MODELS:
-        raise OutputError(
-            "cameras that transforms.json can express",
-            found=f"camera {camera.camera_id} of model {camera.model}",
-            fix="Undistort the scene to PINHOLE, or write the COLMAP layout.",
-        )
-    fisheye = camera.model.endswith("FISHEYE")
-    names = _FISHEYE_TERMS if fisheye else _OPENCV_TERMS
-    terms = camera.params[CAMERA_MODELS[camera.model].num_focal + 2 :]
-    matrix = camera.K
-    return {
-        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": float(matrix[0, 0]),
-        "fl_y": float(matrix[1, 1]),
-        "cx": float(matrix[0, 2]),
-        "cy": float(matrix[1, 2]),
-        **dict(zip(names, (*terms, 0.0, 0.0, 0.0, 0.0), strict=False)),
-    }
