@@ -34,6 +34,8 @@ __all__ = [
 
 Profile = Literal["default", "paper"]
 DEFAULT_RATIO = 4.0
+MAX_POINTS = 1 << 32
+"""More points than this are a slip of the keyboard, not a wish."""
 
 
 def configure(method: str, profile: Profile = "default", **parameters: Any) -> Upsampler:
@@ -96,7 +98,7 @@ def upsample(
         The N originals, first and unchanged, then the new points; ``source`` tells them apart.
 
     Raises:
-        ParameterError: An unknown method, profile or parameter, or a size below the originals'.
+        ParameterError: An unknown method, profile or parameter, or a value or size out of range.
         PointCloudError: Too few distinct finite points for the method.
 
     Example:
@@ -112,14 +114,15 @@ def upsample(
     points = scene.points if isinstance(scene, Scene) else scene
     originals = points.originals
     num_new = planned_size(len(originals), ratio, num_points) - len(originals)
-    name = method if isinstance(method, str) else ""
-    chosen = configure(method, profile, **parameters) if isinstance(method, str) else method
-    if num_new == 0:
+    chosen = _choose(method, profile, parameters)
+    rng = _generator(seed)
+    if num_new == 0 and len(originals) > 0:
         return originals
     cloud = prepare(originals, progress=progress)
-    new = chosen(cloud, num_new, np.random.default_rng(seed), progress)
+    new = chosen(cloud, num_new, rng, progress)
     _check_finite(new)
-    source = np.full(num_new, source_code(name or _name_of(chosen)), np.uint8)
+    name = method if isinstance(method, str) else _name_of(chosen)
+    source = np.full(num_new, source_code(name), np.uint8)
     return PointCloud.concatenate(originals, PointCloud(new.xyz, new.rgb, source))
 
 
@@ -152,7 +155,8 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
     """How many points there will be in all.
 
     Raises:
-        ParameterError: Both are given, the ratio is below 1, or there are more originals.
+        ParameterError: Both are given, the ratio is below 1, or the number is not whole, below the
+            originals' or beyond all reason.
     """
     if ratio is not None and num_points is not None:
         raise ParameterError(
@@ -167,6 +171,12 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
                 fix="Give --ratio 8 for eight times as many points.",
             )
         num_points = round(ratio * num_original)
+    if not isinstance(num_points, (int, np.integer)) or num_points > MAX_POINTS:
+        raise ParameterError(
+            f"a whole number of points, {MAX_POINTS:,} at most",
+            found=f"{num_points:,}" if isinstance(num_points, (int, float)) else repr(num_points),
+            fix="Ask for fewer, or check the ratio.",
+        )
     if num_points < num_original:
         raise ParameterError(
             f"a number of points of at least the {num_original:,} originals",
@@ -174,6 +184,29 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
             fix="Upsampling only adds points; ask for more.",
         )
     return num_points
+
+
+def _choose(method: str | Upsampler, profile: Profile, parameters: dict[str, Any]) -> Upsampler:
+    """The method to run; one that comes with its parameters takes no others."""
+    if isinstance(method, str):
+        return configure(method, profile, **parameters)
+    extra = [*parameters, *(["profile"] if profile != "default" else [])]
+    if extra:
+        raise ParameterError(
+            f"nothing beside {method!r}, which has its own parameters",
+            found=", ".join(extra),
+            fix="Give the method by name, or set its fields with dataclasses.replace.",
+        )
+    return method
+
+
+def _generator(seed: int) -> np.random.Generator:
+    """The source of all random numbers."""
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise ParameterError(
+            "a seed that is a whole number from 0", found=repr(seed), fix="Choose such a seed."
+        )
+    return np.random.default_rng(seed)
 
 
 def _check_finite(new: NewPoints) -> None:

@@ -7,7 +7,22 @@ first) is done once, around it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol, Self, runtime_checkable
+import dataclasses
+import math
+import types
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Literal,
+    NamedTuple,
+    Protocol,
+    Self,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    runtime_checkable,
+)
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -18,7 +33,7 @@ from splatseed.progress import Progress
 if TYPE_CHECKING:  # SciPy and Numba load with the first method, not with the package
     from splatseed.upsample.neighbors import PreparedCloud
 
-__all__ = ["NewPoints", "Upsampler", "require"]
+__all__ = ["NewPoints", "Upsampler", "check_fields", "require"]
 
 
 class NewPoints(NamedTuple):
@@ -56,4 +71,42 @@ def require(condition: bool, expected: str, found: object) -> None:
         ParameterError: ``condition`` does not hold.
     """
     if not condition:
-        raise ParameterError(expected, found=repr(found), fix="Choose a value in that range.")
+        raise ParameterError(expected, found=repr(found), fix="Choose such a value.")
+
+
+def check_fields(method: Any) -> None:
+    """Hold the fields of a method's dataclass to their annotations: a typo must not pass silently.
+
+    Raises:
+        ParameterError: A field is not of its type, or not one of its choices.
+    """
+    hints = get_type_hints(type(method))
+    label = getattr(method, "name", type(method).__name__.lower())
+    for field in dataclasses.fields(method):
+        value, hint = getattr(method, field.name), hints[field.name]
+        require(_fits(value, hint), f"{label}.{field.name} as {_describe(hint)}", value)
+
+
+def _fits(value: object, hint: Any) -> bool:
+    """Whether a value is of a type: a plain one, a choice of literals, or a union of these."""
+    if get_origin(hint) is Literal:
+        return isinstance(value, str) and value in get_args(hint)
+    if get_origin(hint) in {Union, types.UnionType}:
+        return any(_fits(value, choice) for choice in get_args(hint))
+    if isinstance(value, (bool, np.bool_)):
+        return hint is bool
+    if hint is float:
+        return isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value)
+    if hint is int:
+        return isinstance(value, (int, np.integer))
+    return not isinstance(hint, type) or isinstance(value, hint)
+
+
+def _describe(hint: Any) -> str:
+    """A type in words."""
+    if get_origin(hint) in {Literal, Union, types.UnionType}:
+        return " or ".join(_describe(choice) for choice in get_args(hint))
+    plain = {int: "a whole number", float: "a finite number", bool: "true or false"}
+    if isinstance(hint, type):
+        return "none" if hint is type(None) else plain.get(hint, hint.__name__)
+    return repr(hint)

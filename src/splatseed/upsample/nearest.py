@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import PointCloudError
+from splatseed.upsample.method import check_fields
 from splatseed.upsample.neighbors import Neighbors, PreparedCloud, sound_bases
 
 __all__ = ["NearestMethod"]
@@ -24,6 +25,9 @@ class NearestMethod:
     """Never start from a point whose spacing is over 3 times its surroundings' (paper: no)."""
 
     min_points: ClassVar[int] = 2
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @classmethod
     def paper(cls) -> Self:

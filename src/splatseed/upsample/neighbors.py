@@ -101,13 +101,15 @@ class PreparedCloud:
             )
         idx = np.empty((len(self), k), np.int32)
         distance = np.empty((len(self), k))
+        # Points closer than float64 tells apart after centring must not come to lie at distance 0.
+        least = np.finfo(np.float64).eps * np.abs(self.xyz).max()
         row_of_rank = np.empty(len(self), np.int32)
         row_of_rank[self.rank] = np.arange(len(self), dtype=np.int32)
         for start, stop in blocks(len(self), QUERY_BLOCK, "neighbours", self.progress):
             found, ranks = self.tree.query(self.xyz[start:stop], k + 1, workers=-1)
             # Column 0 is the row itself: rows are distinct, so nothing else is at distance 0.
             idx[start:stop] = row_of_rank[ranks[:, 1:]]
-            distance[start:stop] = found[:, 1:]
+            np.maximum(found[:, 1:], least, out=distance[start:stop])
         return Neighbors(idx, distance)
 
 

@@ -44,6 +44,7 @@ class PatchMethod(NearestMethod, ABC):
     name: ClassVar[str]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(self.k >= MIN_NEIGHBORS, f"{self.name}.k of at least {MIN_NEIGHBORS}", self.k)
         require(self.disc_radius > 0, f"{self.name}.disc_radius above 0", self.disc_radius)
         require(

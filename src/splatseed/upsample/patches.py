@@ -52,7 +52,7 @@ def lift(
     """
     cloud, bases = patches.cloud, patches.bases
     out = np.empty((bases.total, 3), np.float32)
-    margin = np.inf if clamp is None else clamp
+    margin = np.inf if clamp is None else float(clamp)
     _lift(
         cloud.xyz, cloud.center, patches.neighbors.idx, patches.frames,
         bases.start, bases.count, patches.uv, height, margin, out,

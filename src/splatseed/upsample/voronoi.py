@@ -59,6 +59,7 @@ class Voronoi(NearestMethod):
     min_points: ClassVar[int] = 4
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(4 <= self.k <= MAX_NEIGHBORS, f"voronoi.k from 4 to {MAX_NEIGHBORS}", self.k)
         require(0 < self.ball <= 1, "voronoi.ball above 0 and up to 1", self.ball)
         require(1 <= self.color_k <= self.k, "voronoi.color_k from 1 to voronoi.k", self.color_k)
@@ -114,7 +115,7 @@ def _relative(
 ) -> Float64[np.ndarray, " n"]:
     """Each volume relative to the median of its neighbours', at most ``cap``, [n]."""
     relative = np.empty_like(volume)
-    _relative_volume(volume, neighbors.idx, cap, relative)
+    _relative_volume(volume, neighbors.idx, float(cap), relative)
     return relative
 
 
