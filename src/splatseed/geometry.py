@@ -38,13 +38,16 @@ class GeometryScore:
     """Geometric quality of upsampled points, in units of the originals' spacing h.
 
     Args:
-        error: Mean distance from a new point to the surface; NaN without new points.
+        error: Mean distance from a new point to the surface; NaN without new points. Few mismatched
+            originals can make up most of it.
+        median: Median of the same.
         p95: 95th percentile of the same.
         coverage: Mean distance from a surface sample to the nearest of all points.
         share_far: Share of new points that are far from every original (see ``far_share``).
     """
 
     error: float
+    median: float
     p95: float
     coverage: float
     share_far: float
@@ -82,9 +85,8 @@ def measure(
     coverage = cKDTree(all_xyz).query(surface_samples)[0].mean() / h
     originals = all_xyz[: len(all_xyz) - len(new_xyz)]
     share = far_share(originals, new_xyz) if len(originals) and len(new_xyz) else 0.0
-    return GeometryScore(
-        float(errors.mean()), float(np.percentile(errors, 95)), float(coverage), share
-    )
+    median, p95 = (float(value) for value in np.percentile(errors, [50, 95]))
+    return GeometryScore(float(errors.mean()), median, p95, float(coverage), share)
 
 
 def spacing(xyz: Float[np.ndarray, "N 3"]) -> float:
@@ -157,7 +159,7 @@ def far_share(
     to_original, nearest = tree.query(finite)
     h = local_spacing(originals, originals[nearest], tree)
     near = np.count_nonzero(to_original <= FAR * h)
-    return 1.0 - near / len(sample)
+    return float(1.0 - near / len(sample))
 
 
 def _finite(xyz: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K 3"]:

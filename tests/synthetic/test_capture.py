@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from PIL import Image as PillowImage
 
-from splatseed.errors import ParameterError
-from splatseed.synthetic import make_capture
+from splatseed.errors import OutputError, ParameterError
+from splatseed.io import load_scene
+from splatseed.synthetic import DEPTH_SCALE, make_capture, write_capture
 from splatseed.synthetic.raycast import visible
 
 
@@ -170,3 +172,29 @@ def test_visible_samples_are_on_surfaces_and_seen(capture, rng):
 def test_too_small_a_capture_is_refused(size):
     with pytest.raises(ParameterError, match="at least 3 views"):
         make_capture(0, *size)
+
+
+def test_a_written_capture_loads_as_the_same_scene(capture, tmp_path):
+    path = write_capture(capture, tmp_path / "room")
+    scene = load_scene(path)
+    assert scene.warnings == ()
+    np.testing.assert_array_equal(scene.points.xyz, capture.scene.points.xyz)
+    np.testing.assert_array_equal(scene.tracks.xyz, capture.scene.tracks.xyz)
+    np.testing.assert_array_equal(scene.tracks.image_ids, capture.scene.tracks.image_ids)
+    assert [image.name for image in scene.images] == [i.name for i in capture.scene.images]
+    for image, picture, depth in zip(scene.images, capture.images, capture.depths, strict=True):
+        np.testing.assert_array_equal(_read(path / "images" / image.name), picture)
+        written = _read(path / "depths" / image.name) / DEPTH_SCALE
+        np.testing.assert_allclose(written, depth, atol=0.51 / DEPTH_SCALE)
+
+
+def test_a_capture_is_not_written_over_another_folder(capture, tmp_path):
+    (tmp_path / "mine.txt").write_text("keep")
+    with pytest.raises(OutputError):
+        write_capture(capture, tmp_path, overwrite=True)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def _read(path):
+    with PillowImage.open(path) as file:
+        return np.asarray(file)

@@ -59,7 +59,8 @@ def test_rays_stop_at_the_first_surface(surface, rng):
     origin = np.array([2.5, 1.7, 2.1])
     directions = surface.sample(1500, rng) - origin
     t = surface.intersect(origin, directions)
-    assert (t <= 1 + 1e-9).mean() > 0.99  # grazing rays may slip past a crest of the sine sheet
+    # A ray may pass through a sliver of a sine sheet's crest unnoticed: its sample is behind.
+    assert (t <= 1 + 1e-9).mean() > (0.98 if isinstance(surface, SineSheet) else 0.9999)
     hit = t[np.isfinite(t), None] * directions[np.isfinite(t)] + origin
     assert surface.distance(hit).max() < 1e-9
     # Nothing lies between: walking along each ray, the surface stays away until the hit.

@@ -17,11 +17,12 @@ from PIL import Image as PillowImage
 
 from splatseed.camera import Camera, Intrinsics, quat_from_rotation
 from splatseed.errors import ParameterError
+from splatseed.io import write_scene
 from splatseed.io.staging import output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene, Tracks
 from splatseed.synthetic.raycast import render_views, visible
-from splatseed.synthetic.room import Room, build_room, orbit_cameras
+from splatseed.synthetic.room import BARE, Room, build_room, orbit_cameras
 from splatseed.synthetic.surfaces import Union
 from splatseed.synthetic.tracks import TrackedPoints, track_points
 
@@ -56,14 +57,23 @@ class Capture:
         """All surfaces as one: ``surfaces.distance(xyz)`` is exact, [N, 3] to [N]."""
         return self.room.surfaces
 
-    def sample_visible(self, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "num 3"]:
+    def sample_visible(
+        self, num: int, rng: np.random.Generator, *, bare: bool = False
+    ) -> Float64[np.ndarray, "num 3"]:
         """Points uniform by area on the parts of the surfaces that some camera sees, [num, 3].
 
         Coverage is asked of these alone: no method can know the inside of the flower pot.
+
+        Args:
+            num: How many.
+            rng: Draws them.
+            bare: Whether the bare wall is included. It has no points to upsample, so that it would
+                outweigh everything else, and a method that strews points at random would win.
         """
+        surfaces = self.surfaces if bare else self.room.without(BARE)
         batches: list[np.ndarray] = []
         while sum(len(batch) for batch in batches) < num:
-            xyz = self.surfaces.sample(num, rng)
+            xyz = surfaces.sample(num, rng)
             batches.append(xyz[self._seen_by_any(xyz)])
         # Union samples part by part; the order must not matter to who takes the first few.
         return np.asarray(rng.permutation(np.concatenate(batches))[:num])
@@ -120,8 +130,6 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
     Raises:
         OutputError: The folder cannot or must not be written.
     """
-    from splatseed.io import write_scene  # noqa: PLC0415  (lands later)
-
     with output_folder(Path(path), overwrite=overwrite) as partial:
         write_scene(capture.scene, partial / "scene")
         for child in (partial / "scene").iterdir():

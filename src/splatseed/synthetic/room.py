@@ -10,21 +10,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
 
 from splatseed.camera import Camera
 from splatseed.synthetic.foliage import Discs
 from splatseed.synthetic.surfaces import Box, Cylinder, Rectangle, Sphere, Surface, Union, yaw_frame
 from splatseed.synthetic.texture import Mottled, Plain, Texture, Tiles
 from splatseed.synthetic.wavy import SineSheet
+from splatseed.viewpoint import look_at
 
-__all__ = ["Room", "build_room", "orbit_cameras"]
+__all__ = ["BARE", "Room", "build_room", "orbit_cameras"]
+
+BARE = "bare wall"
+"""Name of the surface without texture."""
 
 CORNER = -1.6
 REACH = 4.6
 WALL_HEIGHT = 2.4
 NUM_LEAVES = 300
 
+UP = np.array([0.0, 0.0, 1.0])
 LOOK_AT = np.array([-0.15, -0.15, 0.45])
 FOCAL = 0.95
 """Focal length in image widths: a 55 degree lens, as of a phone."""
@@ -47,6 +51,10 @@ class Room:
     def part(self, name: str) -> Surface:
         """The surface of that name."""
         return self.surfaces.parts[self.names.index(name)]
+
+    def without(self, name: str) -> Union:
+        """All surfaces but the one of that name."""
+        return Union(tuple(part for part in self.surfaces.parts if part is not self.part(name)))
 
 
 def build_room(rng: np.random.Generator) -> Room:
@@ -73,13 +81,13 @@ def _walls() -> dict[str, tuple[Surface, Texture]]:
     return {
         "floor": (
             Rectangle(corner, along_x, along_y),
-            Tiles(oak, (0.9, 0.16, 9.0), _grain(9.0, 1, (0.35, 1.6, 1)), joint=0.012, seed=1),
+            Tiles(oak, (0.9, 0.16, 9.0), _grain(14.0, 1, (0.5, 1.5, 1)), joint=0.012, seed=1),
         ),
         "brick wall": (
             Rectangle(corner, along_x, up),
             Tiles(brick, (0.26, 9.0, 0.12), _grain(11.0, 2), joint=0.022, seed=2),
         ),
-        "bare wall": (Rectangle(corner, along_y, up), Plain((0.83, 0.84, 0.82))),
+        BARE: (Rectangle(corner, along_y, up), Plain((0.83, 0.84, 0.82))),
     }
 
 
@@ -97,15 +105,15 @@ def _furniture() -> dict[str, tuple[Surface, Texture]]:
         ),
         "sphere": (
             Sphere(np.array([0.30, 0.35, 0.32]), 0.32),
-            Mottled(marble, (4.5, 4.5, 4.5), octaves=4, contrast=2.8, seed=4),
+            Mottled(marble, (6.5, 6.5, 6.5), octaves=4, contrast=3.0, seed=4),
         ),
         "cylinder": (
             Cylinder(np.array([-0.62, 0.10, 0.24]), yaw_frame(0), 0.21, 0.48),
-            Mottled(rust, (5.0, 5.0, 9.0), octaves=4, contrast=2.6, seed=5),
+            Mottled(rust, (7.0, 7.0, 11.0), octaves=4, contrast=2.6, seed=5),
         ),
         "wavy screen": (
             SineSheet(np.array([-1.5, -0.4, 0.0]), upright, np.array([1.54, 1.25]), 0.07, 0.44),
-            Mottled(cloth, (7.0, 7.0, 3.5), octaves=4, contrast=2.8, seed=6),
+            Mottled(cloth, (9.0, 9.0, 5.0), octaves=4, contrast=2.8, seed=6),
         ),
     }
 
@@ -143,23 +151,4 @@ def orbit_cameras(num_views: int, width: int, height: int) -> tuple[Camera, ...]
         axis=1,
     )
     eyes = LOOK_AT + radius[:, None] * outward
-    return tuple(Camera(K, width, height, look_at(eye, LOOK_AT)) for eye in eyes)
-
-
-def look_at(
-    eye: Float64[np.ndarray, " 3"],
-    target: Float64[np.ndarray, " 3"],
-    up: Float64[np.ndarray, " 3"] | None = None,
-) -> Float64[np.ndarray, "4 4"]:
-    """``cam_from_world`` [4, 4] of an OpenCV camera at ``eye`` that sees ``target`` upright.
-
-    ``up`` is the world direction that is upward in the image, z where left out.
-    """
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, np.array([0.0, 0.0, 1.0]) if up is None else up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    cam_from_world = np.eye(4)
-    cam_from_world[:3, :3] = rotation
-    cam_from_world[:3, 3] = -rotation @ eye
-    return cam_from_world
+    return tuple(Camera(K, width, height, look_at(eye, LOOK_AT, UP)) for eye in eyes)

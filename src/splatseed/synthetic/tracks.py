@@ -23,11 +23,14 @@ from splatseed.synthetic.surfaces import Surface
 
 __all__ = ["TrackNoise", "TrackedPoints", "corner_strength", "find_corners", "track_points"]
 
-MIN_STRENGTH = 2.5e-4
-"""Least corner strength of a feature, for grey values 0..1: above an edge, below weak texture."""
+MIN_STRENGTH = 6e-5
+"""Least corner strength of a feature, for grey values 0..1: above a bare wall's, below texture's."""
 
-CORNERS_PER_PIXEL = 1 / 130
-"""At most this many corners a view: 900 for 400 x 300."""
+MERGE_PIXELS = 2.4
+"""Corners of different views that unproject to within this many pixels are one point."""
+
+FULL_STRENGTH = 2e-3
+"""Corners at least this strong are always candidates, weaker ones in proportion."""
 
 MIN_COSINE = 0.25
 """A surface seen more obliquely than this does not match: 75 degrees."""
@@ -85,12 +88,11 @@ def corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H
 
 
 def find_corners(strength: Float32[np.ndarray, "H W"]) -> Int64[np.ndarray, "M 2"]:
-    """Row and column of the strongest local maxima, strongest first, [M, 2]."""
+    """Row and column of the local maxima above ``MIN_STRENGTH``, [M, 2]."""
     peak = (strength == ndimage.maximum_filter(strength, 3)) & (strength > MIN_STRENGTH)
     peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = (False,) * 4  # filters see no further
     rows, cols = np.nonzero(peak)
-    order = np.argsort(-strength[rows, cols], kind="stable")
-    return np.stack([rows, cols], axis=1)[order[: int(CORNERS_PER_PIXEL * strength.size)]]
+    return np.stack([rows, cols], axis=1)
 
 
 def track_points(
@@ -113,7 +115,7 @@ def track_points(
     """
     noise = noise or TrackNoise()
     strengths = np.stack([corner_strength(image) for image in images])
-    truth = _candidates(cameras, strengths, depths)
+    truth = _candidates(cameras, strengths, depths, rng)
     point_idx, view_idx = _observe(surfaces, cameras, strengths, truth, rng)
     keep = np.bincount(point_idx, minlength=len(truth)) >= noise.min_track
     truth, (point_idx, view_idx) = truth[keep], _renumber(keep, point_idx, view_idx)
@@ -151,17 +153,19 @@ def _candidates(
     cameras: Sequence[Camera],
     strengths: Float32[np.ndarray, "V H W"],
     depths: Float32[np.ndarray, "V H W"],
+    rng: np.random.Generator,
 ) -> Float64[np.ndarray, "N 3"]:
     """Exact surface points under the corners of all views, near-duplicates merged."""
-    found = [
-        _unproject_corners(camera, find_corners(strength), depth)
-        for camera, strength, depth in zip(cameras, strengths, depths, strict=True)
-    ]
+    found = []
+    for camera, strength, depth in zip(cameras, strengths, depths, strict=True):
+        corners = find_corners(strength)
+        at_corner = strength[corners[:, 0], corners[:, 1]]
+        chosen = rng.random(len(corners)) < at_corner / FULL_STRENGTH
+        found.append(_unproject_corners(camera, corners[chosen], depth))
     xyz = np.concatenate([points for points, _ in found])
     footprint = np.median(np.concatenate([size for _, size in found]))
-    # The same corner seen from two views unprojects to within about a pixel: keep one a cell.
-    cells = np.floor(xyz / (1.6 * footprint)).astype(np.int64)
-    return xyz[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+    cells = np.floor(xyz / (MERGE_PIXELS * footprint)).astype(np.int64)
+    return np.asarray(xyz[np.sort(np.unique(cells, axis=0, return_index=True)[1])])
 
 
 def _unproject_corners(

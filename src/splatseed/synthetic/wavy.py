@@ -3,8 +3,8 @@
 Notation: in the sheet's frame (rows of ``frame``, origin at ``corner``) a point is (u, v, w) and the
 sheet is w = height(u) = A sin(2 pi u / wavelength) for 0 <= u <= size[0], 0 <= v <= size[1].
 Promise: distances and depths are refined by bisection to 1e-10 of the sheet's size.
-A ray that only grazes a crest, entering and leaving within 1/64 of its way through the sheet's
-bounding box, may be taken to miss it.
+A ray that only grazes a crest, entering and leaving within a 48th of a wave, may be taken to miss
+it.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from splatseed.synthetic.surfaces import slab_interval
 __all__ = ["SineSheet"]
 
 _BISECTIONS = 36
-"""Halvings of a first bracket of at most a 32nd of the way: down to 1e-12 of it."""
+"""Halvings of a bracket that is a small part of the sheet to begin with."""
 
-_MARCH_STEPS = 64
+_STEPS_PER_WAVE = 48
 _GRID_PER_WAVE = 32
 _CHUNK = 20_000
 
@@ -110,15 +110,22 @@ class SineSheet:
     def _first_crossing(
         self, start: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray
     ) -> np.ndarray:
-        """March from near to far, then halve the first step whose ends lie on different sides."""
+        """March from near to far, then halve the first step whose ends lie on different sides.
+
+        A step covers a fixed part of a wave, so that rays across the sheet take few.
+        """
         at_start = self._above(start, directions, near)
-        low, high = near, np.full(len(near), np.inf)
-        for step in range(1, _MARCH_STEPS + 1):
-            t = near + (far - near) * (step / _MARCH_STEPS)
-            open_ = np.isinf(high)
-            crossed = open_ & (self._above(start, directions, t) != at_start)
-            high = np.where(crossed, t, high)
-            low = np.where(open_ & ~crossed, t, low)
+        along_wave = np.maximum(np.abs(directions[:, 0]), 1e-12)
+        step = self.wavelength / _STEPS_PER_WAVE / along_wave
+        low, high = near.copy(), np.full(len(near), np.inf)
+        active = np.arange(len(near))
+        while len(active):
+            t = np.minimum(low[active] + step[active], far[active])
+            crossed = self._above(start, directions[active], t) != at_start[active]
+            high[active[crossed]] = t[crossed]
+            going = ~crossed & (t < far[active])
+            low[active[going]] = t[going]
+            active = active[going]
         hit = np.isfinite(high)
         high[hit] = self._bisect(start, directions[hit], low[hit], high[hit])
         return high
