@@ -253,7 +253,10 @@ def test_bad_image_folders(photos: Path, tmp_path: Path) -> None:
     with pytest.raises(SceneNotFoundError, match=r"other kinds: \.heic"):
         reconstruct(folder, out)
     shutil.copy(photos / "view0.png", folder / "a.png")
-    with pytest.raises(SceneNotFoundError, match="at least 2 images"):
+    with pytest.raises(SceneNotFoundError, match="at least 2 photographs"):
+        reconstruct(folder, out)
+    PilImage.new("I;16", (WIDTH, HEIGHT)).save(folder / "depth.png")
+    with pytest.raises(SceneNotFoundError, match="found 1"):
         reconstruct(folder, out)
     (folder / "b.png").write_bytes(b"not an image")
     with pytest.raises(SceneFormatError, match=r"b\.png to be a readable image"):

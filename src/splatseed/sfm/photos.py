@@ -20,6 +20,7 @@ from splatseed.scene import Image, Scene
 __all__ = ["Photo", "find_photos", "match_poses", "name_some"]
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+_DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
 _SHOWN = 8
 
 
@@ -39,21 +40,26 @@ class Photo:
 
 
 def find_photos(image_dir: Path, *, at_least: int) -> tuple[Photo, ...]:
-    """The images below ``image_dir``, hidden files left out, sorted by name.
+    """The photographs below ``image_dir``, sorted by name.
+
+    Hidden files are left out, and so are 16-bit and floating-point grey images: those are the
+    depth maps of an RGB-D capture.
 
     Raises:
-        SceneNotFoundError: The folder is missing or holds fewer images than ``at_least``.
+        SceneNotFoundError: The folder is missing or holds fewer photographs than ``at_least``.
         SceneFormatError: An image cannot be decoded.
     """
     names = _image_names(image_dir)
-    if len(names) < at_least:
+    with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
+        read = pool.map(lambda name: _read_photo(image_dir, name), names)
+        photos = tuple(photo for photo in read if photo is not None)
+    if len(photos) < at_least:
         raise SceneNotFoundError(
-            f"at least {at_least} images in {image_dir}",
-            found=f"{len(names)}",
+            f"at least {at_least} photographs in {image_dir}",
+            found=f"{len(photos)}",
             fix="Add photographs of the same scene from other places.",
         )
-    with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
-        return tuple(pool.map(lambda name: _read_photo(image_dir, name), names))
+    return photos
 
 
 def match_poses(
@@ -120,10 +126,13 @@ def _image_names(image_dir: Path) -> list[str]:
     return names
 
 
-def _read_photo(image_dir: Path, name: str) -> Photo:
+def _read_photo(image_dir: Path, name: str) -> Photo | None:
+    """The photograph, decoded and found whole; None for a depth map."""
     path = image_dir / name
     try:
         with PilImage.open(path) as image:
+            if image.mode.startswith(_DEPTH_MODES):
+                return None
             width, height = image.size
             image.draft("L", (1, 1))  # an eighth of the JPEG's size: checks all bytes, cheaply
             image.load()
