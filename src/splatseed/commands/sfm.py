@@ -14,6 +14,8 @@ from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, trian
 
 __all__ = ["run"]
 
+NAMES_SHOWN = 5
+
 
 @dataclass(frozen=True)
 class Options:
@@ -89,6 +91,8 @@ def _summarise(options: Options, report: SfmReport) -> None:
     ]
     print_pairs("splatseed sfm", rows)
     if report.unregistered:
-        print_note(f"without a pose: {', '.join(report.unregistered)}")
+        shown = ", ".join(report.unregistered[:NAMES_SHOWN])
+        more = len(report.unregistered) - NAMES_SHOWN
+        print_note(f"without a pose: {shown}" + (f" and {more} more" if more > 0 else ""))
     command = f"splatseed upsample {options.output} --method mls --ratio 8 -o OUT --preview"
     print_commands("next", [("", command)])

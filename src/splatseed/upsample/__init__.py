@@ -110,6 +110,7 @@ def upsample(
         (800, 100)
     """
     from splatseed.upsample.neighbors import prepare  # noqa: PLC0415  (loads SciPy and Numba)
+    from splatseed.upsample.trust import trusted_originals  # noqa: PLC0415
 
     points = scene.points if isinstance(scene, Scene) else scene
     originals = points.originals
@@ -118,7 +119,8 @@ def upsample(
     rng = _generator(seed)
     if num_new == 0 and len(originals) > 0:
         return originals
-    cloud = prepare(originals, progress=progress)
+    trusted = trusted_originals(scene) if isinstance(scene, Scene) else None
+    cloud = prepare(originals, trusted, progress)
     new = chosen(cloud, num_new, rng, progress)
     _check_finite(new)
     name = method if isinstance(method, str) else _name_of(chosen)

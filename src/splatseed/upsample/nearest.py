@@ -22,7 +22,8 @@ class NearestMethod:
     """Base of the methods that need only the nearest neighbours of a base point."""
 
     reject_isolated: bool = True
-    """Never start from a point whose spacing is over 3 times its surroundings' (paper: no)."""
+    """Never start from a point that stands alone (its spacing is over 3 times its surroundings') or
+    that few images saw and that reprojects badly (paper: no)."""
 
     min_points: ClassVar[int] = 2
 
@@ -49,6 +50,6 @@ class NearestMethod:
                 fix="Use a cloud with more points, or the method 'random'.",
             )
         if not self.reject_isolated:
-            return cloud.neighbors(k), cloud.trusted.astype(np.float64)
+            return cloud.neighbors(k), np.ones(len(cloud))
         neighbors = cloud.neighbors(max(k, OUTLIER_CHECK_NEIGHBORS))
         return neighbors, sound_bases(cloud, neighbors)
