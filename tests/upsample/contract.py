@@ -1,0 +1,75 @@
+"""What the contract suite runs over: every method in every profile, a third party's too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+import splatseed as ss
+from splatseed.upsample.method import NewPoints
+
+__all__ = ["KINDS", "Copies", "Kind", "named"]
+
+
+@dataclass(frozen=True)
+class Copies:
+    """A third party's method: copies of random originals."""
+
+    @classmethod
+    def paper(cls) -> Self:
+        return cls()
+
+    def __call__(self, cloud, num_new, rng, progress):
+        progress("copies", 0.0)
+        row_of_rank = np.argsort(cloud.rank)
+        rows = row_of_rank[rng.integers(0, len(cloud), num_new)]
+        return NewPoints((cloud.xyz[rows] + cloud.center).astype(np.float32), cloud.rgb[rows])
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A method in one of its profiles, and what may be asked of it."""
+
+    method: str
+    profile: str
+
+    def __str__(self) -> str:
+        return f"{self.method}-{self.profile}"
+
+    @property
+    def turns_with_the_cloud(self) -> bool:
+        """Neither the fit nor the box it samples stands on the world's axes."""
+        if self.method == "random":
+            return False
+        return self.profile == "default" or self.method in {"linear", "triangle", "copies"}
+
+    @property
+    def stays_on_flat_sets(self) -> bool:
+        """New points of a line or plane lie on it; cells and boxes reach beyond."""
+        return self.turns_with_the_cloud and self.method != "voronoi"
+
+    @property
+    def takes_any_cloud(self) -> bool:
+        """One point is enough."""
+        return self.method in {"random", "copies"}
+
+    def __call__(self, cloud, **options):
+        """Upsample ``cloud``, four times unless told otherwise."""
+        return ss.upsample(cloud, self.method, profile=self.profile, **options)
+
+    def new(self, cloud, num_new, **options):
+        """Only the new points."""
+        seeds = self(cloud, num_points=len(cloud) + num_new, **options)
+        return seeds.select(slice(len(cloud), None))
+
+
+METHOD_NAMES = ("linear", "triangle", "spline", "mls", "voronoi", "random", "copies")
+KINDS = [Kind(method, profile) for method in METHOD_NAMES for profile in ("default", "paper")]
+
+
+def named(**expectation: bool) -> list[Kind]:
+    """The kinds of which a property holds, such as ``turns_with_the_cloud=True``."""
+    ((name, value),) = expectation.items()
+    return [kind for kind in KINDS if getattr(kind, name) is value]

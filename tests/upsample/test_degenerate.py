@@ -1,0 +1,121 @@
+"""Clouds that are hardly clouds: too few points, points on a line, on a plane, on a lattice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from splatseed import PointCloud
+from splatseed.errors import PointCloudError
+
+from .contract import KINDS, named
+
+pytestmark = pytest.mark.usefixtures("third_party")
+
+every_kind = pytest.mark.parametrize("kind", KINDS, ids=str)
+needs_neighbors = pytest.mark.parametrize("kind", named(takes_any_cloud=False), ids=str)
+on_flat_sets = pytest.mark.parametrize("kind", named(stays_on_flat_sets=True), ids=str)
+TURN = Rotation.from_euler("xyz", [0.4, 0.9, -0.3])
+SHIFT = np.array([0.5, -2.0, 1.0])
+
+
+def cloud_of(xyz):
+    xyz = np.asarray(xyz, np.float32).reshape(-1, 3)
+    return PointCloud(xyz, np.random.default_rng(1).integers(0, 256, xyz.shape, np.uint8))
+
+
+def tilted(xyz):
+    return cloud_of(TURN.apply(np.asarray(xyz, np.float64)) + SHIFT)
+
+
+def untilted(cloud):
+    return TURN.inv().apply(cloud.xyz - SHIFT)
+
+
+@every_kind
+@pytest.mark.parametrize("size", [{}, {"ratio": 1}, {"num_points": 7}], ids=str)
+def test_no_points_are_an_error(kind, size):
+    with pytest.raises(PointCloudError, match="at least one original point"):
+        kind(cloud_of(np.empty((0, 3))), **size)
+
+
+@every_kind
+def test_no_finite_points_are_an_error(kind):
+    with pytest.raises(PointCloudError, match="finite"):
+        kind(cloud_of(np.full((5, 3), np.nan)))
+
+
+@needs_neighbors
+@pytest.mark.parametrize("copies", [1, 30])
+def test_one_place_is_an_error(kind, copies):
+    with pytest.raises(PointCloudError, match="distinct finite points for"):
+        kind(cloud_of(np.tile([1.0, 2.0, 3.0], (copies, 1))))
+
+
+@pytest.mark.parametrize("kind", named(takes_any_cloud=True), ids=str)
+def test_one_place_is_enough_for_some(kind):
+    seeds = kind(cloud_of([1.0, 2.0, 3.0]), ratio=5)
+    np.testing.assert_array_equal(seeds.xyz, np.tile([1.0, 2.0, 3.0], (5, 1)))
+
+
+@every_kind
+@pytest.mark.parametrize("num", [4, 5, 6, 9])
+def test_fewer_points_than_neighbors_will_do(kind, num, rng):
+    seeds = kind(cloud_of(rng.normal(size=(num, 3))), ratio=40)
+    assert len(seeds) == 40 * num
+    assert seeds.finite.all()
+
+
+@on_flat_sets
+@pytest.mark.parametrize("num", [4, 60])
+def test_points_of_a_line_stay_on_it(kind, num, rng):
+    line = np.zeros((num, 3))
+    line[:, 0] = rng.uniform(-1.0, 1.0, num)
+    new = untilted(kind.new(tilted(line), 400))
+    assert np.abs(new[:, 1:]).max() < 1e-5
+    assert np.abs(new[:, 0]).max() < 3.0
+
+
+@on_flat_sets
+@pytest.mark.parametrize("num", [4, 60])
+def test_points_of_a_plane_stay_on_it(kind, num, rng):
+    plane = rng.uniform(-1.0, 1.0, (num, 3)) * [1.0, 1.0, 0.0]
+    new = untilted(kind.new(tilted(plane), 400))
+    assert np.abs(new[:, 2]).max() < 1e-5
+    assert np.abs(new[:, :2]).max() < 3.0
+
+
+@every_kind
+@pytest.mark.parametrize("dimension", [1, 2, 3])
+def test_a_lattice_gives_finite_points_near_it(kind, dimension):
+    axes = [np.arange(5.0 if d < dimension else 1.0) for d in range(3)]
+    lattice = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    seeds = kind(cloud_of(lattice), ratio=20)
+    assert seeds.finite.all()
+    if kind.profile == "default":
+        assert seeds.xyz.min() > -4.0
+        assert seeds.xyz.max() < 8.0
+
+
+@every_kind
+@pytest.mark.parametrize("gap", [1e-7, 1e-30], ids=["one last place", "below float64"])
+def test_points_that_nearly_coincide_do_no_harm(kind, gap, wavy):
+    xyz = wavy.xyz.copy()
+    xyz[0], xyz[1] = (0.0, 0.0, 0.0), (gap, 0.0, 0.0)
+    seeds = kind(wavy.replace(xyz=xyz), ratio=20)
+    assert seeds.finite.all()
+
+
+@every_kind
+@pytest.mark.parametrize("scale", [1e-30, 1e30])
+def test_extreme_units_are_no_obstacle(kind, scale, wavy):
+    seeds = kind(wavy.replace(xyz=(wavy.xyz.astype(np.float64) * scale).astype(np.float32)))
+    assert seeds.finite.all()
+
+
+@every_kind
+def test_a_cloud_far_outside_its_own_spacing_survives(kind, wavy):
+    xyz = (wavy.xyz + np.float64(5e6)).astype(np.float32)  # as UTM: float32 leaves steps of 0.5
+    assert len(np.unique(xyz, axis=0)) < len(wavy)
+    assert kind(wavy.replace(xyz=xyz)).finite.all()

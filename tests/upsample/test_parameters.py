@@ -1,0 +1,165 @@
+"""How many points, by which method, with which parameters: and what is said when it cannot be."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import splatseed as ss
+from splatseed import METHODS
+from splatseed.errors import ParameterError, PointCloudError
+from splatseed.upsample import Upsampler, configure, planned_size
+from splatseed.upsample.method import NewPoints
+
+from .contract import METHOD_NAMES, Copies
+
+BUILT_IN = [name for name in METHOD_NAMES if name != "copies"]
+SOURCES = {"linear": 1, "triangle": 2, "spline": 3, "mls": 4, "voronoi": 5, "random": 7}
+
+WRONG_PARAMETERS = [
+    ("mls", {"k": 2}, "mls.k of at least 3"),
+    ("mls", {"k": 10.0}, "mls.k as a whole number"),
+    ("mls", {"k": "10"}, "mls.k as a whole number"),
+    ("mls", {"k": True}, "mls.k as a whole number"),
+    ("mls", {"frame": "locl"}, "'local' or 'world'"),
+    ("mls", {"placement": "disk"}, "'disc' or 'triangle' or 'box'"),
+    ("mls", {"disc_radius": 0}, "disc_radius above 0"),
+    ("mls", {"disc_radius": np.inf}, "a finite number"),
+    ("mls", {"clamp": -0.1}, "clamp of at least 0"),
+    ("mls", {"clamp": np.nan}, "a finite number or none"),
+    ("mls", {"neighbours": 12}, "a parameter of mls"),
+    ("linear", {"k": 3}, "a parameter of linear"),
+    ("linear", {"reject_isolated": 1}, "true or false"),
+    ("random", {"k": 3}, "it has none"),
+    ("spline", {"smoothing": 0}, "smoothing above 0"),
+    ("spline", {"smoothing": "gvc"}, "'gcv'"),
+    ("spline", {"basis": "cubic"}, "'pspline' or 'bicubic'"),
+    ("voronoi", {"k": 3}, "voronoi.k from 4"),
+    ("voronoi", {"k": 1000}, "voronoi.k from 4"),
+    ("voronoi", {"ball": 0}, "ball above 0"),
+    ("voronoi", {"color_k": 26}, "color_k from 1"),
+    ("voronoi", {"max_weight": 0.5}, "max_weight of at least 1"),
+    ("voronoi", {"cells": "boxes"}, "'clamped' or 'box'"),
+]
+
+
+@pytest.mark.parametrize(("method", "wrong", "says"), WRONG_PARAMETERS, ids=str)
+def test_wrong_parameters_are_named(method, wrong, says):
+    with pytest.raises(ParameterError, match=says):
+        configure(method, **wrong)
+
+
+WRONG_CALLS = [
+    ({"method": "mlx"}, "linear, triangle"),
+    ({"profile": "papr"}, "'default' or 'paper'"),
+    ({"ratio": 0.5}, "at least 1"),
+    ({"ratio": np.nan}, "at least 1"),
+    ({"ratio": np.inf}, "at least 1"),
+    ({"ratio": 1e30}, "4,294,967,296 at most"),
+    ({"num_points": 159}, "at least the 160 originals"),
+    ({"num_points": -1}, "at least the 160 originals"),
+    ({"num_points": 200.5}, "a whole number"),
+    ({"ratio": 2, "num_points": 320}, "found both"),
+    ({"seed": -1}, "a seed"),
+    ({"seed": "one"}, "a seed"),
+]
+
+
+@pytest.mark.parametrize(("options", "says"), WRONG_CALLS, ids=str)
+def test_wrong_calls_are_named(options, says, wavy):
+    with pytest.raises(ParameterError, match=says):
+        ss.upsample(wavy, **options)
+
+
+@pytest.mark.parametrize("extra", [{"k": 9}, {"profile": "paper"}], ids=str)
+def test_a_configured_method_takes_nothing_more(extra, wavy):
+    with pytest.raises(ParameterError, match="its own parameters"):
+        ss.upsample(wavy, configure("mls"), **extra)
+
+
+@pytest.mark.parametrize("method", BUILT_IN)
+@pytest.mark.parametrize("size", [{"ratio": 1}, {"num_points": 160}], ids=str)
+def test_nothing_to_add_gives_the_originals(method, size, wavy):
+    seeds = ss.upsample(wavy, method, **size)
+    np.testing.assert_array_equal(seeds.xyz, wavy.xyz)
+    np.testing.assert_array_equal(seeds.rgb, wavy.rgb)
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [({}, 640), ({"ratio": 1.33}, 213), ({"ratio": 2.5}, 400), ({"num_points": 161}, 161)],
+    ids=str,
+)
+def test_sizes_count_the_originals(size, expected, wavy):
+    assert len(ss.upsample(wavy, "linear", **size)) == expected
+    assert planned_size(160, size.get("ratio"), size.get("num_points")) == expected
+
+
+@pytest.mark.parametrize("method", BUILT_IN)
+def test_source_says_which_method_made_a_point(method, wavy):
+    by_name = ss.upsample(wavy, method, ratio=2).source
+    by_instance = ss.upsample(wavy, configure(method), ratio=2).source
+    for source in (by_name, by_instance):
+        assert set(source[:160]) == {0}
+        assert set(source[160:]) == {SOURCES[method]}
+
+
+@pytest.mark.parametrize("method", BUILT_IN)
+def test_an_instance_and_its_name_do_the_same(method, wavy):
+    by_name = ss.upsample(wavy, method, seed=3, profile="paper")
+    by_instance = ss.upsample(wavy, METHODS[method].paper(), seed=3)
+    np.testing.assert_array_equal(by_name.xyz, by_instance.xyz)
+
+
+def test_arrays_and_clouds_give_the_same(wavy):
+    xyz, rgb = ss.upsample_points(wavy.xyz, wavy.rgb, "mls", ratio=2, k=12)
+    seeds = ss.upsample(wavy, "mls", ratio=2, k=12)
+    np.testing.assert_array_equal(xyz, seeds.xyz)
+    np.testing.assert_array_equal(rgb, seeds.rgb)
+
+
+@pytest.mark.parametrize("method", BUILT_IN)
+def test_methods_are_frozen_and_follow_the_protocol(method):
+    chosen = configure(method)
+    assert isinstance(chosen, Upsampler)
+    assert METHODS[method].__doc__
+    if dataclasses.fields(chosen):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(chosen, dataclasses.fields(chosen)[0].name, 0)
+
+
+PAPER_VALUES = [
+    ("mls", {"k": 10}),
+    ("spline", {"k": 25, "basis": "bicubic"}),
+    ("voronoi", {"ball": 0.5, "color_k": 5}),
+    *((m, {"frame": "world", "placement": "box", "clamp": None}) for m in ("mls", "spline")),
+    *((m, {"reject_isolated": False}) for m in BUILT_IN if m != "random"),
+]
+
+
+@pytest.mark.parametrize(("method", "values"), PAPER_VALUES, ids=str)
+def test_the_paper_profile_has_the_papers_values(method, values):
+    chosen = configure(method, "paper")
+    assert {name: getattr(chosen, name) for name in values} == values
+
+
+@pytest.mark.usefixtures("third_party")
+def test_a_third_party_adds_methods_and_takes_none_over(wavy):
+    assert METHODS["copies"] is Copies
+    assert METHODS["mls"] is not Copies
+    assert list(METHODS) == list(METHOD_NAMES)
+    assert len(METHODS) == len(METHOD_NAMES)
+    assert set(ss.upsample(wavy, "copies").source) == {0, 255}
+
+
+def test_a_third_partys_bad_points_are_refused(wavy):
+    class Broken(Copies):
+        def __call__(self, cloud, num_new, rng, progress):
+            new = super().__call__(cloud, num_new, rng, progress)
+            new.xyz[17, 1] = np.nan
+            return NewPoints(*new)
+
+    with pytest.raises(PointCloudError, match="at new point 17"):
+        ss.upsample(wavy, Broken())
