@@ -34,6 +34,6 @@ def kernel(function: F) -> F:
 
 
 def inline(function: F) -> F:
-    """Compile a helper that kernels of the same file call."""
+    """Compile a serial function, or a helper that kernels of the same file call."""
     compiled: Any = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
     return cast("F", compiled)

@@ -18,6 +18,7 @@ from PIL import Image as PillowImage, ImageDraw, ImageFont
 from splatseed.camera import Camera
 from splatseed.errors import PointCloudError
 from splatseed.io.staging import atomic_file
+from splatseed.jit import inline
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.viewpoint import choose_camera, choose_image
@@ -104,28 +105,27 @@ def _front_points(
     radii: Float64[np.ndarray, " N"],
     size: Int64[np.ndarray, " 2"],
 ) -> Int64[np.ndarray, "H W"]:
-    """Index of the nearest point whose disc covers each pixel, [H, W]; N where there is none.
-
-    Points are ranked by depth, and every pixel keeps its lowest rank; the loop is over the pixels
-    of a disc, not over points.
-    """
+    """Index of the nearest point whose disc covers each pixel, [H, W]; -1 where there is none."""
     width, height = (int(side) for side in size)
-    order = np.argsort(depth, kind="stable")
-    uv, radii = uv[order], radii[order]
-    lowest = np.full(width * height, len(order))
-    corner = np.floor(uv).astype(np.int64)
-    reach = int(np.ceil(radii.max())) if len(radii) else 0
-    for dy in range(-reach, reach + 1):
-        for dx in range(-reach, reach + 1):
-            pixel = corner + np.array([dx, dy])
-            off = pixel + 0.5 - uv
-            covered = np.hypot(off[:, 0], off[:, 1]) <= radii
-            if dx == dy == 0:
-                covered[:] = True  # however small, a point is seen
-            covered &= ((pixel >= 0) & (pixel < size)).all(axis=1)
-            rank = np.flatnonzero(covered)
-            np.minimum.at(lowest, pixel[rank, 1] * width + pixel[rank, 0], rank)
-    return np.asarray(np.append(order, len(order))[lowest]).reshape(height, width)
+    front = np.full((height, width), -1)
+    _draw_discs(uv, depth, radii, np.full((height, width), np.inf), front)
+    return front
+
+
+@inline
+def _draw_discs(uv, depth, radii, nearest, front):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Draw every disc into the depth buffer ``nearest``; at equal depth the first point stays."""
+    height, width = front.shape
+    for i in range(len(depth)):
+        u, v, r = uv[i, 0], uv[i, 1], radii[i]
+        column, row = int(np.floor(u)), int(np.floor(v))
+        for y in range(max(int(v - r), 0), min(int(v + r) + 1, height)):
+            for x in range(max(int(u - r), 0), min(int(u + r) + 1, width)):
+                covered = (x + 0.5 - u) ** 2 + (y + 0.5 - v) ** 2 <= r * r
+                own = x == column and y == row  # however small, a point is seen
+                if (covered or own) and depth[i] < nearest[y, x]:
+                    nearest[y, x] = depth[i]
+                    front[y, x] = i
 
 
 def preview_pair(

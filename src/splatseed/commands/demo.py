@@ -107,11 +107,10 @@ def _write_table(path: Path, scores: Mapping[str, GeometryScore]) -> None:
     """Scores as CSV, in units of the originals' spacing."""
     with atomic_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["method", "error_h", "p95_h", "coverage_h", "share_far"])
+        writer.writerow(["method", "error_h", "median_h", "p95_h", "coverage_h", "share_far"])
         for name, s in scores.items():
-            writer.writerow(
-                [name, *(f"{x:.4f}" for x in (s.error, s.p95, s.coverage, s.share_far))]
-            )
+            values = (s.error, s.median, s.p95, s.coverage, s.share_far)
+            writer.writerow([name, *(f"{x:.4f}" for x in values)])
 
 
 def _write_pictures(
@@ -143,15 +142,22 @@ def _summarise(
     print_table(
         f"{len(scene.points):,} points, {options.ratio:g}x; distances in units of the originals' "
         "spacing, less is better",
-        ("method", "error", "95%", "coverage", "far"),
+        ("method", "error", "median", "95%", "coverage", "far"),
         [
-            (n, f"{s.error:.3f}", f"{s.p95:.3f}", f"{s.coverage:.3f}", f"{s.share_far:.2%}")
-            for n, s in scores.items()
+            (
+                name,
+                *(f"{x:.3f}" for x in (s.error, s.median, s.p95, s.coverage)),
+                f"{s.share_far:.2%}",
+            )
+            for name, s in scores.items()
         ],
     )
     names = ["preview.png", "preview_methods.png", "preview_errors.png"] if options.preview else []
     rows = [
-        ("error", "mean distance of new points to the true surfaces (95%: its 95th percentile)"),
+        (
+            "error",
+            "mean distance of new points to the true surfaces; its median and 95th percentile",
+        ),
         ("coverage", "mean distance of the surfaces that cameras see to the nearest point"),
         ("far", "share of new points over 3 spacings from any original"),
         ("seconds", ", ".join(f"{stage} {time:.1f}" for stage, time in seconds.items())),

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Int64, UInt8
-from numba import njit
+
+from splatseed.jit import inline
 
 __all__ = ["HEAD_BYTES", "PAIR_BYTES", "join_records", "scan_records", "split_records"]
 
@@ -20,7 +21,7 @@ PAIR_BYTES = 8
 _LENGTH_AT = 43  # of the track length within a head
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@inline
 def scan_records(
     buffer: UInt8[np.ndarray, " B"], first: int, starts: Int64[np.ndarray, " N+1"]
 ) -> int:
@@ -47,7 +48,7 @@ def scan_records(
     return len(starts) - 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@inline
 def split_records(
     buffer: UInt8[np.ndarray, " B"],
     starts: Int64[np.ndarray, " N+1"],
@@ -65,7 +66,7 @@ def split_records(
             out += 1
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@inline
 def join_records(
     heads: UInt8[np.ndarray, "N 51"],
     pairs: UInt8[np.ndarray, " 8*T"],

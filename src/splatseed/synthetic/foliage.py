@@ -12,8 +12,8 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float64
-from numba import njit
 
+from splatseed.jit import inline
 from splatseed.synthetic.surfaces import Sphere
 
 __all__ = ["Discs"]
@@ -78,7 +78,7 @@ class Discs:
         return np.asarray(self.axes[self._nearest(xyz)[1]])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inline
 def _nearest_disc(
     xyz: np.ndarray,  # float64 [N, 3]
     centers: np.ndarray,  # float64 [L, 3]
@@ -105,7 +105,7 @@ def _nearest_disc(
     return distances, which
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inline
 def _first_disc(
     origin: np.ndarray,  # float64 [3]
     directions: np.ndarray,  # float64 [N, 3]

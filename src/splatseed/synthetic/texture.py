@@ -13,7 +13,8 @@ from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Float64
-from numba import njit
+
+from splatseed.jit import inline
 
 __all__ = ["Mottled", "Plain", "Texture", "Tiles", "value_noise"]
 
@@ -118,7 +119,7 @@ def value_noise(
     return np.asarray(_noise_sum(np.ascontiguousarray(xyz, np.float64), octaves, seed))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inline
 def _lattice(x: int, y: int, z: int, seed: int) -> float:
     """A value in 0..1 hashed from a lattice point (multiply-xorshift rounds on 64 bits)."""
     h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed)
@@ -128,7 +129,7 @@ def _lattice(x: int, y: int, z: int, seed: int) -> float:
     return float((h ^ (h >> np.uint64(32))) >> np.uint64(11)) * 2.0**-53
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inline
 def _octave(x: float, y: float, z: float, seed: int) -> float:
     """Value noise of one octave at one point: a smoothed trilinear blend of 8 lattice values."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
@@ -144,7 +145,7 @@ def _octave(x: float, y: float, z: float, seed: int) -> float:
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@inline
 def _noise_sum(
     xyz: np.ndarray,  # float64 [N, 3]
     octaves: int,
