@@ -29,14 +29,10 @@ ERR = Console(stderr=True)
 
 
 class StageClock:
-    """A ``Progress`` that times the stages and shows them as bars.
+    """A ``Progress`` that times the stages, and shows them while within ``stage_display``."""
 
-    Args:
-        bar: Where to show them; None to time only.
-    """
-
-    def __init__(self, bar: Bar | None = None) -> None:
-        self._bar = bar
+    def __init__(self) -> None:
+        self._bar: Bar | None = None
         self._tasks: dict[str, TaskID] = {}
         self._started: list[tuple[str, float]] = []
 
@@ -68,18 +64,34 @@ class StageClock:
         if self._bar is not None and "compiling" in self._tasks:
             self._bar.remove_task(self._tasks.pop("compiling"))
 
+    @contextmanager
+    def shown_on(self, bar: Bar) -> Iterator[None]:
+        """Show the stages on ``bar`` while the block runs."""
+        self._bar, self._tasks = bar, {}
+        try:
+            yield
+        finally:
+            self._bar = None
+
 
 @contextmanager
-def stage_display() -> Iterator[StageClock]:
-    """A clock whose bars are on stderr while the block runs."""
+def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
+    """Bars on stderr while the block runs; print to stdout outside of it, or the two get mixed.
+
+    Args:
+        clock: One that has been shown before, to go on with; a new one when left out.
+    """
+    clock = StageClock() if clock is None else clock
     if not ERR.is_terminal:
-        yield StageClock()
+        yield clock
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Bar(*columns, console=ERR, transient=True) as bar:
-        clock = StageClock(bar)
-        with _compilation_shown(clock):
-            yield clock
+    with (
+        Bar(*columns, console=ERR, transient=True) as bar,
+        clock.shown_on(bar),
+        _compilation_shown(clock),
+    ):
+        yield clock
 
 
 @contextmanager

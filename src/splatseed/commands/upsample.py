@@ -87,22 +87,15 @@ def run(arguments: list[str]) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene)
-        check_output(options.output, overwrite=options.overwrite, protect=(options.scene,))
-        _announce(options, scene, method)
+    check_output(options.output, overwrite=options.overwrite, protect=(options.scene,))
+    _announce(options, scene, method)
+    with stage_display(clock):
         seeds = _upsample(options, scene, method, clock)
         clock("check", 0.0)
-        far = far_share(
-            scene.points.xyz, seeds.xyz[len(scene.points) :], rng=np.random.default_rng(0)
-        )
+        new = seeds.xyz[len(scene.points) :]
+        far = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
         clock("write", 0.0)
-        report = write_scene(
-            scene.replace(points=seeds),
-            options.output,
-            format=options.format,
-            overwrite=options.overwrite,
-            copy_images=options.copy_images,
-            provenance=_provenance(options, method),
-        )
+        report = _write(options, scene.replace(points=seeds), method)
         if options.preview:
             _write_previews(options, scene, seeds, methods, clock)
         seconds = clock.seconds()
@@ -140,6 +133,17 @@ def _upsample(options: Options, scene: Scene, method: Upsampler, clock: StageClo
         num_points=options.num_points,
         seed=options.seed,
         progress=clock,
+    )
+
+
+def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
+    return write_scene(
+        scene,
+        options.output,
+        format=options.format,
+        overwrite=options.overwrite,
+        copy_images=options.copy_images,
+        provenance=_provenance(options, method),
     )
 
 
