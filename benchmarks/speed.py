@@ -200,4 +200,7 @@ def _or_skip(what: str, measure: Callable[[], None]) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Settings, description=__doc__))
+    try:
+        main(tyro.cli(Settings, description=__doc__))
+    except SplatseedError as error:
+        raise SystemExit(str(error)) from None
