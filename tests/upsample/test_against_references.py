@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import splatseed as ss
 from splatseed.upsample.spline_gcv import LAMBDAS
@@ -75,3 +76,33 @@ def test_cross_validation_is_no_fixed_smoothing(wavy):
     for smoothing in LAMBDAS:
         fixed = ss.upsample(wavy, "spline", ratio=2, smoothing=float(smoothing))
         assert not np.array_equal(fixed.xyz, chosen.xyz)
+
+
+@pytest.mark.filterwarnings("ignore:(?s).*storage space exceeds:UserWarning")
+@pytest.mark.parametrize("tilt", [0, 60, 90])
+def test_fitpacks_smoothing_is_inert_at_the_papers_size(tilt, rng):
+    # With 26 points there is room for no knot: whatever s, it is the least-squares bicubic.
+    turn = Rotation.from_euler("x", tilt, degrees=True)
+    flat = np.concatenate([rng.uniform(-1.0, 1.0, (25, 3)) * [1.0, 1.0, 0.1], np.zeros((1, 3))])
+    local = turn.apply(flat)
+    distance = np.sort(np.linalg.norm(local[:25], axis=1))
+    places = rng.uniform(local.min(axis=0)[:2], local.max(axis=0)[:2], (50, 2))
+    heights = [
+        [slow.bicubic_surface(local, distance, s)(u, v) for u, v in places]
+        for s in (1e-9, 0.1 * 25, 1e9)
+    ]
+    for other in heights[:2]:
+        np.testing.assert_allclose(other, heights[2], rtol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:(?s).*storage space exceeds:UserWarning")
+def test_the_papers_spline_is_fitpacks_on_a_wall_too(wavy, wavy_exact):
+    # There the fit is ill-conditioned, and a different least-squares solver could differ.
+    upright = [0, 2, 1]
+    wall = wavy.replace(xyz=wavy.xyz[:, upright])
+    exact = slow.Cloud(wavy_exact.xyz[:, upright], wavy_exact.rgb)
+    reference, options = CASES["spline, paper"]
+    new, xyz, _ = fast_and_slow(wall, exact, "spline", reference, options)
+    reach = np.linalg.norm(xyz, axis=1)
+    agree = np.linalg.norm(new.xyz - xyz, axis=1) <= 1e-5 * np.maximum(reach, 1.0)
+    assert agree.mean() >= 0.99
