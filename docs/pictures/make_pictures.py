@@ -1,0 +1,186 @@
+"""Make the pictures of the documentation, all from the demo's made-up capture.
+
+Notation: a *panel* is a labelled picture, uint8 [H, W, 3]; a picture of the documentation is a grid
+of panels, given as rows. Promise: the same versions give the same pictures; nothing but the PNGs
+beside this file is written.
+
+Run it from anywhere: ``python docs/pictures/make_pictures.py`` (about half a minute).
+"""
+
+# ruff: noqa: INP001  (a script, not a package)
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+from matplotlib import colormaps
+from PIL import Image as PillowImage, ImageDraw, ImageFont
+
+import splatseed as ss
+from splatseed.geometry import spacing
+from splatseed.io.staging import atomic_file
+from splatseed.preview import choose_camera, render_points
+from splatseed.synthetic import Capture, make_capture
+from splatseed.viewpoint import choose_image, look_at
+
+HERE = Path(__file__).parent
+RATIO = 8
+GAP, LABEL, INK, PAPER = 10, 28, (20, 20, 20), (255, 255, 255)
+
+Picture = UInt8[np.ndarray, "H W 3"]
+
+
+class Panel(NamedTuple):
+    """A picture and what it shows."""
+
+    label: str
+    picture: Picture
+
+
+def main() -> None:
+    """Make every picture."""
+    capture = make_capture()
+    clouds = {name: ss.upsample(capture.scene, name, ratio=RATIO, seed=0) for name in ss.METHODS}
+    draw_before_after(capture, clouds["mls"])
+    draw_overview(capture, clouds)
+    draw_errors(capture, clouds)
+    for name, cloud in clouds.items():
+        draw_method(capture.scene, name, cloud)
+
+
+def draw_before_after(capture: Capture, upsampled: ss.PointCloud) -> None:
+    """The README's picture: photograph, points, upsampled points."""
+    points, width = capture.scene.points, 390
+    clouds = {
+        f"SfM: {len(points):,} points": points,
+        f"splatseed, mls {RATIO}x: {len(upsampled):,} points": upsampled,
+    }
+    panels = [Panel("photograph", photograph(capture, width))]
+    panels += cloud_panels(clouds, choose_camera(capture.scene), width, point_size=1.7)
+    write_grid([panels], HERE / "before_after.png", colors=160)
+
+
+def draw_overview(capture: Capture, clouds: Mapping[str, ss.PointCloud]) -> None:
+    """Every method in one grid."""
+    width, originals = 270, capture.scene.points
+    labelled = {f"originals, {len(originals):,}": originals}
+    labelled |= {f"{name}, {len(cloud):,}": cloud for name, cloud in clouds.items()}
+    panels = [Panel("photograph", photograph(capture, width))]
+    panels += cloud_panels(labelled, choose_camera(capture.scene), width, point_size=1.0)
+    write_grid([panels[:4], panels[4:]], HERE / "methods.png", colors=64)
+
+
+def draw_errors(capture: Capture, clouds: Mapping[str, ss.PointCloud]) -> None:
+    """Every method's new points, coloured by their distance to the true surfaces."""
+    originals = capture.scene.points
+    h = spacing(originals.xyz)
+    colored = {}
+    for name, cloud in clouds.items():
+        new = cloud.select(slice(len(originals), None))
+        distance = capture.surfaces.distance(new.xyz) / h
+        colored[f"{name}: median {np.median(distance):.2g} h"] = new.replace(rgb=heat(distance))
+    panels = cloud_panels(colored, choose_camera(capture.scene), 320, point_size=1.2)
+    bar = np.tile(heat(np.linspace(0.0, 1.0, 320)), (14, 1, 1))
+    ends = [Panel("distance to the surface: 0 ... 1 h or more", bar)]
+    write_grid([panels[:3], panels[3:], ends], HERE / "errors.png", colors=48)
+
+
+def draw_method(scene: ss.Scene, name: str, cloud: ss.PointCloud) -> None:
+    """One method on part of the room, and on a few points to show its construction."""
+    camera = part_of(choose_camera(scene), left=80, top=88, width=240, height=160)
+    width = 420
+    room = {"originals": scene.points, f"{name}, {RATIO}x": cloud}
+    eyes = {
+        "few originals (black), many new points, from above": np.array([0.0, -1e-3, 40.0]),
+        "... from the side": np.array([0.0, -40.0, 0.0]),
+    }
+    shown = [Panel(label, construction(name, eye, width)) for label, eye in eyes.items()]
+    rows = [cloud_panels(room, camera, width, point_size=2.6), shown]
+    write_grid(rows, HERE / f"{name}.png", colors=64)
+
+
+def construction(name: str, eye: Float64[np.ndarray, " 3"], width: int) -> Picture:
+    """Originals on a wave in black, the points that a method makes of them in blue."""
+    seeds = ss.upsample(few_points(), name, ratio=60, seed=0)
+    new = seeds.source != 0
+    rgb = np.where(new[:, None], (60, 130, 200), (0, 0, 0)).astype(np.uint8)
+    height, focal = width * 5 // 8, 3.4 * width
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    camera = ss.Camera(K, width, height, look_at(eye, np.zeros(3), np.array([0, 1e-3, 1.0])))
+    layers = [
+        render_points(seeds.replace(rgb=rgb).select(which), camera, point_size=size)
+        for which, size in ((new, 1.6), (~new, 6.0))
+    ]
+    return np.minimum(*layers)
+
+
+def few_points() -> ss.PointCloud:
+    """A jittered grid of 70 points on a gentle wave."""
+    rng = np.random.default_rng(4)
+    u, v = np.meshgrid(np.arange(10.0), np.arange(7.0))
+    u, v = (axis.ravel() + rng.uniform(-0.33, 0.33, axis.size) for axis in (u, v))
+    xyz = np.stack([u - 4.5, v - 3.0, np.sin(0.7 * u)], axis=1)
+    return ss.PointCloud(xyz, np.zeros((len(xyz), 3), np.uint8))
+
+
+def part_of(camera: ss.Camera, *, left: int, top: int, width: int, height: int) -> ss.Camera:
+    """The camera with its image cropped to a rectangle of pixels."""
+    K = camera.K.copy()
+    K[:2, 2] -= left, top
+    return ss.Camera(K, width, height, camera.cam_from_world)
+
+
+def photograph(capture: Capture, width: int) -> Picture:
+    """The photograph that ``choose_camera`` looks through."""
+    chosen = choose_image(capture.scene)
+    place = next(i for i, image in enumerate(capture.scene.images) if image is chosen)
+    photo = PillowImage.fromarray(capture.images[place])
+    height = round(photo.height * width / photo.width)
+    return np.asarray(photo.resize((width, height), PillowImage.Resampling.LANCZOS))
+
+
+def heat(values: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
+    """Colours of 0..1 in 12 steps, so that a palette can hold them."""
+    steps = np.round(np.clip(values, 0.0, 1.0) * 11) / 11
+    return np.asarray(colormaps["plasma"](steps, bytes=True)[:, :3])
+
+
+def cloud_panels(
+    clouds: Mapping[str, ss.PointCloud], camera: ss.Camera, width: int, *, point_size: float
+) -> list[Panel]:
+    """The clouds by label, from one camera."""
+    scale = width / camera.width
+    return [
+        Panel(label, render_points(cloud, camera, scale=scale, point_size=point_size))
+        for label, cloud in clouds.items()
+    ]
+
+
+def write_grid(rows: Sequence[Sequence[Panel]], path: Path, *, colors: int) -> None:
+    """Set rows of panels under one another, and write a PNG of ``colors`` colours."""
+    heights = [len(row[0].picture) + LABEL for row in rows]
+    width = max(sum(panel.picture.shape[1] + GAP for panel in row) for row in rows) + GAP
+    page = PillowImage.new("RGB", (width, sum(heights) + GAP), PAPER)
+    draw = ImageDraw.Draw(page)
+    for i, row in enumerate(rows):
+        left, top = GAP, sum(heights[:i])
+        for panel in row:
+            draw.text((left, top + LABEL / 2), panel.label, fill=INK, font=_font(), anchor="lm")
+            page.paste(PillowImage.fromarray(panel.picture), (left, top + LABEL))
+            left += panel.picture.shape[1] + GAP
+    none = PillowImage.Dither.NONE
+    palette = page.quantize(colors, PillowImage.Quantize.MEDIANCUT, kmeans=colors, dither=none)
+    with atomic_file(path) as partial:
+        palette.save(partial, format="PNG", optimize=True)
+
+
+def _font() -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    return ImageFont.load_default(size=15)
+
+
+if __name__ == "__main__":
+    main()
