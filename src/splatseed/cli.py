@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from importlib import import_module
 from importlib.metadata import version
+from typing import NoReturn
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from splatseed.errors import SplatseedError
@@ -25,6 +28,7 @@ INTERRUPTED = 130
 def main(arguments: list[str] | None = None) -> None:
     """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
     words = sys.argv[1:] if arguments is None else arguments
+    _print_any_name()
     if not words or words[0] in {"-h", "--help"}:
         _print_help()
         return
@@ -45,22 +49,29 @@ def _run(verb: str, words: list[str]) -> None:
         import_module(f"splatseed.commands.{verb}").run(words)
     except SplatseedError as error:
         _fail(str(error))
+    except MemoryError as error:
+        _fail(
+            f"expected enough memory; found {error or 'none left'}. "
+            "Ask for fewer points, or close other programs."
+        )
     except KeyboardInterrupt:
-        Console(stderr=True).print("\ninterrupted; nothing was written")
+        Console(stderr=True).print("\ninterrupted; nothing was left half-written")
         sys.exit(INTERRUPTED)
 
 
-def _fail(message: str) -> None:
+def _print_any_name() -> None:
+    """Let file names that are no valid text be printed, escaped, as Python does on stderr."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _fail(message: str) -> NoReturn:
     """Print one error on stderr and exit with 2."""
+    line = escape(" ".join(message.splitlines()))
     Console(stderr=True).print(
-        f"[bold red]error:[/bold red] {_plain(message)}", soft_wrap=True, highlight=False
+        f"[bold red]error:[/bold red] {line}", soft_wrap=True, highlight=False
     )
     sys.exit(2)
-
-
-def _plain(message: str) -> str:
-    """Keep rich from reading brackets in a message, such as a shape, as markup."""
-    return message.replace("[", r"\[")
 
 
 def _print_help() -> None:

@@ -143,7 +143,9 @@ def find_problems(
             f"{cloud.isolated:,} points ({cloud.isolated / cloud.num_points:.1%}) stand alone: "
             "outliers or a sparse background; methods do not start from them"
         )
-    if regions is not None and regions.mean > MANY_EMPTY:
+    if cloud.num_points == 0:
+        found.append("there are no points to upsample")
+    elif regions is not None and regions.mean > MANY_EMPTY:
         found.append(
             f"{regions.mean:.0%} of the images' area has no point: upsampling fills between "
             "points, but only depth can fill a bare wall"

@@ -8,6 +8,7 @@ the true surfaces and how well they cover them.
 from __future__ import annotations
 
 import csv
+import shlex
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from splatseed.commands._options import parse_options
 from splatseed.console import StageClock, print_commands, print_pairs, print_table, stage_display
 from splatseed.geometry import GeometryScore, measure, spacing
 from splatseed.io import load_scene, write_scene
@@ -54,7 +56,7 @@ class Options:
 
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
-    options = tyro.cli(Options, prog="splatseed demo", args=arguments)
+    options = parse_options(Options, "demo", arguments)
     with (
         stage_display() as clock,
         output_folder(options.output, overwrite=options.overwrite) as folder,
@@ -165,5 +167,6 @@ def _summarise(
         *(("pictures" if not i else "", str(options.output / n)) for i, n in enumerate(names)),
     ]
     print_pairs("splatseed demo", rows)
-    command = f"splatseed upsample {options.output / 'scene'} --method spline --ratio 16 -o OUT"
+    scene_dir = shlex.quote(str(options.output / "scene"))
+    command = f"splatseed upsample {scene_dir} --method spline --ratio 16 -o OUT"
     print_commands("next", [("", command)])

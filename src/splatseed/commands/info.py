@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Annotated
 
 import tyro
 
+from splatseed.commands._options import parse_options
 from splatseed.console import OUT, print_commands, print_pairs, stage_display
 from splatseed.diagnostics import (
     CloudStatistics,
@@ -24,6 +26,9 @@ from splatseed.scene import Scene
 
 __all__ = ["run"]
 
+KINDS_SHOWN = 3
+"""Kinds of cameras listed; collections of photographs from the web have one a photograph."""
+
 
 @dataclass(frozen=True)
 class Options:
@@ -35,10 +40,10 @@ class Options:
 
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
-    options = tyro.cli(Options, prog="splatseed info", args=arguments)
+    options = parse_options(Options, "info", arguments)
     with stage_display() as clock:
         clock("read", 0.0)
-        scene = load_scene(options.scene)
+        scene = load_scene(options.scene, require_points=False)
         cloud = cloud_statistics(scene, clock)
         tracks = track_statistics(scene)
         regions = empty_regions(scene, clock)
@@ -47,24 +52,37 @@ def run(arguments: list[str]) -> None:
     problems = find_problems(scene, cloud, regions)
     OUT.print("\n[bold]problems[/bold]" if problems else "\nno problems found")
     for problem in problems:
-        OUT.print(f"  - {problem}", soft_wrap=True, highlight=False)
-    if cloud.num_points:
-        command = f"splatseed upsample {options.scene} --method mls --ratio 8 -o OUT"
-        print_commands("next", [("", command)])
+        OUT.print(f"  - {problem}", soft_wrap=True, highlight=False, markup=False)
+    print_commands("next", [("", _next_command(options.scene, scene))])
+
+
+def _next_command(path: Path, scene: Scene) -> str:
+    """What to run on the scene: points can be upsampled once there are some."""
+    quoted = shlex.quote(str(path))
+    if len(scene.points):
+        return f"splatseed upsample {quoted} --method mls --ratio 8 -o OUT"
+    images = scene.source.image_dir if scene.source else None
+    photographs = "IMAGES" if images is None else shlex.quote(str(images))
+    return f"splatseed sfm {photographs} --poses-from {quoted} -o OUT"
 
 
 def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     sizes = Counter(f"{c.model} {c.width}x{c.height}" for c in scene.intrinsics)
-    cameras = ", ".join(f"{count} {kind}" for kind, count in sizes.items())
+    cameras = [f"{count:,} {kind}" for kind, count in sizes.most_common(KINDS_SHOWN)]
+    if len(sizes) > KINDS_SHOWN:
+        cameras.append(f"{len(sizes) - KINDS_SHOWN:,} kinds more")
     train, test = scene.split()
+    images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test)"
     return [
         ("format", scene.source.format if scene.source else "memory"),
-        ("cameras", cameras or "none"),
-        ("images", f"{len(scene.images):,} ({len(train)} to train, {len(test)} to test)"),
+        ("cameras", ", ".join(cameras) or "none"),
+        ("images", images if scene.images else "none"),
     ]
 
 
 def _cloud_rows(cloud: CloudStatistics) -> list[tuple[str, str]]:
+    if not cloud.num_points:
+        return [("points", "none")]
     low, high = (" ".join(f"{x:.4g}" for x in corner) for corner in (cloud.low, cloud.high))
     return [
         ("points", f"{cloud.num_points:,}"),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from splatseed.commands._options import parse_options
 from splatseed.console import StageClock, print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, triangulate
@@ -25,7 +27,9 @@ class Options:
     """The folder of photographs."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
-    poses_from: Path | None = None
+    poses_from: Annotated[
+        Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
+    ] = None
     """A scene whose poses and intrinsics are kept, so that only points are triangulated."""
     matcher: MatcherName = "exhaustive"
     """Compare every pair of images, or (for a video) each with its successors."""
@@ -49,7 +53,7 @@ class Options:
 
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
-    options = tyro.cli(Options, prog="splatseed sfm", args=arguments)
+    options = parse_options(Options, "sfm", arguments)
     with stage_display() as clock:
         clock("prepare", 0.0)
         report = _reconstruct(options, clock)
@@ -94,5 +98,5 @@ def _summarise(options: Options, report: SfmReport) -> None:
         shown = ", ".join(report.unregistered[:NAMES_SHOWN])
         more = len(report.unregistered) - NAMES_SHOWN
         print_note(f"without a pose: {shown}" + (f" and {more} more" if more > 0 else ""))
-    command = f"splatseed upsample {options.output} --method mls --ratio 8 -o OUT --preview"
+    command = f"splatseed upsample {shlex.quote(str(options.output))} --method mls --ratio 8 -o OUT --preview"
     print_commands("next", [("", command)])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 
+from splatseed.commands._options import parse_options
 from splatseed.console import (
     OUT,
     StageClock,
@@ -32,6 +32,15 @@ __all__ = ["parse", "run"]
 DEFAULT_METHOD = "mls"
 
 
+def _number(kind: type, default: str) -> Any:
+    """How an optional number shows in the help: as a number, with what stands in for it."""
+    return tyro.conf.arg(
+        constructor=kind,
+        metavar=kind.__name__.upper(),
+        help_behavior_hint=f"(default: {default})",
+    )
+
+
 @dataclass(frozen=True)
 class Options:
     """Upsample the points of a scene, ready for any 3DGS trainer."""
@@ -42,15 +51,14 @@ class Options:
     """The scene folder to write."""
     method: str = DEFAULT_METHOD
     """How new points are made; the flags of each method are below."""
-    ratio: float | None = None
-    """Points in all, as a multiple of the originals (4 if neither this nor --num-points)."""
-    num_points: int | None = None
+    ratio: Annotated[float | None, _number(float, "4, unless --num-points is given")] = None
+    """Points in all, as a multiple of the originals."""
+    num_points: Annotated[int | None, _number(int, "by the ratio")] = None
     """Points in all, instead of a ratio."""
     seed: int = 0
     """The same seed gives the same bytes."""
     profile: Profile = "default"
-    """"default" treats the paper's traps; "paper" follows its text to the letter, and changes the
-    defaults of the method flags below."""
+    """Defaults of the method flags below: improved ones, or those of the paper's text."""
     preview: bool = False
     """Also write preview.png (before and after) and preview_methods.png (every method)."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
@@ -63,8 +71,15 @@ class Options:
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """The options, and every method with its parameters, from the command line's words."""
-    paper = "--profile=paper" in arguments or ("--profile", "paper") in pairwise(arguments)
-    methods = {name: METHODS[name].paper() if paper else METHODS[name]() for name in METHODS}
+    options = _parse_with({name: METHODS[name]() for name in METHODS}, arguments)
+    if options.profile == "paper":
+        # The profile sets the defaults of other flags, so it must be known before they are read.
+        options = _parse_with({name: METHODS[name].paper() for name in METHODS}, arguments)
+    return options, {name: getattr(options, name) for name in METHODS}
+
+
+def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
+    """Options with one more field a method, whose default is the method given."""
     names = tuple(methods)
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
@@ -76,18 +91,17 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
         frozen=True,
     )
     full.__doc__ = Options.__doc__
-    options: Any = tyro.cli(full, prog="splatseed upsample", args=arguments)
-    return options, {name: getattr(options, name) for name in methods}
+    return parse_options(full, "upsample", arguments)
 
 
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
     options, methods = parse(arguments)
     method = methods[options.method]
+    check_output(options.output, overwrite=options.overwrite, protect=(options.scene,))
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene)
-    check_output(options.output, overwrite=options.overwrite, protect=(options.scene,))
     _announce(options, scene, method)
     with stage_display(clock):
         seeds = _upsample(options, scene, method, clock)
@@ -115,6 +129,7 @@ def _announce(options: Options, scene: Scene, method: Upsampler) -> None:
         f"  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n"
         f"  -> {options.output} ({total:,} points, seed {options.seed})",
         highlight=False,
+        markup=False,
         soft_wrap=True,
     )
 
@@ -155,7 +170,7 @@ def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
         "profile": options.profile,
         "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]
         "ratio": _ratio(options),
-        "num_points": options.num_points,
+        "num_points_asked": options.num_points,
         "seed": options.seed,
     }
 

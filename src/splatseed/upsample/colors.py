@@ -6,8 +6,6 @@ linear arithmetic on the 8-bit values as the paper has it, rounded to the neares
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from jaxtyping import Float32, UInt8
 
@@ -40,32 +38,47 @@ def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # t
     for i in parallel_range(len(xyz)):
         if count[i] > 0:
             around, color = _gather(xyz, rgb, i, idx[i])
+            weight = np.empty(around.shape[1], np.float32)
+            nearest = np.float32(floor[i] * floor[i])
             for m in range(start[i], start[i] + count[i]):
-                _weigh(around, color, new_xyz[m] - center, floor[i], out[m])
+                x = np.float32(new_xyz[m, 0] - center[0] - xyz[i, 0])
+                y = np.float32(new_xyz[m, 1] - center[1] - xyz[i, 1])
+                z = np.float32(new_xyz[m, 2] - center[2] - xyz[i, 2])
+                _weights(around, x, y, z, nearest, weight)
+                _mix(weight, color, out[m])
 
 
 @inline
 def _gather(xyz, rgb, i, rows):  # type: ignore[no-untyped-def]
-    """Positions and colours of a row and its neighbours, once for all its outputs."""
+    """Positions relative to the base [3, k + 1] and colours [k + 1, 3], once for all its outputs."""
     k = rows.size
-    around, color = np.empty((k + 1, 3)), np.empty((k + 1, 3))
+    around, color = np.zeros((3, k + 1), np.float32), np.empty((k + 1, 3), np.float32)
     for axis in range(3):
-        around[k, axis], color[k, axis] = xyz[i, axis], rgb[i, axis]
+        color[k, axis] = rgb[i, axis]  # the base itself comes last, at the origin
         for j in range(k):
-            around[j, axis], color[j, axis] = xyz[rows[j], axis], rgb[rows[j], axis]
+            around[axis, j] = xyz[rows[j], axis] - xyz[i, axis]
+            color[j, axis] = rgb[rows[j], axis]
     return around, color
 
 
 @inline
-def _weigh(around, color, p, floor, out):  # type: ignore[no-untyped-def]
-    total = red = green = blue = 0.0
-    for j in range(len(around)):
-        dx, dy, dz = p[0] - around[j, 0], p[1] - around[j, 1], p[2] - around[j, 2]
-        weight = 1.0 / max(math.sqrt(dx * dx + dy * dy + dz * dz), floor)
-        total += weight
-        red += weight * color[j, 0]
-        green += weight * color[j, 1]
-        blue += weight * color[j, 2]
-    out[0] = np.uint8(red / total + 0.5)
-    out[1] = np.uint8(green / total + 0.5)
-    out[2] = np.uint8(blue / total + 0.5)
+def _weights(around, x, y, z, nearest, weight):  # type: ignore[no-untyped-def]
+    """Inverse distances; apart from the sums, so that the square roots run in vector registers."""
+    for j in range(weight.size):
+        dx, dy, dz = x - around[0, j], y - around[1, j], z - around[2, j]
+        squared = max(dx * dx + dy * dy + dz * dz, nearest)
+        weight[j] = np.float32(1.0) / np.sqrt(squared)
+
+
+@inline
+def _mix(weight, color, out):  # type: ignore[no-untyped-def]
+    total = red = green = blue = np.float32(0.0)
+    for j in range(weight.size):
+        total += weight[j]
+        red += weight[j] * color[j, 0]
+        green += weight[j] * color[j, 1]
+        blue += weight[j] * color[j, 2]
+    half = np.float32(0.5)
+    out[0] = np.uint8(red / total + half)
+    out[1] = np.uint8(green / total + half)
+    out[2] = np.uint8(blue / total + half)

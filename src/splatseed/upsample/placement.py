@@ -63,13 +63,14 @@ def place_in_box(
 @kernel
 def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def]
     """Polar coordinates with a square-root radius, in place of the draws in ``uv``."""
+    turn = np.float32(2.0 * math.pi)  # float32 throughout: its sine and cosine are twice as fast
     for i in parallel_range(len(radius)):
-        flat = 0.0 if collinear[i] else 1.0
+        reach_u = np.float32(radius[i])
+        reach_v = np.float32(0.0) if collinear[i] else reach_u
         for m in range(start[i], start[i] + count[i]):
-            r = radius[i] * math.sqrt(np.float64(uv[m, 0]))
-            angle = 2.0 * math.pi * np.float64(uv[m, 1])
-            uv[m, 0] = r * math.cos(angle)
-            uv[m, 1] = flat * r * math.sin(angle)
+            r, angle = np.sqrt(uv[m, 0]), turn * uv[m, 1]
+            uv[m, 0] = reach_u * r * np.cos(angle)
+            uv[m, 1] = reach_v * r * np.sin(angle)
 
 
 @kernel
