@@ -118,11 +118,11 @@ def track_statistics(scene: Scene) -> TrackStatistics | None:
 
 
 def empty_regions(scene: Scene, progress: Progress = silent) -> EmptyRegions | None:
-    """Which share of the images' area has no point; None for a scene without images.
+    """Which share of the images' area has no point; None for a scene without images or points.
 
     Visibility is not tested: a wall with points behind it counts as covered.
     """
-    if not scene.images:
+    if not scene.images or not len(scene.points):
         return None
     xyz = scene.points.xyz[scene.points.finite]
     shares = []
