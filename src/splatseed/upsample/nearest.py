@@ -22,8 +22,7 @@ class NearestMethod:
     """Base of the methods that need only the nearest neighbours of a base point."""
 
     reject_isolated: bool = True
-    """Never start from a point that stands alone (its spacing is over 3 times its surroundings') or
-    that few images saw and that reprojects badly (paper: no)."""
+    """Start nothing from points that stand alone, or whose track is short and bad (paper: no)."""
 
     min_points: ClassVar[int] = 2
 

@@ -33,8 +33,7 @@ class PatchMethod(NearestMethod, ABC):
     frame: Literal["local", "world"] = "local"
     """Axes of the fit: the neighbourhood's principal axes, or the world's (paper: world)."""
     placement: Literal["disc", "triangle", "box"] = "disc"
-    """Where on the patch: a disc about the base (coverage), a triangle of the base and two of its
-    8 nearest (accuracy), or the neighbourhood's bounding box (paper: box)."""
+    """Where: a disc (covers best), a triangle of neighbours (most exact), a box (paper: box)."""
     disc_radius: float = 1.5
     """Radius of the disc in units of the base point's spacing."""
     clamp: float | None = 0.25

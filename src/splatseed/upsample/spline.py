@@ -50,11 +50,9 @@ class Spline(PatchMethod):
     k: int = 25
     """Neighbours in a fit (paper: 25)."""
     basis: Literal["pspline", "bicubic"] = "pspline"
-    """A penalised 6 x 6 cubic B-spline, or what FITPACK makes of the paper's parameters: a bicubic
-    polynomial (paper: bicubic)."""
+    """A penalised B-spline, or the bicubic that the paper's parameters give (paper: bicubic)."""
     smoothing: float | Literal["gcv"] = 0.01
-    """Weight of the roughness penalty, without unit, or "gcv" to choose it for every patch by
-    generalised cross-validation. The paper's s = 0.1 k bounds FITPACK's residual and is inert."""
+    """Weight of the roughness penalty, or gcv: cross-validated (paper: s = 0.1 k, inert)."""
 
     name: ClassVar[str] = "spline"
 
