@@ -20,7 +20,7 @@ VERBS = {
     "upsample": "Add points to a scene and write it for any 3DGS trainer.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",
-    "demo": "Make a small scene, upsample it by every method, and show the result.",
+    "demo": "Make a small scene, upsample it by every method, measure.",
 }
 INTERRUPTED = 130
 

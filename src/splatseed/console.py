@@ -112,7 +112,7 @@ def _compilation_shown(clock: StageClock) -> Iterator[None]:
 
 def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
     """Print a two-column table, what and how much, unwrapped so that paths can be copied."""
-    OUT.print(f"\n[bold]{escape(title)}[/bold]", highlight=False)
+    _print_title(title)
     _print_columns(rows)
 
 
@@ -123,19 +123,23 @@ def print_note(note: str) -> None:
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print a table whose first column names the row."""
-    table = Table(title=escape(title), title_justify="left", box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False)
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i == 0 else "right")
     for row in rows:
         table.add_row(*row)
-    OUT.print()
+    _print_title(title)
     OUT.print(table)
 
 
 def print_commands(title: str, commands: Sequence[tuple[str, str]]) -> None:
     """Print commands one a line, unwrapped, so that they can be copied."""
-    OUT.print(f"\n[bold]{escape(title)}[/bold]", highlight=False)
+    _print_title(title)
     _print_columns(commands)
+
+
+def _print_title(title: str) -> None:
+    OUT.print(f"\n[bold]{escape(title)}[/bold]", soft_wrap=True, highlight=False)
 
 
 def _print_columns(rows: Sequence[tuple[str, str]]) -> None:

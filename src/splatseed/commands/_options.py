@@ -10,7 +10,7 @@ import io
 import re
 from collections.abc import Sequence
 from contextlib import redirect_stderr
-from itertools import takewhile
+from itertools import dropwhile, takewhile
 from typing import TypeVar
 
 import tyro
@@ -22,7 +22,7 @@ __all__ = ["parse_options"]
 Options = TypeVar("Options")
 
 COLOR = re.compile(r"\x1b\[[0-9;]*m")
-RULE = "──"
+RULE = re.compile("[─-]{5,}")
 TRIED = "Got errors:"
 """What follows lists tyro's attempts to read a value, for its own developers."""
 
@@ -53,9 +53,9 @@ def parse_options(kind: type[Options], verb: str, arguments: Sequence[str]) -> O
 
 
 def _sentence(box: str) -> str:
-    """What a box of tyro's says above its first rule, on one line."""
-    lines = COLOR.sub("", box).splitlines()
-    inside = [line.strip("│ ") for line in lines if line.startswith("│")] or lines
-    said = takewhile(lambda line: not line.startswith((RULE, TRIED)), inside)
+    """What a box of tyro's, drawn in Unicode or ASCII, says between its title and next rule."""
+    lines = [line.strip("│ ") for line in COLOR.sub("", box).splitlines()]
+    below_title = dropwhile(RULE.fullmatch, [line for line in lines if line][1:])
+    said = takewhile(lambda line: not RULE.fullmatch(line) and line != TRIED, below_title)
     words = " ".join(" ".join(said).split()).rstrip(".")
     return words[:1].lower() + words[1:]

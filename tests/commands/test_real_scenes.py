@@ -1,0 +1,69 @@
+"""The command line on real captures, each by another method."""
+
+from __future__ import annotations
+
+import pycolmap
+import pytest
+
+from splatseed.io import load_scene, write_scene
+from splatseed.io.ply import write_ply
+
+RUNS = [
+    ("bonsai", "mls"),
+    ("fox", "linear"),
+    ("fern", "triangle"),
+    ("treehill", "voronoi"),
+    ("mipnerf360_sfm/bicycle", "spline"),
+    ("mipnerf360_sfm/stump", "random"),
+]
+
+
+@pytest.mark.parametrize(("name", "method"), RUNS)
+def test_colmap_scenes_are_upsampled_and_open(name, method, scenes, tmp_path, splatseed):
+    run = splatseed(
+        "upsample", scenes / name, "--method", method, "--ratio", 2, "-o", tmp_path / "o"
+    )
+    assert (run.code, run.err) == (0, "")
+    before, after = load_scene(scenes / name), load_scene(tmp_path / "o")
+    model = pycolmap.Reconstruction(tmp_path / "o/sparse/0")
+    assert model.num_points3D() == len(after.points)
+    assert model.num_images() == len(before.images)
+    assert ("train it with" in run.out) == bool(before.images)
+    # Duplicates of the input are left out, and told of.
+    assert 1.9 * len(before.points) < len(after.points) <= 2 * len(before.points)
+    assert ("repeat the position" in run.out) == ("left out" in run.out)
+
+
+def test_a_transforms_scene_made_of_fern(scenes, tmp_path, splatseed):
+    write_scene(load_scene(scenes / "fern"), tmp_path / "nerf", format="transforms")
+    run = splatseed("upsample", tmp_path / "nerf", "--ratio", 2, "-o", tmp_path / "out")
+    assert run.code == 0
+    assert len(load_scene(tmp_path / "out").points) == 2 * len(load_scene(tmp_path / "nerf").points)
+    assert "ns-train splatfacto" in run.out
+
+
+def test_a_ply_of_fern(scenes, tmp_path, splatseed):
+    write_ply(tmp_path / "fern.ply", load_scene(scenes / "fern").points)
+    run = splatseed("upsample", tmp_path / "fern.ply", "--ratio", 2, "-o", tmp_path / "out")
+    assert run.code == 0
+    assert pycolmap.Reconstruction(tmp_path / "out/sparse/0").num_points3D() > 12_000
+
+
+@pytest.mark.parametrize("name", [name for name, _ in RUNS[1:]])
+def test_info_on_real_captures(name, scenes, splatseed):
+    run = splatseed("info", scenes / name)
+    assert (run.code, run.err) == (0, "")
+    assert f"{len(load_scene(scenes / name).points):,}" in run.out
+    assert "nan" not in run.out
+
+
+@pytest.mark.parametrize("name", ["replica/room0", "7scenes_redkitchen"])
+def test_depth_captures_have_no_points_yet(name, scenes, tmp_path, splatseed):
+    run = splatseed("info", scenes / name)
+    assert run.code == 0
+    assert "--poses-from" in run.out
+    assert "nan" not in run.out
+    run = splatseed("upsample", scenes / name, "-o", tmp_path / "out")
+    assert run.code == 2
+    assert "--poses-from" in run.err
+    assert not list(tmp_path.iterdir())
