@@ -74,8 +74,8 @@ def build_cells(
 def _build(xyz, idx, distance, frames, first, last, center, radius, volume, closed):  # type: ignore[no-untyped-def]
     for i in parallel_range(first, last):
         normal, offset = np.empty((MAX_PLANES, 3)), np.empty(MAX_PLANES)
-        triple, vertex = np.empty((MAX_VERTICES, 3), np.int64), np.empty((MAX_VERTICES, 3))
-        twin = np.full((MAX_PLANES, MAX_PLANES), -1)
+        triple, vertex = np.empty((MAX_VERTICES, 3), np.int16), np.empty((MAX_VERTICES, 3))
+        twin = np.empty((MAX_PLANES, MAX_PLANES), np.int16)  # an edge is set before it is read
         reach = 0.5 * distance[i, -1]
         count = _cube(frames[i], reach, normal, offset, triple, vertex, twin)
         count, complete = _cut_all(
@@ -113,9 +113,10 @@ def _set(triple, twin, v, a, b, c):  # type: ignore[no-untyped-def]
 def _cut_all(xyz, i, rows, distance, normal, offset, triple, vertex, twin, count):  # type: ignore[no-untyped-def]
     """Cut by the bisectors; returns the number of vertices and whether the cell is complete."""
     signed = np.empty(MAX_VERTICES)
-    fresh, place = np.empty((MAX_VERTICES, 2), np.int64), np.empty((MAX_VERTICES, 3))
+    fresh, place = np.empty((MAX_VERTICES, 2), np.int16), np.empty((MAX_VERTICES, 3))
+    farthest = _farthest_squared(vertex, count)
     for j in range(rows.size):
-        if 0.25 * distance[j] * distance[j] > _farthest_squared(vertex, count):
+        if 0.25 * distance[j] * distance[j] > farthest:
             return count, True
         plane = 6 + j
         for axis in range(3):
@@ -124,7 +125,8 @@ def _cut_all(xyz, i, rows, distance, normal, offset, triple, vertex, twin, count
         tolerance = COINCIDENT * distance[-1]
         if _measure(normal[plane], offset[plane], vertex, count, signed) > tolerance:
             count = _cut(plane, triple, vertex, twin, count, signed, fresh, place)
-    return count, 0.25 * distance[-1] * distance[-1] > _farthest_squared(vertex, count)
+            farthest = _farthest_squared(vertex, count)
+    return count, 0.25 * distance[-1] * distance[-1] > farthest
 
 
 @inline
