@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections import Counter
 from dataclasses import dataclass
@@ -53,7 +54,8 @@ def run(arguments: list[str]) -> None:
     OUT.print("\n[bold]problems[/bold]" if problems else "\nno problems found")
     for problem in problems:
         OUT.print(f"  - {problem}", soft_wrap=True, highlight=False, markup=False)
-    print_commands("next", [("", _next_command(options.scene, scene))])
+    if len(scene.points) or scene.images:
+        print_commands("next", [("", _next_command(options.scene, scene))])
 
 
 def _next_command(path: Path, scene: Scene) -> str:
@@ -81,15 +83,16 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
 
 
 def _cloud_rows(cloud: CloudStatistics) -> list[tuple[str, str]]:
-    if not cloud.num_points:
-        return [("points", "none")]
+    rows = [("points", f"{cloud.num_points:,}"), ("not finite", f"{cloud.non_finite:,}")]
+    if cloud.num_points == cloud.non_finite:  # nothing to measure
+        return rows if cloud.num_points else [("points", "none")]
     low, high = (" ".join(f"{x:.4g}" for x in corner) for corner in (cloud.low, cloud.high))
+    spacing = " ".join(f"{x:.4g}" for x in cloud.spacing if not math.isnan(x))
     return [
-        ("points", f"{cloud.num_points:,}"),
-        ("not finite", f"{cloud.non_finite:,}"),
+        *rows,
         ("duplicates", f"{cloud.duplicates:,}"),
         ("isolated", f"{cloud.isolated:,}"),
-        ("spacing 5/25/50/75/95%", " ".join(f"{x:.4g}" for x in cloud.spacing)),
+        ("spacing 5/25/50/75/95%", spacing or "none"),
         ("bounding box", f"{low}  to  {high}"),
         ("float32 step there", f"{cloud.resolution:.2g}"),
     ]

@@ -1,0 +1,166 @@
+"""The command line as a process: exit codes, streams, terminals and signals."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+from importlib.metadata import entry_points, version
+
+import numpy as np
+import pytest
+
+from splatseed.cli import VERBS, main
+from splatseed.io.ply import write_ply
+from splatseed.pointcloud import PointCloud
+
+COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()")
+
+
+@pytest.fixture
+def ply(rng, tmp_path):
+    """A wavy sheet of 300 points."""
+    xyz = rng.random((300, 3))
+    xyz[:, 2] = 0.1 * np.sin(9 * xyz[:, 0])
+    write_ply(
+        tmp_path / "cloud.ply", PointCloud(xyz, (255 * rng.random(xyz.shape)).astype(np.uint8))
+    )
+    return tmp_path / "cloud.ply"
+
+
+def _run(*words, command=COMMAND, **options):
+    words = [*command, *(str(word) for word in words)]
+    return subprocess.run(words, capture_output=True, check=False, timeout=120, **options)
+
+
+def test_the_command_is_installed():
+    (command,) = entry_points(group="console_scripts", name="splatseed")
+    assert command.load() is main
+
+
+def test_from_end_to_end(ply, tmp_path):
+    run = _run("upsample", ply, "-o", tmp_path / "out", "--ratio", 2, text=True)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert "600" in run.stdout
+    assert (tmp_path / "out/sparse/0/points3D.bin").is_file()
+    run = _run("info", tmp_path / "out", text=True)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert re.search(r"points +600\n", run.stdout)
+
+
+def test_errors_go_to_stderr_with_code_2(ply, tmp_path):
+    run = _run("upsample", ply, "-o", tmp_path / "out", "--method", "magic", text=True)
+    assert (run.returncode, run.stdout) == (2, "")
+    assert re.fullmatch(r"error: expected .*; found .*\n", run.stderr)
+
+
+def test_a_terminal_sees_progress_and_stdout_does_not(ply, tmp_path):
+    master, terminal = pty.openpty()
+    words = [*COMMAND, "upsample", str(ply), "-o", str(tmp_path / "out"), "--ratio", "500"]
+    # A bar needs a terminal that can move its cursor, which the test's own may not be.
+    environment = os.environ | {"TERM": "xterm"}
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=terminal, env=environment
+    ) as process:
+        os.close(terminal)
+        shown = _read_all(master)
+        out = process.communicate(timeout=120)[0].decode()
+    assert process.returncode == 0
+    assert "neighbours" in shown
+    assert "\x1b[" in shown
+    assert not set(out) & {"\r", "\x1b"}
+    assert "points out" in out
+
+
+def _read_all(master):
+    """All that is written to a terminal until its last writer closes it."""
+    pieces = []
+    try:
+        while piece := os.read(master, 65536):
+            pieces.append(piece)
+    except OSError:  # Linux's way to say that nobody writes any more
+        pass
+    os.close(master)
+    return b"".join(pieces).decode()
+
+
+SLOW_WRITER = """
+import sys, time
+from pathlib import Path
+from splatseed.cli import main
+from splatseed.io import colmap_binary
+
+def write(path, points, tracks=None):
+    Path(path).write_bytes(b"half")
+    print("writing", flush=True)
+    time.sleep(60)
+
+colmap_binary.write_points3d = write
+main()
+"""
+
+
+def test_ctrl_c_while_writing_leaves_nothing(ply, tmp_path):
+    words = [sys.executable, "-c", SLOW_WRITER, "upsample", str(ply), "-o", str(tmp_path / "a/out")]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        for line in process.stdout:
+            if line == "writing\n":
+                break
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "interrupted" in err
+    assert "Traceback" not in err
+    assert [path.name for path in tmp_path.iterdir()] == [ply.name]
+
+
+def test_a_reader_that_leaves_early_is_no_traceback(ply):
+    words = [*COMMAND, "info", str(ply)]
+    read, write = os.pipe()
+    os.close(read)
+    run = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, check=False, timeout=60)
+    os.close(write)
+    assert b"Traceback" not in run.stderr
+
+
+def test_names_that_are_no_text(ply, tmp_path):
+    odd = os.fsencode(tmp_path) + b"/odd\xff.ply"
+    os.link(ply, odd)
+    run = _run("info", os.fsdecode(odd))
+    assert run.returncode == 0
+    assert b"odd\\udcff.ply" in run.stdout
+
+
+@pytest.mark.parametrize("words", [[], ["-h"], ["--help"]])
+def test_help_names_every_verb(words, capsys):
+    main(words)
+    out, err = capsys.readouterr()
+    assert err == ""
+    for verb, does in VERBS.items():
+        assert re.search(rf"^  {verb} +{re.escape(does)}", out, re.MULTILINE)
+
+
+def test_version(capsys):
+    main(["--version"])
+    assert capsys.readouterr().out == f"splatseed {version('splatseed')}\n"
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself(verb, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([verb, "--help"])
+    assert not stop.value.code
+    out = capsys.readouterr().out
+    assert f"splatseed {verb}" in out
+    assert "-h, --help" in out
+
+
+def test_help_waits_for_nothing_heavy():
+    code = "import sys; from splatseed.cli import main; main(['--help']); print(*sys.modules)"
+    run = _run(command=(sys.executable, "-c", code), text=True)
+    assert not {"numba", "scipy", "matplotlib", "torch"} & set(run.stdout.split())
