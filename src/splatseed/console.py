@@ -47,6 +47,8 @@ class StageClock:
 
     def seconds(self) -> dict[str, float]:
         """Wall time of each stage so far, in order of first appearance."""
+        if not self._started:
+            return {}
         ends = [start for _, start in self._started[1:]] + [time.perf_counter()]
         total: dict[str, float] = {}
         for (stage, start), end in zip(self._started, ends, strict=True):

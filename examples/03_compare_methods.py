@@ -1,0 +1,49 @@
+"""Compare every method on surfaces that are known, so that its errors can be measured.
+
+python examples/03_compare_methods.py
+
+Distances are in units of the originals' spacing: *error* from the new points to the true surface,
+*coverage* from the surface to the nearest of all points. Less is better, and each alone is easy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+import splatseed as ss
+from splatseed.geometry import measure, spacing
+from splatseed.synthetic import SHAPES, Surface
+
+NUM_POINTS = 2000
+NOISE = 0.1
+"""Of the originals, in units of their spacing."""
+
+
+def noisy_cloud(surface: Surface, rng: np.random.Generator) -> ss.PointCloud:
+    """Points near a surface, as Structure-from-Motion would find them."""
+    xyz = surface.sample(NUM_POINTS, rng)
+    xyz += NOISE * spacing(xyz) * rng.normal(size=xyz.shape)
+    return ss.PointCloud(xyz, np.full(xyz.shape, 128, np.uint8))
+
+
+def score(surface: Surface, method: str) -> tuple[float, float]:
+    """Error and coverage of a method at 8 times the points."""
+    rng = np.random.default_rng(0)
+    cloud = noisy_cloud(surface, rng)
+    seeds = ss.upsample(cloud, method=method, ratio=8, seed=0)
+    new = seeds.xyz[len(cloud) :]
+    result = measure(new, seeds.xyz, surface, surface.sample(2000, rng), spacing(cloud.xyz))
+    return result.error, result.coverage
+
+
+def main() -> None:
+    """Print one row a shape, one column a method."""
+    print("error / coverage".ljust(18) + "".join(f"{method:>15}" for method in ss.METHODS))
+    for name, make_shape in SHAPES.items():
+        scores = [score(make_shape(), method) for method in ss.METHODS]
+        cells = [f"{error:.3f} / {coverage:.3f}" for error, coverage in scores]
+        print(name.ljust(18) + "".join(f"{cell:>15}" for cell in cells))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Cameras against the definition of projection, and against pycolmap."""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+import pytest
+from hypothesis import given, strategies as st
+from hypothesis.extra import numpy as hnp
+
+from splatseed.camera import (
+    CAMERA_MODELS,
+    Camera,
+    Intrinsics,
+    quat_from_rotation,
+    rotation_from_quat,
+)
+from splatseed.errors import SceneFormatError
+
+QUATS = hnp.arrays(np.float64, 4, elements=st.floats(-1, 1)).filter(
+    lambda quat: np.linalg.norm(quat) > 1e-3
+)
+K = np.array([[300.0, 0, 160], [0, 310.0, 120], [0, 0, 1]])
+
+
+def _camera(quat, translation=(0.3, -0.2, 4.0)):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation_from_quat(np.asarray(quat, float)), translation
+    return Camera(K, 320, 240, pose)
+
+
+@given(QUATS)
+def test_rotations_are_rotations(quat):
+    rotation = rotation_from_quat(quat)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+
+
+@given(QUATS)
+def test_quaternions_come_back(quat):
+    unit = quat / np.linalg.norm(quat)
+    back = quat_from_rotation(rotation_from_quat(quat))
+    assert back[0] >= 0
+    assert np.linalg.norm(back) == pytest.approx(1)
+    assert abs(back @ unit) == pytest.approx(1, abs=1e-12)  # q and -q turn alike
+
+
+def test_a_quarter_turn():
+    half = np.sqrt(0.5)
+    rotation = rotation_from_quat(np.array([half, 0, 0, half]))  # 90 degrees about z
+    np.testing.assert_allclose(rotation @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+
+
+def test_a_matrix_that_is_not_quite_a_rotation_gives_the_nearest(rng):
+    exact = rotation_from_quat(rng.normal(size=4))
+    quat = quat_from_rotation(exact + 1e-6 * rng.normal(size=(3, 3)))
+    np.testing.assert_allclose(rotation_from_quat(quat), exact, atol=1e-5)
+
+
+@given(QUATS)
+def test_unproject_undoes_project(quat):
+    camera = _camera(quat)
+    rng = np.random.default_rng(0)
+    uv, depth = rng.uniform(0, [320, 240], (20, 2)), rng.uniform(0.5, 9, 20)
+    back_uv, back_depth = camera.project(camera.unproject(uv, depth))
+    np.testing.assert_allclose(back_uv, uv, atol=1e-8)
+    np.testing.assert_allclose(back_depth, depth, atol=1e-9)
+
+
+@given(QUATS)
+def test_the_centre_is_where_the_camera_is(quat):
+    camera = _camera(quat)
+    np.testing.assert_allclose(camera.world_from_cam @ camera.cam_from_world, np.eye(4), atol=1e-12)
+    at_camera = camera.cam_from_world @ [*camera.center, 1]
+    np.testing.assert_allclose(at_camera, [0, 0, 0, 1], atol=1e-12)
+
+
+def test_what_is_not_in_front_has_no_pixel():
+    camera = _camera([1, 0, 0, 0], (0, 0, 0))
+    uv, depth = camera.project(np.array([[0, 0, -1.0], [1, 1, 0], [0, 0, 1]]))
+    assert np.isnan(uv[:2]).all()
+    np.testing.assert_array_equal(depth, [-1, 0, 1])
+    np.testing.assert_array_equal(uv[2], [160, 120])
+
+
+def test_x_points_right_and_y_down():
+    uv, _ = _camera([1, 0, 0, 0], (0, 0, 0)).project(np.array([[1.0, 0, 10], [0, 1.0, 10]]))
+    np.testing.assert_allclose(uv, [[190, 120], [160, 151]])
+
+
+@pytest.mark.parametrize("name", CAMERA_MODELS)
+def test_models_are_colmaps(name):
+    model = CAMERA_MODELS[name]
+    theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
+    assert int(theirs.model) == model.model_id
+    assert len(theirs.params) == model.num_params
+    assert len(theirs.focal_length_idxs()) == model.num_focal
+    assert list(theirs.principal_point_idxs()) == [model.num_focal, model.num_focal + 1]
+    theirs.params = [
+        *theirs.params[: model.num_focal + 2],
+        *[0.01] * len(theirs.extra_params_idxs()),
+    ]
+    ours = Intrinsics(1, name, 640, 480, tuple(theirs.params))
+    np.testing.assert_allclose(ours.K, theirs.calibration_matrix())
+    assert ours.is_pinhole == theirs.is_undistorted()
+
+
+def test_projection_is_colmaps(rng):
+    ours = _camera([0.9, 0.1, -0.2, 0.3])
+    pose = pycolmap.Rigid3d(ours.cam_from_world[:3])
+    theirs = pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[300, 310, 160, 120])
+    xyz = rng.normal(size=(50, 3))
+    uv, _ = ours.project(xyz)
+    expected = np.array([theirs.img_from_cam(pose * point) for point in xyz])
+    np.testing.assert_allclose(uv, expected.reshape(-1, 2), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "says"),
+    [("FISHEYE", (1.0,) * 4, "'FISHEYE'"), ("PINHOLE", (1.0,) * 3, "4 parameters; found 3")],
+)
+def test_records_that_are_none(model, params, says):
+    with pytest.raises(SceneFormatError, match=says) as error:
+        Intrinsics(17, model, 10, 10, params)
+    assert "camera 17" in str(error.value)

@@ -1,0 +1,118 @@
+"""What the terminal shows, and what it must not break."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from splatseed import console
+from splatseed.console import (
+    StageClock,
+    print_commands,
+    print_note,
+    print_pairs,
+    print_table,
+    stage_display,
+)
+
+LONG = "/".join(["a_rather_long_folder_name"] * 9)
+
+
+def test_a_stage_lasts_until_the_next_begins(monkeypatch):
+    now = iter([0.0, 1.0, 4.0, 10.0])
+    monkeypatch.setattr(console.time, "perf_counter", lambda: next(now))
+    clock = StageClock()
+    for stage, fraction in (("read", 0), ("read", 1), ("fit", 0), ("fit", 0.5), ("read", 0)):
+        clock(stage, fraction)
+    assert clock.seconds() == {"read": 1.0 + 6.0, "fit": 3.0}
+
+
+def test_a_clock_that_never_ran_has_no_stages():
+    assert StageClock().seconds() == {}
+
+
+def test_nothing_is_drawn_where_nobody_looks(capsys):
+    with stage_display() as clock:
+        clock("read", 0.5)
+        clock.announce_compilation()
+        clock.finish_compilation()
+    assert capsys.readouterr() == ("", "")
+    assert list(clock.seconds()) == ["read"]
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """What would have been drawn on stderr, were it a terminal."""
+    drawn = io.StringIO()
+    screen = Console(file=drawn, force_terminal=True, force_interactive=True, width=80)
+    monkeypatch.setattr(console, "ERR", screen)
+    return drawn
+
+
+def test_a_terminal_sees_the_stages(terminal, capsys):
+    with stage_display() as clock:
+        clock("read", 1.0)
+    with stage_display(clock):
+        clock("write", 0.5)
+    assert "read" in terminal.getvalue()
+    assert "write" in terminal.getvalue()
+    assert capsys.readouterr() == ("", "")
+    assert list(clock.seconds()) == ["read", "write"]
+
+
+def test_compilation_is_shown_once_and_taken_away(terminal):
+    with stage_display() as clock:
+        for _ in range(3):
+            clock.announce_compilation()
+        clock("fit", 0.1)
+        clock.finish_compilation()
+        clock.finish_compilation()
+    assert "compiling kernels" in terminal.getvalue()
+
+
+def test_the_bars_go_away_when_the_work_fails(terminal):
+    clock = StageClock()
+
+    def fail():
+        with stage_display(clock):
+            clock("read", 0.5)
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    drawn = terminal.getvalue()
+    assert drawn.rfind("\x1b[?25h") > drawn.rfind("\x1b[?25l") >= 0  # the cursor is back
+    clock("write", 0.5)
+    assert terminal.getvalue() == drawn
+
+
+@pytest.mark.parametrize("text", [LONG, "[bold]no markup[/bold]", "a [3, 4] b", "3 x 4 = 12.5"])
+def test_text_is_printed_as_it_is_on_one_line(text, capsys):
+    print_pairs(text, [("label", text)])
+    print_commands(text, [("", text)])
+    print_note(text)
+    print_table(text, ("name", "value"), [("one", "1")])
+    out = capsys.readouterr().out
+    lines = [line for line in out.splitlines() if text in line]
+    assert len(lines) == 6
+    assert "\x1b" not in out
+
+
+def test_columns_line_up(capsys):
+    print_pairs("title", [("a", "first"), ("much longer", "second"), ("", "third")])
+    lines = capsys.readouterr().out.splitlines()[2:]
+    assert [
+        line.index(word) for line, word in zip(lines, ("first", "second", "third"), strict=True)
+    ] == [
+        15,
+        15,
+        15,
+    ]
+
+
+def test_numbers_are_aligned_to_the_right(capsys):
+    print_table("title", ("name", "value"), [("a", "1"), ("b", "1000")])
+    lines = capsys.readouterr().out.splitlines()[2:]
+    assert len({len(line.rstrip()) for line in lines}) == 1

@@ -1,0 +1,217 @@
+"""The package as a whole: what imports what, what is public, and that it all says so."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import splatseed
+
+ROOT = Path(__file__).parents[1]
+SOURCE = Path(splatseed.__file__).parent
+MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__path__, "splatseed.")]
+
+ORDER = (
+    "errors",
+    "progress",
+    "jit",
+    "camera",
+    "pointcloud",
+    "scene",
+    "io",
+    "upsample",
+    "geometry",
+    "viewpoint",
+    "preview",
+    "synthetic",
+    "sfm",
+    "diagnostics",
+    "trainers",
+    "console",
+    "commands",
+    "cli",
+)
+"""Parts of the package: each imports only parts before it, or itself."""
+
+LIGHT = {"numpy", "jaxtyping", "numba", "scipy"}
+"""What methods may need beside the standard library; upsampling takes no PyTorch."""
+
+
+def _imports(path):
+    """The modules that a file imports anywhere, also within functions."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            if node.module == "splatseed":  # of which a name may be a part of it
+                yield from (f"splatseed.{alias.name}" for alias in node.names)
+            else:
+                yield str(node.module)
+
+
+def _files(part):
+    """The files of a part of the package, which is a module or a folder."""
+    return sorted((SOURCE / part).rglob("*.py")) or [SOURCE / f"{part}.py"]
+
+
+def test_every_part_has_its_place():
+    parts = {path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or path.is_dir()}
+    assert {part for part in parts if not part.startswith("__")} == set(ORDER)
+
+
+@pytest.mark.parametrize("part", ORDER)
+def test_imports_run_one_way(part):
+    allowed = set(ORDER[: ORDER.index(part) + 1])
+    for path in _files(part):
+        names = [name.split(".") for name in _imports(path)]
+        ours = {name[1] for name in names if name[0] == "splatseed" and len(name) > 1}
+        assert ours <= allowed, path.name
+        assert ["splatseed"] not in names, f"{path.name} imports the whole package"
+
+
+def test_upsampling_needs_little():
+    for path in _files("upsample"):
+        tops = {name.split(".")[0] for name in _imports(path)}
+        assert tops <= {"splatseed", *LIGHT, *sys.stdlib_module_names}, path.name
+
+
+def test_an_import_loads_nothing_heavy():
+    code = "import sys, splatseed; print(*sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
+    heavy = {"torch", "numba", "scipy", "matplotlib", "pycolmap", "PIL", "rich", "tyro"}
+    assert not heavy & set(run.stdout.split())
+
+
+def test_every_module_can_be_imported_first():
+    """Each in a process of its own, forked from one that has loaded only what is not ours."""
+    code = """
+import importlib, os, sys
+import numpy, jaxtyping, numba, scipy.spatial, rich.progress, tyro, PIL.Image, PIL.ImageDraw
+for name in sys.argv[1:]:
+    child = os.fork()
+    if not child:
+        importlib.import_module(name)
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0, name
+"""
+    words = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", code, *MODULES]
+    run = subprocess.run(words, capture_output=True, check=False, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_public_names_are_there_sorted_and_explained(name):
+    module = importlib.import_module(name)
+    assert module.__doc__
+    public = getattr(module, "__all__", [])
+    assert list(public) == sorted(set(public), key=_as_ruff_sorts)
+    for each in public:
+        member = getattr(module, each)
+        if "._" not in name:  # what is public within a package only needs a name that speaks
+            _assert_explained(member, f"{name}.{each}")
+    assert public or not any(_own_public(module)), f"{name} has no __all__"
+
+
+def _as_ruff_sorts(name):
+    """CONSTANTS, then Classes, then the rest."""
+    return (0 if name.isupper() else 1 if name[0].isupper() else 2, name)
+
+
+def _own_public(module):
+    """Public functions and classes that are defined in a module."""
+    for name, each in vars(module).items():
+        if not name.startswith("_") and getattr(each, "__module__", None) == module.__name__:
+            yield name
+
+
+def _assert_explained(each, where):
+    """A docstring on a function, or on a class and all its public methods."""
+    if inspect.isclass(each) and each.__module__.startswith("splatseed"):
+        assert each.__doc__, where
+        for name, member in vars(each).items():
+            function = member.fget if isinstance(member, property) else member
+            function = getattr(function, "__func__", function)
+            if inspect.isfunction(function) and not name.startswith("_"):
+                assert function.__doc__, f"{where}.{name}"
+    elif inspect.isfunction(each):
+        assert each.__doc__, where
+
+
+def test_the_front_door_lists_what_the_packages_promise():
+    assert set(splatseed.__all__) == {
+        "METHODS",
+        "Camera",
+        "PointCloud",
+        "Scene",
+        "SplatseedError",
+        "load_scene",
+        "upsample",
+        "upsample_points",
+        "write_scene",
+    }
+
+
+def test_every_error_is_ours_and_says_three_things():
+    from splatseed import errors  # noqa: PLC0415  (so that the front door is tested without it)
+
+    for name in errors.__all__:
+        error = getattr(errors, name)("a cat", found="a dog", fix="Look again.")
+        assert isinstance(error, splatseed.SplatseedError)
+        assert str(error) == "expected a cat; found a dog. Look again."
+        assert (error.expected, error.found, error.fix) == ("a cat", "a dog", "Look again.")
+
+
+def test_the_version_is_the_same_everywhere():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert version("splatseed") == project["version"]
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(rf"^## \[?{re.escape(project['version'])}\b", changes, re.MULTILINE)
+
+
+def test_dependencies_are_those_that_are_imported():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = {re.split(r"[><=\[;]", line)[0] for line in project["dependencies"]}
+    imported = {name.split(".")[0] for path in SOURCE.rglob("*.py") for name in _imports(path)}
+    needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
+    assert {"pillow" if name == "PIL" else name for name in needed} <= wanted
+
+
+def _tracked():
+    """The text files under version control."""
+    run = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=False, text=True
+    )
+    if run.returncode:
+        pytest.skip("not a git checkout")
+    paths = [ROOT / name for name in run.stdout.split("\0") if name]
+    return [path for path in paths if path.suffix != ".png" and path.is_file()]
+
+
+def test_no_file_names_a_place_on_somebodys_machine():
+    place = re.compile(rb"(?<![\w.>)}])/(home|Users|root|work|tmp|mnt)/\w")
+    assert not [path.name for path in _tracked() if place.search(path.read_bytes())]
+
+
+def test_no_python_file_is_long():
+    lengths = {
+        path.name: path.read_bytes().count(b"\n") for path in _tracked() if path.suffix == ".py"
+    }
+    assert not {name: lines for name, lines in lengths.items() if lines > 400}
+
+
+def test_files_end_in_one_newline_and_lines_in_no_blank():
+    for path in _tracked():
+        text = path.read_bytes()
+        assert not text or text.endswith(b"\n"), path.name
+        assert not re.search(rb"[ \t\r]\n", text), path.name

@@ -1,0 +1,81 @@
+"""Scene: the split, the poses, and which points keep their tracks."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatseed.camera import Intrinsics, rotation_from_quat
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Observations, Scene, Tracks
+
+INTRINSICS = Intrinsics(1, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
+
+
+def _image(name, quat=(1.0, 0, 0, 0), translation=(0.0, 0, 0)):
+    return Image(name, 1, INTRINSICS, np.array(quat), np.array(translation))
+
+
+@pytest.fixture
+def scene(rng):
+    xyz = rng.normal(size=(5, 3))
+    xyz[2] = np.nan
+    lengths = np.array([2, 3, 2, 4, 2])
+    offsets = np.concatenate([[0], np.cumsum(lengths)])
+    seen = np.zeros(offsets[-1], np.uint32)
+    tracks = Tracks(np.arange(5), xyz, np.ones(5), offsets, seen, seen)
+    return Scene(PointCloud(xyz, np.zeros((5, 3), np.uint8)), tracks=tracks)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 20])
+def test_the_split_takes_every_eighth_name(count, rng):
+    names = [f"{i:03d}.jpg" for i in range(count)]
+    images = tuple(_image(names[i]) for i in rng.permutation(count))
+    train, test = Scene(PointCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8)), images).split()
+    assert [image.name for image in test] == names[::8]
+    assert sorted(image.name for image in train + test) == names
+    assert [image.name for image in train] == sorted(image.name for image in train)
+
+
+def test_an_images_camera_has_its_pose_and_lens(rng):
+    quat, translation = rng.normal(size=4), rng.normal(size=3)
+    camera = _image("a", quat, translation).camera
+    np.testing.assert_array_equal(camera.cam_from_world[:3, :3], rotation_from_quat(quat))
+    np.testing.assert_array_equal(camera.cam_from_world[:, 3], [*translation, 1])
+    np.testing.assert_array_equal(camera.K, INTRINSICS.K)
+    assert (camera.width, camera.height) == (64, 48)
+
+
+def test_track_lengths(scene):
+    assert scene.tracks.lengths.tolist() == [2, 3, 2, 4, 2]
+    assert len(scene.tracks) == 5
+
+
+def test_tracks_stay_with_the_points_they_belong_to(scene):
+    more = PointCloud.concatenate(scene.points, scene.points)  # also those that are NaN
+    assert scene.replace(points=more).tracks is scene.tracks
+    recolored = scene.points.replace(rgb=np.full((5, 3), 9, np.uint8))
+    assert scene.replace(points=recolored).tracks is scene.tracks
+
+
+def test_tracks_do_not_pass_to_other_points(scene):
+    points = scene.points
+    for other in (
+        points.select(slice(1, None)),
+        points.select(np.arange(5)[::-1]),
+        points.replace(xyz=points.xyz + 1),
+        points.select(slice(0)),
+    ):
+        changed = scene.replace(points=other)
+        assert changed.tracks is None
+        assert scene.tracks is not None
+
+
+def test_tracks_given_with_the_points_are_kept(scene):
+    tracks = scene.tracks
+    changed = scene.replace(points=scene.points.select(slice(1)), tracks=tracks)
+    assert changed.tracks is tracks
+
+
+def test_observations_are_counted():
+    assert len(Observations(np.zeros((7, 2)), np.full(7, -1))) == 7
