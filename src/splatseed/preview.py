@@ -113,7 +113,7 @@ def _front_points(
 
 
 @inline
-def _draw_discs(uv, depth, radii, nearest, front):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _draw_discs(uv, depth, radii, nearest, front):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202  (a Numba kernel)
     """Draw every disc into the depth buffer ``nearest``; at equal depth the first point stays."""
     height, width = front.shape
     for i in range(len(depth)):

@@ -57,7 +57,7 @@ WRONG_CALLS = [
     ({"ratio": 0.5}, "at least 1"),
     ({"ratio": np.nan}, "at least 1"),
     ({"ratio": np.inf}, "at least 1"),
-    ({"ratio": 1e30}, "4,294,967,296 at most"),
+    ({"ratio": 1e308}, "4,294,967,296 at most"),
     ({"num_points": 159}, "at least the 160 originals"),
     ({"num_points": -1}, "at least the 160 originals"),
     ({"num_points": 200.5}, "a whole number"),

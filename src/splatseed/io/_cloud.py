@@ -69,7 +69,7 @@ def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
         warnings.append(f"{num_nonfinite} points are not finite; they are left out when written.")
     if num_duplicates:
         warnings.append(
-            f"{num_duplicates} points repeat the position of another; they are left out when"
+            f"{num_duplicates:,} points repeat the position of another; they are left out when"
             " written."
         )
     if _is_too_far_out(points):

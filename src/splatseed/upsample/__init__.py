@@ -110,7 +110,7 @@ def upsample(
         (800, 100)
     """
     from splatseed.upsample.neighbors import prepare  # noqa: PLC0415  (loads SciPy and Numba)
-    from splatseed.upsample.trust import trusted_originals  # noqa: PLC0415
+    from splatseed.upsample.trust import trusted_originals  # noqa: PLC0415  (likewise)
 
     points = scene.points if isinstance(scene, Scene) else scene
     originals = points.originals
@@ -172,7 +172,7 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
                 found=f"{ratio:g}",
                 fix="Give --ratio 8 for eight times as many points.",
             )
-        num_points = round(ratio * num_original)
+        num_points = round(min(ratio * num_original, 2.0 * MAX_POINTS))
     if not isinstance(num_points, (int, np.integer)) or num_points > MAX_POINTS:
         raise ParameterError(
             f"a whole number of points, {MAX_POINTS:,} at most",

@@ -75,7 +75,7 @@ class Spline(PatchMethod):
     ) -> None:
         """Fit rows ``first:last`` and write S(u, v) of all their outputs into ``out`` [M]."""
         if self.basis == "bicubic":
-            from splatseed.upsample.spline_bicubic import bicubic_heights  # noqa: PLC0415
+            from splatseed.upsample.spline_bicubic import bicubic_heights  # noqa: PLC0415  (LAPACK)
 
             bicubic_heights(patches, first, last, out)
             return
@@ -87,7 +87,7 @@ class Spline(PatchMethod):
     def _smoothing(self, basis: PatchBasis, count: np.ndarray) -> Float64[np.ndarray, " rows"]:
         """The penalty's weight for each row."""
         if isinstance(self.smoothing, str):
-            from splatseed.upsample.spline_gcv import cross_validate  # noqa: PLC0415
+            from splatseed.upsample.spline_gcv import cross_validate  # noqa: PLC0415  (compiles)
 
             return cross_validate(basis, count)
         return np.full(len(basis.z), float(self.smoothing))
