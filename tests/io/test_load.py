@@ -151,7 +151,7 @@ def test_duplicates_are_found_exactly(scene_dir, rng):
     xyz = rng.integers(0, 8, (3000, 3)).astype(np.float64)
     rewrite_points(scene_dir, xyz)
     count = 3000 - len(np.unique(xyz, axis=0))
-    assert f"{count} points repeat" in warnings_of(scene_dir)
+    assert f"{count:,} points repeat" in warnings_of(scene_dir)
 
 
 def test_coordinates_beyond_float32s_resolution_are_told(scene_dir, rng):
