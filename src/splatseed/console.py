@@ -26,6 +26,7 @@ __all__ = [
 
 OUT = Console()
 ERR = Console(stderr=True)
+COMPILE = "compiling kernels"
 
 
 class StageClock:
@@ -35,6 +36,8 @@ class StageClock:
         self._bar: Bar | None = None
         self._tasks: dict[str, TaskID] = {}
         self._started: list[tuple[str, float]] = []
+        self._compiling = 0
+        self._before = COMPILE
 
     def __call__(self, stage: str, fraction: float) -> None:
         """Note that ``fraction`` of ``stage`` is done."""
@@ -55,16 +58,23 @@ class StageClock:
             total[stage] = total.get(stage, 0.0) + end - start
         return total
 
-    def announce_compilation(self) -> None:
-        """Say, once, that kernels are being compiled."""
-        if self._bar is not None and "compiling" not in self._tasks:
-            note = "compiling kernels (first use only, then cached)"
-            self._tasks["compiling"] = self._bar.add_task(note, total=None)
+    def begin_compilation(self) -> None:
+        """Count time as compilation, and show it; compilations can nest."""
+        self._compiling += 1
+        if self._compiling == 1:
+            self._before = self._started[-1][0] if self._started else COMPILE
+            self._started.append((COMPILE, time.perf_counter()))
+            if self._bar is not None and COMPILE not in self._tasks:
+                note = f"{COMPILE} (first use only, then cached)"
+                self._tasks[COMPILE] = self._bar.add_task(note, total=None)
 
-    def finish_compilation(self) -> None:
-        """Take the note away again."""
-        if self._bar is not None and "compiling" in self._tasks:
-            self._bar.remove_task(self._tasks.pop("compiling"))
+    def end_compilation(self) -> None:
+        """Go on with the stage that compilation came into."""
+        self._compiling -= 1
+        if self._compiling == 0:
+            self._started.append((self._before, time.perf_counter()))
+            if self._bar is not None and COMPILE in self._tasks:
+                self._bar.remove_task(self._tasks.pop(COMPILE))
 
     @contextmanager
     def shown_on(self, bar: Bar) -> Iterator[None]:
@@ -85,7 +95,8 @@ def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
     """
     clock = StageClock() if clock is None else clock
     if not ERR.is_terminal:
-        yield clock
+        with _compilation_shown(clock):
+            yield clock
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with (
@@ -98,15 +109,15 @@ def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
 
 @contextmanager
 def _compilation_shown(clock: StageClock) -> Iterator[None]:
-    """Show Numba's compilations, which make a first run slow, for what they are."""
+    """Tell the clock of Numba's compilations, which make a first run slow."""
     from numba.core import event  # noqa: PLC0415  (only commands that compute pay for Numba)
 
     class _Listener(event.Listener):
         def on_start(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
-            clock.announce_compilation()
+            clock.begin_compilation()
 
         def on_end(self, event: object) -> None:  # noqa: ARG002
-            clock.finish_compilation()
+            clock.end_compilation()
 
     with event.install_listener("numba:compile", _Listener()):
         yield

@@ -141,7 +141,7 @@ def find_problems(
     if cloud.isolated > MANY_ISOLATED * max(cloud.num_points, 1):
         found.append(
             f"{cloud.isolated:,} points ({cloud.isolated / cloud.num_points:.1%}) stand alone: "
-            "outliers or a sparse background; methods do not start from them"
+            "outliers or a sparse background; spline, mls and voronoi start nothing from them"
         )
     if cloud.num_points == 0:
         found.append("there are no points to upsample")

@@ -6,10 +6,12 @@ A ``Progress`` is any callable that takes a stage's name and the fraction of it 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import TypeAlias
 
-__all__ = ["Progress", "blocks", "silent"]
+__all__ = ["Progress", "blocks", "in_threads", "silent"]
 
 Progress: TypeAlias = Callable[[str, float], None]
 
@@ -25,3 +27,22 @@ def blocks(total: int, size: int, stage: str, progress: Progress) -> Iterator[tu
         stop = min(start + size, total)
         yield start, stop
         progress(stage, stop / total)
+
+
+def in_threads(
+    work: Callable[[int, int], None], total: int, size: int, stage: str, progress: Progress
+) -> None:
+    """Call ``work(start, stop)`` for the pieces of ``range(total)`` on all cores, reporting after each.
+
+    For work that releases the GIL. An interrupt is raised only when the pieces in hand are done:
+    SciPy's own ``workers`` leave theirs running on arrays that are then freed, which crashes.
+    """
+    progress(stage, 0.0)
+    starts = range(0, total, size)
+    pool = ThreadPoolExecutor(os.cpu_count())
+    try:
+        pieces = pool.map(lambda start: work(start, min(start + size, total)), starts)
+        for done, _ in enumerate(pieces, start=1):
+            progress(stage, done / len(starts))
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)

@@ -19,12 +19,14 @@ def training_commands(path: Path, written_format: SceneFormat) -> list[tuple[str
             the former.
 
     Example:
-        >>> dict(training_commands(Path("out"), "colmap"))["graphdeco"]
-        'python train.py -s out -m out-graphdeco --eval'
+        >>> dict(training_commands(Path("/data/out"), "colmap"))["graphdeco"]
+        'python train.py -s /data/out -m /data/out-graphdeco --eval'
     """
+    # Trainers are run from their own checkouts, so a relative path would miss.
+    path = path.absolute()
     scene = shlex.quote(str(path))
     result = shlex.quote(f"{path}-gsplat"), shlex.quote(f"{path}-graphdeco")
-    brush = ("Brush", f"brush_app {scene} --with-viewer --total-steps 30000")
+    brush = ("Brush", f"brush_app {scene} --with-viewer")
     opensplat = ("OpenSplat", f"./opensplat {scene} -n 30000")
     if written_format == "transforms":
         return [("nerfstudio", f"ns-train splatfacto --data {scene}"), brush, opensplat]

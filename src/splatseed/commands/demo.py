@@ -26,7 +26,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
 from splatseed.scene import Scene
 from splatseed.synthetic import Capture, make_capture, write_capture
-from splatseed.upsample import METHODS, upsample
+from splatseed.upsample import METHODS, planned_size, upsample
 
 __all__ = ["run"]
 
@@ -57,6 +57,7 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
     options = parse_options(Options, "demo", arguments)
+    planned_size(1, options.ratio, None)  # refuses a wrong ratio before a minute's work
     with (
         stage_display() as clock,
         output_folder(options.output, overwrite=options.overwrite) as folder,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,13 +20,22 @@ from splatseed.console import (
     print_pairs,
     stage_display,
 )
+from splatseed.errors import PointCloudError
 from splatseed.geometry import far_share
 from splatseed.io import WriteReport, load_scene, write_scene
 from splatseed.io.staging import check_output
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.trainers import training_commands
-from splatseed.upsample import DEFAULT_RATIO, METHODS, Profile, Upsampler, planned_size, upsample
+from splatseed.upsample import (
+    DEFAULT_RATIO,
+    METHODS,
+    Profile,
+    Upsampler,
+    configure,
+    planned_size,
+    upsample,
+)
 
 __all__ = ["parse", "run"]
 
@@ -98,11 +108,12 @@ def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
     options, methods = parse(arguments)
     method = methods[options.method]
+    planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     check_output(options.output, overwrite=options.overwrite, protect=(options.scene,))
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene)
-    _announce(options, scene, method)
+    _announce(options, scene, method, _idle(options, methods))
     with stage_display(clock):
         seeds = _upsample(options, scene, method, clock)
         clock("check", 0.0)
@@ -116,10 +127,12 @@ def run(arguments: list[str]) -> None:
     _summarise(options, scene, report, seconds, far)
 
 
-def _announce(options: Options, scene: Scene, method: Upsampler) -> None:
-    """Say what will be done, before it is done."""
+def _announce(options: Options, scene: Scene, method: Upsampler, idle: Sequence[str]) -> None:
+    """Say what will be done, before it is done, and which flags have no part in it."""
     for warning in scene.warnings:
         print_note(warning)
+    for name in idle:
+        print_note(f"--{name}.* flags change nothing with --method {options.method}.")
     ratio = _ratio(options)
     total = planned_size(len(scene.points), ratio, options.num_points)
     kind = scene.source.format if scene.source else "memory"
@@ -132,6 +145,14 @@ def _announce(options: Options, scene: Scene, method: Upsampler) -> None:
         markup=False,
         soft_wrap=True,
     )
+
+
+def _idle(options: Options, methods: dict[str, Upsampler]) -> list[str]:
+    """Methods whose flags were changed though they are not used."""
+    if options.preview:  # draws them all
+        return []
+    plain = {name: configure(name, options.profile) for name in methods}
+    return [n for n in methods if n != options.method and methods[n] != plain[n]]
 
 
 def _ratio(options: Options) -> float | None:
@@ -185,10 +206,13 @@ def _write_previews(
     """Two pictures: before and after, and every method side by side."""
     from splatseed.preview import preview_methods, preview_pair  # noqa: PLC0415  (Pillow)
 
-    clouds = {
-        name: seeds if name == options.method else _upsample(options, scene, method, clock)
-        for name, method in methods.items()
-    }
+    clouds = {}
+    for name, method in methods.items():
+        try:
+            done = name == options.method
+            clouds[name] = seeds if done else _upsample(options, scene, method, clock)
+        except PointCloudError:  # too few points for this one: the others are still worth showing
+            continue
     clock("preview", 0.0)
     preview_pair(scene, seeds, options.output / "preview.png", title=options.method)
     clock("preview", 0.5)
@@ -222,5 +246,7 @@ def _summarise(
     print_pairs("splatseed upsample", rows)
     for note in report.notes:
         print_note(note)
-    if scene.images:
+    if report.layout == "transforms":
+        print_note("gsplat's examples and graphdeco's code read COLMAP only: --format colmap.")
+    if scene.images and scene.source is not None and scene.source.image_dir is not None:
         print_commands("train it with", training_commands(options.output, report.layout))

@@ -6,7 +6,7 @@ that every 3DGS trainer reads: ``images/`` free of lens distortion, ``sparse/0/*
 cameras.
 
 Promise: the output appears whole or not at all, and every failure is one of ``splatseed.errors``.
-pycolmap is an optional dependency (``pip install "splatseed[sfm]"``), imported when it is needed.
+pycolmap is an optional dependency (``pip install "pycolmap>=4.0"``), imported when it is needed.
 
 Reproducibility: with one version of pycolmap on the CPU of one machine, features and verified matches
 are the same for the same images, options and seed. Mapping with several threads adds in an order of

@@ -27,7 +27,7 @@ MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 DeviceName: TypeAlias = Literal["auto", "cpu", "cuda"]
 
 _OLDEST = 4  # the first to pose an image and its rig in one call
-_INSTALL = 'Run: pip install --upgrade "splatseed[sfm]"'
+_INSTALL = 'Run: pip install --upgrade "pycolmap>=4.0"'
 _MAX_SEED = 2**31 - 1  # pycolmap takes an int
 
 

@@ -20,14 +20,14 @@ from scipy.spatial import cKDTree
 from splatseed.errors import PointCloudError
 from splatseed.jit import inline, kernel, parallel_range
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, blocks, silent
+from splatseed.progress import Progress, in_threads, silent
 
 __all__ = ["Bases", "Neighbors", "PreparedCloud", "draw_bases", "prepare", "sound_bases"]
 
 SPACING_NEIGHBORS = 6
 OUTLIER_NEIGHBORS = 16
 OUTLIER_FACTOR = 3.0
-QUERY_BLOCK = 1 << 16
+QUERY_BLOCK = 1 << 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +105,14 @@ class PreparedCloud:
         least = np.finfo(np.float64).eps * np.abs(self.xyz).max()
         row_of_rank = np.empty(len(self), np.int32)
         row_of_rank[self.rank] = np.arange(len(self), dtype=np.int32)
-        for start, stop in blocks(len(self), QUERY_BLOCK, "neighbours", self.progress):
-            found, ranks = self.tree.query(self.xyz[start:stop], k + 1, workers=-1)
+
+        def query(start: int, stop: int) -> None:
+            found, ranks = self.tree.query(self.xyz[start:stop], k + 1)
             # Column 0 is the row itself: rows are distinct, so nothing else is at distance 0.
             idx[start:stop] = row_of_rank[ranks[:, 1:]]
             np.maximum(found[:, 1:], least, out=distance[start:stop])
+
+        in_threads(query, len(self), QUERY_BLOCK, "neighbours", self.progress)
         return Neighbors(idx, distance)
 
 

@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from splatseed.progress import blocks, in_threads, silent
+
+
+def test_blocks_cover_the_range_and_report_each_end():
+    told = []
+    pieces = list(blocks(10, 4, "stage", lambda stage, done: told.append((stage, done))))
+    assert pieces == [(0, 4), (4, 8), (8, 10)]
+    assert told == [("stage", 0.0), ("stage", 0.4), ("stage", 0.8), ("stage", 1.0)]
+
+
+def test_threads_do_every_piece_once():
+    done = [0] * 1000
+
+    def work(start, stop):
+        for i in range(start, stop):
+            done[i] += 1
+
+    in_threads(work, 1000, 7, "stage", silent)
+    assert done == [1] * 1000
+
+
+def test_an_interrupt_waits_for_the_pieces_in_hand_and_drops_the_rest():
+    running, started, lock = set(), [], threading.Lock()
+
+    def work(start, stop):  # noqa: ARG001
+        with lock:
+            running.add(start)
+            started.append(start)
+        time.sleep(0.02)
+        with lock:
+            running.discard(start)
+
+    def interrupt(stage, done):  # noqa: ARG001
+        if done > 0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        in_threads(work, 1000, 1, "stage", interrupt)
+    assert not running
+    assert len(started) < 1000
+
+
+def test_an_error_in_a_thread_comes_out():
+    def work(start, stop):  # noqa: ARG001
+        if start == 50:
+            message = "at 50"
+            raise ValueError(message)
+
+    with pytest.raises(ValueError, match="at 50"):
+        in_threads(work, 100, 10, "stage", silent)
