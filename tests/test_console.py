@@ -36,10 +36,12 @@ def test_a_clock_that_never_ran_has_no_stages():
 def test_nothing_is_drawn_where_nobody_looks(capsys):
     with stage_display() as clock:
         clock("read", 0.5)
-        clock.announce_compilation()
-        clock.finish_compilation()
+        clock.begin_compilation()
+        clock.begin_compilation()  # they nest
+        clock.end_compilation()
+        clock.end_compilation()
     assert capsys.readouterr() == ("", "")
-    assert list(clock.seconds()) == ["read"]
+    assert list(clock.seconds()) == ["read", "compiling kernels"]
 
 
 @pytest.fixture
@@ -65,10 +67,9 @@ def test_a_terminal_sees_the_stages(terminal, capsys):
 def test_compilation_is_shown_once_and_taken_away(terminal):
     with stage_display() as clock:
         for _ in range(3):
-            clock.announce_compilation()
+            clock.begin_compilation()
+            clock.end_compilation()
         clock("fit", 0.1)
-        clock.finish_compilation()
-        clock.finish_compilation()
     assert "compiling kernels" in terminal.getvalue()
 
 
