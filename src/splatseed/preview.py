@@ -243,7 +243,7 @@ def _photo(scene: Scene, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"] | 
     try:
         with PillowImage.open(scene.source.image_dir / image.name) as file:
             return np.asarray(file.convert("RGB").resize(size, PillowImage.Resampling.LANCZOS))
-    except OSError:
+    except (OSError, PillowImage.DecompressionBombError):
         return None  # a scene without its pictures still has points to show
 
 

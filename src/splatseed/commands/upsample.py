@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,13 +23,11 @@ from splatseed.console import (
 )
 from splatseed.errors import PointCloudError
 from splatseed.geometry import far_share
-from splatseed.io import WriteReport, load_scene, write_scene
+from splatseed.io import WriteReport, find_usable, load_scene, write_scene
 from splatseed.io.staging import check_output
-from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.trainers import training_commands
 from splatseed.upsample import (
-    DEFAULT_RATIO,
     METHODS,
     Profile,
     Upsampler,
@@ -113,28 +112,34 @@ def run(arguments: list[str]) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene)
-    _announce(options, scene, method, _idle(options, methods))
+        scene = scene.replace(points=scene.points.originals)
+        usable = find_usable(scene.points)
+        total = planned_size(int(usable.keep.sum()), options.ratio, options.num_points)
+    _announce(options, scene, method, total, _idle(options, methods))
     with stage_display(clock):
-        seeds = _upsample(options, scene, method, clock)
+        # Points that writing leaves out are asked for on top, so that the output has ``total``.
+        asked = total + int((~usable.keep).sum())
+        seeds = upsample(scene, method, num_points=asked, seed=options.seed, progress=clock)
         clock("check", 0.0)
         new = seeds.xyz[len(scene.points) :]
         far = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
         clock("write", 0.0)
         report = _write(options, scene.replace(points=seeds), method)
         if options.preview:
-            _write_previews(options, scene, seeds, methods, clock)
+            shown = scene.replace(points=scene.points.select(usable.keep), tracks=None)
+            _write_previews(options, shown, total, methods, clock)
         seconds = clock.seconds()
     _summarise(options, scene, report, seconds, far)
 
 
-def _announce(options: Options, scene: Scene, method: Upsampler, idle: Sequence[str]) -> None:
+def _announce(
+    options: Options, scene: Scene, method: Upsampler, total: int, idle: Sequence[str]
+) -> None:
     """Say what will be done, before it is done, and which flags have no part in it."""
     for warning in scene.warnings:
         print_note(warning)
     for name in idle:
         print_note(f"--{name}.* flags change nothing with --method {options.method}.")
-    ratio = _ratio(options)
-    total = planned_size(len(scene.points), ratio, options.num_points)
     kind = scene.source.format if scene.source else "memory"
     parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]
     OUT.print(
@@ -155,23 +160,6 @@ def _idle(options: Options, methods: dict[str, Upsampler]) -> list[str]:
     return [n for n in methods if n != options.method and methods[n] != plain[n]]
 
 
-def _ratio(options: Options) -> float | None:
-    if options.ratio is None and options.num_points is None:
-        return DEFAULT_RATIO
-    return options.ratio
-
-
-def _upsample(options: Options, scene: Scene, method: Upsampler, clock: StageClock) -> PointCloud:
-    return upsample(
-        scene,
-        method,
-        ratio=_ratio(options),
-        num_points=options.num_points,
-        seed=options.seed,
-        progress=clock,
-    )
-
-
 def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
     return write_scene(
         scene,
@@ -190,7 +178,7 @@ def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
         "method": options.method,
         "profile": options.profile,
         "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]
-        "ratio": _ratio(options),
+        "ratio": options.ratio,
         "num_points_asked": options.num_points,
         "seed": options.seed,
     }
@@ -199,7 +187,7 @@ def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
 def _write_previews(
     options: Options,
     scene: Scene,
-    seeds: PointCloud,
+    total: int,
     methods: dict[str, Upsampler],
     clock: StageClock,
 ) -> None:
@@ -208,13 +196,14 @@ def _write_previews(
 
     clouds = {}
     for name, method in methods.items():
-        try:
-            done = name == options.method
-            clouds[name] = seeds if done else _upsample(options, scene, method, clock)
-        except PointCloudError:  # too few points for this one: the others are still worth showing
-            continue
+        # Too few points for one of the methods: the others are still worth showing.
+        with suppress(PointCloudError):
+            clouds[name] = upsample(
+                scene, method, num_points=total, seed=options.seed, progress=clock
+            )
     clock("preview", 0.0)
-    preview_pair(scene, seeds, options.output / "preview.png", title=options.method)
+    shown = clouds[options.method]
+    preview_pair(scene, shown, options.output / "preview.png", title=options.method)
     clock("preview", 0.5)
     preview_methods(scene, clouds, options.output / "preview_methods.png")
     clock("preview", 1.0)

@@ -5,7 +5,8 @@ Splatting trainer loads unchanged. Promise: malformed input and failing output r
 ``splatseed.errors``; importing this package loads neither Numba nor SciPy.
 """
 
+from splatseed.io._cloud import UsablePoints, find_usable
 from splatseed.io.load import load_scene
 from splatseed.io.write import WriteReport, write_scene
 
-__all__ = ["WriteReport", "load_scene", "write_scene"]
+__all__ = ["UsablePoints", "WriteReport", "find_usable", "load_scene", "write_scene"]

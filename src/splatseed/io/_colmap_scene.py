@@ -27,6 +27,7 @@ __all__ = [
     "read_colmap_scene",
     "read_model_cameras",
     "read_model_points",
+    "scene_root",
 ]
 
 _MODEL_FILES = ("cameras", "images", "points3D")
@@ -47,7 +48,7 @@ def _model_file(model_dir: Path, name: str) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
-def _scene_root(model_dir: Path) -> Path:
+def scene_root(model_dir: Path) -> Path:
     """The scene's folder: the model's, less ``sparse/0`` or ``sparse``, and ``colmap`` above."""
     parts = model_dir.absolute().parts
     levels = 1 if parts[-1] == "sparse" else 2 if parts[-2:-1] == ("sparse",) else 0
@@ -59,7 +60,7 @@ def _scene_root(model_dir: Path) -> Path:
 
 
 def read_colmap_scene(model_dir: Path) -> Scene:
-    root = _scene_root(model_dir)
+    root = scene_root(model_dir)
     intrinsics, images = read_model_cameras(model_dir)
     points, tracks, points_path = read_model_points(model_dir)
     image_dir = _find_image_dir(root, images)

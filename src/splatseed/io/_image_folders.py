@@ -7,6 +7,7 @@ never written to.
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
@@ -16,7 +17,10 @@ from splatseed.scene import Scene
 
 __all__ = ["bring", "frame_folders", "image_folders"]
 
-_SIBLINGS = ("images*", "masks*", "depths*")  # also images_2, images_4, ... of other resolutions
+_SIBLINGS = tuple(
+    f"{kind}{scale}" for kind in ("images", "masks", "depths") for scale in ("", "_2", "_4", "_8")
+)
+"""Folders by which trainers find pictures, at the resolutions they ask for."""
 
 
 def image_folders(scene: Scene) -> dict[str, Path]:
@@ -71,8 +75,7 @@ def _first_folders(paths: Iterable[str]) -> list[str]:
 
 
 def _siblings(root: Path) -> dict[str, Path]:
-    found = (path for pattern in _SIBLINGS for path in root.glob(pattern))
-    return {path.name: path for path in found if path.is_dir()}
+    return {name: root / name for name in _SIBLINGS if (root / name).is_dir()}
 
 
 def _linked(source: Path, target: Path) -> bool:
@@ -83,7 +86,16 @@ def _linked(source: Path, target: Path) -> bool:
 
 
 def _copy(source: Path, target: Path) -> None:
-    if source.is_dir():
-        shutil.copytree(source, target)
-    else:
-        shutil.copy2(source, target)
+    """Copy contents without modes: a copy of a read-only folder could not be removed again."""
+    if not source.is_dir():
+        shutil.copyfile(source, target)
+        return
+    for parent, _, names in os.walk(source, followlinks=True, onerror=_raise):
+        folder = target / Path(parent).relative_to(source)
+        folder.mkdir()
+        for name in names:
+            shutil.copyfile(Path(parent, name), folder / name)
+
+
+def _raise(error: OSError) -> None:
+    raise error

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from jaxtyping import Bool
 
 from splatseed.camera import Intrinsics
 from splatseed.io import colmap_binary
+from splatseed.io._colmap_scene import read_model_cameras
 from splatseed.io._image_folders import frame_folders, image_folders
 from splatseed.io._model_ids import Renumbered, renumber
 from splatseed.io._transforms_json import (
@@ -36,7 +36,7 @@ __all__ = ["write_colmap", "write_json", "write_transforms"]
 
 _ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json")  # gsplat's examples read them if present
 _MODEL_EXTRAS = ("depth_params.json", "test.txt")  # graphdeco's trainer reads them if present
-_RIG_FILES = ("rigs.bin", "frames.bin", "rigs.txt", "frames.txt")
+_RIG_FILES = ("rigs", "frames")
 
 
 def write_colmap(
@@ -101,25 +101,35 @@ def _copy_extras(scene: Scene, folder: Path, model_dir: Path) -> list[str]:
         return []
     extras = {source.root / name: folder / name for name in _ROOT_EXTRAS}
     extras |= {source.model_dir / name: model_dir / name for name in _MODEL_EXTRAS}
-    rigs = [source.model_dir / name for name in _RIG_FILES]
-    notes = []
-    if _has_all_images(scene, source.model_dir):
-        extras |= {path: model_dir / path.name for path in rigs}
-    elif any(path.is_file() for path in rigs):
-        notes.append("Rigs and frames were left out: they name images that are not in the scene.")
+    rigs, notes = _rigs(scene, source.model_dir)
+    extras |= {path: model_dir / path.name for path in rigs}
     for path, target in extras.items():
         if path.is_file():
             shutil.copyfile(path, target)
     return notes
 
 
+def _rigs(scene: Scene, model_dir: Path) -> tuple[list[Path], list[str]]:
+    """The model's rigs and frames if they hold for the output too, else a note why not."""
+    there = [model_dir / f"{name}.bin" for name in _RIG_FILES]
+    there = [path for path in there if path.is_file()]
+    if there and _has_all_images(scene, model_dir):
+        return there, []
+    if there:
+        return [], ["Rigs and frames were left out: the scene no longer has the same images."]
+    if any((model_dir / f"{name}.txt").is_file() for name in _RIG_FILES):
+        return [], [
+            "Rigs and frames were left out: as text they would not be read beside the binary model."
+        ]
+    return [], []
+
+
 def _has_all_images(scene: Scene, model_dir: Path) -> bool:
-    """Whether the scene still has as many images as its model."""
-    path = model_dir / "images.bin"
-    if not path.is_file():
-        return True  # a text model's rigs are not read beside our binary files
-    with path.open("rb") as file:
-        return file.read(8) == struct.pack("<Q", len(scene.images))
+    """Whether the scene still has the very images of its model."""
+    _, images = read_model_cameras(model_dir)
+    return {(im.image_id, im.name) for im in images} == {
+        (im.image_id, im.name) for im in scene.images
+    }
 
 
 def _model_notes(scene: Scene, model: Renumbered) -> list[str]:

@@ -7,12 +7,13 @@ becomes a sentence in ``Scene.warnings``, what is not raises one error.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io._cloud import cloud_warnings
-from splatseed.io._colmap_scene import find_model, read_colmap_scene
+from splatseed.io._colmap_scene import find_model, read_colmap_scene, scene_root
+from splatseed.io._manifest import mark_generated
 from splatseed.io._transforms_scene import read_transforms_scene
 from splatseed.io.ply import read_ply
 from splatseed.scene import Scene, SceneSource
@@ -27,15 +28,16 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     """Read a scene.
 
     Args:
-        path: A folder with a COLMAP model (``sparse/0``, ``sparse``, ``colmap/sparse/0`` or itself
-            the model), with ``transforms.json``, or with an RGB-D capture (``traj.txt``); or a
+        path: A folder with a COLMAP model (``sparse/0``, ``sparse``, ``colmap/sparse/0``, itself
+            the model, or ``0`` in it), with ``transforms.json``, or with an RGB-D capture (``traj.txt``); or a
             ``.json`` or ``.ply`` file. Where there are several, ``sparse`` goes before
             ``transforms.json``, and that before ``colmap/sparse/0``.
         require_points: Whether a scene without points is an error; else its cloud is empty.
 
     Returns:
         The scene in the world of its files, cameras in OpenCV axes. Points are as in the file,
-        non-finite ones and duplicates included; ``warnings`` tells of them.
+        non-finite ones and duplicates included; ``warnings`` tells of them. Points that splatseed
+        added before have ``source`` 255 (``GENERATED``) and no tracks.
 
     Raises:
         SceneNotFoundError: There is no scene, or it has no points.
@@ -51,7 +53,9 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
             fix="Check that you may read the folder and its files.",
         ) from None
     if require_points and not len(scene.points):
-        raise SceneNotFoundError(f"points in {path}", found="none", fix=_TRIANGULATE)
+        fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
+        raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
+    scene = mark_generated(scene)
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
 
 
@@ -62,7 +66,7 @@ def _read(path: Path) -> Scene:
         raise SceneNotFoundError(
             f"a scene at {path}", found="no such file or folder", fix="Check the path."
         )
-    first = find_model(path / "sparse" / "0", path / "sparse", path)
+    first = find_model(path / "sparse" / "0", path / "sparse", path, path / "0")
     if first is not None:
         return read_colmap_scene(first)
     if (path / _TRANSFORMS).is_file():
@@ -83,6 +87,12 @@ def _read_file(path: Path) -> Scene:
         ".json": read_transforms_scene,
     }
     reader = readers.get(path.suffix.lower())
+    if reader is None and find_model(path.parent) is not None:
+        raise SceneFormatError(
+            f"{path} to be a scene folder, a .ply or a .json file",
+            found="one file of a COLMAP model",
+            fix=f"Name the scene's folder: {scene_root(path.parent)}",
+        )
     if reader is None:
         raise SceneFormatError(
             f"{path} to be a scene folder, a .ply or a .json file",
@@ -93,15 +103,33 @@ def _read_file(path: Path) -> Scene:
 
 
 def _no_scene(path: Path) -> SceneNotFoundError:
-    near = sorted(
-        each.name for suffix in ("*.json", "*.ply", "*/sparse") for each in path.glob(suffix)
-    )
+    scenes = [each.name for each in sorted(path.iterdir()) if _is_scene(each)]
+    near = sorted(each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix))
+    fix = "Name the scene's folder, or a .ply or .json file itself."
+    if scenes:
+        found, fix = f"scenes in it: {_some(scenes)}", f"Name one of them: {path / scenes[0]}"
+    elif near:
+        found = f"only {_some(near)}"
+    else:
+        found = "none of them"
+        fix += " For photographs alone, run: splatseed sfm IMAGES -o SCENE."
     return SceneNotFoundError(
         f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS} or traj.txt in {path}",
-        found=f"only {', '.join(near[:5])}" if near else "none of them",
-        fix="Name the scene's folder, or a .ply or .json file itself. For photographs alone, run:"
-        " splatseed sfm IMAGES -o SCENE.",
+        found=found,
+        fix=fix,
     )
+
+
+def _is_scene(folder: Path) -> bool:
+    model_dirs = (folder / "sparse/0", folder / "sparse", folder, folder / "colmap/sparse/0")
+    markers = (folder / _TRANSFORMS, folder / "traj.txt")
+    return find_model(*model_dirs) is not None or any(each.is_file() for each in markers)
+
+
+def _some(names: Sequence[str]) -> str:
+    """The first five names, and how many more there are."""
+    more = f" and {len(names) - 5:,} more" if len(names) > 5 else ""
+    return ", ".join(names[:5]) + more
 
 
 def _read_bare_ply(path: Path) -> Scene:

@@ -3,12 +3,13 @@
 Notation: the *target* is what the user named, the *partial* a hidden sibling ``.NAME.partial-XXXX``
 that is written first and renamed to the target at the end. Promise: whatever interrupts the writing
 (an error, a full disk, Ctrl-C), the partial is removed and an older output is still there unharmed;
-an ``OSError`` becomes an ``OutputError`` that says what to do.
+an ``OSError`` becomes an ``OutputError`` that says what to do, and what cannot be removed is named.
 """
 
 from __future__ import annotations
 
 import errno
+import os
 import secrets
 import shutil
 from collections.abc import Iterator, Sequence
@@ -16,11 +17,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatseed.errors import OutputError
+from splatseed.io._manifest import MANIFEST, add_files, unlisted_files
 
-__all__ = ["MANIFEST", "atomic_file", "check_output", "output_folder"]
-
-MANIFEST = "splatseed.json"
-"""The file that marks a folder as written by splatseed: only such a folder is ever replaced."""
+__all__ = ["MANIFEST", "add_files", "atomic_file", "check_output", "output_folder"]
 
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -33,7 +32,8 @@ def output_folder(
     """A folder to write into that appears at ``path`` when the block ends without an error.
 
     Missing parents are made. An empty folder at ``path`` is used up; a full one is replaced only
-    with ``overwrite`` and only if it holds ``splatseed.json``, so the block should write one.
+    with ``overwrite`` and only if it holds ``splatseed.json``, so the block should write one. If
+    that lists ``files``, the folder may hold nothing else.
 
     Args:
         path: Where the output is to be.
@@ -55,8 +55,8 @@ def output_folder(
             partial.mkdir()
             yield partial
             _put_in_place(partial, target)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
+        except BaseException as error:
+            _remove_after(error, partial)
             raise
 
 
@@ -72,28 +72,24 @@ def check_output(path: Path, *, overwrite: bool = False, protect: Sequence[Path]
 
 
 @contextmanager
-def atomic_file(path: Path, *, overwrite: bool = True) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """A file name to write to; the file appears at ``path`` when the block ends without an error.
 
-    The name keeps the suffix, by which image writers choose the format. Missing parents are made.
+    The name keeps the suffix, by which image writers choose the format. Missing parents are made,
+    and a file that is there is replaced.
 
     Args:
         path: Where the file is to be.
-        overwrite: Whether a file there may be replaced.
 
     Yields:
         The name of the partial file, which does not exist yet.
 
     Raises:
-        OutputError: ``path`` is a folder or is taken, or writing failed.
+        OutputError: ``path`` is a folder, or writing failed.
     """
     target = Path(path).resolve()
-    if target.is_dir() or (target.exists() and not overwrite):
-        raise OutputError(
-            f"a file name that is free at {target}",
-            found="a folder" if target.is_dir() else "a file",
-            fix="Choose another name, or pass --overwrite to replace a file.",
-        )
+    if target.is_dir():
+        raise OutputError(f"a file name at {target}", found="a folder", fix="Choose another name.")
     partial = _partial_name(target, target.suffix)
     with _oserror_as_output_error(target), _parents(target.parent):
         try:
@@ -136,9 +132,20 @@ def _check_replaceable(target: Path, *, overwrite: bool) -> None:
         fix = "Choose another folder, or empty this one yourself."
     elif not overwrite:
         found, fix = "an earlier output", "Pass --overwrite to replace it, or choose another name."
+    elif foreign := _foreign_files(target):
+        found = f"an earlier output with files that splatseed did not write: {foreign}"
+        fix = "Move them elsewhere, or choose another name."
     else:
         return
     raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
+
+
+def _foreign_files(target: Path) -> str:
+    """Up to three files of the user's in an earlier output, and how many more there are."""
+    with _oserror_as_output_error(target):
+        names = unlisted_files(target)
+    more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more
 
 
 @contextmanager
@@ -161,13 +168,59 @@ def _put_in_place(partial: Path, target: Path) -> None:
         partial.rename(target)
         return
     old = target.with_name(f".{target.name}.old-{secrets.token_hex(4)}")
-    target.rename(old)
     try:
+        target.rename(old)
         partial.rename(target)
     except BaseException:
-        old.rename(target)
+        if not target.exists():
+            old.rename(target)
         raise
-    shutil.rmtree(old, ignore_errors=True)
+    finally:
+        if old.exists():
+            _discard(old, target)
+
+
+def _discard(old: Path, target: Path) -> None:
+    """Remove the earlier output, now that the new one is in its place."""
+    try:
+        _remove_tree(old)
+    except OSError as error:
+        raise OutputError(
+            f"the earlier output, set aside as {old}, to be removed",
+            found=_reason(error),
+            fix=f"Remove it yourself; the new output is complete at {target}.",
+        ) from error
+
+
+def _remove_after(failure: BaseException, partial: Path) -> None:
+    """Remove what an interrupted block has written, or say where it is."""
+    try:
+        _remove_tree(partial)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        cause = f"{type(failure).__name__}: {failure}".rstrip(": ")
+        raise OutputError(
+            f"{partial}, left by a failure ({cause}), to be removed",
+            found=_reason(error),
+            fix="Remove it yourself before you try again.",
+        ) from failure
+
+
+def _remove_tree(folder: Path) -> None:
+    """Remove a folder of our own, also where folders in it are read-only."""
+    folder.chmod(0o700)
+    for parent, names, _ in os.walk(folder):
+        for name in names:
+            child = Path(parent, name)
+            if not child.is_symlink():  # its target is the user's
+                child.chmod(0o700)
+    shutil.rmtree(folder)
+
+
+def _reason(error: OSError) -> str:
+    where = f" at {error.filename}" if error.filename else ""
+    return f"{error.strerror or type(error).__name__}{where}"
 
 
 @contextmanager
@@ -175,7 +228,6 @@ def _oserror_as_output_error(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        where = f" at {error.filename}" if error.filename else ""
         if error.errno in _NO_SPACE:
             fix = "Free some space, or choose another disk."
         elif error.errno in _NO_PERMISSION:
@@ -184,6 +236,6 @@ def _oserror_as_output_error(target: Path) -> Iterator[None]:
             fix = "Check the disk and try again."
         raise OutputError(
             f"{target} to be written",
-            found=f"{error.strerror or type(error).__name__}{where}",
+            found=_reason(error),
             fix=f"{fix} Nothing was left behind.",
         ) from error

@@ -18,7 +18,7 @@ from PIL import Image as PillowImage
 from splatseed.camera import Camera, Intrinsics, quat_from_rotation
 from splatseed.errors import ParameterError
 from splatseed.io import write_scene
-from splatseed.io.staging import output_folder
+from splatseed.io.staging import add_files, output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene, Tracks
 from splatseed.synthetic.raycast import render_views, visible
@@ -140,6 +140,7 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
             (partial / folder).mkdir()
             for image, array in zip(capture.scene.images, arrays, strict=True):
                 PillowImage.fromarray(array).save(partial / folder / image.name)
+        add_files(partial, ("images", "depths"))
     return Path(path)
 
 

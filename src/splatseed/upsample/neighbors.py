@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
+from splatseed.io import find_usable
 from splatseed.jit import inline, kernel, parallel_range
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, in_threads, silent
 
 __all__ = ["Bases", "Neighbors", "PreparedCloud", "draw_bases", "prepare", "sound_bases"]
@@ -129,15 +130,14 @@ def prepare(
     Raises:
         PointCloudError: No finite original is left.
     """
-    keep = points.finite & (points.source == 0)
-    if not keep.any():
+    originals = np.flatnonzero(points.source == ORIGINAL)
+    keep_idx = originals[find_usable(points.select(originals)).keep]
+    if len(keep_idx) == 0:
         raise PointCloudError(
             "at least one original point with finite coordinates",
             found=f"{len(points)} points, none of them finite and original",
             fix="Check that the scene holds the point cloud you meant.",
         )
-    keep_idx = np.flatnonzero(keep)
-    keep_idx = keep_idx[_first_of_equals(points.xyz[keep_idx])]
     center = points.xyz[keep_idx].mean(axis=0, dtype=np.float64)
     xyz = points.xyz[keep_idx].astype(np.float64) - center
     tree = cKDTree(xyz, balanced_tree=False)
@@ -145,30 +145,6 @@ def prepare(
     rows = keep_idx[rank]
     trusted_rows = np.ones(len(rows), bool) if trusted is None else trusted[rows]
     return PreparedCloud(xyz[rank], points.rgb[rows], rank, trusted_rows, center, tree, progress)
-
-
-def _first_of_equals(xyz: np.ndarray) -> np.ndarray:
-    """Sorted indices [M] of the first point of each set of exactly equal ones."""
-    xyz = np.ascontiguousarray(xyz + np.float32(0))  # -0.0 and 0.0 are the same place
-    suspects = np.flatnonzero(_hash_collides(xyz))
-    rows = xyz[suspects].view(np.dtype((np.void, xyz.itemsize * 3))).ravel()
-    first = np.ones(len(xyz), bool)
-    first[suspects] = False
-    first[suspects[np.unique(rows, return_index=True)[1]]] = True
-    return np.flatnonzero(first)
-
-
-def _hash_collides(xyz: np.ndarray) -> np.ndarray:
-    """Which points share a 64-bit hash with another, bool [N]: ten times faster than sorting rows."""
-    bits = xyz.view(np.uint32).astype(np.uint64)
-    odd = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-    mixed = bits * odd
-    hashes = mixed[:, 0] ^ (mixed[:, 1] >> np.uint64(17)) ^ (mixed[:, 2] << np.uint64(13))
-    ordered = np.sort(hashes)
-    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
-    if repeated.size == 0:
-        return np.zeros(len(xyz), bool)
-    return np.asarray(np.isin(hashes, repeated))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,12 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import cast
 
 from splatseed.errors import ParameterError
+from splatseed.pointcloud import GENERATED
 from splatseed.upsample.method import Upsampler
 
 __all__ = ["METHODS", "source_code"]
 
 GROUP = "splatseed.methods"
-PLUGIN_SOURCE = 255
 
 BUILT_IN = {
     "linear": "splatseed.upsample.linear:Linear",
@@ -68,4 +68,4 @@ METHODS = MethodRegistry()
 
 def source_code(name: str) -> int:
     """The ``PointCloud.source`` code of a method; 255 for every method of a third party."""
-    return SOURCE_CODES.get(name, PLUGIN_SOURCE)
+    return SOURCE_CODES.get(name, GENERATED)
