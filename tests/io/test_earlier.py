@@ -1,0 +1,49 @@
+"""Points of an earlier upsampling are told from the originals, and never grow new ones."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from splatseed import load_scene, upsample, write_scene
+from splatseed.pointcloud import GENERATED
+from splatseed.synthetic import make_capture
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_capture(0, 6, 96, 72).scene
+
+
+@pytest.mark.parametrize("layout", ["colmap", "transforms"])
+def test_an_output_knows_its_originals(scene, tmp_path, layout):
+    seeds = upsample(scene, "mls", ratio=4)
+    write_scene(scene.replace(points=seeds), tmp_path / "out", format=layout)
+    again = load_scene(tmp_path / "out")
+    n = len(scene.points)
+    assert np.array_equal(again.points.source == GENERATED, np.arange(4 * n) >= n)
+    assert any("upsampled before" in warning for warning in again.warnings)
+    assert again.tracks is None or len(again.tracks) == n
+    more = upsample(again, "linear", ratio=2)
+    assert len(more) == 2 * n
+    write_scene(again.replace(points=more), tmp_path / "more")
+    assert len(load_scene(tmp_path / "more").points.originals) == n
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"num_points": 1, "num_original": 1}', '{"num_points": "x"}', "\xff"]
+)
+def test_a_manifest_that_does_not_fit_says_nothing(scene, tmp_path, text):
+    write_scene(scene, tmp_path / "out")
+    (tmp_path / "out" / "splatseed.json").write_text(text, encoding="latin-1")
+    assert not load_scene(tmp_path / "out").points.source.any()
+
+
+def test_a_cloud_that_was_changed_since_is_all_originals(scene, tmp_path):
+    write_scene(scene.replace(points=upsample(scene, "linear", ratio=2)), tmp_path / "out")
+    manifest = tmp_path / "out" / "splatseed.json"
+    facts = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps({**facts, "num_points": facts["num_points"] + 1}))
+    assert not load_scene(tmp_path / "out").points.source.any()
