@@ -120,9 +120,7 @@ def _count_pairs(means2d, conics, reach, columns, rows, count):  # type: ignore[
         total = 0
         first_row, last_row = _rows(a, b, c, reach[g], means2d[g, 1], rows)
         for row in range(first_row, last_row):
-            first, last = _row_range(
-                a, b, c, reach[g], means2d[g, 0], means2d[g, 1], row, columns
-            )
+            first, last = _row_range(a, b, c, reach[g], means2d[g, 0], means2d[g, 1], row, columns)
             total += max(last - first, 0)
         count[g] = total
 

@@ -119,9 +119,7 @@ def _exponent(records, r, dx, dy):
     """-sigma of a Gaussian at sixteen pixels."""
     a, b, c = splat(records[r + 2]), splat(records[r + 3]), splat(records[r + 4])
     square = fma(multiply(a, dx), dx, multiply(multiply(c, dy), dy))
-    return subtract(
-        multiply(splat(-HALF), square), multiply(multiply(b, dx), dy)
-    )
+    return subtract(multiply(splat(-HALF), square), multiply(multiply(b, dx), dy))
 
 
 @inline
@@ -170,15 +168,16 @@ def backward(
 
 
 @inline
-def _backward_pair(
-    records, r, slot, block, x, y, lane_x, lane_y, gradient, behind, passing, sums
-):
+def _backward_pair(records, r, slot, block, x, y, lane_x, lane_y, gradient, behind, passing, sums):
     """Add one Gaussian to a tile's four blocks; returns whether light still passes somewhere."""
     zero = splat(ZERO)
     gx, gy, ga, gb, gc, go = zero, zero, zero, zero, zero, zero
     g0, g1, g2, g3, ax, ay = zero, zero, zero, zero, zero, zero
     touched = passes = False
-    mean_x, mean_y = splat(records[r] - np.float32(x) - HALF), splat(records[r + 1] - np.float32(y) - HALF)
+    mean_x, mean_y = (
+        splat(records[r] - np.float32(x) - HALF),
+        splat(records[r + 1] - np.float32(y) - HALF),
+    )
     lowest = splat(records[r + 6])
     for q in range(BLOCKS):
         px = add(load(lane_x, 0), splat(np.float32(4 * (q % 2))))
@@ -208,9 +207,7 @@ def _backward_pair(
                 store(behind, LANES * (block + q), far)
                 g0, g1 = fma(gained, v0, g0), fma(gained, v1, g1)
                 g2, g3 = fma(gained, v2, g2), fma(gained, v3, g3)
-                slope = subtract(
-                    multiply(t, shade), divide(far, subtract(splat(ONE), alpha))
-                )
+                slope = subtract(multiply(t, shade), divide(far, subtract(splat(ONE), alpha)))
                 slope = select_greater(gained, zero, slope, zero)
                 # A clamped alpha is constant.
                 slope = select_greater(raw, splat(MAX_ALPHA), zero, slope)
@@ -228,9 +225,7 @@ def _backward_pair(
     if touched:
         half = splat(HALF)
         ga, gc = multiply(ga, half), multiply(gc, half)
-        row = lane_sums(
-            (gx, gy, ga, gb, gc, go, g0, g1, g2, g3, ax, ay, zero, zero, zero, zero)
-        )
+        row = lane_sums((gx, gy, ga, gb, gc, go, g0, g1, g2, g3, ax, ay, zero, zero, zero, zero))
         store(sums, slot, row)
     return passes
 

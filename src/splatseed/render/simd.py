@@ -225,8 +225,7 @@ def _add_halves(builder, a, b, width):
 
 # exp(x) on [-0.7, 0] to 8e-8 relative (minimax, degree 5); exp(h) = exp(h / 8)^8.
 _EXP = [
-    np.float32(c)
-    for c in (0.99999992, 0.99999255, 0.49988271, 0.16597434, 0.03977302, 0.00584696)
+    np.float32(c) for c in (0.99999992, 0.99999255, 0.49988271, 0.16597434, 0.03977302, 0.00584696)
 ]
 
 
