@@ -31,9 +31,9 @@ CHUNKS = 16
 class TileLists(NamedTuple):
     """The pairs of one view: G visible Gaussians in depth order, P pairs, t tiles."""
 
-    slot_start: Int64[np.ndarray, "G+1"]
+    slot_start: Int64[np.ndarray, " G+1"]
     """First slot of each Gaussian (by depth rank), [G + 1]."""
-    tile_start: Int64[np.ndarray, "t+1"]
+    tile_start: Int64[np.ndarray, " t+1"]
     """First list entry of each tile, [t + 1]."""
     listed_rank: Int32[np.ndarray, " P"]
     """Depth rank of each list entry, [P]."""

@@ -42,8 +42,10 @@ def _array(tensor: Tensor) -> np.ndarray:
 
 
 class Project(torch.autograd.Function):
-    """means [N, 3], quats [N, 4], scales [N, 3], opacities [N], viewmat [4, 4] ->
-    radii [N, 2], means2d [N, 2], depths [N], conics [N, 3], compensations [N].
+    """3D Gaussians to one camera's image plane.
+
+    Inputs: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], viewmat [4, 4], lens.
+    Outputs: radii [N, 2], means2d [N, 2], depths [N], conics [N, 3], compensations [N].
 
     Opacities only bound the radii; they get no gradient here, as in gsplat.
     """
@@ -58,13 +60,14 @@ class Project(torch.autograd.Function):
         viewmat: Tensor,
         lens: Lens,
     ) -> tuple[Tensor, ...]:
+        """Run the kernel and keep what backward needs."""
         arrays = [_array(t) for t in (means, quats, scales, opacities, viewmat)]
         n = len(means)
         radii, out = (
             np.empty((n, 2), np.int32),
             [np.zeros(shape, np.float32) for shape in ((n, 2), (n,), (n, 3), (n,))],
         )
-        projection.project(*arrays, *lens, radii, *out)
+        projection.project(*arrays, *lens, radii, *out)  # type: ignore[call-arg]  # star arguments
         ctx.save_for_backward(means, quats, scales, viewmat)
         ctx.lens, ctx.radii = lens, radii
         results = [torch.from_numpy(each) for each in (radii, *out)]
@@ -74,11 +77,12 @@ class Project(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        """Gradients of the inputs."""
         means, quats, scales, viewmat = (_array(t) for t in ctx.saved_tensors)
         lens: Lens = ctx.lens
         results = [np.zeros(each.shape, np.float32) for each in (means, quats, scales)]
         by_view = np.zeros((projection.CHUNKS, 4, 4))
-        projection.project_vjp(
+        projection.project_vjp(  # type: ignore[call-arg]  # star arguments
             means, quats, scales, viewmat, lens.K, lens.width, lens.height, lens.eps2d, ctx.radii,
             *(_array(g) for g in gradients[1:]), *results, by_view,
         )  # fmt: skip
@@ -87,12 +91,13 @@ class Project(torch.autograd.Function):
 
 
 class Harmonics(torch.autograd.Function):
-    """directions [N, 3], coefficients [N, K, 3], visible [N], degree -> colours [N, 3]."""
+    """Directions [N, 3], coefficients [N, K, 3], visible [N], degree to colours [N, 3]."""
 
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any, directions: Tensor, coefficients: Tensor, visible: Tensor, degree: int
     ) -> Tensor:
+        """Run the kernel and keep what backward needs."""
         colors = np.empty((len(directions), 3), np.float32)
         sh.harmonics(
             _array(directions), _array(coefficients), _array(visible), (degree + 1) ** 2, colors
@@ -104,6 +109,7 @@ class Harmonics(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_colors: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        """Gradients of the inputs."""
         directions, coefficients, visible = (_array(t) for t in ctx.saved_tensors)
         results = [np.zeros(each.shape, np.float32) for each in (directions, coefficients)]
         terms = (ctx.degree + 1) ** 2
@@ -129,8 +135,10 @@ class _Prepared(NamedTuple):
 
 
 class Blend(torch.autograd.Function):
-    """means2d [G, 2], conics [G, 3], colours [G, D], opacities [G], background [D] or None,
-    depths [G], radii [G, 2], width, height, on_absgrad -> image [H, W, D], alphas [H, W].
+    """Projected Gaussians to an image.
+
+    Inputs: means2d [G, 2], conics [G, 3], colours [G, D], opacities [G], background [D] or None,
+    depths [G], radii [G, 2], width, height, on_absgrad. Outputs: image [H, W, D], alphas [H, W].
 
     ``on_absgrad``: None, or called by backward with the summed absolute gradients of the 2D means,
     [G, 2].
@@ -150,6 +158,7 @@ class Blend(torch.autograd.Function):
         height: int,
         on_absgrad: Callable[[Tensor], None] | None,
     ) -> tuple[Tensor, Tensor]:
+        """Run the kernel and keep what backward needs."""
         prepared = _prepare(means2d, conics, opacities, depths, radii, width, height)
         parts, transmittance = [], np.empty(0, np.float32)
         for first in range(0, colors.shape[1], blending.CHANNELS):
@@ -170,6 +179,7 @@ class Blend(torch.autograd.Function):
     def backward(  # type: ignore[override]
         ctx: Any, d_image: Tensor, d_alphas: Tensor
     ) -> tuple[Tensor | None, ...]:
+        """Gradients of the inputs."""
         means2d, conics, colors, opacities, background = ctx.saved_tensors
         prepared: _Prepared = ctx.prepared
         gradient = _array(d_image)

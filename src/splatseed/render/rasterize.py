@@ -193,7 +193,7 @@ def _background(backgrounds: Tensor | None, render_mode: RenderMode) -> Tensor |
 
 
 def _info(views: Sequence[_View], packed: bool, **facts: int) -> dict[str, Any]:
-    """gsplat's dictionary: stacked over cameras, or only what is visible, camera by camera."""
+    """The dictionary of gsplat: stacked over cameras, or only what is visible, camera by camera."""
     info: dict[str, Any] = {**facts, "n_cameras": len(views), "camera_ids": None}
     info["gaussian_ids"] = None
     if not packed:

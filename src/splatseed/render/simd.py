@@ -88,7 +88,7 @@ def _call(builder, name, arguments):
 
 @intrinsic
 def fma(typing_context, a, b, c):  # noqa: ARG001
-    """a b + c, rounded once."""
+    """The product a b plus c, rounded once."""
 
     def generate(context, builder, signature, arguments):  # noqa: ARG001
         return _call(builder, "fma", arguments)
