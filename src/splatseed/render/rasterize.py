@@ -8,7 +8,6 @@ cameras, distributed rendering, rolling shutter) is refused, never ignored.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import Enum
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
@@ -16,13 +15,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseed.errors import ParameterError
+from splatseed.render.arguments import (
+    check_absgrad,
+    check_numbers,
+    check_tensors,
+    check_unsupported,
+)
 from splatseed.render.functions import Blend, Harmonics, Lens, Project
-from splatseed.render.harmonics import MAX_DEGREE
 
 __all__ = ["rasterization"]
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RasterizeMode = Literal["classic", "antialiased"]
 GSPLAT_TILE = 16
 """What ``info`` reports as the size of a tile."""
 
@@ -48,7 +52,7 @@ def rasterization(
     render_mode: RenderMode = "RGB",
     sparse_grad: bool = False,
     absgrad: bool = False,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
+    rasterize_mode: RasterizeMode = "classic",
     channel_chunk: int = 32,
     **unsupported: Any,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
@@ -85,7 +89,8 @@ def rasterization(
         ``packed`` camera_ids and gaussian_ids.
 
     Raises:
-        ParameterError: An argument that the CPU rasteriser does not support.
+        ParameterError: An argument that the CPU rasteriser does not support, or tensors that are not
+            float32 or whose shapes do not go together.
 
     Example:
         >>> import torch
@@ -106,7 +111,16 @@ def rasterization(
             far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, backgrounds, render_mode,
             sparse_grad, absgrad, rasterize_mode, channel_chunk, **unsupported,
         )  # fmt: skip
-    _refuse(unsupported, sh_degree)
+    check_unsupported(unsupported)
+    check_numbers(
+        width, height, near_plane, eps2d, sh_degree,
+        render_mode=(render_mode, RenderMode), rasterize_mode=(rasterize_mode, RasterizeMode),
+    )  # fmt: skip
+    check_tensors(
+        {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors,
+         "viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds},
+        sh_degree,
+    )  # fmt: skip
     antialiased = rasterize_mode == "antialiased"
     views = [
         _project(
@@ -120,6 +134,7 @@ def rasterization(
         _with_depth(_colors(means, colors, viewmats, camera, view, sh_degree), view, render_mode)
         for camera, view in enumerate(views)
     ]
+    check_absgrad(absgrad, shades[0].shape[1])
     info = _info(views, packed, width=width, height=height, tile_size=tile_size)
     images, alphas = _blend(views, shades, info, _background(backgrounds, render_mode), absgrad)
     if render_mode in {"ED", "RGB+ED"}:
@@ -169,8 +184,8 @@ def _colors(
     """Colours of N Gaussians in one camera, [N, D]."""
     if sh_degree is None:
         return colors if colors.dim() == 2 else colors[camera]
-    rotation, translation = viewmats[camera, :3, :3], viewmats[camera, :3, 3]
-    directions = means + rotation.T @ translation  # less the camera's centre, -R' t
+    # The general inverse, as gsplat takes it: the rigid one has another gradient off the rotations.
+    directions = means - torch.linalg.inv_ex(viewmats[camera]).inverse[:3, 3]
     coefficients = colors if colors.dim() == 3 else colors[camera]
     shades: Tensor = Harmonics.apply(directions, coefficients, view.seen, sh_degree)  # type: ignore[no-untyped-call]
     return torch.clamp_min(shades + 0.5, 0.0)
@@ -236,20 +251,3 @@ def _blend(
 
 def _keep_absgrad(means2d: Any, rows: Any, gradient: Tensor) -> None:
     means2d.absgrad[rows] = gradient
-
-
-def _refuse(unsupported: dict[str, Any], sh_degree: int | None) -> None:
-    """Raise for what only gsplat's CUDA code does."""
-    if sh_degree is not None and not 0 <= sh_degree <= MAX_DEGREE:
-        raise ParameterError(
-            f"an sh_degree from 0 to {MAX_DEGREE} on the CPU",
-            found=str(sh_degree),
-            fix="Render with fewer coefficients, or on CUDA.",
-        )
-    for name, value in unsupported.items():
-        if value not in (None, False, "pinhole") and not isinstance(value, Enum):
-            raise ParameterError(
-                f"{name} to be left at its default on the CPU",
-                found=repr(value),
-                fix="Render on CUDA, or leave it out.",
-            )
