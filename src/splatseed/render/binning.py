@@ -82,7 +82,7 @@ def list_tiles(
 
 @inline
 def _row_range(a, b, c, reach, mx, my, row, columns):  # type: ignore[no-untyped-def]
-    """First and last-but-one tile column that an ellipse touches in one row of tiles.
+    """First and one-past-last tile column that an ellipse touches in one row of tiles.
 
     The ellipse is {d : (a dx^2 + 2 b dx dy + c dy^2) / 2 <= reach}, d the pixel less the mean. Its
     extent along x within the strip of the row's pixel centres is at its own extreme point, where
@@ -90,6 +90,8 @@ def _row_range(a, b, c, reach, mx, my, row, columns):  # type: ignore[no-untyped
     """
     low, high = row * TILE + 0.5 - my, row * TILE + (TILE - 0.5) - my
     det = a * c - b * b
+    if not det > 0.0:
+        return 0, columns
     y_max = math.sqrt(2.0 * reach * a / det)
     if low > y_max or high < -y_max:
         return 0, 0
@@ -99,18 +101,32 @@ def _row_range(a, b, c, reach, mx, my, row, columns):  # type: ignore[no-untyped
     right = (-b * at_right + math.sqrt(max(2.0 * reach * a - det * at_right * at_right, 0.0))) / a
     left = (-b * at_left - math.sqrt(max(2.0 * reach * a - det * at_left * at_left, 0.0))) / a
     # A pixel's slack, in case rounding moved the edge past a pixel centre.
-    first = math.floor((mx + left - 0.5 - 0.01) / TILE)
-    last = math.floor((mx + right - 0.5 + 0.01) / TILE)
-    return max(int(first), 0), min(int(last) + 1, columns)
+    return _clipped(mx + left - 0.5 - 0.01, mx + right - 0.5 + 0.01, columns)
 
 
 @inline
 def _rows(a, b, c, reach, my, rows):  # type: ignore[no-untyped-def]
-    """First and last-but-one row of tiles that an ellipse touches."""
-    y_max = math.sqrt(2.0 * reach * a / (a * c - b * b))
-    first = math.floor((my - y_max - 0.5 - 0.01) / TILE)
-    last = math.floor((my + y_max - 0.5 + 0.01) / TILE)
-    return max(int(first), 0), min(int(last) + 1, rows)
+    """First and one-past-last row of tiles that an ellipse touches.
+
+    All of them where float32 has rounded the conic to one that is no ellipse (a needle or a sheet of
+    thousands of pixels).
+    """
+    det = a * c - b * b
+    if not det > 0.0:
+        return 0, rows
+    y_max = math.sqrt(2.0 * reach * a / det)
+    return _clipped(my - y_max - 0.5 - 0.01, my + y_max - 0.5 + 0.01, rows)
+
+
+@inline
+def _clipped(low, high, tiles):  # type: ignore[no-untyped-def]
+    """First and one-past-last of the tiles between two pixels.
+
+    Clipped while still floats: the pixels of a giant overflow integers.
+    """
+    first = min(max(low / TILE, 0.0), np.float64(tiles))
+    last = min(max(high / TILE + 1.0, 0.0), np.float64(tiles))
+    return int(first), int(last)
 
 
 @kernel

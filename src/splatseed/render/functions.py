@@ -22,6 +22,8 @@ from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles
 
 __all__ = ["Blend", "Harmonics", "Lens", "Project"]
 
+FARTHEST = np.log(np.float32(255.0))
+
 
 class Lens(NamedTuple):
     """What of a camera is not differentiated."""
@@ -159,7 +161,7 @@ class Blend(torch.autograd.Function):
         on_absgrad: Callable[[Tensor], None] | None,
     ) -> tuple[Tensor, Tensor]:
         """Run the kernel and keep what backward needs."""
-        prepared = _prepare(means2d, conics, opacities, depths, radii, width, height)
+        prepared = _prepare(means2d, conics, colors, opacities, depths, radii, width, height)
         parts, transmittance = [], np.empty(0, np.float32)
         for first in range(0, colors.shape[1], blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, opacities, first)
@@ -218,19 +220,32 @@ class Blend(torch.autograd.Function):
 def _prepare(
     means2d: Tensor,
     conics: Tensor,
+    colors: Tensor,
     opacities: Tensor,
     depths: Tensor,
     radii: Tensor,
     width: int,
     height: int,
 ) -> _Prepared:
-    """Sort what is visible by depth and list it by tile."""
+    """Sort what is visible by depth and list it by tile.
+
+    A colour that is not finite is left out here: 0 times NaN would carry it to every pixel of a tile.
+    """
     alphas = _array(opacities)
     seen = (_array(radii) > 0).all(axis=1) & (alphas >= projection.MIN_ALPHA)
+    seen &= np.isfinite(_array(colors)).all(axis=1)
     order = depth_order(_array(depths), seen)
-    reach = np.log(255.0 * alphas[order], dtype=np.float32)
+    reach = _reach(alphas[order])
     lists = list_tiles(_array(means2d)[order], _array(conics)[order], reach, width, height)
     return _Prepared(order, lists, width, height)
+
+
+def _reach(opacities: np.ndarray) -> np.ndarray:
+    """log(255 opacity), float32: how large sigma can be for alpha to reach 1/255.
+
+    An opacity above 1 reaches no farther than 1 does, where the kernels' exponential ends.
+    """
+    return np.clip(np.log(255.0 * opacities, dtype=np.float32), 0.0, FARTHEST)
 
 
 def _records(
@@ -247,7 +262,7 @@ def _records(
     records[:, 0:2] = _array(means2d)[order]
     records[:, 2:5] = _array(conics)[order]
     records[:, 5] = _array(opacities)[order]
-    records[:, 6] = -np.log(255.0 * records[:, 5], dtype=np.float32)
+    records[:, 6] = -_reach(records[:, 5])
     part = _array(colors)[order, first : first + blending.CHANNELS]
     records[:, 7 : 7 + part.shape[1]] = part
     return records.reshape(-1)

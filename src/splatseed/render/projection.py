@@ -72,9 +72,9 @@ def project(  # type: ignore[no-untyped-def]
         xx, yy = xx + eps2d, yy + eps2d
         opacity = opacities[i] * compensation if antialiased else np.float64(opacities[i])
         u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        if det > 0.0 and det < np.inf and opacity >= MIN_ALPHA:
+        if det > 0.0 and det < np.inf and MIN_ALPHA <= opacity < np.inf:
             sigmas = min(MAX_SIGMAS, math.sqrt(2.0 * math.log(opacity / MIN_ALPHA)))
-            rx, ry = math.ceil(sigmas * math.sqrt(xx)), math.ceil(sigmas * math.sqrt(yy))
+            rx, ry = np.ceil(sigmas * math.sqrt(xx)), np.ceil(sigmas * math.sqrt(yy))
             inside = u + rx > 0 and u - rx < width and v + ry > 0 and v - ry < height
             if inside and (rx > radius_clip or ry > radius_clip):
                 radii[i, 0], radii[i, 1] = min(rx, 1e9), min(ry, 1e9)
