@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from splatseed.train.gaussians import Gaussians
 from splatseed.train.views import View
 
 __all__ = ["SCENE_SCALE", "TrainingFrame", "training_frame"]
@@ -42,6 +43,14 @@ class TrainingFrame:
     def points_to_world(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Points of the training frame in the world."""
         return np.asarray(xyz.astype(np.float64) / self.scale + self.origin)
+
+    def gaussians_to_world(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians of the training frame in the world (float32 there: see the promise)."""
+        return dataclasses.replace(
+            gaussians,
+            means=self.points_to_world(gaussians.means).astype(np.float32),
+            scales=gaussians.scales - np.float32(np.log(self.scale)),
+        )
 
     def view(self, view: View) -> View:
         """The same view, its camera posed in the training frame."""

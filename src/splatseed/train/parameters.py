@@ -22,6 +22,7 @@ from splatseed.train.settings import LEARNING_RATES
 from splatseed.train.views import View
 
 __all__ = [
+    "MEANS_LR",
     "Optimizers",
     "Parameters",
     "gaussians_of",
@@ -35,6 +36,8 @@ Parameters = torch.nn.ParameterDict
 Optimizers = dict[str, torch.optim.Optimizer]
 
 ADAM_EPSILON = 1e-15
+MEANS_LR = LEARNING_RATES["means"] * SCENE_SCALE
+"""The first learning rate of positions, in the training frame."""
 
 
 def make_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
@@ -47,15 +50,14 @@ def make_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
     )
 
 
-def gaussians_of(params: Mapping[str, Tensor]) -> Gaussians:
+def gaussians_of(params: Parameters | Mapping[str, Tensor]) -> Gaussians:
     """The parameters as NumPy arrays (those of the CPU share their memory)."""
     return Gaussians(**{name: value.detach().cpu().numpy() for name, value in params.items()})
 
 
 def make_optimizers(params: Parameters) -> Optimizers:
     """One Adam a parameter, with 3DGS's learning rates."""
-    rates = dict(LEARNING_RATES)
-    rates["means"] *= SCENE_SCALE
+    rates = {**LEARNING_RATES, "means": MEANS_LR}
     return {
         name: torch.optim.Adam([{"params": [value]}], lr=rates[name], eps=ADAM_EPSILON, fused=True)
         for name, value in params.items()
@@ -63,7 +65,7 @@ def make_optimizers(params: Parameters) -> Optimizers:
 
 
 def render_view(
-    params: Mapping[str, Tensor], view: View, sh_degree: int
+    params: Parameters | Mapping[str, Tensor], view: View, sh_degree: int
 ) -> tuple[Float[Tensor, "H W 3"], dict[str, Any]]:
     """What the Gaussians look like from a view, and the rasteriser's ``info``.
 
@@ -94,7 +96,7 @@ def photograph(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
     return torch.from_numpy(view.image).to(device).to(torch.float32) / 255.0
 
 
-def _harmonics(params: Mapping[str, Tensor], sh_degree: int) -> Float[Tensor, "N K 3"]:
+def _harmonics(params: Parameters | Mapping[str, Tensor], sh_degree: int) -> Float[Tensor, "N K 3"]:
     """The coefficients in use: copying, and optimising, the idle ones would be half of a step."""
     rest = (sh_degree + 1) ** 2 - 1
     if rest == 0:
