@@ -18,6 +18,7 @@ __all__ = ["main"]
 
 VERBS = {
     "upsample": "Add points to a scene and write it for any 3DGS trainer.",
+    "evaluate": "Score a trained model: PSNR, SSIM, LPIPS.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",
     "demo": "Make a small scene, upsample it by every method, measure.",
