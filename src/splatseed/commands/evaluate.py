@@ -92,7 +92,7 @@ def _task(options: Options) -> _Task:
     """The files and settings, from a run's config where the options do not say."""
     path, config = options.model, _config(options.model)
     scene = options.scene or config.get("scene")
-    if scene is None:
+    if not isinstance(scene, str | Path):
         raise ParameterError(
             f"--scene, as {path} does not say what it is of",
             found="none",

@@ -1,8 +1,9 @@
 """The loop that scores renders of views: PSNR, SSIM, LPIPS.
 
 Notation: a render and a photograph are [H, W, 3], sRGB values 0..1, not made linear. Promise:
-renders are clamped to [0, 1] and not rounded to 8 bits; each view is scored at its own size; SSIM is
-the mean over the places where its 11 x 11 Gaussian window (sigma 1.5) fits whole, over channels.
+renders are clamped to [0, 1] and not rounded to 8 bits; each view is scored at its own size; SSIM
+has an 11 x 11 Gaussian window (sigma 1.5) and images mirrored at their edges, which is what
+torchmetrics and so gsplat's trainer report.
 """
 
 from __future__ import annotations
@@ -14,13 +15,15 @@ from typing import TypeAlias
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from splatseed.errors import ParameterError
 from splatseed.evaluate.lpips import Lpips
 from splatseed.evaluate.result import NOT_ASKED, EvalResult, ViewScore
 from splatseed.progress import Progress, silent
-from splatseed.train.losses import psnr, ssim
+from splatseed.train.losses import psnr, ssim as ssim_inside
 from splatseed.train.parameters import photograph
+from splatseed.train.ssim import WINDOW
 from splatseed.train.views import View
 
 __all__ = ["Render", "evaluate_views"]
@@ -85,10 +88,19 @@ def _score(render: Render, view: View, lpips: Lpips | None) -> ViewScore:
     return ViewScore(
         view.name,
         psnr=psnr(clamped, truth),
-        ssim=float(ssim(clamped, truth)),
+        ssim=_ssim(clamped, truth),
         lpips=None if lpips is None else lpips(clamped, truth),
         seconds=seconds,
     )
+
+
+def _ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> float:
+    """SSIM averaged over all pixels; the mirrored margin lets the window fit at each of them."""
+    margin = [WINDOW // 2] * 4
+    mirrored = (
+        pad(image.permute(2, 0, 1), margin, mode="reflect").permute(1, 2, 0) for image in (x, y)
+    )
+    return float(ssim_inside(*mirrored))
 
 
 def _now() -> float:
