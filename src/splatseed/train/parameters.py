@@ -93,7 +93,8 @@ def render_view(
 
 def photograph(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
     """The view's pixels as float32 from 0 to 1."""
-    return torch.from_numpy(view.image).to(device).to(torch.float32) / 255.0
+    # A copy: PyTorch warns on stderr of arrays that are read-only, as a view's may be.
+    return torch.tensor(view.image, device=device).to(torch.float32) / 255.0
 
 
 def _harmonics(params: Parameters | Mapping[str, Tensor], sh_degree: int) -> Float[Tensor, "N K 3"]:
