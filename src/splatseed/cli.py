@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 from importlib import import_module
 from importlib.metadata import version
@@ -18,6 +19,7 @@ __all__ = ["main"]
 
 VERBS = {
     "upsample": "Add points to a scene and write it for any 3DGS trainer.",
+    "train": "Train 3D Gaussians on a scene, on a GPU or on the CPU.",
     "evaluate": "Score a trained model: PSNR, SSIM, LPIPS.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",
@@ -29,6 +31,9 @@ INTERRUPTED = 130
 def main(arguments: list[str] | None = None) -> None:
     """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
     words = sys.argv[1:] if arguments is None else arguments
+    # PyTorch and Numba each keep a pool of threads. Waiting by spinning, as is the default, the one
+    # takes the cores from the other, and on a busy machine a training step took 5-20 times as long.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     _print_any_name()
     if not words or words[0] in {"-h", "--help"}:
         _print_help()

@@ -17,6 +17,7 @@ import torch
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
+from splatseed.train.device import device_name
 from splatseed.train.seeds import seeds_digest
 from splatseed.train.settings import TrainSettings
 
@@ -35,7 +36,7 @@ def make_config(
         "scene": str(scene.source.root.resolve()) if scene.source else None,
         "points": str(scene.source.points_path.resolve()) if scene.source else None,
         **dataclasses.asdict(settings),
-        "device": _device_name(device),
+        "device": device_name(device),
         "seeds": {"count": len(seeds), "digest": seeds_digest(seeds)},
         "versions": {
             "python": platform.python_version(),
@@ -102,9 +103,3 @@ def _version(package: str) -> str | None:
         return version(package)
     except PackageNotFoundError:
         return None
-
-
-def _device_name(device: torch.device) -> str:
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return f"CPU, {torch.get_num_threads()} threads"

@@ -13,7 +13,7 @@ import torch
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.train.settings import Backend
 
-__all__ = ["check_fits", "free_bytes", "pick_device"]
+__all__ = ["check_fits", "device_name", "free_bytes", "pick_device"]
 
 BYTES_EACH = 2000
 """A Gaussian's 59 numbers, their gradients and two moments (944 bytes), and as much again for the
@@ -35,6 +35,13 @@ def pick_device(backend: Backend) -> torch.device:
             fix="Pass --backend cpu, or install PyTorch's CUDA build.",
         )
     return torch.device("cuda" if seen and backend != "cpu" else "cpu")
+
+
+def device_name(device: torch.device) -> str:
+    """The device in words."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU, {torch.get_num_threads()} threads"
 
 
 def check_fits(count: int, device: torch.device) -> None:

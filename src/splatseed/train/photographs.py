@@ -55,12 +55,12 @@ def load_photograph(
     kept = None if cache_dir is None or factor == 1 else cache_dir / _key(raw, factor)
     if kept is not None and kept.is_file():
         with suppress(SceneFormatError):  # a damaged copy is made again
-            return np.asarray(_decode(kept, _read(kept))), _size(path, raw)
+            return np.array(_decode(kept, _read(kept))), _size(path, raw)
     picture = _decode(path, raw)
     smaller = _reduce(path, picture, factor)
     if kept is not None:
         _keep(smaller, kept)
-    return np.asarray(smaller), picture.size
+    return np.array(smaller), picture.size
 
 
 def user_cache_dir() -> Path:

@@ -6,6 +6,7 @@ goes on where it stopped, with the settings that it began with; results are in t
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.train.config import check_same_seeds, make_config, resumed_settings
 from splatseed.train.curve import Record, write_curve_csv, write_curve_png
-from splatseed.train.device import check_fits, pick_device
+from splatseed.train.device import check_fits, device_name, pick_device
 from splatseed.train.frame import TrainingFrame, training_frame
 from splatseed.train.gaussians import initial_gaussians
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
@@ -148,6 +149,11 @@ class TrainingRun:
         train, test = ([frame.view(view) for view in part] for part in views)
         self.trainer = Trainer(state, settings, train, test, self._on_record)
 
+    @property
+    def device(self) -> str:
+        """Where it trains, in words."""
+        return device_name(self.trainer.device)
+
     def train(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
         """Train to the end, or until the user interrupts: then a checkpoint is there.
 
@@ -194,7 +200,6 @@ class TrainingRun:
 
     def _facts(self) -> dict[str, object]:
         state = self.state
-        tested = [record for record in state.records if record.test_psnr is not None]
         return {
             "steps": state.step,
             "train_seconds": round(state.watch.seconds, 3),
@@ -204,10 +209,11 @@ class TrainingRun:
                 {
                     "step": record.step,
                     "seconds": record.seconds,
-                    "psnr": record.test_psnr,
+                    "psnr": record.test_psnr if math.isfinite(record.test_psnr) else None,
                     "num_gaussians": record.num_gaussians,
                 }
-                for record in tested
+                for record in state.records
+                if record.test_psnr is not None
             ],
         }
 

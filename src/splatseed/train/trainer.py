@@ -82,7 +82,7 @@ class Trainer:
         """Render and compare once, so that kernels are compiled before the clock runs."""
         view = self.train_views[0]
         render, _ = render_view(self.state.params, view, self.settings.sh_degree)
-        photometric_loss(render, photograph(view, self._device)).backward()
+        photometric_loss(render, photograph(view, self.device)).backward()
         for value in self.state.params.values():
             value.grad = None
 
@@ -98,7 +98,7 @@ class Trainer:
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
         torch.manual_seed(_step_seed(self.settings.seed, step))
         view = self.train_views[self._view_index(step)]
-        truth = photograph(view, self._device)
+        truth = photograph(view, self.device)
         render, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
         strategy.before(params, optimizers, step, info)
         loss = photometric_loss(render, truth)
@@ -128,7 +128,7 @@ class Trainer:
 
     def test_psnr(self) -> float:
         """Mean over the test views of each one's PSNR, dB."""
-        values = [psnr(self.render(v), photograph(v, self._device)) for v in self.test_views]
+        values = [psnr(self.render(v), photograph(v, self.device)) for v in self.test_views]
         return sum(values) / len(values)
 
     def _is_due(self, times: int) -> bool:
@@ -141,12 +141,13 @@ class Trainer:
         return int(_epoch_order(self.settings.seed, epoch, len(self.train_views))[position])
 
     @property
-    def _device(self) -> torch.device:
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
         means: Tensor = self.state.params["means"]
         return means.device
 
     def _cuda_devices(self) -> list[torch.device]:
-        return [self._device] if self._device.type == "cuda" else []
+        return [self.device] if self.device.type == "cuda" else []
 
 
 @lru_cache(maxsize=2)
