@@ -154,6 +154,7 @@ def _require(fits: object, expected: str, found: object) -> None:
 
 
 def _describe(value: object) -> str:
-    if isinstance(value, Tensor):
-        return f"{value.dtype} {list(value.shape)} on {value.device}"
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        kind = type(value).__name__
+        return f"{kind} {value.dtype} {list(value.shape)} on {getattr(value, 'device', 'cpu')}"
     return repr(value)

@@ -103,7 +103,7 @@ def rasterization(
         >>> image.shape, round(float(alpha.max()), 1)
         (torch.Size([1, 16, 16, 3]), 0.8)
     """
-    if means.is_cuda:
+    if isinstance(means, Tensor) and means.is_cuda:
         from gsplat import rasterization as on_cuda  # noqa: PLC0415  (needs CUDA)
 
         return on_cuda(  # type: ignore[no-any-return]
