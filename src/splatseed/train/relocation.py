@@ -1,4 +1,4 @@
-"""How MCMC splits a Gaussian into several that look like it: the formula that gsplat has in CUDA.
+"""What gsplat's MCMC strategy has in CUDA only, for the CPU: splitting a Gaussian, and covariances.
 
 Notation: o opacity, s scales, n how many Gaussians share the place. With o' = 1 - (1 - o)^(1/n)
 (3DGS as MCMC, Kheradmand et al. 2024, eq. 9; the double sum folded by the hockey-stick identity):
@@ -17,8 +17,9 @@ from contextlib import contextmanager
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize
 
-__all__ = ["compute_relocation", "relocation_on_cpu"]
+__all__ = ["compute_relocation", "covariances", "mcmc_on_cpu"]
 
 
 def compute_relocation(
@@ -47,6 +48,28 @@ def compute_relocation(
     return new.to(opacities.dtype), scales * factor.to(scales.dtype)[:, None]
 
 
+def covariances(
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    compute_covar: bool = True,  # noqa: ARG001  (gsplat's signature)
+    compute_preci: bool = False,  # noqa: ARG001
+    triu: bool = False,  # noqa: ARG001
+) -> tuple[Float[Tensor, "N 3 3"], None]:
+    """R S S R' of each Gaussian, [N, 3, 3]; element by element, as small products are slow in BLAS.
+
+    Args:
+        quats: wxyz rotations of any length, [N, 4].
+        scales: Standard deviations, [N, 3].
+        compute_covar: gsplat's flag; covariances are always given.
+        compute_preci: gsplat's flag; precisions never are.
+        triu: gsplat's flag; matrices are always whole.
+    """
+    from gsplat.utils import normalized_quat_to_rotmat  # noqa: PLC0415  (as above)
+
+    half = normalized_quat_to_rotmat(normalize(quats, dim=-1)) * scales[:, None, :]
+    return (half[:, :, None, :] * half[:, None, :, :]).sum(dim=-1), None
+
+
 def _coefficients(largest: int) -> Float[Tensor, "n k"]:
     """(-1)^k C(n, k+1) / sqrt(k+1) for n to ``largest``, zero beyond k = n - 1."""
     rows = [
@@ -57,13 +80,13 @@ def _coefficients(largest: int) -> Float[Tensor, "n k"]:
 
 
 @contextmanager
-def relocation_on_cpu() -> Iterator[None]:
-    """While the block runs, gsplat's MCMC strategy uses this formula."""
+def mcmc_on_cpu() -> Iterator[None]:
+    """While the block runs, gsplat's MCMC strategy uses these functions."""
     from gsplat.strategy import ops  # noqa: PLC0415  (only MCMC on the CPU needs it)
 
-    original = ops.compute_relocation
-    ops.compute_relocation = compute_relocation
+    before = ops.compute_relocation, ops.quat_scale_to_covar_preci
+    ops.compute_relocation, ops.quat_scale_to_covar_preci = compute_relocation, covariances
     try:
         yield
     finally:
-        ops.compute_relocation = original
+        ops.compute_relocation, ops.quat_scale_to_covar_preci = before

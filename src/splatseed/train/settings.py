@@ -39,6 +39,7 @@ MEANS_LR_DECAY = 0.01
 """The learning rate of positions at the end, as a part of that at the start; exponential between."""
 FULL_RUN = 30_000
 MCMC_CAP = 1_000_000
+MIN_REFINE_EVERY = 10
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,8 @@ class Schedule:
 
     @property
     def refine_every(self) -> int:
-        """From one densification to the next."""
-        return self.scaled(100)
+        """From one densification to the next; long enough to see some photographs between."""
+        return max(self.scaled(100), MIN_REFINE_EVERY)
 
     @property
     def reset_every(self) -> int:

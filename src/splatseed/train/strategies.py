@@ -21,7 +21,7 @@ from torch import Tensor
 
 from splatseed.train.frame import SCENE_SCALE
 from splatseed.train.parameters import Optimizers, Parameters
-from splatseed.train.relocation import relocation_on_cpu
+from splatseed.train.relocation import mcmc_on_cpu
 from splatseed.train.settings import MCMC_CAP, TrainSettings
 
 __all__ = ["Strategy", "make_strategy"]
@@ -149,5 +149,5 @@ class _Mcmc(Strategy):
         self, params: Parameters, optimizers: Optimizers, step: int, info: Any, means_lr: float
     ) -> None:
         on_cpu = params["means"].device.type == "cpu"
-        with relocation_on_cpu() if on_cpu else nullcontext():
+        with mcmc_on_cpu() if on_cpu else nullcontext():
             self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=means_lr)
