@@ -25,7 +25,7 @@ EXTREME = {
     "colors": st.sampled_from([0.0, 1.0, 1e6, -1e6]),
 }
 QUICK = settings(
-    max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 
 

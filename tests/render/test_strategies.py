@@ -60,8 +60,7 @@ def train(
     return losses, counts, params, state
 
 
-@pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize("absgrad", [True, False])
+@pytest.mark.parametrize(("packed", "absgrad"), [(True, True), (False, False)])
 def test_default_strategy_densifies(packed: bool, absgrad: bool) -> None:
     torch.manual_seed(0)
     strategy = DefaultStrategy(

@@ -101,7 +101,7 @@ def rasterization(
         ...     viewmats=torch.eye(4)[None],
         ...     Ks=torch.tensor([[[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]]]), width=16, height=16)
         >>> image.shape, round(float(alpha.max()), 1)
-        (torch.Size([1, 16, 16, 3]), 0.8)
+        (torch.Size([1, 16, 16, 3]), 0.7)
     """
     if isinstance(means, Tensor) and means.is_cuda:
         from gsplat import rasterization as on_cuda  # noqa: PLC0415  (needs CUDA)
