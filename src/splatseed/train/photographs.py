@@ -1,6 +1,6 @@
 """Photographs as pixels: decoded, made smaller by a whole factor, and kept for the next run.
 
-Promise: a smaller copy is the mean over f x f blocks, exactly (a few pixels at the right and lower
+Promise: a smaller copy is the mean over f x f blocks, rounded (a few pixels at the right and lower
 edge that make no whole block are cut off), so intrinsics divide by f and nothing else; it is looked
 up by the content of the original, so a changed photograph is never mistaken for the old one. Only
 ``cache_dir`` is written to, and what cannot be written there is not missed.

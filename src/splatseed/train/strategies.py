@@ -78,20 +78,46 @@ class _Fixed(Strategy):
         pass
 
 
+class _Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
+    """gsplat's strategy; with a cap, only the largest image gradients that it leaves room for grow."""
+
+    cap: int | None = None
+    grow_grad2d: float
+
+    def _grow_gs(self, params: Parameters, optimizers: Any, state: Any, step: int) -> Any:
+        wanted = self.grow_grad2d
+        self.grow_grad2d = self._threshold(params, state)
+        try:
+            return super()._grow_gs(params, optimizers, state, step)
+        finally:
+            self.grow_grad2d = wanted
+
+    def _threshold(self, params: Parameters, state: Any) -> float:
+        """A gradient that at most as many exceed as there is room: each one adds one Gaussian."""
+        if self.cap is None:
+            return self.grow_grad2d
+        room = self.cap - len(params["means"])
+        if room <= 0:
+            return math.inf
+        gradients = state["grad2d"] / state["count"].clamp_min(1)
+        if room >= len(gradients):
+            return self.grow_grad2d
+        return max(self.grow_grad2d, float(torch.topk(gradients, room + 1).values[-1]))
+
+
 class _Default(Strategy):
     """3DGS's densification: clone and split where the image gradient is large, prune the faint."""
 
     def __init__(self, settings: TrainSettings) -> None:
         super().__init__()
         schedule = settings.schedule
-        self.inner = DefaultStrategy(
+        self.inner = _Capped(
             refine_start_iter=schedule.refine_start,
             refine_stop_iter=schedule.refine_stop("default"),
             refine_every=schedule.refine_every,
             reset_every=schedule.reset_every,
         )
-        self.grow_above = self.inner.grow_grad2d
-        self.cap = settings.cap
+        self.inner.cap = settings.cap
         self.resets = settings.opacity_reset
         self.state = self.inner.initialize_state(scene_scale=SCENE_SCALE)
 
@@ -106,8 +132,6 @@ class _Default(Strategy):
         info: Any,
         means_lr: float,  # noqa: ARG002  (MCMC's)
     ) -> None:
-        full = self.cap is not None and len(params["means"]) >= self.cap
-        self.inner.grow_grad2d = math.inf if full else self.grow_above
         self.inner.step_post_backward(params, optimizers, self.state, step, info)
         if self._resets_at(step):
             reset_opa(params, optimizers, self.state, value=2 * self.inner.prune_opa)
