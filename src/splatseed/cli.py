@@ -35,6 +35,7 @@ def main(arguments: list[str] | None = None) -> None:
     # takes the cores from the other, and on a busy machine a training step took 5-20 times as long.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     _print_any_name()
+    _let_threads_sleep()
     if not words or words[0] in {"-h", "--help"}:
         _print_help()
         return
@@ -69,6 +70,15 @@ def _print_any_name() -> None:
     """Let file names that are no valid text be printed, escaped, as Python does on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _let_threads_sleep() -> None:
+    """Have idle threads sleep rather than spin; OpenMP reads this as PyTorch and Numba load it.
+
+    The two have a pool of threads each: spinning, one slows the other, and on a machine that is
+    also at other work a training step was seen to take several times as long.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def _fail(message: str) -> NoReturn:
