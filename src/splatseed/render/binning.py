@@ -19,13 +19,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.jit import always_inline, kernel, parallel_range
 
 __all__ = ["TILE", "TileLists", "depth_order", "list_tiles"]
 
 TILE = 8
 CHUNKS = 16
 """Pieces of the depth order that are counted and listed in parallel, whatever the threads."""
+STRIDE = 7
+"""Pieces are taken in this stride: near Gaussians are large, and threads take consecutive turns."""
 
 
 class TileLists(NamedTuple):
@@ -67,20 +69,24 @@ def list_tiles(
         height: Image height in pixels.
     """
     columns, rows = -(-width // TILE), -(-height // TILE)
+    first_row, row_start = np.empty(len(reach), np.int32), np.zeros(len(reach) + 1, np.int64)
+    _count_rows(means2d, conics, reach, rows, first_row, row_start[1:])
+    np.cumsum(row_start, out=row_start)
+    spans = np.empty((row_start[-1], 2), np.int32)
     slot_start = np.zeros(len(reach) + 1, np.int64)
-    _count_pairs(means2d, conics, reach, columns, rows, slot_start[1:])
-    np.cumsum(slot_start, out=slot_start)
     counts = np.zeros((CHUNKS, rows * columns), np.int64)
-    bounds = np.linspace(0, len(reach), CHUNKS + 1).astype(np.int64)
-    _count_tiles(means2d, conics, reach, columns, rows, bounds, counts)
+    _count_tiles(
+        means2d, conics, reach, columns, first_row, row_start, spans, slot_start[1:], counts
+    )
+    np.cumsum(slot_start, out=slot_start)
     tile_start = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
     cursor = tile_start[:-1] + np.cumsum(counts, axis=0) - counts
     listed = np.empty((2, slot_start[-1]), np.int32)
-    _fill(means2d, conics, reach, columns, rows, bounds, slot_start, cursor, listed[0], listed[1])
+    _fill(columns, first_row, row_start, spans, slot_start, cursor, listed[0], listed[1])
     return TileLists(slot_start, tile_start, listed[0], listed[1])
 
 
-@inline
+@always_inline
 def _row_range(a, b, c, reach, mx, my, row, columns):  # type: ignore[no-untyped-def]
     """First and one-past-last tile column that an ellipse touches in one row of tiles.
 
@@ -104,7 +110,7 @@ def _row_range(a, b, c, reach, mx, my, row, columns):  # type: ignore[no-untyped
     return _clipped(mx + left - 0.5 - 0.01, mx + right - 0.5 + 0.01, columns)
 
 
-@inline
+@always_inline
 def _rows(a, b, c, reach, my, rows):  # type: ignore[no-untyped-def]
     """First and one-past-last row of tiles that an ellipse touches.
 
@@ -118,7 +124,7 @@ def _rows(a, b, c, reach, my, rows):  # type: ignore[no-untyped-def]
     return _clipped(my - y_max - 0.5 - 0.01, my + y_max - 0.5 + 0.01, rows)
 
 
-@inline
+@always_inline
 def _clipped(low, high, tiles):  # type: ignore[no-untyped-def]
     """First and one-past-last of the tiles between two pixels.
 
@@ -130,48 +136,48 @@ def _clipped(low, high, tiles):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _count_pairs(means2d, conics, reach, columns, rows, count):  # type: ignore[no-untyped-def]
+def _count_rows(means2d, conics, reach, rows, first_row, count):  # type: ignore[no-untyped-def]
     for g in parallel_range(len(reach)):
         a, b, c = np.float64(conics[g, 0]), np.float64(conics[g, 1]), np.float64(conics[g, 2])
-        total = 0
-        first_row, last_row = _rows(a, b, c, reach[g], means2d[g, 1], rows)
-        for row in range(first_row, last_row):
-            first, last = _row_range(a, b, c, reach[g], means2d[g, 0], means2d[g, 1], row, columns)
-            total += max(last - first, 0)
-        count[g] = total
+        first, last = _rows(a, b, c, reach[g], means2d[g, 1], rows)
+        first_row[g], count[g] = first, max(last - first, 0)
 
 
 @kernel
-def _count_tiles(means2d, conics, reach, columns, rows, bounds, counts):  # type: ignore[no-untyped-def]
-    for chunk in parallel_range(CHUNKS):
-        for g in range(bounds[chunk], bounds[chunk + 1]):
+def _count_tiles(  # type: ignore[no-untyped-def]
+    means2d, conics, reach, columns, first_row, row_start, spans, pairs, counts
+):
+    """The span of columns of every row of tiles, and how many pairs that makes."""
+    for k in parallel_range(CHUNKS):
+        chunk, total = STRIDE * k % CHUNKS, len(reach)
+        for g in range(chunk * total // CHUNKS, (chunk + 1) * total // CHUNKS):
             a, b, c = np.float64(conics[g, 0]), np.float64(conics[g, 1]), np.float64(conics[g, 2])
-            first_row, last_row = _rows(a, b, c, reach[g], means2d[g, 1], rows)
-            for row in range(first_row, last_row):
+            pairs[g] = 0
+            for entry in range(row_start[g], row_start[g + 1]):
+                row = first_row[g] + entry - row_start[g]
                 first, last = _row_range(
                     a, b, c, reach[g], means2d[g, 0], means2d[g, 1], row, columns
                 )
+                spans[entry, 0], spans[entry, 1] = first, last
+                pairs[g] += max(last - first, 0)
                 for column in range(first, last):
                     counts[chunk, row * columns + column] += 1
 
 
 @kernel
 def _fill(  # type: ignore[no-untyped-def]
-    means2d, conics, reach, columns, rows, bounds, slot_start, cursor, listed_rank, listed_slot
+    columns, first_row, row_start, spans, slot_start, cursor, listed_rank, listed_slot
 ):
     """A stable counting sort: chunks write to places that were set aside for them."""
-    for chunk in parallel_range(CHUNKS):
-        for g in range(bounds[chunk], bounds[chunk + 1]):
+    for k in parallel_range(CHUNKS):
+        chunk, total = STRIDE * k % CHUNKS, len(first_row)
+        for g in range(chunk * total // CHUNKS, (chunk + 1) * total // CHUNKS):
             slot = slot_start[g]
-            a, b, c = np.float64(conics[g, 0]), np.float64(conics[g, 1]), np.float64(conics[g, 2])
-            first_row, last_row = _rows(a, b, c, reach[g], means2d[g, 1], rows)
-            for row in range(first_row, last_row):
-                first, last = _row_range(
-                    a, b, c, reach[g], means2d[g, 0], means2d[g, 1], row, columns
-                )
-                for column in range(first, last):
+            for entry in range(row_start[g], row_start[g + 1]):
+                row = first_row[g] + entry - row_start[g]
+                for column in range(spans[entry, 0], spans[entry, 1]):
                     tile = row * columns + column
-                    listed_rank[cursor[chunk, tile]] = g
-                    listed_slot[cursor[chunk, tile]] = slot
-                    cursor[chunk, tile] += 1
+                    place = cursor[chunk, tile]
+                    listed_rank[place], listed_slot[place] = g, slot
+                    cursor[chunk, tile] = place + 1
                     slot += 1

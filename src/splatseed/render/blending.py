@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.jit import always_inline, kernel, parallel_range
 from splatseed.render.binning import TILE
 from splatseed.render.simd import (
     LANES,
@@ -83,7 +83,7 @@ def forward(  # type: ignore[no-untyped-def]
             )  # fmt: skip
 
 
-@inline
+@always_inline
 def _forward_block(records, listed_rank, first, last, px, py, block, image, transmittance):
     zero, stop = splat(ZERO), splat(STOP)
     c0, c1, c2, c3 = zero, zero, zero, zero
@@ -114,7 +114,7 @@ def _forward_block(records, listed_rank, first, last, px, py, block, image, tran
     store(transmittance, LANES * block, add(passing, frozen))
 
 
-@inline
+@always_inline
 def _exponent(records, r, dx, dy):
     """-sigma of a Gaussian at sixteen pixels."""
     a, b, c = splat(records[r + 2]), splat(records[r + 3]), splat(records[r + 4])
@@ -122,14 +122,14 @@ def _exponent(records, r, dx, dy):
     return subtract(multiply(splat(-HALF), square), multiply(multiply(b, dx), dy))
 
 
-@inline
+@always_inline
 def _falloff(h, lowest):
     """exp(h), finite also where h is below what counts."""
     held = select_greater(h, lowest, h, lowest)
     return exp_nonpositive(minimum(held, splat(ZERO)))
 
 
-@inline
+@always_inline
 def _alpha(raw, h, lowest):
     """Alpha where it counts (sigma >= 0, alpha >= 1/255), else 0."""
     zero = splat(ZERO)
@@ -167,7 +167,7 @@ def backward(
                 break
 
 
-@inline
+@always_inline
 def _backward_pair(records, r, slot, block, x, y, lane_x, lane_y, gradient, behind, passing, sums):
     """Add one Gaussian to a tile's four blocks; returns whether light still passes somewhere."""
     zero = splat(ZERO)

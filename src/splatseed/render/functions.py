@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from splatseed.render import blending, harmonics as sh, projection
+from splatseed.render import blending, harmonics as sh, layout, projection
 from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles
 
 __all__ = ["Blend", "Harmonics", "Lens", "Project"]
@@ -123,17 +123,20 @@ class _Prepared(NamedTuple):
     """A view sorted and listed: what forward and backward share."""
 
     order: np.ndarray
+    reach: np.ndarray
     lists: TileLists
     width: int
     height: int
 
     @property
     def columns(self) -> int:
+        """Tiles in a row."""
         return -(-self.width // TILE)
 
     @property
-    def rows(self) -> int:
-        return -(-self.height // TILE)
+    def lanes(self) -> int:
+        """Pixels of all tiles."""
+        return self.columns * -(-self.height // TILE) * TILE**2
 
 
 class Blend(torch.autograd.Function):
@@ -162,19 +165,17 @@ class Blend(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         """Run the kernel and keep what backward needs."""
         prepared = _prepare(means2d, conics, colors, opacities, depths, radii, width, height)
-        parts, transmittance = [], np.empty(0, np.float32)
-        for first in range(0, colors.shape[1], blending.CHANNELS):
+        channels = colors.shape[1]
+        behind = np.zeros(channels, np.float32) if background is None else _array(background)
+        image = np.empty((height, width, channels), np.float32)
+        passing = np.empty((height, width), np.float32)
+        for first in range(0, channels, blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, opacities, first)
-            block_image, transmittance = _forward(prepared, records)
-            parts.append(_to_image(prepared, block_image, blending.CHANNELS))
-        image = np.concatenate(parts, axis=2)[:, :, : colors.shape[1]]
-        passing = _to_image(prepared, transmittance, 1)
-        if background is not None:
-            image = image + passing * _array(background)
-        ctx.prepared, ctx.on_absgrad, ctx.passing = prepared, on_absgrad, passing
-        ctx.image = np.ascontiguousarray(image)
+            blocks = _forward(prepared, records)
+            layout.from_blocks(*blocks, prepared.columns, behind, first, image, passing)  # type: ignore[call-arg]  # star arguments
+        ctx.prepared, ctx.on_absgrad, ctx.passing, ctx.image = prepared, on_absgrad, passing, image
         ctx.save_for_backward(means2d, conics, colors, opacities, background)
-        return torch.from_numpy(ctx.image), torch.from_numpy(1.0 - passing[:, :, 0])
+        return torch.from_numpy(image), torch.from_numpy(1.0 - passing)
 
     @staticmethod
     @once_differentiable
@@ -184,37 +185,24 @@ class Blend(torch.autograd.Function):
         """Gradients of the inputs."""
         means2d, conics, colors, opacities, background = ctx.saved_tensors
         prepared: _Prepared = ctx.prepared
-        gradient = _array(d_image)
-        passing = ctx.passing
-        # What lies behind the first Gaussian: all of the image; every chunk of channels takes its
-        # own part, and the first the gradient of alpha too.
-        d_colors = np.zeros(tuple(colors.shape), np.float32)
-        geometry = np.zeros((len(prepared.order), blending.SUMS), np.float32)
+        gradient, passing = _array(d_image), ctx.passing
+        shapes = [tuple(each.shape) for each in (means2d, conics, opacities, colors, means2d)]
+        results = [np.zeros(shape, np.float32) for shape in shapes]
+        # Every pass of channels takes its own part of what lies behind the first Gaussian; the first
+        # pass takes the gradient of alpha too.
+        d_passing = -_array(d_alphas) * passing
         for first in range(0, colors.shape[1], blending.CHANNELS):
-            channels = slice(first, first + blending.CHANNELS)
-            behind = (gradient[:, :, channels] * ctx.image[:, :, channels]).sum(axis=2)
-            if first == 0:
-                behind = behind - _array(d_alphas) * passing[:, :, 0]
             records = _records(prepared, means2d, conics, colors, opacities, first)
-            totals = _backward(prepared, records, gradient[:, :, channels], behind)
-            wide = min(blending.CHANNELS, colors.shape[1] - first)
-            d_colors[prepared.order, first : first + wide] = totals[:, 6 : 6 + wide]
-            geometry += totals
-        scattered = np.zeros((len(means2d), blending.SUMS), np.float32)
-        scattered[prepared.order] = geometry
+            totals = _backward(prepared, records, gradient, ctx.image, d_passing, first)
+            layout.scatter(prepared.order, totals, first, *results)  # type: ignore[call-arg]  # star arguments
+            d_passing = np.zeros_like(passing)
         if ctx.on_absgrad is not None:
-            ctx.on_absgrad(torch.from_numpy(scattered[:, 10:12].copy()))
+            ctx.on_absgrad(torch.from_numpy(results[4]))
         d_background = None
         if background is not None and ctx.needs_input_grad[4]:
-            d_background = torch.from_numpy((gradient * passing).sum(axis=(0, 1)))
-        return (
-            torch.from_numpy(scattered[:, 0:2].copy()),
-            torch.from_numpy(scattered[:, 2:5].copy()),
-            torch.from_numpy(d_colors),
-            torch.from_numpy(scattered[:, 5].copy()),
-            d_background,
-            *(None,) * 5,
-        )
+            d_background = torch.from_numpy((gradient * passing[:, :, None]).sum(axis=(0, 1)))
+        d_means2d, d_conics, d_opacities, d_colors = map(torch.from_numpy, results[:4])
+        return d_means2d, d_conics, d_colors, d_opacities, d_background, *(None,) * 5
 
 
 def _prepare(
@@ -227,17 +215,14 @@ def _prepare(
     width: int,
     height: int,
 ) -> _Prepared:
-    """Sort what is visible by depth and list it by tile.
-
-    A colour that is not finite is left out here: 0 times NaN would carry it to every pixel of a tile.
-    """
+    """Sort what is visible by depth and list it by tile."""
     alphas = _array(opacities)
-    seen = (_array(radii) > 0).all(axis=1) & (alphas >= projection.MIN_ALPHA)
-    seen &= np.isfinite(_array(colors)).all(axis=1)
+    seen = np.empty(len(alphas), np.bool_)
+    layout.mark_visible(_array(radii), alphas, _array(colors), projection.MIN_ALPHA, seen)
     order = depth_order(_array(depths), seen)
     reach = _reach(alphas[order])
     lists = list_tiles(_array(means2d)[order], _array(conics)[order], reach, width, height)
-    return _Prepared(order, lists, width, height)
+    return _Prepared(order, reach, lists, width, height)
 
 
 def _reach(opacities: np.ndarray) -> np.ndarray:
@@ -257,21 +242,18 @@ def _records(
     first: int,
 ) -> np.ndarray:
     """The Gaussians in depth order as ``blending`` reads them, flat."""
-    order = prepared.order
-    records = np.zeros((len(order), blending.RECORD), np.float32)
-    records[:, 0:2] = _array(means2d)[order]
-    records[:, 2:5] = _array(conics)[order]
-    records[:, 5] = _array(opacities)[order]
-    records[:, 6] = -_reach(records[:, 5])
-    part = _array(colors)[order, first : first + blending.CHANNELS]
-    records[:, 7 : 7 + part.shape[1]] = part
-    return records.reshape(-1)
+    records = np.empty(len(prepared.order) * blending.RECORD, np.float32)
+    arrays = [_array(each) for each in (means2d, conics, opacities)]
+    layout.gather(  # type: ignore[call-arg]  # star arguments
+        prepared.order, *arrays, prepared.reach, _array(colors), first, records
+    )
+    return records
 
 
 def _forward(prepared: _Prepared, records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    blocks = prepared.rows * prepared.columns * blending.BLOCKS
-    image = np.empty(blocks * blending.CHANNELS * 16, np.float32)
-    transmittance = np.empty(blocks * 16, np.float32)
+    """The block image and its transmittance."""
+    image = np.empty(prepared.lanes * blending.CHANNELS, np.float32)
+    transmittance = np.empty(prepared.lanes, np.float32)
     blending.forward(
         records, prepared.lists.tile_start, prepared.lists.listed_rank, prepared.columns,
         blending.COLUMN, blending.ROW, image, transmittance,
@@ -280,33 +262,22 @@ def _forward(prepared: _Prepared, records: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def _backward(
-    prepared: _Prepared, records: np.ndarray, gradient: np.ndarray, behind: np.ndarray
+    prepared: _Prepared,
+    records: np.ndarray,
+    d_image: np.ndarray,
+    image: np.ndarray,
+    d_passing: np.ndarray,
+    first: int,
 ) -> np.ndarray:
     """Gradient sums of every visible Gaussian, by depth rank, [G, 16]."""
-    lists = prepared.lists
+    lists, lanes = prepared.lists, prepared.lanes
+    gradient, behind = np.zeros(lanes * blending.CHANNELS, np.float32), np.zeros(lanes, np.float32)
+    layout.to_blocks(d_image, image, d_passing, prepared.columns, first, gradient, behind)
     sums = np.zeros(len(lists.listed_rank) * blending.SUMS, np.float32)
     blending.backward(
         records, lists.tile_start, lists.listed_rank, lists.listed_slot, prepared.columns,
-        blending.COLUMN, blending.ROW, _to_blocks(prepared, gradient, blending.CHANNELS),
-        _to_blocks(prepared, behind[:, :, None], 1), sums,
+        blending.COLUMN, blending.ROW, gradient, behind, sums,
     )  # fmt: skip
     totals = np.empty((len(prepared.order), blending.SUMS), np.float32)
     blending.sum_pairs(lists.slot_start, sums, totals)
     return totals
-
-
-def _to_image(prepared: _Prepared, blocks: np.ndarray, channels: int) -> np.ndarray:
-    """A block image as [H, W, channels]."""
-    rows, columns = prepared.rows, prepared.columns
-    tiled = blocks.reshape(rows, columns, 2, 2, channels, 4, 4).transpose(0, 2, 5, 1, 3, 6, 4)
-    image = tiled.reshape(rows * TILE, columns * TILE, channels)
-    return image[: prepared.height, : prepared.width]
-
-
-def _to_blocks(prepared: _Prepared, image: np.ndarray, channels: int) -> np.ndarray:
-    """[H, W, up to ``channels``] as a flat block image, padded with 0."""
-    rows, columns = prepared.rows, prepared.columns
-    padded = np.zeros((rows * TILE, columns * TILE, channels), np.float32)
-    padded[: prepared.height, : prepared.width, : image.shape[2]] = image
-    tiled = padded.reshape(rows, 2, 4, columns, 2, 4, channels).transpose(0, 3, 1, 4, 6, 2, 5)
-    return np.ascontiguousarray(tiled).reshape(-1)

@@ -12,12 +12,14 @@ import math
 
 import numpy as np
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.jit import always_inline, kernel, parallel_range
 
 __all__ = ["MAX_DEGREE", "harmonics", "harmonics_vjp"]
 
 MAX_DEGREE = 3
 TERMS = 16
+CHUNKS = 64
+"""Pieces that threads take, each with working arrays of its own."""
 Y0 = 0.2820947917738781
 Y1 = 0.48860251190292
 Y2A, Y2B, Y2C = 1.0925484305920792, 0.9461746957575601, 0.5462742152960396
@@ -37,17 +39,18 @@ def harmonics(directions, coefficients, visible, terms, colors):  # type: ignore
         terms: How many of the K take part: (degree + 1)^2.
         colors: Written, float32 [N, 3].
     """
-    for i in parallel_range(len(directions)):
-        colors[i, 0] = colors[i, 1] = colors[i, 2] = 0.0
-        if visible[i]:
-            basis = np.empty(TERMS)
-            x, y, z, _ = _unit(directions[i])
-            _basis(x, y, z, terms, basis)
-            for channel in range(3):
-                total = 0.0
-                for k in range(terms):
-                    total += basis[k] * coefficients[i, k, channel]
-                colors[i, channel] = total
+    for chunk in parallel_range(CHUNKS):
+        basis = np.empty(TERMS)
+        for i in range(chunk * len(directions) // CHUNKS, (chunk + 1) * len(directions) // CHUNKS):
+            colors[i, 0] = colors[i, 1] = colors[i, 2] = 0.0
+            if visible[i]:
+                x, y, z, _ = _unit(directions[i])
+                _basis(x, y, z, terms, basis)
+                for channel in range(3):
+                    total = 0.0
+                    for k in range(terms):
+                        total += basis[k] * coefficients[i, k, channel]
+                    colors[i, channel] = total
 
 
 @kernel
@@ -65,36 +68,37 @@ def harmonics_vjp(  # type: ignore[no-untyped-def]
         d_directions: Written, float32 [N, 3]; must hold 0.
         d_coefficients: Written, float32 [N, K, 3]; must hold 0.
     """
-    for i in parallel_range(len(directions)):
-        if visible[i]:
-            basis, slope, weight = np.empty(TERMS), np.zeros((3, TERMS)), np.empty(TERMS)
-            x, y, z, length = _unit(directions[i])
-            _basis(x, y, z, terms, basis)
-            _slopes(x, y, z, terms, slope)
-            for k in range(terms):
-                weight[k] = 0.0
-                for channel in range(3):
-                    d_coefficients[i, k, channel] = basis[k] * d_colors[i, channel]
-                    weight[k] += coefficients[i, k, channel] * np.float64(d_colors[i, channel])
-            dx = dy = dz = 0.0
-            for k in range(terms):
-                dx += weight[k] * slope[0, k]
-                dy += weight[k] * slope[1, k]
-                dz += weight[k] * slope[2, k]
-            along = dx * x + dy * y + dz * z
-            d_directions[i, 0] = (dx - along * x) / length
-            d_directions[i, 1] = (dy - along * y) / length
-            d_directions[i, 2] = (dz - along * z) / length
+    for chunk in parallel_range(CHUNKS):
+        basis, slope, weight = np.empty(TERMS), np.zeros((3, TERMS)), np.empty(TERMS)
+        for i in range(chunk * len(directions) // CHUNKS, (chunk + 1) * len(directions) // CHUNKS):
+            if visible[i]:
+                x, y, z, length = _unit(directions[i])
+                _basis(x, y, z, terms, basis)
+                _slopes(x, y, z, terms, slope)
+                for k in range(terms):
+                    weight[k] = 0.0
+                    for channel in range(3):
+                        d_coefficients[i, k, channel] = basis[k] * d_colors[i, channel]
+                        weight[k] += coefficients[i, k, channel] * np.float64(d_colors[i, channel])
+                dx = dy = dz = 0.0
+                for k in range(terms):
+                    dx += weight[k] * slope[0, k]
+                    dy += weight[k] * slope[1, k]
+                    dz += weight[k] * slope[2, k]
+                along = dx * x + dy * y + dz * z
+                d_directions[i, 0] = (dx - along * x) / length
+                d_directions[i, 1] = (dy - along * y) / length
+                d_directions[i, 2] = (dz - along * z) / length
 
 
-@inline
+@always_inline
 def _unit(direction):  # type: ignore[no-untyped-def]
     x, y, z = np.float64(direction[0]), np.float64(direction[1]), np.float64(direction[2])
     length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
     return x / length, y / length, z / length, length
 
 
-@inline
+@always_inline
 def _basis(x, y, z, terms, out):  # type: ignore[no-untyped-def]
     """The basis functions at a unit direction."""
     out[0] = Y0
@@ -113,7 +117,7 @@ def _basis(x, y, z, terms, out):  # type: ignore[no-untyped-def]
         out[15] = -Y3A * x * (x * x - 3.0 * y * y)
 
 
-@inline
+@always_inline
 def _slopes(x, y, z, terms, out):  # type: ignore[no-untyped-def]
     """Derivatives of ``_basis`` along x, y and z; ``out`` holds 0."""
     if terms > 1:

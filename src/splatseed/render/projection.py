@@ -19,7 +19,7 @@ import math
 
 import numpy as np
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.jit import always_inline, kernel, parallel_range
 
 __all__ = ["project", "project_vjp"]
 
@@ -57,33 +57,35 @@ def project(  # type: ignore[no-untyped-def]
         conics: Written, float32 [N, 3].
         compensations: Written, float32 [N].
     """
-    for i in parallel_range(len(means)):
-        radii[i, 0] = radii[i, 1] = 0
-        x, y, z = _to_camera(means[i], view)
-        if not near <= z <= far:
-            continue
+    for chunk in parallel_range(CHUNKS):
+        # One allocation a chunk: one a Gaussian takes as long as all of the arithmetic.
         R, M, V, P = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3))
-        _rotation(quats[i], R)
-        J = _jacobian(x, y, z, K, width, height)
-        _factors(R, scales[i], view, J, M, V, P)
-        xx, xy, yy = _covariance(P)
-        det = (xx + eps2d) * (yy + eps2d) - xy * xy
-        compensation = math.sqrt(max((xx * yy - xy * xy) / det, 0.0))
-        xx, yy = xx + eps2d, yy + eps2d
-        opacity = opacities[i] * compensation if antialiased else np.float64(opacities[i])
-        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        if det > 0.0 and det < np.inf and MIN_ALPHA <= opacity < np.inf:
-            sigmas = min(MAX_SIGMAS, math.sqrt(2.0 * math.log(opacity / MIN_ALPHA)))
-            rx, ry = np.ceil(sigmas * math.sqrt(xx)), np.ceil(sigmas * math.sqrt(yy))
-            inside = u + rx > 0 and u - rx < width and v + ry > 0 and v - ry < height
-            if inside and (rx > radius_clip or ry > radius_clip):
-                radii[i, 0], radii[i, 1] = min(rx, 1e9), min(ry, 1e9)
-                means2d[i, 0], means2d[i, 1], depths[i] = u, v, z
-                conics[i, 0], conics[i, 1], conics[i, 2] = yy / det, -xy / det, xx / det
-                compensations[i] = compensation
+        for i in range(chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS):
+            radii[i, 0] = radii[i, 1] = 0
+            x, y, z = _to_camera(means[i], view)
+            if not near <= z <= far:
+                continue
+            _rotation(quats[i], R)
+            J = _jacobian(x, y, z, K, width, height)
+            _factors(R, scales[i], view, J, M, V, P)
+            xx, xy, yy = _covariance(P)
+            det = (xx + eps2d) * (yy + eps2d) - xy * xy
+            compensation = math.sqrt(max((xx * yy - xy * xy) / det, 0.0))
+            xx, yy = xx + eps2d, yy + eps2d
+            opacity = opacities[i] * compensation if antialiased else np.float64(opacities[i])
+            u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+            if det > 0.0 and det < np.inf and MIN_ALPHA <= opacity < np.inf:
+                sigmas = min(MAX_SIGMAS, math.sqrt(2.0 * math.log(opacity / MIN_ALPHA)))
+                rx, ry = np.ceil(sigmas * math.sqrt(xx)), np.ceil(sigmas * math.sqrt(yy))
+                inside = u + rx > 0 and u - rx < width and v + ry > 0 and v - ry < height
+                if inside and (rx > radius_clip or ry > radius_clip):
+                    radii[i, 0], radii[i, 1] = min(rx, 1e9), min(ry, 1e9)
+                    means2d[i, 0], means2d[i, 1], depths[i] = u, v, z
+                    conics[i, 0], conics[i, 1], conics[i, 2] = yy / det, -xy / det, xx / det
+                    compensations[i] = compensation
 
 
-@inline
+@always_inline
 def _to_camera(mean, view):  # type: ignore[no-untyped-def]
     m0, m1, m2 = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
     return (
@@ -93,7 +95,7 @@ def _to_camera(mean, view):  # type: ignore[no-untyped-def]
     )
 
 
-@inline
+@always_inline
 def _rotation(quat, R):  # type: ignore[no-untyped-def]
     """Fill R(q / |q|); return |q|."""
     w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
@@ -105,7 +107,7 @@ def _rotation(quat, R):  # type: ignore[no-untyped-def]
     return norm
 
 
-@inline
+@always_inline
 def _jacobian(x, y, z, K, width, height):  # type: ignore[no-untyped-def]
     """(J00, J02, J11, J12), and whether x / z and y / z were held back."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -115,7 +117,7 @@ def _jacobian(x, y, z, K, width, height):  # type: ignore[no-untyped-def]
     return fx / z, -fx * u / z, fy / z, -fy * v / z, u != x / z, v != y / z
 
 
-@inline
+@always_inline
 def _factors(R, scale, view, J, M, V, P):  # type: ignore[no-untyped-def]
     """M = R diag(s), V = W M and P = J V."""
     for r in range(3):
@@ -129,7 +131,7 @@ def _factors(R, scale, view, J, M, V, P):  # type: ignore[no-untyped-def]
         P[1, c] = J[2] * V[1, c] + J[3] * V[2, c]
 
 
-@inline
+@always_inline
 def _covariance(P):  # type: ignore[no-untyped-def]
     xx = P[0, 0] * P[0, 0] + P[0, 1] * P[0, 1] + P[0, 2] * P[0, 2]
     xy = P[0, 0] * P[1, 0] + P[0, 1] * P[1, 1] + P[0, 2] * P[1, 2]
@@ -178,7 +180,7 @@ def project_vjp(  # type: ignore[no-untyped-def]
                 _shape_vjp(quats[i], norm, R, scales[i], dM, d_quats[i], d_scales[i])
 
 
-@inline
+@always_inline
 def _covariance_vjp(P, eps2d, d_conic, d_compensation, dP):  # type: ignore[no-untyped-def]
     """From the conic and the compensation to P."""
     raw_xx, xy, raw_yy = _covariance(P)
@@ -203,7 +205,7 @@ def _covariance_vjp(P, eps2d, d_conic, d_compensation, dP):  # type: ignore[no-u
         dP[1, c_] = 2.0 * d_yy * P[1, c_] + d_xy * P[0, c_]
 
 
-@inline
+@always_inline
 def _camera_vjp(x, y, z, K, J, V, dP, d_mean2d, d_depth, dV, dt):  # type: ignore[no-untyped-def]
     """From P, the 2D mean and the depth to V and the mean in camera axes."""
     fx, fy = np.float64(K[0, 0]), np.float64(K[1, 1])
@@ -227,7 +229,7 @@ def _camera_vjp(x, y, z, K, J, V, dP, d_mean2d, d_depth, dV, dt):  # type: ignor
         dt[2] += d12 * fy * y / (z * z * z)
 
 
-@inline
+@always_inline
 def _world_vjp(mean, view, M, dV, dt, dM, d_mean, d_view):  # type: ignore[no-untyped-def]
     """From camera axes to the world, and to the camera's pose."""
     for r in range(3):
@@ -239,7 +241,7 @@ def _world_vjp(mean, view, M, dV, dt, dM, d_mean, d_view):  # type: ignore[no-un
         d_view[r, 3] += dt[r]
 
 
-@inline
+@always_inline
 def _shape_vjp(quat, norm, R, scale, dM, d_quat, d_scale):  # type: ignore[no-untyped-def]
     """From M = R(q / |q|) diag(s) to the scales and the unnormalised quaternion."""
     for c in range(3):
