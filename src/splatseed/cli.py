@@ -23,7 +23,7 @@ VERBS = {
     "evaluate": "Score a trained model: PSNR, SSIM, LPIPS.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",
-    "demo": "Make a small scene, upsample it by every method, measure.",
+    "demo": "Make a small scene, upsample it by every method, measure, train.",
 }
 INTERRUPTED = 130
 

@@ -157,7 +157,7 @@ def _lpips(options: Options) -> tuple[Lpips | None, str]:
     except (MissingDependencyError, SceneNotFoundError) as error:
         if options.lpips_weights is not None:
             raise
-        return None, f"no {error.expected}. {error.fix}"
+        return None, str(error)
 
 
 def _evaluate(

@@ -13,7 +13,7 @@ from jaxtyping import Float32, UInt8
 
 from splatseed.io.staging import atomic_file
 
-__all__ = ["FULL_ERROR", "beside_truth", "picture_name", "write_picture"]
+__all__ = ["FULL_ERROR", "beside_truth", "error_map", "picture_name", "write_picture"]
 
 FULL_ERROR = 0.25
 """The error that is drawn brightest."""
@@ -30,11 +30,22 @@ def beside_truth(
         truth: The photograph.
         render: What the Gaussians look like, 0 to 1; clamped.
     """
-    clamped = np.clip(render, 0.0, 1.0)
-    error = np.abs(clamped - truth / np.float32(255)).mean(axis=2)
     gap = np.full((len(truth), GAP, 3), WHITE, np.uint8)
-    drawn = np.round(clamped * 255).astype(np.uint8)
-    return np.concatenate([truth, gap, drawn, gap, _heat(error)], axis=1)
+    drawn = np.round(np.clip(render, 0.0, 1.0) * 255).astype(np.uint8)
+    return np.concatenate([truth, gap, drawn, gap, error_map(truth, render)], axis=1)
+
+
+def error_map(
+    truth: UInt8[np.ndarray, "H W 3"], render: Float32[np.ndarray, "H W 3"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The error of each pixel as a colour: black is none, ``FULL_ERROR`` or more the brightest.
+
+    Args:
+        truth: The photograph.
+        render: What the Gaussians look like, 0 to 1; clamped.
+    """
+    error = np.abs(np.clip(render, 0.0, 1.0) - truth / np.float32(255)).mean(axis=2)
+    return _heat(error)
 
 
 def picture_name(image_name: str) -> str:
