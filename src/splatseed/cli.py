@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 from importlib import import_module
 from importlib.metadata import version
@@ -18,9 +19,11 @@ __all__ = ["main"]
 
 VERBS = {
     "upsample": "Add points to a scene and write it for any 3DGS trainer.",
+    "train": "Train 3D Gaussians on a scene, on a GPU or on the CPU.",
+    "evaluate": "Score a trained model: PSNR, SSIM, LPIPS.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",
-    "demo": "Make a small scene, upsample it by every method, measure.",
+    "demo": "Make a small scene, upsample it by every method, measure, train.",
 }
 INTERRUPTED = 130
 
@@ -28,7 +31,11 @@ INTERRUPTED = 130
 def main(arguments: list[str] | None = None) -> None:
     """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
     words = sys.argv[1:] if arguments is None else arguments
+    # PyTorch and Numba each keep a pool of threads. Waiting by spinning, as is the default, the one
+    # takes the cores from the other, and on a busy machine a training step took 5-20 times as long.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     _print_any_name()
+    _let_threads_sleep()
     if not words or words[0] in {"-h", "--help"}:
         _print_help()
         return
@@ -63,6 +70,15 @@ def _print_any_name() -> None:
     """Let file names that are no valid text be printed, escaped, as Python does on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
+
+
+def _let_threads_sleep() -> None:
+    """Have idle threads sleep rather than spin; OpenMP reads this as PyTorch and Numba load it.
+
+    The two have a pool of threads each: spinning, one slows the other, and on a machine that is
+    also at other work a training step was seen to take several times as long.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def _fail(message: str) -> NoReturn:

@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeEl
 from rich.table import Table
 
 __all__ = [
+    "ERR",
     "OUT",
     "StageClock",
     "print_commands",

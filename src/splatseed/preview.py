@@ -23,7 +23,15 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.viewpoint import choose_camera, choose_image
 
-__all__ = ["choose_camera", "preview_errors", "preview_methods", "preview_pair", "render_points"]
+__all__ = [
+    "Tile",
+    "choose_camera",
+    "preview_errors",
+    "preview_methods",
+    "preview_pair",
+    "render_points",
+    "write_grid",
+]
 
 PAIR_SIDE = 800
 GRID_SIDE = 600
@@ -39,7 +47,9 @@ PAPER = (255, 255, 255)
 INK = (20, 20, 20)
 
 
-class _Tile(NamedTuple):
+class Tile(NamedTuple):
+    """A picture and the words above it."""
+
     label: str
     picture: UInt8[np.ndarray, "H W 3"]
 
@@ -145,7 +155,7 @@ def preview_pair(
     """
     camera = choose_camera(scene)
     clouds = {"original": scene.points, title: upsampled}
-    return _write_grid(_cloud_tiles(clouds, camera, PAIR_SIDE), path, columns=2)
+    return write_grid(_cloud_tiles(clouds, camera, PAIR_SIDE), path, columns=2)
 
 
 def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: Path | str) -> Path:
@@ -165,8 +175,8 @@ def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: Path |
     height, width = tiles[0].picture.shape[:2]
     photo = _photo(scene, (width, height))
     if photo is not None:
-        tiles.insert(0, _Tile("photograph", photo))
-    return _write_grid(tiles, path, columns=_columns(len(tiles)))
+        tiles.insert(0, Tile("photograph", photo))
+    return write_grid(tiles, path, columns=_columns(len(tiles)))
 
 
 def preview_errors(
@@ -197,11 +207,11 @@ def preview_errors(
         for label, cloud in clouds.items()
     }
     tiles = [
-        _Tile(f"{tile.label}: mean error {distances[label].mean():.2f} {unit}", tile.picture)
+        Tile(f"{tile.label}: mean error {distances[label].mean():.2f} {unit}", tile.picture)
         for label, tile in zip(colored, _cloud_tiles(colored, camera, GRID_SIDE), strict=True)
     ]
     bar = _color_bar(limit, unit)
-    return _write_grid(tiles, path, columns=_columns(len(tiles)), footer=bar)
+    return write_grid(tiles, path, columns=_columns(len(tiles)), footer=bar)
 
 
 def _matching(distances: np.ndarray, cloud: PointCloud, label: str) -> np.ndarray:
@@ -222,10 +232,10 @@ def _heat(values: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
     return np.asarray(rgba[..., :3])
 
 
-def _cloud_tiles(clouds: Mapping[str, PointCloud], camera: Camera, side: int) -> list[_Tile]:
+def _cloud_tiles(clouds: Mapping[str, PointCloud], camera: Camera, side: int) -> list[Tile]:
     scale = side / max(camera.width, camera.height)
     return [
-        _Tile(f"{label}   {len(cloud):,} points", render_points(cloud, camera, scale=scale))
+        Tile(f"{label}   {len(cloud):,} points", render_points(cloud, camera, scale=scale))
         for label, cloud in clouds.items()
     ]
 
@@ -263,14 +273,24 @@ def _color_bar(limit: float, unit: str) -> UInt8[np.ndarray, "H W 3"]:
     return np.asarray(bar)
 
 
-def _write_grid(
-    tiles: Sequence[_Tile],
+def write_grid(
+    tiles: Sequence[Tile],
     path: Path | str,
     *,
     columns: int,
     footer: UInt8[np.ndarray, "H W 3"] | None = None,
 ) -> Path:
-    """Set the tiles in rows, each with its label above, and write the PNG."""
+    """Set pictures of one size in rows, each with its label above, and write the PNG.
+
+    Args:
+        tiles: At least one, set row by row.
+        path: The PNG to write.
+        columns: Tiles in a row.
+        footer: A strip below all, no wider than the page.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
     gap, label_height = 12, 34
     height, width = tiles[0].picture.shape[:2]
     rows = -(-len(tiles) // columns)

@@ -15,7 +15,7 @@ from splatseed.upsample import METHODS
 
 def test_demo_leaves_a_scene_scores_and_pictures(tmp_path, splatseed):
     out = tmp_path / "demo"
-    run = splatseed("demo", "--views", 6, "--ratio", 4, "-o", out)
+    run = splatseed("demo", "--views", 6, "--ratio", 4, "--train-steps", 0, "-o", out)
     assert (run.code, run.err) == (0, "")
     for name in ("preview.png", "preview_methods.png", "preview_errors.png"):
         assert str(out / name) in run.out

@@ -2,23 +2,32 @@
 
 It photographs a made-up room, finds points as Structure-from-Motion would, writes them as a COLMAP
 scene, reads that back, upsamples it by every method, and measures how far the new points lie from
-the true surfaces and how well they cover them.
+the true surfaces and how well they cover them. Then, where PyTorch and gsplat are installed, it
+trains for a short while from the points as found and from the upsampled ones, and compares.
 """
 
 from __future__ import annotations
 
 import csv
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
 from splatseed.commands._options import parse_options
-from splatseed.console import StageClock, print_commands, print_pairs, print_table, stage_display
+from splatseed.console import (
+    StageClock,
+    print_commands,
+    print_note,
+    print_pairs,
+    print_table,
+    stage_display,
+)
+from splatseed.errors import MissingDependencyError, ParameterError
 from splatseed.geometry import GeometryScore, measure, spacing
 from splatseed.io import load_scene, write_scene
 from splatseed.io.staging import atomic_file, output_folder
@@ -26,19 +35,24 @@ from splatseed.pointcloud import PointCloud
 from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
 from splatseed.scene import Scene
 from splatseed.synthetic import Capture, make_capture, write_capture
+from splatseed.train.requirements import require
 from splatseed.upsample import METHODS, planned_size, upsample
+
+if TYPE_CHECKING:  # importing PyTorch takes a while, and it may be absent
+    from splatseed.commands._demo_training import TrainedArm
 
 __all__ = ["run"]
 
 SHOWN = "mls"
 SAMPLES = 20_000
 """Places on the surfaces at which coverage is taken."""
+TRAINED_PICTURE = "preview_trained.png"
 MANIFEST_TEXT = '{"command": "demo"}\n'
 
 
 @dataclass(frozen=True)
 class Options:
-    """Make a small scene, upsample it by every method, and show the result."""
+    """Make a small scene, upsample it by every method, train from it, and show the result."""
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """The folder to write."""
@@ -48,6 +62,8 @@ class Options:
     """Photographs of the made-up room."""
     seed: int = 0
     """The same seed gives the same demo."""
+    train_steps: int = 500
+    """Training steps from each of two sets of seeds; 0 for no training."""
     preview: bool = True
     """Write pictures."""
     overwrite: bool = False
@@ -57,7 +73,7 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
     options = parse_options(Options, "demo", arguments)
-    planned_size(1, options.ratio, None)  # refuses a wrong ratio before a minute's work
+    _check(options)
     with (
         stage_display() as clock,
         output_folder(options.output, overwrite=options.overwrite) as folder,
@@ -78,6 +94,17 @@ def run(arguments: list[str]) -> None:
         (folder / "splatseed.json").write_text(MANIFEST_TEXT, encoding="utf-8")
         seconds = clock.seconds()
     _summarise(options, scene, scores, seconds)
+    trained = _train(options) if options.train_steps else False
+    _say_what_next(options, trained=trained)
+
+
+def _check(options: Options) -> None:
+    """Refuse what would fail after a minute's work."""
+    planned_size(1, options.ratio, None)
+    if options.train_steps < 0:
+        raise ParameterError(
+            "--train-steps of 0 or more", found=f"{options.train_steps}", fix="Pass 0 not to train."
+        )
 
 
 def _upsample_all(options: Options, scene: Scene, clock: StageClock) -> dict[str, PointCloud]:
@@ -168,6 +195,87 @@ def _summarise(
         *(("pictures" if not i else "", str(options.output / n)) for i, n in enumerate(names)),
     ]
     print_pairs("splatseed demo", rows)
-    scene_dir = shlex.quote(str(options.output / "scene"))
-    command = f"splatseed upsample {scene_dir} --method spline --ratio 16 -o OUT"
-    print_commands("next", [("", command)])
+
+
+def _train(options: Options) -> bool:
+    """Train from both sets of seeds and compare, if what it takes is installed."""
+    try:
+        require("torch", "gsplat")
+    except MissingDependencyError as error:
+        print_note(f"not trained: {error.found} installed. {error.fix}")
+        return False
+    # These import PyTorch.
+    from splatseed.commands._demo_training import Arm, train_arm, write_comparison  # noqa: PLC0415
+    from splatseed.train.settings import TrainSettings  # noqa: PLC0415
+
+    folder = options.output
+    arms = [
+        Arm("SfM seeds", folder / "scene", folder / "run_sfm"),
+        Arm(f"{SHOWN} {options.ratio:g}x", folder / f"scene_{SHOWN}", folder / f"run_{SHOWN}"),
+    ]
+    settings = TrainSettings(strategy="none", max_steps=options.train_steps, seed=options.seed)
+    with stage_display() as clock:
+        trained = [train_arm(arm, settings, clock) for arm in arms]
+        if options.preview:
+            write_comparison(trained, folder / TRAINED_PICTURE)
+    _summarise_training(options, trained)
+    return True
+
+
+def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None:
+    """Both runs side by side, and what they do and do not show."""
+    base = trained[0].metrics
+    goal = base["tests"][-1]["psnr"]
+    rows = [_row(each, goal) for each in trained]
+    print_table(
+        f"{options.train_steps:,} training steps, {len(base['per_image'])} test views",
+        ("seeds", "Gaussians", "seconds", "PSNR, dB", "SSIM", f"{goal:.2f} dB after"),
+        rows,
+    )
+    pictures = [("pictures", str(options.output / TRAINED_PICTURE))] if options.preview else []
+    print_pairs(
+        "what this shows",
+        [
+            ("fixed", "no Gaussian is added or removed, so this is the worth of the seeds alone"),
+            ("cost", "a step takes longer with more Gaussians: compare the seconds as well"),
+            (
+                "limits",
+                "a made-up room, one run each, no error bars; a long run with densification",
+            ),
+            ("", "adds Gaussians of its own, and the difference can be smaller or gone"),
+            *pictures,
+        ],
+    )
+
+
+def _row(each: TrainedArm, goal: float) -> tuple[str, ...]:
+    from splatseed.commands._demo_training import when_reached  # noqa: PLC0415  (as above)
+
+    metrics, reached = each.metrics, when_reached(goal, each.metrics)
+    return (
+        each.arm.label,
+        f"{metrics['num_gaussians']:,}",
+        f"{metrics['train_seconds']:.1f}",
+        f"{metrics['psnr']:.2f}",
+        f"{metrics['ssim']:.4f}",
+        "not reached" if reached is None else f"{reached[0]:,} steps, {reached[1]:.1f} s",
+    )
+
+
+def _say_what_next(options: Options, *, trained: bool) -> None:
+    scene, seeded = (options.output / name for name in ("scene", f"scene_{SHOWN}"))
+    run = options.output / f"run_{SHOWN}"
+    commands = [
+        (
+            "another method",
+            f"splatseed upsample {_quoted(scene)} --method spline --ratio 16 -o OUT",
+        ),
+        ("a longer run", f"splatseed train {_quoted(seeded)} --max-steps 3000 -o RUN"),
+    ]
+    if trained:
+        commands.append(("the scores again", f"splatseed evaluate {_quoted(run)}"))
+    print_commands("next", commands)
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))

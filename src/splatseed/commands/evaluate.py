@@ -1,0 +1,233 @@
+"""``splatseed evaluate``: how close a trained model comes to photographs it has not seen."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from splatseed.commands._options import parse_options
+from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
+from splatseed.errors import (
+    MissingDependencyError,
+    ParameterError,
+    SceneNotFoundError,
+)
+from splatseed.io.staging import MANIFEST, atomic_file, check_output, output_folder
+from splatseed.train.photographs import user_cache_dir
+from splatseed.train.requirements import require
+from splatseed.train.run_folder import RunFolder
+from splatseed.train.settings import Backend, TrainSettings
+
+if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
+    from splatseed.evaluate import EvalResult, Lpips
+
+__all__ = ["run"]
+
+MANIFEST_TEXT = '{"command": "evaluate"}\n'
+PathOrNone = Annotated[
+    Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
+]
+CountOrNone = Annotated[
+    int | None, tyro.conf.arg(constructor=int, metavar="INT", help_behavior_hint="")
+]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Score a trained model on the test views of its scene: PSNR, SSIM, LPIPS."""
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """The folder of a run of splatseed train, or a .ply of Gaussians from any trainer."""
+    scene: PathOrNone = None
+    """The scene that the model is of, in the same world; a run knows its own."""
+    data_factor: CountOrNone = None
+    """By how much photographs are made smaller; a run's own, else 1."""
+    test_every: CountOrNone = None
+    """Of the images sorted by name, every so many-th is scored; a run's own, else 8."""
+    lpips_net: Literal["vgg", "alex"] = "vgg"
+    """The network that LPIPS compares features of."""
+    lpips_weights: PathOrNone = None
+    """The file of that network's weights, or its folder; PyTorch's cache if left out."""
+    backend: Backend = "auto"
+    """Where to render; auto takes a GPU if PyTorch sees one."""
+    output: Annotated[
+        Path | None,
+        tyro.conf.arg(aliases=["-o"], constructor=Path, metavar="PATH", help_behavior_hint=""),
+    ] = None
+    """A JSON file to write the scores to."""
+    renders: PathOrNone = None
+    """A folder to write pictures to: photograph, render, and error map of each test view."""
+    overwrite: bool = False
+    """Replace files and folders that are there."""
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What is scored against what."""
+
+    gaussians: Path
+    scene: Path
+    data_factor: int
+    test_every: int
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = parse_options(Options, "evaluate", arguments)
+    require("torch")
+    task = _task(options)
+    _check_outputs(options, task)
+    lpips, reason = _lpips(options)
+    with stage_display() as clock:
+        result = _evaluate(options, task, lpips, reason, clock)
+    _summarise(options, task, result)
+
+
+def _task(options: Options) -> _Task:
+    """The files and settings, from a run's config where the options do not say."""
+    path, config = options.model, _config(options.model)
+    scene = options.scene or config.get("scene")
+    if not isinstance(scene, str | Path):
+        raise ParameterError(
+            f"--scene, as {path} does not say what it is of",
+            found="none",
+            fix="Pass --scene SCENE: the scene that it was trained on.",
+        )
+    return _Task(
+        gaussians=RunFolder(path).gaussians if path.is_dir() else path,
+        scene=Path(scene),
+        data_factor=_whole("data_factor", options.data_factor, config, least=1),
+        test_every=_whole("test_every", options.test_every, config, least=2),
+    )
+
+
+def _config(path: Path) -> Mapping[str, Any]:
+    """The config of a run that has finished; nothing for a single file."""
+    if path.is_file():
+        return {}
+    folder = RunFolder(path)
+    if path.is_dir() and folder.is_run and folder.gaussians.is_file():
+        return folder.read_config()
+    found = "nothing there"
+    if path.is_dir():
+        found = "a run that has not finished" if folder.is_run else "a folder that is no run"
+    raise SceneNotFoundError(
+        f"{path} to be a finished run of splatseed train, or a .ply of Gaussians",
+        found=found,
+        fix="Name the .ply itself, or go on with the run: splatseed train SCENE -o RUN --resume.",
+    )
+
+
+def _whole(name: str, given: int | None, config: Mapping[str, Any], *, least: int) -> int:
+    value = config.get(name, getattr(TrainSettings, name)) if given is None else given
+    if not isinstance(value, int) or value < least:
+        raise ParameterError(
+            f"--{name.replace('_', '-')} of {least} or more",
+            found=f"{value}",
+            fix="See splatseed evaluate --help.",
+        )
+    return value
+
+
+def _check_outputs(options: Options, task: _Task) -> None:
+    """Refuse what cannot be written before any work is done."""
+    if options.renders is not None:
+        check_output(
+            options.renders, overwrite=options.overwrite, protect=[task.scene, options.model]
+        )
+    if options.output is not None and options.output.exists() and not options.overwrite:
+        raise ParameterError(
+            f"no file at {options.output}",
+            found="one",
+            fix="Pass --overwrite to replace it, or choose another name.",
+        )
+
+
+def _lpips(options: Options) -> tuple[Lpips | None, str]:
+    """The metric, or why there is none: weights that the user names must be there."""
+    from splatseed.evaluate import load_lpips  # noqa: PLC0415  (imports PyTorch)
+
+    try:
+        return load_lpips(options.lpips_net, options.lpips_weights), ""
+    except (MissingDependencyError, SceneNotFoundError) as error:
+        if options.lpips_weights is not None:
+            raise
+        return None, str(error)
+
+
+def _evaluate(
+    options: Options, task: _Task, lpips: Lpips | None, reason: str, clock: StageClock
+) -> EvalResult:
+    """Read the model and its scene, score the test views, and write what is asked for."""
+    from splatseed.evaluate import (  # noqa: PLC0415  (imports PyTorch)
+        evaluate_model,
+        load_model,
+        write_renders,
+    )
+    from splatseed.train.device import pick_device  # noqa: PLC0415  (likewise)
+
+    clock("read", 0.0)
+    model = load_model(
+        task.gaussians,
+        task.scene,
+        data_factor=task.data_factor,
+        test_every=task.test_every,
+        device=pick_device(options.backend),
+        cache_dir=user_cache_dir(),
+        progress=clock,
+    )
+    result = evaluate_model(model, lpips=lpips, lpips_reason=reason, progress=clock)
+    if options.renders is not None:
+        with output_folder(options.renders, overwrite=options.overwrite) as folder:
+            write_renders(model, folder, clock)
+            (folder / MANIFEST).write_text(MANIFEST_TEXT, encoding="utf-8")
+    if options.output is not None:
+        _write_json(options.output, options, task, result)
+    return result
+
+
+def _write_json(path: Path, options: Options, task: _Task, result: EvalResult) -> None:
+    content = {
+        "model": str(options.model),
+        "scene": str(task.scene),
+        "data_factor": task.data_factor,
+        "test_every": task.test_every,
+        **result.to_dict(),
+    }
+    with atomic_file(path, overwrite=options.overwrite) as partial:
+        partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", "utf-8")
+
+
+def _summarise(options: Options, task: _Task, result: EvalResult) -> None:
+    net = f"LPIPS ({result.lpips_net})" if result.lpips_net else "LPIPS"
+    rows = [
+        (s.name, *_numbers(s.psnr, s.ssim, s.lpips), f"{1e3 * s.seconds:.1f}")
+        for s in result.per_image
+    ]
+    mean = _numbers(result.psnr, result.ssim, result.lpips)
+    print_table(
+        f"{len(rows)} test views of {task.scene}",
+        ("image", "PSNR, dB", "SSIM", net, "render, ms"),
+        [*rows, ("mean", *mean, f"{1e3 * result.render_seconds:.1f}")],
+    )
+    written = [("scores", options.output), ("renders", options.renders)]
+    print_pairs(
+        str(options.model),
+        [
+            ("Gaussians", f"{result.num_gaussians:,}"),
+            ("size", f"{(result.model_bytes or 0) / 1e6:.1f} MB of parameters"),
+            ("data factor", str(task.data_factor)),
+            *((label, str(path)) for label, path in written if path is not None),
+        ],
+    )
+    if result.lpips is None:
+        print_note(f"LPIPS was not measured: {result.lpips_reason}")
+
+
+def _numbers(psnr: float, ssim: float, lpips: float | None) -> tuple[str, str, str]:
+    return f"{psnr:.2f}", f"{ssim:.4f}", "-" if lpips is None else f"{lpips:.4f}"

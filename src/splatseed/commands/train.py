@@ -1,0 +1,210 @@
+"""``splatseed train``: a scene and its seeds to trained Gaussians."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress as Bar,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from splatseed.commands._options import parse_options
+from splatseed.console import (
+    ERR,
+    OUT,
+    StageClock,
+    print_commands,
+    print_note,
+    print_pairs,
+    stage_display,
+)
+from splatseed.io import load_scene
+from splatseed.train.photographs import user_cache_dir
+from splatseed.train.requirements import require
+from splatseed.train.settings import Backend, StrategyName, TrainSettings
+
+if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
+    from splatseed.train.run import TrainingRun
+
+__all__ = ["run"]
+
+INTERRUPTED = 130
+DEFAULT = TrainSettings()
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train 3D Gaussians on a scene, on a GPU or on the CPU, and score them."""
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A scene with photographs, as splatseed upsample writes it."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The folder of the run."""
+    backend: Backend = DEFAULT.backend
+    """Where to train; auto takes a GPU if PyTorch sees one."""
+    strategy: StrategyName = DEFAULT.strategy
+    """Densify as 3DGS does, as MCMC up to a cap, or keep the seeds' number."""
+    max_steps: int = DEFAULT.max_steps
+    """Steps; all schedules shrink with them."""
+    data_factor: int = DEFAULT.data_factor
+    """By how much the photographs are made smaller."""
+    seed: int = DEFAULT.seed
+    """On the CPU the same seed gives the same bytes."""
+    cap_max: Annotated[
+        int | None,
+        tyro.conf.arg(
+            constructor=int, metavar="INT", help_behavior_hint="(default: 1000000 for mcmc)"
+        ),
+    ] = None
+    """Most Gaussians; more seeds than that are thinned out."""
+    sh_degree: int = DEFAULT.sh_degree
+    """How finely colours depend on the direction, 0 to 3."""
+    test_every: int = DEFAULT.test_every
+    """Of the images sorted by name, every so many-th is kept for the test."""
+    opacity_reset: bool = DEFAULT.opacity_reset
+    """Lower all opacities at times, as 3DGS does (strategy default; gsplat 1.5.3 does not)."""
+    resume: bool = False
+    """Go on with the run in the output folder, with its own settings."""
+    tensorboard: bool = False
+    """Also write a log for TensorBoard."""
+    overwrite: bool = False
+    """Replace an earlier run in the output folder."""
+
+    @property
+    def settings(self) -> TrainSettings:
+        """Those of the options that say how to train."""
+        return TrainSettings(**{each.name: getattr(self, each.name) for each in fields(DEFAULT)})
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = parse_options(Options, "train", arguments)
+    settings = options.settings
+    require("torch", "gsplat")
+    notes: list[str] = []
+    with stage_display() as clock:
+        training = _prepare(options, settings, notes.append, clock)
+    _announce(options, training, notes)
+    with _training_bar(training) as show:
+        done = training.train(show)
+    if not done:
+        _say_how_to_go_on(options, training)
+        sys.exit(INTERRUPTED)
+    with stage_display(clock):
+        metrics = _finish(training, clock)
+    _summarise(options, metrics)
+
+
+def _prepare(
+    options: Options, settings: TrainSettings, note: Callable[[str], None], clock: StageClock
+) -> TrainingRun:
+    from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (imports PyTorch)
+
+    clock("read", 0.0)
+    scene = load_scene(options.scene)
+    for warning in scene.warnings:
+        note(warning)
+    how = RunOptions(
+        resume=options.resume,
+        overwrite=options.overwrite,
+        tensorboard=options.tensorboard,
+        cache_dir=user_cache_dir(),
+    )
+    return prepare_run(scene, options.output, settings, how, note=note, progress=clock)
+
+
+def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None:
+    """Say what will be done, before it is done."""
+    for note in notes:
+        print_note(note)
+    settings, views = training.settings, training.trainer.train_views
+    OUT.print(
+        f"{options.scene} ({len(views)} training and {len(training.trainer.test_views)} test views"
+        f" of {views[0].width} x {views[0].height}, {len(training.state.params['means']):,} Gaussians)\n"
+        f"  -> {settings.strategy}, {settings.max_steps:,} steps, seed {settings.seed},"
+        f" on {training.device}\n"
+        f"  -> {options.output}",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+@contextmanager
+def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
+    """A function that shows the steps done; nothing is drawn when stderr is not a terminal."""
+    columns = (BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}"))
+    if not ERR.is_terminal:
+        yield lambda _: None
+        return
+    with Bar(*columns, TimeRemainingColumn(), console=ERR, transient=True) as bar:
+        first, total = training.state.step, training.settings.max_steps
+        task = bar.add_task("", total=total, completed=first)
+
+        def show(step: int) -> None:
+            bar.update(task, completed=step, description=_line(training, bar.tasks[0].speed))
+
+        yield show
+
+
+def _line(training: TrainingRun, steps_per_second: float | None) -> str:
+    records = training.state.records
+    if not records:
+        return ""
+    last = records[-1]
+    tested = next((r.test_psnr for r in reversed(records) if r.test_psnr is not None), None)
+    test = "" if tested is None else f" (test {tested:.2f})"
+    speed = "" if steps_per_second is None else f"  {steps_per_second:.1f} steps/s"
+    return (
+        f"loss {last.loss:.4f}  PSNR {last.train_psnr:.2f}{test} dB"
+        f"  {last.num_gaussians:,} Gaussians{speed}"
+    )
+
+
+def _finish(training: TrainingRun, clock: StageClock) -> Mapping[str, Any]:
+    from splatseed.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
+
+    return training.finish(
+        lambda render, views: evaluate_views(render, views, progress=clock).to_dict(), clock
+    )
+
+
+def _say_how_to_go_on(options: Options, training: TrainingRun) -> None:
+    scene, output = shlex.quote(str(options.scene)), shlex.quote(str(options.output))
+    ERR.print(
+        f"\ninterrupted after step {training.state.step:,}; saved. Go on with:\n"
+        f"  splatseed train {scene} -o {output} --resume",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+def _summarise(options: Options, metrics: Mapping[str, Any]) -> None:
+    """The closing table and the commands to go on with."""
+    seconds, steps = metrics["train_seconds"], metrics["steps"]
+    psnr = "infinite" if metrics["psnr"] is None else f"{metrics['psnr']:.2f} dB"
+    print_pairs(
+        "splatseed train",
+        [
+            ("test PSNR", psnr),
+            ("test SSIM", f"{metrics['ssim']:.4f}"),
+            ("Gaussians", f"{metrics['num_gaussians']:,} from {metrics['num_seeds']:,} seeds"),
+            ("training", f"{seconds:.1f} s, {1e3 * seconds / steps:.1f} ms a step"),
+            ("Gaussians in", str(options.output / "point_cloud.ply")),
+            ("pictures", f"{options.output / 'renders'}, {options.output / 'curve.png'}"),
+        ],
+    )
+    output = shlex.quote(str(options.output))
+    print_commands("next", [("score again, with LPIPS", f"splatseed evaluate {output}")])

@@ -1,0 +1,35 @@
+"""Evaluation: how close renders come to photographs that were not trained on.
+
+``evaluate_views`` scores any function from a view to an image; ``load_model`` and
+``evaluate_model`` a trained .ply in the world of its scene, whoever trained it. Needs PyTorch
+(``pip install "splatseed[train]"``).
+"""
+
+from splatseed.train.requirements import require
+
+require("torch")  # asked for first, so that its absence is said once and plainly
+
+from splatseed.evaluate.lpips import LPIPS_NETS, Lpips, LpipsNet, load_lpips  # noqa: E402
+from splatseed.evaluate.metrics import Render, evaluate_views  # noqa: E402
+from splatseed.evaluate.model import (  # noqa: E402
+    TrainedModel,
+    evaluate_model,
+    load_model,
+    write_renders,
+)
+from splatseed.evaluate.result import EvalResult, ViewScore  # noqa: E402
+
+__all__ = [
+    "LPIPS_NETS",
+    "EvalResult",
+    "Lpips",
+    "LpipsNet",
+    "Render",
+    "TrainedModel",
+    "ViewScore",
+    "evaluate_model",
+    "evaluate_views",
+    "load_lpips",
+    "load_model",
+    "write_renders",
+]

@@ -1,0 +1,172 @@
+"""A trained model beside the test views of its scene, in the world of that scene.
+
+Notation: the training frame is that of the scene's training cameras (``train.frame``). Promise: a
+model is rendered in that frame whoever trained it, so that the near plane lies at the same place as
+in training and single precision suffices for a far-off world; what is behind all is black.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseed.errors import SceneNotFoundError
+from splatseed.evaluate.lpips import Lpips
+from splatseed.evaluate.metrics import Render, evaluate_views
+from splatseed.evaluate.result import NOT_ASKED, EvalResult
+from splatseed.io import load_scene
+from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
+from splatseed.train.frame import TrainingFrame, training_frame
+from splatseed.train.gaussians import Gaussians
+from splatseed.train.parameters import render_view
+from splatseed.train.pictures import beside_truth, picture_name, write_picture
+from splatseed.train.ply import read_gaussians
+from splatseed.train.views import View, load_views
+
+__all__ = [
+    "TrainedModel",
+    "evaluate_model",
+    "frame_of_scene",
+    "gaussian_renderer",
+    "load_model",
+    "write_renders",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedModel:
+    """Gaussians and what to hold them to.
+
+    Args:
+        gaussians: In the scene's world.
+        views: The scene's test views, in its world.
+        render: Renders the Gaussians from a view of the world.
+    """
+
+    gaussians: Gaussians
+    views: Sequence[View]
+    render: Render
+
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of the parameters as float32: 236 a Gaussian at degree 3."""
+        return sum(array.nbytes for array in self.gaussians.arrays().values())
+
+
+def load_model(
+    path: Path,
+    scene_path: Path,
+    *,
+    data_factor: int = 1,
+    test_every: int = 8,
+    device: torch.device | None = None,
+    cache_dir: Path | None = None,
+    progress: Progress = silent,
+) -> TrainedModel:
+    """Read Gaussians that any trainer wrote, and the test views of the scene that they are of.
+
+    Args:
+        path: The .ply, in the scene's own world frame.
+        scene_path: The scene.
+        data_factor: By how much photographs are made smaller.
+        test_every: Of the images sorted by name, every so many-th is a test view.
+        device: Where to render; the CPU when left out.
+        cache_dir: Where smaller photographs are kept for the next time; nowhere when left out.
+        progress: Told how far reading is.
+
+    Raises:
+        SceneNotFoundError: The model, the scene or its images are missing.
+        SceneFormatError: One of them is not what its format promises.
+    """
+    gaussians = read_gaussians(path)
+    scene = load_scene(scene_path, require_points=False)
+    train, test = scene.split(test_every)
+    if not train or not test:
+        raise SceneNotFoundError(
+            f"{scene_path} to have images, some to train on and some to test on",
+            found=f"{len(scene.images)}",
+            fix="Name the scene with its cameras and photographs.",
+        )
+    views = load_views(scene, test, data_factor=data_factor, cache_dir=cache_dir, progress=progress)
+    render = gaussian_renderer(gaussians, frame_of_scene(scene, test_every), device)
+    return TrainedModel(gaussians, views, render)
+
+
+def evaluate_model(
+    model: TrainedModel,
+    *,
+    lpips: Lpips | None = None,
+    lpips_reason: str = NOT_ASKED,
+    progress: Progress = silent,
+) -> EvalResult:
+    """Score a model on its test views, and count its Gaussians; see ``evaluate_views``.
+
+    Raises:
+        ParameterError: A render is not finite.
+    """
+    result = evaluate_views(
+        model.render, model.views, lpips=lpips, lpips_reason=lpips_reason, progress=progress
+    )
+    return dataclasses.replace(
+        result, num_gaussians=len(model.gaussians), model_bytes=model.num_bytes
+    )
+
+
+def gaussian_renderer(
+    gaussians: Gaussians, frame: TrainingFrame, device: torch.device | None = None
+) -> Render:
+    """A function from a view of the world to its render, without gradients.
+
+    Args:
+        gaussians: In the world.
+        frame: What to render in.
+        device: Where; the CPU when left out.
+    """
+    in_frame = dataclasses.replace(
+        gaussians,
+        means=frame.points_from_world(gaussians.means),
+        scales=gaussians.scales + np.float32(math.log(frame.scale)),
+    )
+    tensors = {k: torch.tensor(array, device=device) for k, array in in_frame.arrays().items()}
+    sh_degree = math.isqrt(1 + gaussians.shN.shape[1]) - 1
+
+    @torch.no_grad()
+    def render(view: View) -> Float[Tensor, "H W 3"]:
+        return render_view(tensors, frame.view(view), sh_degree)[0]
+
+    return render
+
+
+def frame_of_scene(scene: Scene, test_every: int = 8) -> TrainingFrame:
+    """The frame that a scene is trained in, from the poses alone.
+
+    Args:
+        scene: At least two images.
+        test_every: As it was trained with.
+    """
+    train, _ = scene.split(test_every)
+    unseen = np.empty((0, 0, 3), np.uint8)
+    return training_frame(
+        [View(i.name, unseen, i.camera.K, 0, 0, i.camera.cam_from_world) for i in train]
+    )
+
+
+def write_renders(model: TrainedModel, folder: Path, progress: Progress = silent) -> None:
+    """Write a picture of each test view: photograph, render, error map.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    for done, view in enumerate(model.views):
+        picture = beside_truth(view.image, model.render(view).cpu().numpy())
+        write_picture(folder / picture_name(view.name), picture)
+        progress("write", (done + 1) / len(model.views))

@@ -1,0 +1,160 @@
+"""What ``rasterization`` accepts on the CPU; kernels index without bounds checks and rely on it.
+
+Notation: N Gaussians, C cameras, D channels, K coefficients a channel, as in ``rasterization``.
+Promise: whatever the kernels could not read, and whatever only gsplat's CUDA code does, raises one
+``ParameterError`` here; nothing is ignored and nothing is rendered before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from numbers import Integral
+from typing import Any, get_args
+
+import torch
+from torch import Tensor
+
+from splatseed.errors import ParameterError
+from splatseed.render.blending import CHANNELS
+from splatseed.render.harmonics import MAX_DEGREE
+
+__all__ = ["check_absgrad", "check_numbers", "check_tensors", "check_unsupported"]
+
+CUDA_ONLY: Mapping[str, object] = {
+    "distributed": False,
+    "camera_model": "pinhole",
+    "segmented": False,
+    "covars": None,
+    "with_ut": False,
+    "with_eval3d": False,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "rolling_shutter": None,
+    "viewmats_rs": None,
+}
+"""gsplat's further arguments with their defaults."""
+
+
+def check_unsupported(arguments: Mapping[str, object]) -> None:
+    """Refuse what only gsplat's CUDA code does, and what nobody does.
+
+    Raises:
+        ParameterError: An unknown name, or one of ``CUDA_ONLY`` that is not at its default.
+    """
+    for name, value in arguments.items():
+        if name not in CUDA_ONLY:
+            raise ParameterError(
+                "arguments of gsplat's rasterization",
+                found=repr(name),
+                fix="Correct the name, or leave it out.",
+            )
+        # gsplat's own default for the shutter is an enumeration's member, known here by its name.
+        is_default = value is CUDA_ONLY[name] or getattr(value, "name", None) == "GLOBAL"
+        if not is_default and not (isinstance(value, str) and value == CUDA_ONLY[name]):
+            raise ParameterError(
+                f"{name} to be left at its default on the CPU",
+                found=_describe(value),
+                fix="Render on CUDA, or leave it out.",
+            )
+
+
+def check_numbers(
+    width: int,
+    height: int,
+    near_plane: float,
+    eps2d: float,
+    sh_degree: int | None,
+    **choices: tuple[str, object],
+) -> None:
+    """Check what is not a tensor.
+
+    Args:
+        width: Pixels, at least 1.
+        height: Pixels, at least 1.
+        near_plane: At least 0: depths sort as their bits do only where they are not negative.
+        eps2d: px^2, at least 0.
+        sh_degree: None, or 0 to ``MAX_DEGREE``.
+        choices: By name, a value and the ``Literal`` of those allowed.
+
+    Raises:
+        ParameterError: One is out of its range.
+    """
+    for name, size in (("width", width), ("height", height)):
+        _require(
+            isinstance(size, Integral) and int(size) >= 1, f"{name} as an int of at least 1", size
+        )
+    for name, number in (("near_plane", near_plane), ("eps2d", eps2d)):
+        _require(number >= 0, f"{name} of at least 0", number)
+    degrees = (None, *range(MAX_DEGREE + 1))
+    _require(sh_degree in degrees, f"an sh_degree from 0 to {MAX_DEGREE} on the CPU", sh_degree)
+    for name, (value, literal) in choices.items():
+        allowed = get_args(literal)
+        _require(value in allowed, f"{name} as one of {', '.join(allowed)}", value)
+
+
+def check_tensors(tensors: Mapping[str, Tensor | None], sh_degree: int | None) -> None:
+    """Check the types and shapes of means, quats, scales, opacities, colors, viewmats, Ks, backgrounds.
+
+    Raises:
+        ParameterError: One is not a float32 CPU tensor or its shape does not go with the others'.
+    """
+    for name, each in tensors.items():
+        fits = (
+            isinstance(each, Tensor) and each.dtype == torch.float32 and each.device.type == "cpu"
+        )
+        optional = each is None and name == "backgrounds"
+        _require(fits or optional, f"{name} as a float32 tensor on the CPU, like means", each)
+    shapes = {name: tuple(each.shape) for name, each in tensors.items() if each is not None}
+    n, cameras = shapes["means"][:1], shapes["viewmats"][:1]
+    _require(n, "means of shape [N, 3]", tensors["means"])
+    _require(cameras not in {(), (0,)}, "viewmats of at least one camera", tensors["viewmats"])
+    _check_colors(tensors["colors"], n, cameras, sh_degree)
+    channels = shapes["colors"][-1]
+    expected = {
+        "means": (*n, 3), "quats": (*n, 4), "scales": (*n, 3), "opacities": n,
+        "viewmats": (*cameras, 4, 4), "Ks": (*cameras, 3, 3), "backgrounds": (*cameras, channels),
+    }  # fmt: skip
+    for name, shape in expected.items():
+        fits = shapes.get(name, shape) == shape
+        _require(fits, f"{name} of shape {list(shape)}", tensors[name])
+
+
+def _check_colors(
+    colors: Any, n: tuple[int, ...], cameras: tuple[int, ...], sh_degree: int | None
+) -> None:
+    """Shared by the cameras or one set a camera: only the number of axes tells them apart."""
+    terms = 0 if sh_degree is None else (sh_degree + 1) ** 2
+    one, axes = ("D", 2) if sh_degree is None else (f"K >= {terms}, 3", 3)
+    shape = tuple(colors.shape)
+    shared = shape[1:] if len(shape) == axes + 1 and shape[:1] == cameras else shape
+    fits = len(shared) == axes and shared[:1] == n and shared[-1] >= 1
+    if fits and sh_degree is not None:
+        fits = shared[1] >= terms and shared[2] == 3
+    sizes = f"N = {n[0]}, C = {cameras[0]}"
+    _require(fits, f"colors of shape [N, {one}] or [C, N, {one}] ({sizes})", colors)
+
+
+def check_absgrad(absgrad: bool, channels: int) -> None:
+    """Refuse absolute gradients of more channels than one pass takes: they do not add up.
+
+    Raises:
+        ParameterError: There are more than ``CHANNELS``, depth included.
+    """
+    limit = f"no more than {CHANNELS} channels, depth included, with absgrad on the CPU"
+    _require(not absgrad or channels <= CHANNELS, limit, channels)
+
+
+def _require(fits: object, expected: str, found: object) -> None:
+    if not fits:
+        raise ParameterError(
+            expected, found=_describe(found), fix="Correct the arguments of rasterization."
+        )
+
+
+def _describe(value: object) -> str:
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        kind = type(value).__name__
+        return f"{kind} {value.dtype} {list(value.shape)} on {getattr(value, 'device', 'cpu')}"
+    return repr(value)

@@ -1,0 +1,283 @@
+"""The CPU stages as PyTorch functions, one camera at a time.
+
+``Project``, ``Harmonics`` and ``Blend`` are separate so that the 2D means between the first and the
+last are an ordinary tensor: densification strategies watch its gradient. Tensors are float32 on the
+CPU; NumPy views of them go to the kernels without a copy.
+"""
+
+# mypy: disable-error-code="no-untyped-call"
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from splatseed.render import blending, harmonics as sh, layout, projection
+from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles
+
+__all__ = ["Blend", "Harmonics", "Lens", "Project"]
+
+FARTHEST = np.log(np.float32(255.0))
+
+
+class Lens(NamedTuple):
+    """What of a camera is not differentiated."""
+
+    K: np.ndarray
+    """float32 [3, 3]."""
+    width: int
+    height: int
+    near: float
+    far: float
+    eps2d: float
+    radius_clip: float
+    antialiased: bool
+
+
+def _array(tensor: Tensor) -> np.ndarray:
+    return np.asarray(tensor.detach().contiguous().numpy())
+
+
+class Project(torch.autograd.Function):
+    """3D Gaussians to one camera's image plane.
+
+    Inputs: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], viewmat [4, 4], lens.
+    Outputs: radii [N, 2], means2d [N, 2], depths [N], conics [N, 3], compensations [N].
+
+    Opacities only bound the radii; they get no gradient here, as in gsplat.
+    """
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        viewmat: Tensor,
+        lens: Lens,
+    ) -> tuple[Tensor, ...]:
+        """Run the kernel and keep what backward needs."""
+        arrays = [_array(t) for t in (means, quats, scales, opacities, viewmat)]
+        n = len(means)
+        radii, out = (
+            np.empty((n, 2), np.int32),
+            [np.zeros(shape, np.float32) for shape in ((n, 2), (n,), (n, 3), (n,))],
+        )
+        projection.project(*arrays, *lens, radii, *out)  # type: ignore[call-arg]  # star arguments
+        ctx.save_for_backward(means, quats, scales, viewmat)
+        ctx.lens, ctx.radii = lens, radii
+        results = [torch.from_numpy(each) for each in (radii, *out)]
+        ctx.mark_non_differentiable(results[0])
+        return tuple(results)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        """Gradients of the inputs."""
+        means, quats, scales, viewmat = (_array(t) for t in ctx.saved_tensors)
+        lens: Lens = ctx.lens
+        results = [np.zeros(each.shape, np.float32) for each in (means, quats, scales)]
+        by_view = np.zeros((projection.CHUNKS, 4, 4))
+        projection.project_vjp(  # type: ignore[call-arg]  # star arguments
+            means, quats, scales, viewmat, lens.K, lens.width, lens.height, lens.eps2d, ctx.radii,
+            *(_array(g) for g in gradients[1:]), *results, by_view,
+        )  # fmt: skip
+        d_view = torch.from_numpy(by_view.sum(axis=0).astype(np.float32))
+        return (*(torch.from_numpy(r) for r in results), None, d_view, None)
+
+
+class Harmonics(torch.autograd.Function):
+    """Directions [N, 3], coefficients [N, K, 3], visible [N], degree to colours [N, 3]."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, directions: Tensor, coefficients: Tensor, visible: Tensor, degree: int
+    ) -> Tensor:
+        """Run the kernel and keep what backward needs."""
+        colors = np.empty((len(directions), 3), np.float32)
+        sh.harmonics(
+            _array(directions), _array(coefficients), _array(visible), (degree + 1) ** 2, colors
+        )
+        ctx.save_for_backward(directions, coefficients, visible)
+        ctx.degree = degree
+        return torch.from_numpy(colors)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, d_colors: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        """Gradients of the inputs."""
+        directions, coefficients, visible = (_array(t) for t in ctx.saved_tensors)
+        results = [np.zeros(each.shape, np.float32) for each in (directions, coefficients)]
+        terms = (ctx.degree + 1) ** 2
+        sh.harmonics_vjp(directions, coefficients, visible, terms, _array(d_colors), *results)
+        return (*(torch.from_numpy(r) for r in results), None, None)
+
+
+class _Prepared(NamedTuple):
+    """A view sorted and listed: what forward and backward share."""
+
+    order: np.ndarray
+    reach: np.ndarray
+    lists: TileLists
+    width: int
+    height: int
+
+    @property
+    def columns(self) -> int:
+        """Tiles in a row."""
+        return -(-self.width // TILE)
+
+    @property
+    def lanes(self) -> int:
+        """Pixels of all tiles."""
+        return self.columns * -(-self.height // TILE) * TILE**2
+
+
+class Blend(torch.autograd.Function):
+    """Projected Gaussians to an image.
+
+    Inputs: means2d [G, 2], conics [G, 3], colours [G, D], opacities [G], background [D] or None,
+    depths [G], radii [G, 2], width, height, on_absgrad. Outputs: image [H, W, D], alphas [H, W].
+
+    ``on_absgrad``: None, or called by backward with the summed absolute gradients of the 2D means,
+    [G, 2].
+    """
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any,
+        means2d: Tensor,
+        conics: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        background: Tensor | None,
+        depths: Tensor,
+        radii: Tensor,
+        width: int,
+        height: int,
+        on_absgrad: Callable[[Tensor], None] | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Run the kernel and keep what backward needs."""
+        prepared = _prepare(means2d, conics, colors, opacities, depths, radii, width, height)
+        channels = colors.shape[1]
+        behind = np.zeros(channels, np.float32) if background is None else _array(background)
+        image = np.empty((height, width, channels), np.float32)
+        passing = np.empty((height, width), np.float32)
+        for first in range(0, channels, blending.CHANNELS):
+            records = _records(prepared, means2d, conics, colors, opacities, first)
+            blocks = _forward(prepared, records)
+            layout.from_blocks(*blocks, prepared.columns, behind, first, image, passing)  # type: ignore[call-arg]  # star arguments
+        ctx.prepared, ctx.on_absgrad, ctx.passing, ctx.image = prepared, on_absgrad, passing, image
+        ctx.save_for_backward(means2d, conics, colors, opacities, background)
+        return torch.from_numpy(image), torch.from_numpy(1.0 - passing)
+
+    @staticmethod
+    @once_differentiable
+    def backward(  # type: ignore[override]
+        ctx: Any, d_image: Tensor, d_alphas: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        """Gradients of the inputs."""
+        means2d, conics, colors, opacities, background = ctx.saved_tensors
+        prepared: _Prepared = ctx.prepared
+        gradient, passing = _array(d_image), ctx.passing
+        shapes = [tuple(each.shape) for each in (means2d, conics, opacities, colors, means2d)]
+        results = [np.zeros(shape, np.float32) for shape in shapes]
+        # Every pass of channels takes its own part of what lies behind the first Gaussian; the first
+        # pass takes the gradient of alpha too.
+        d_passing = -_array(d_alphas) * passing
+        for first in range(0, colors.shape[1], blending.CHANNELS):
+            records = _records(prepared, means2d, conics, colors, opacities, first)
+            totals = _backward(prepared, records, gradient, ctx.image, d_passing, first)
+            layout.scatter(prepared.order, totals, first, *results)  # type: ignore[call-arg]  # star arguments
+            d_passing = np.zeros_like(passing)
+        if ctx.on_absgrad is not None:
+            ctx.on_absgrad(torch.from_numpy(results[4]))
+        d_background = None
+        if background is not None and ctx.needs_input_grad[4]:
+            d_background = torch.from_numpy((gradient * passing[:, :, None]).sum(axis=(0, 1)))
+        d_means2d, d_conics, d_opacities, d_colors = map(torch.from_numpy, results[:4])
+        return d_means2d, d_conics, d_colors, d_opacities, d_background, *(None,) * 5
+
+
+def _prepare(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    depths: Tensor,
+    radii: Tensor,
+    width: int,
+    height: int,
+) -> _Prepared:
+    """Sort what is visible by depth and list it by tile."""
+    alphas = _array(opacities)
+    seen = np.empty(len(alphas), np.bool_)
+    layout.mark_visible(_array(radii), alphas, _array(colors), projection.MIN_ALPHA, seen)
+    order = depth_order(_array(depths), seen)
+    reach = _reach(alphas[order])
+    lists = list_tiles(_array(means2d)[order], _array(conics)[order], reach, width, height)
+    return _Prepared(order, reach, lists, width, height)
+
+
+def _reach(opacities: np.ndarray) -> np.ndarray:
+    """log(255 opacity), float32: how large sigma can be for alpha to reach 1/255.
+
+    An opacity above 1 reaches no farther than 1 does, where the kernels' exponential ends.
+    """
+    return np.clip(np.log(255.0 * opacities, dtype=np.float32), 0.0, FARTHEST)
+
+
+def _records(
+    prepared: _Prepared,
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    opacities: Tensor,
+    first: int,
+) -> np.ndarray:
+    """The Gaussians in depth order as ``blending`` reads them, flat."""
+    records = np.empty(len(prepared.order) * blending.RECORD, np.float32)
+    arrays = [_array(each) for each in (means2d, conics, opacities)]
+    layout.gather(  # type: ignore[call-arg]  # star arguments
+        prepared.order, *arrays, prepared.reach, _array(colors), first, records
+    )
+    return records
+
+
+def _forward(prepared: _Prepared, records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The block image and its transmittance."""
+    image = np.empty(prepared.lanes * blending.CHANNELS, np.float32)
+    transmittance = np.empty(prepared.lanes, np.float32)
+    blending.forward(
+        records, prepared.lists.tile_start, prepared.lists.listed_rank, prepared.columns,
+        blending.COLUMN, blending.ROW, image, transmittance,
+    )  # fmt: skip
+    return image, transmittance
+
+
+def _backward(
+    prepared: _Prepared,
+    records: np.ndarray,
+    d_image: np.ndarray,
+    image: np.ndarray,
+    d_passing: np.ndarray,
+    first: int,
+) -> np.ndarray:
+    """Gradient sums of every visible Gaussian, by depth rank, [G, 16]."""
+    lists, lanes = prepared.lists, prepared.lanes
+    gradient, behind = np.zeros(lanes * blending.CHANNELS, np.float32), np.zeros(lanes, np.float32)
+    layout.to_blocks(d_image, image, d_passing, prepared.columns, first, gradient, behind)
+    sums = np.zeros(len(lists.listed_rank) * blending.SUMS, np.float32)
+    blending.backward(
+        records, lists.tile_start, lists.listed_rank, lists.listed_slot, prepared.columns,
+        blending.COLUMN, blending.ROW, gradient, behind, sums,
+    )  # fmt: skip
+    totals = np.empty((len(prepared.order), blending.SUMS), np.float32)
+    blending.sum_pairs(lists.slot_start, sums, totals)
+    return totals

@@ -1,0 +1,253 @@
+"""``rasterization``: gsplat's signature, on the CPU.
+
+Meant for code written against gsplat 1.5.3: arguments, results and the ``info`` dict are gsplat's, so
+that its densification strategies run unchanged. What the CPU does not do (fisheye and orthographic
+cameras, distributed rendering, rolling shutter) is refused, never ignored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatseed.render.arguments import (
+    check_absgrad,
+    check_numbers,
+    check_tensors,
+    check_unsupported,
+)
+from splatseed.render.functions import Blend, Harmonics, Lens, Project
+
+__all__ = ["rasterization"]
+
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
+RasterizeMode = Literal["classic", "antialiased"]
+GSPLAT_TILE = 16
+"""What ``info`` reports as the size of a tile."""
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = GSPLAT_TILE,
+    backgrounds: Tensor | None = None,
+    render_mode: RenderMode = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: RasterizeMode = "classic",
+    channel_chunk: int = 32,
+    **unsupported: Any,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render N Gaussians into C pinhole cameras; differentiable.
+
+    Args:
+        means: Centres, world, float32 [N, 3].
+        quats: wxyz rotations of any length but 0, [N, 4].
+        scales: Standard deviations (not their logarithms), [N, 3].
+        opacities: 0 to 1, [N].
+        colors: [N, D] or [C, N, D]; with ``sh_degree`` coefficients [N, K, 3].
+        viewmats: cam_from_world, OpenCV axes, [C, 4, 4].
+        Ks: Pinhole matrices in px, [C, 3, 3].
+        width: Pixels.
+        height: Pixels.
+        near_plane: Least z.
+        far_plane: Greatest z.
+        radius_clip: Gaussians no larger than this are left out, px.
+        eps2d: Blur added to the 2D covariance, px^2.
+        sh_degree: Degree of spherical harmonics, 0 to 3; None takes colours as they are.
+        packed: Whether ``info`` lists visible Gaussians only; the image is the same.
+        tile_size: Kept for gsplat's sake; the CPU has tiles of its own.
+        backgrounds: Colours behind everything, [C, D].
+        render_mode: Colour, depth accumulated (D) or expected (ED), or both.
+        sparse_grad: Kept for gsplat's sake; gradients are dense.
+        absgrad: Whether ``info["means2d"].absgrad`` is set by backward.
+        rasterize_mode: "antialiased" lowers opacities by what the blur adds.
+        channel_chunk: Kept for gsplat's sake.
+        unsupported: gsplat's further arguments; only their defaults are accepted.
+
+    Returns:
+        Colours [C, H, W, D] (with depth as last channel where asked for), alphas [C, H, W, 1], and
+        ``info`` with means2d, radii, depths, conics, opacities, width, height, n_cameras, and for
+        ``packed`` camera_ids and gaussian_ids.
+
+    Raises:
+        ParameterError: An argument that the CPU rasteriser does not support, or tensors that are not
+            float32 or whose shapes do not go together.
+
+    Example:
+        >>> import torch
+        >>> one = torch.ones(1, 3)
+        >>> image, alpha, info = rasterization(
+        ...     means=torch.tensor([[0.0, 0.0, 2.0]]), quats=torch.tensor([[1.0, 0, 0, 0]]),
+        ...     scales=0.1 * one, opacities=torch.tensor([0.9]), colors=one,
+        ...     viewmats=torch.eye(4)[None],
+        ...     Ks=torch.tensor([[[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]]]), width=16, height=16)
+        >>> image.shape, round(float(alpha.max()), 1)
+        (torch.Size([1, 16, 16, 3]), 0.7)
+    """
+    if isinstance(means, Tensor) and means.is_cuda:
+        from gsplat import rasterization as on_cuda  # noqa: PLC0415  (needs CUDA)
+
+        return on_cuda(  # type: ignore[no-any-return]
+            means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane,
+            far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, backgrounds, render_mode,
+            sparse_grad, absgrad, rasterize_mode, channel_chunk, **unsupported,
+        )  # fmt: skip
+    check_unsupported(unsupported)
+    check_numbers(
+        width, height, near_plane, eps2d, sh_degree,
+        render_mode=(render_mode, RenderMode), rasterize_mode=(rasterize_mode, RasterizeMode),
+    )  # fmt: skip
+    check_tensors(
+        {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors,
+         "viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds},
+        sh_degree,
+    )  # fmt: skip
+    antialiased = rasterize_mode == "antialiased"
+    views = [
+        _project(
+            means, quats, scales, opacities, viewmats[camera],
+            Lens(_intrinsics(Ks[camera]), width, height, near_plane, far_plane, eps2d, radius_clip,
+                 antialiased),
+        )
+        for camera in range(len(viewmats))
+    ]  # fmt: skip
+    shades = [
+        _with_depth(_colors(means, colors, viewmats, camera, view, sh_degree), view, render_mode)
+        for camera, view in enumerate(views)
+    ]
+    check_absgrad(absgrad, shades[0].shape[1])
+    info = _info(views, packed, width=width, height=height, tile_size=tile_size)
+    images, alphas = _blend(views, shades, info, _background(backgrounds, render_mode), absgrad)
+    if render_mode in {"ED", "RGB+ED"}:
+        expected = images[..., -1:] / alphas.clamp(min=1e-10)
+        images = torch.cat([images[..., :-1], expected], dim=-1)
+    return images, alphas, info
+
+
+class _View(NamedTuple):
+    """N Gaussians in one camera."""
+
+    radii: Tensor
+    means2d: Tensor
+    depths: Tensor
+    conics: Tensor
+    opacities: Tensor
+
+    @property
+    def seen(self) -> Tensor:
+        """Which are not culled, bool [N]."""
+        return (self.radii > 0).all(dim=-1)
+
+
+def _intrinsics(K: Tensor) -> np.ndarray:
+    return np.asarray(K.detach().to(torch.float32).contiguous().numpy())
+
+
+def _project(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmat: Tensor, lens: Lens
+) -> _View:
+    radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]
+        means, quats, scales, opacities, viewmat, lens
+    )
+    if lens.antialiased:
+        opacities = opacities * compensations
+    return _View(radii, means2d, depths, conics, opacities)
+
+
+def _colors(
+    means: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    camera: int,
+    view: _View,
+    sh_degree: int | None,
+) -> Tensor:
+    """Colours of N Gaussians in one camera, [N, D]."""
+    if sh_degree is None:
+        return colors if colors.dim() == 2 else colors[camera]
+    # The general inverse, as gsplat takes it: the rigid one has another gradient off the rotations.
+    directions = means - torch.linalg.inv_ex(viewmats[camera]).inverse[:3, 3]
+    coefficients = colors if colors.dim() == 3 else colors[camera]
+    shades: Tensor = Harmonics.apply(directions, coefficients, view.seen, sh_degree)  # type: ignore[no-untyped-call]
+    return torch.clamp_min(shades + 0.5, 0.0)
+
+
+def _with_depth(colors: Tensor, view: _View, render_mode: RenderMode) -> Tensor:
+    """The channels that the mode asks for, depth last."""
+    if render_mode == "RGB":
+        return colors
+    depth = view.depths[:, None]
+    return depth if render_mode in {"D", "ED"} else torch.cat([colors, depth], dim=-1)
+
+
+def _background(backgrounds: Tensor | None, render_mode: RenderMode) -> Tensor | None:
+    """Backgrounds with a depth of 0 where there is a depth channel."""
+    if backgrounds is None or render_mode == "RGB":
+        return backgrounds
+    depth = torch.zeros_like(backgrounds[..., :1])
+    return depth if render_mode in {"D", "ED"} else torch.cat([backgrounds, depth], dim=-1)
+
+
+def _info(views: Sequence[_View], packed: bool, **facts: int) -> dict[str, Any]:
+    """The dictionary of gsplat: stacked over cameras, or only what is visible, camera by camera."""
+    info: dict[str, Any] = {**facts, "n_cameras": len(views), "camera_ids": None}
+    info["gaussian_ids"] = None
+    if not packed:
+        for name in _View._fields:
+            info[name] = torch.stack([getattr(view, name) for view in views])
+        return info
+    ids = [torch.nonzero(view.seen)[:, 0] for view in views]
+    for name in _View._fields:
+        info[name] = torch.cat([getattr(view, name)[i] for view, i in zip(views, ids, strict=True)])
+    info["gaussian_ids"] = torch.cat(ids)
+    info["camera_ids"] = torch.cat([torch.full_like(i, c) for c, i in enumerate(ids)])
+    return info
+
+
+def _blend(
+    views: Sequence[_View],
+    shades: Sequence[Tensor],
+    info: dict[str, Any],
+    backgrounds: Tensor | None,
+    absgrad: bool,
+) -> tuple[Tensor, Tensor]:
+    """Images [C, H, W, D] and alphas [C, H, W, 1], by way of ``info["means2d"]``."""
+    means2d, ids = info["means2d"], info["gaussian_ids"]
+    if absgrad:
+        means2d.absgrad = torch.zeros_like(means2d)
+    images, alphas = [], []
+    for camera, (view, colors) in enumerate(zip(views, shades, strict=True)):
+        rows: Any = camera if ids is None else info["camera_ids"] == camera
+        each = slice(None) if ids is None else ids[rows]
+        image, alpha = Blend.apply(  # type: ignore[no-untyped-call]
+            means2d[rows], view.conics[each], colors[each], view.opacities[each],
+            None if backgrounds is None else backgrounds[camera],
+            view.depths[each], view.radii[each], info["width"], info["height"],
+            partial(_keep_absgrad, means2d, rows) if absgrad else None,
+        )  # fmt: skip
+        images.append(image)
+        alphas.append(alpha[..., None])
+    return torch.stack(images), torch.stack(alphas)
+
+
+def _keep_absgrad(means2d: Any, rows: Any, gradient: Tensor) -> None:
+    means2d.absgrad[rows] = gradient

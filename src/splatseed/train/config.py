@@ -1,0 +1,105 @@
+"""config.json: what a run was asked to do, by which it is continued and evaluated.
+
+Promise: a run is never continued with other settings or other seeds than it began with.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+from splatseed.train.device import device_name
+from splatseed.train.seeds import seeds_digest
+from splatseed.train.settings import TrainSettings
+
+__all__ = ["check_same_seeds", "make_config", "resumed_settings"]
+
+WHERE = {"backend"}
+"""Settings that may change when a run goes on."""
+
+
+def make_config(
+    scene: Scene, seeds: PointCloud, settings: TrainSettings, device: torch.device
+) -> dict[str, Any]:
+    """What is written to config.json."""
+    return {
+        "splatseed": _version("splatseed"),
+        "scene": str(scene.source.root.resolve()) if scene.source else None,
+        "points": str(scene.source.points_path.resolve()) if scene.source else None,
+        **dataclasses.asdict(settings),
+        "device": device_name(device),
+        "seeds": {"count": len(seeds), "digest": seeds_digest(seeds)},
+        "versions": {
+            "python": platform.python_version(),
+            **{name: _version(name) for name in ("torch", "gsplat", "numba", "numpy")},
+        },
+    }
+
+
+def resumed_settings(begun: Mapping[str, Any] | None, asked: TrainSettings) -> TrainSettings:
+    """The settings of a run that goes on; those asked for if there is none.
+
+    Args:
+        begun: The run's config.
+        asked: What the user says now: a setting left at its default follows the run.
+
+    Raises:
+        ParameterError: A setting is neither the run's nor the default.
+        SceneFormatError: The config is not of this version.
+    """
+    if begun is None:
+        return asked
+    default, changes = TrainSettings(), {}
+    for field in dataclasses.fields(TrainSettings):
+        if field.name not in begun:
+            raise SceneFormatError(
+                f"{field.name} in the config.json of the run",
+                found="none",
+                fix="Start again with --overwrite.",
+            )
+        now, then = getattr(asked, field.name), begun[field.name]
+        if field.name in WHERE or now == then:
+            continue
+        if now != getattr(default, field.name):
+            raise _differs(field.name, then, now)
+        changes[field.name] = then
+    return dataclasses.replace(asked, **changes)
+
+
+def check_same_seeds(path: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Refuse to go on from other points.
+
+    Raises:
+        ParameterError: The scene's points are not those that the run began with.
+    """
+    if begun.get("seeds") != now["seeds"]:
+        raise ParameterError(
+            f"the scene that the run began with ({begun.get('scene')}, says {path})",
+            found=f"other points in {now['scene']}",
+            fix="Name that scene, or start again with --overwrite.",
+        )
+
+
+def _differs(name: str, then: object, now: object) -> ParameterError:
+    return ParameterError(
+        f"--{name.replace('_', '-')} {then}, with which the run began",
+        found=f"{now}",
+        fix="Leave the option out to go on, or start again with --overwrite.",
+    )
+
+
+def _version(package: str) -> str | None:
+    """None for a package that is run from its source tree."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,90 @@
+"""Where to train, and how many Gaussians fit the memory there.
+
+Promise: a GPU that is asked for is used or an error, never replaced in silence; a cloud that cannot be trained is refused before the first step, with the number that can.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import torch
+
+from splatseed.errors import ParameterError, PointCloudError
+from splatseed.train.settings import Backend
+
+__all__ = ["check_fits", "device_name", "free_bytes", "pick_device"]
+
+BYTES_EACH = 2000
+"""A Gaussian's 59 numbers, their gradients and two moments (944 bytes), and as much again for the
+rasteriser's lists and for copies while Gaussians are added."""
+CGROUP = Path("/sys/fs/cgroup")
+
+
+def pick_device(backend: Backend) -> torch.device:
+    """The device that a backend stands for; ``auto`` takes a GPU if PyTorch sees one.
+
+    Raises:
+        ParameterError: CUDA is asked for and there is none.
+    """
+    seen = torch.cuda.is_available()
+    if backend == "cuda" and not seen:
+        raise ParameterError(
+            "a GPU for --backend cuda",
+            found="none that PyTorch sees",
+            fix="Pass --backend cpu, or install PyTorch's CUDA build.",
+        )
+    return torch.device("cuda" if seen and backend != "cpu" else "cpu")
+
+
+def device_name(device: torch.device) -> str:
+    """The device in words."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"CPU, {torch.get_num_threads()} threads"
+
+
+def check_fits(count: int, device: torch.device) -> None:
+    """Refuse more Gaussians than can be trained.
+
+    Raises:
+        PointCloudError: There are too many.
+    """
+    free = free_bytes(device)
+    if free is not None and count * BYTES_EACH > free:
+        most = free // BYTES_EACH
+        raise PointCloudError(
+            f"at most {most:,} points, which the {free / 1e9:.1f} GB of free memory hold",
+            found=f"{count:,}",
+            fix=f"Pass --cap-max {most}, upsample less, or free some memory.",
+        )
+
+
+def free_bytes(device: torch.device) -> int | None:
+    """Free memory of the device in bytes; None where the system does not tell."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    known = [free for free in (_free_of_machine(), _free_of_container()) if free is not None]
+    return min(known, default=None)
+
+
+def _free_of_machine() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text("ascii").splitlines()
+        kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable:"))
+        return int(kilobytes) * 1024
+    except (OSError, StopIteration):
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # not on Windows
+        return None
+
+
+def _free_of_container() -> int | None:
+    try:
+        limit = (CGROUP / "memory.max").read_text("ascii").strip()
+        used = (CGROUP / "memory.current").read_text("ascii").strip()
+    except OSError:
+        return None
+    return int(limit) - int(used) if limit.isdigit() else None

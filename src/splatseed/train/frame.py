@@ -1,0 +1,72 @@
+"""The frame that training works in: the cameras' centroid at 0, the farthest camera at distance 1.
+
+Notation: ``x_train = scale (x_world - origin)``. Promise: the frame depends on the training cameras
+alone, so that runs from different seeds are compared in one frame; there is no rotation, so
+quaternions and spherical harmonics stay as they are; single precision suffices for far-off origins.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+
+from splatseed.train.gaussians import Gaussians
+from splatseed.train.views import View
+
+__all__ = ["SCENE_SCALE", "TrainingFrame", "training_frame"]
+
+SCENE_SCALE = 1.1
+"""What the strategies and the learning rate of positions take as the size of the scene: the
+cameras' extent, and as in 3DGS a tenth more."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingFrame:
+    """A similarity without rotation.
+
+    Args:
+        origin: World point that becomes 0, float64 [3].
+        scale: Training units per world unit.
+    """
+
+    origin: Float64[np.ndarray, " 3"]
+    scale: float
+
+    def points_from_world(self, xyz: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+        """World points in the training frame."""
+        return np.asarray((xyz.astype(np.float64) - self.origin) * self.scale, np.float32)
+
+    def points_to_world(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        """Points of the training frame in the world."""
+        return np.asarray(xyz.astype(np.float64) / self.scale + self.origin)
+
+    def gaussians_to_world(self, gaussians: Gaussians) -> Gaussians:
+        """Gaussians of the training frame in the world (float32 there: see the promise)."""
+        return dataclasses.replace(
+            gaussians,
+            means=self.points_to_world(gaussians.means).astype(np.float32),
+            scales=gaussians.scales - np.float32(np.log(self.scale)),
+        )
+
+    def view(self, view: View) -> View:
+        """The same view, its camera posed in the training frame."""
+        cam_from_train = view.cam_from_world.copy()
+        rotation, translation = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
+        cam_from_train[:3, 3] = self.scale * (rotation @ self.origin + translation)
+        return dataclasses.replace(view, cam_from_world=cam_from_train)
+
+
+def training_frame(views: Sequence[View]) -> TrainingFrame:
+    """The frame of these cameras; that of the world, moved, where all are in one place."""
+    centers = np.array(
+        [-view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3] for view in views]
+    )
+    origin = centers.mean(axis=0)
+    extent = float(np.linalg.norm(centers - origin, axis=1).max())
+    # Rounding leaves a little extent even where all cameras are in one place.
+    rounding = 1e-9 * float(np.abs(centers).max())
+    return TrainingFrame(origin, 1.0 / extent if extent > rounding else 1.0)

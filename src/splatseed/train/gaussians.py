@@ -1,0 +1,106 @@
+"""Gaussians as the optimiser sees them, and how seeds become Gaussians.
+
+Notation: N Gaussians; ``means`` [N, 3], ``scales`` [N, 3] as logarithms, ``quats`` [N, 4] wxyz of
+any length, ``opacities`` [N] as logits, ``sh0`` [N, 1, 3], ``shN`` [N, 15, 3]: gsplat's names and
+conventions. Promise: arrays here are NumPy, so that a .ply can be read and written without PyTorch;
+equal seeds give equal Gaussians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64
+from scipy.spatial import cKDTree
+
+from splatseed.errors import PointCloudError
+from splatseed.pointcloud import PointCloud
+
+__all__ = ["SH_C0", "Gaussians", "initial_gaussians", "neighbor_distances"]
+
+SH_C0 = 0.28209479177387814
+"""The spherical harmonic of degree 0, 1 / (2 sqrt(pi)); colour = 0.5 + SH_C0 * sh0."""
+NEIGHBORS = 3
+GAP = 10.0
+"""An initial scale is at most this many times the median: beyond it a point stands alone."""
+COINCIDENT = 1e-2
+"""And at least this many times the median: a point upon another would never be seen."""
+MIN_POINTS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """The parameters of N Gaussians, float32; see the module for their conventions."""
+
+    means: Float32[np.ndarray, "N 3"]
+    scales: Float32[np.ndarray, "N 3"]
+    quats: Float32[np.ndarray, "N 4"]
+    opacities: Float32[np.ndarray, " N"]
+    sh0: Float32[np.ndarray, "N 1 3"]
+    shN: Float32[np.ndarray, "N K 3"]  # noqa: N815  (gsplat's name)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def arrays(self) -> dict[str, Float32[np.ndarray, "N ..."]]:
+        """The parameters by name, in the order above."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def initial_gaussians(
+    seeds: PointCloud,
+    *,
+    sh_degree: int = 3,
+    opacity: float = 0.1,
+    scale_factor: float = 1.0,
+) -> Gaussians:
+    """One round Gaussian a seed, as large as the gap to its 3 nearest neighbours.
+
+    Args:
+        seeds: Finite points.
+        sh_degree: Degree up to which colours may come to depend on the direction.
+        opacity: Of each, between 0 and 1.
+        scale_factor: Multiplies the size.
+
+    Raises:
+        PointCloudError: Fewer than two distinct finite points.
+    """
+    count, rest = len(seeds), (sh_degree + 1) ** 2 - 1
+    distance = neighbor_distances(seeds.xyz)
+    scales = np.repeat(np.log(distance * scale_factor)[:, None], 3, axis=1)
+    sh0 = (seeds.rgb / 255.0 - 0.5) / SH_C0
+    return Gaussians(
+        means=np.array(seeds.xyz, np.float32),
+        scales=scales.astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        opacities=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
+        sh0=sh0.astype(np.float32)[:, None],
+        shN=np.zeros((count, rest, 3), np.float32),
+    )
+
+
+def neighbor_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    """Root mean square distance to the 3 nearest others, kept near the median, [N].
+
+    Raises:
+        PointCloudError: Fewer than two distinct finite points.
+    """
+    squares = _squared_distances(xyz)
+    median = np.sqrt(np.median(squares[squares > 0])) if (squares > 0).any() else 0.0
+    if not median > 0:
+        raise PointCloudError(
+            f"at least {MIN_POINTS} distinct finite points to start from",
+            found=f"{len(xyz)} points in one place",
+            fix="Check that the scene was read correctly (splatseed info SCENE).",
+        )
+    return np.asarray(np.clip(np.sqrt(squares), COINCIDENT * median, GAP * median))
+
+
+def _squared_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    if len(xyz) < MIN_POINTS:
+        return np.zeros(len(xyz))
+    # An unbalanced tree is built several times faster and queried as fast.
+    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
+    distances, _ = tree.query(xyz, k=min(NEIGHBORS, len(xyz) - 1) + 1, workers=-1)
+    return np.asarray((distances[:, 1:] ** 2).mean(axis=1))

@@ -1,0 +1,148 @@
+"""Photographs as pixels: decoded, made smaller by a whole factor, and kept for the next run.
+
+Promise: a smaller copy is the mean over f x f blocks, rounded (a few pixels at the right and lower
+edge that make no whole block are cut off), so intrinsics divide by f and nothing else; it is looked
+up by the content of the original, so a changed photograph is never mistaken for the old one. Only
+``cache_dir`` is written to, and what cannot be written there is not missed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import UInt8
+
+from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.staging import atomic_file
+
+if TYPE_CHECKING:
+    from PIL import Image as PilImage
+
+__all__ = ["load_photograph", "user_cache_dir"]
+
+FILTER = "box-1"
+"""Goes into the key: change it with the way copies are made."""
+
+
+def load_photograph(
+    path: Path, factor: int = 1, cache_dir: Path | None = None
+) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]]:
+    """The pixels of an image file, smaller by ``factor``, and the file's own width and height.
+
+    Transparent pixels are laid over black, which Gaussians are drawn on.
+
+    Args:
+        path: The image.
+        factor: 1 or more; a block of factor x factor pixels becomes one.
+        cache_dir: Where smaller copies are kept; nowhere when left out.
+
+    Raises:
+        ParameterError: The factor is less than 1.
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is no image, or too small for the factor.
+    """
+    if factor < 1:
+        raise ParameterError(
+            "--data-factor of 1 or more", found=f"{factor}", fix="Images are never enlarged."
+        )
+    raw = _read(path)
+    kept = None if cache_dir is None or factor == 1 else cache_dir / _key(raw, factor)
+    if kept is not None and kept.is_file():
+        with suppress(SceneFormatError):  # a damaged copy is made again
+            return np.array(_decode(kept, _read(kept))), _size(path, raw)
+    picture = _decode(path, raw)
+    smaller = _reduce(path, picture, factor)
+    if kept is not None:
+        _keep(smaller, kept)
+    return np.array(smaller), picture.size
+
+
+def user_cache_dir() -> Path:
+    """Where this user's programs keep what they can make again (not created here)."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "splatseed" / "images"
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise SceneNotFoundError(
+            f"the image {path}",
+            found="no such file",
+            fix="Put it there, or drop it from the model.",
+        ) from None
+    except OSError as error:
+        raise _unusable(path, error.strerror or type(error).__name__) from None
+
+
+def _key(raw: bytes, factor: int) -> str:
+    digest = hashlib.blake2b(raw, digest_size=16, person=FILTER.encode())
+    return f"{digest.hexdigest()}_{factor}.png"
+
+
+def _open(path: Path, raw: bytes) -> PilImage.Image:
+    from io import BytesIO  # noqa: PLC0415  (with Pillow, which is slow to import)
+
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
+
+    try:
+        return Image.open(BytesIO(raw))
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError) as error:
+        raise _unusable(path, type(error).__name__) from None
+
+
+def _size(path: Path, raw: bytes) -> tuple[int, int]:
+    return _open(path, raw).size
+
+
+def _decode(path: Path, raw: bytes) -> PilImage.Image:
+    picture = _open(path, raw)
+    try:
+        if "A" in picture.getbands() or "transparency" in picture.info:
+            return _over_black(picture.convert("RGBA"))
+        return picture.convert("RGB")
+    except (OSError, ValueError, SyntaxError) as error:  # what Pillow's decoders raise
+        raise _unusable(path, f"an image cut short or damaged ({error})") from None
+
+
+def _over_black(picture: PilImage.Image) -> PilImage.Image:
+    from PIL import Image  # noqa: PLC0415
+
+    black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
+    return Image.alpha_composite(black, picture).convert("RGB")
+
+
+def _reduce(path: Path, picture: PilImage.Image, factor: int) -> PilImage.Image:
+    if factor == 1:
+        return picture
+    width, height = picture.width // factor, picture.height // factor
+    if not width or not height:
+        raise SceneFormatError(
+            f"{path} to be larger than --data-factor {factor}",
+            found=f"{picture.width} x {picture.height}",
+            fix="Choose a smaller --data-factor.",
+        )
+    return picture.reduce(factor, (0, 0, width * factor, height * factor))
+
+
+def _keep(picture: PilImage.Image, path: Path) -> None:
+    with suppress(OutputError), atomic_file(path) as partial:
+        picture.save(partial, compress_level=1)
+
+
+def _unusable(path: Path, found: str) -> SceneFormatError:
+    return SceneFormatError(
+        f"{path} to be an image", found=found, fix="Copy or export the image again."
+    )

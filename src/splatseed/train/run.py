@@ -1,0 +1,272 @@
+"""A training run, from a scene to a folder of results.
+
+Promise: nothing is written before the scene is known to be trainable; a run that was interrupted
+goes on where it stopped, with the settings that it began with; results are in the scene's world.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
+from splatseed.train.config import check_same_seeds, make_config, resumed_settings
+from splatseed.train.curve import Record, write_curve_csv, write_curve_png
+from splatseed.train.device import check_fits, device_name, pick_device
+from splatseed.train.frame import TrainingFrame, training_frame
+from splatseed.train.gaussians import initial_gaussians
+from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
+from splatseed.train.pictures import beside_truth, picture_name, write_picture
+from splatseed.train.ply import write_gaussians
+from splatseed.train.requirements import require
+from splatseed.train.run_folder import RunFolder, write_json
+from splatseed.train.seeds import usable_seeds
+from splatseed.train.settings import TrainSettings
+from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
+from splatseed.train.strategies import make_strategy
+from splatseed.train.tensorboard import Board
+from splatseed.train.trainer import Trainer
+from splatseed.train.views import View, load_split
+
+__all__ = ["Render", "RunOptions", "Score", "TrainingRun", "prepare_run"]
+
+Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
+Score: TypeAlias = Callable[[Render, Sequence[View]], Mapping[str, object]]
+"""Scores renders of views against them; the result goes into metrics.json as it is."""
+
+SAVE_EVERY = 60.0
+"""Least seconds between checkpoints, so that saving stays a small part of the time."""
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run does beside training.
+
+    Args:
+        resume: Go on with the run in the folder, if there is one, with its own settings.
+        overwrite: Replace an earlier run in the folder.
+        tensorboard: Also write TensorBoard's log.
+        cache_dir: Where smaller photographs are kept for the next run; nowhere when left out.
+    """
+
+    resume: bool = False
+    overwrite: bool = False
+    tensorboard: bool = False
+    cache_dir: Path | None = None
+
+
+def prepare_run(
+    scene: Scene,
+    output: Path,
+    settings: TrainSettings,
+    options: RunOptions | None = None,
+    *,
+    note: Callable[[str], None] = lambda _: None,
+    progress: Progress = silent,
+) -> TrainingRun:
+    """Read what a run needs, and open its folder.
+
+    Args:
+        scene: A scene with photographs; its points are the seeds.
+        output: The folder of the run.
+        settings: How to train.
+        options: What else to do.
+        note: Told what the user should know, a sentence each.
+        progress: Told how far reading is.
+
+    Raises:
+        OutputError: ``output`` is taken, protected or cannot be written.
+        SceneNotFoundError: Photographs are missing.
+        SceneFormatError: A camera, a photograph or the run to go on with cannot be used.
+        PointCloudError: Too few points, or more than fit the memory.
+        ParameterError: No GPU where one is asked for; settings that are not those of the run.
+        MissingDependencyError: TensorBoard is asked for and absent.
+    """
+    options = options or RunOptions()
+    folder = _checked_folder(output, scene, options)
+    begun = folder.read_config() if options.resume and folder.is_run else None
+    settings = resumed_settings(begun, settings)
+    device = pick_device(settings.backend)
+    seeds = usable_seeds(scene.points, settings, note)
+    check_fits(len(seeds), device)
+    config = make_config(scene, seeds, settings, device)
+    if begun:
+        check_same_seeds(folder.config, begun, config)
+    factor, every, cache = settings.data_factor, settings.test_every, options.cache_dir
+    views = load_split(
+        scene, data_factor=factor, test_every=every, cache_dir=cache, progress=progress
+    )
+    frame = training_frame(views[0])
+    state = _state(folder if begun else None, seeds, frame, settings, device)
+    if not begun:
+        folder.begin(config)
+    if state.step:
+        note(f"Going on after step {state.step:,} of {settings.max_steps:,}.")
+    board = Board(folder.tensorboard, state.step) if options.tensorboard else None
+    run = TrainingRun(folder, settings, frame, state, views, board)
+    progress("compile", 0.0)
+    run.trainer.warm_up()
+    return run
+
+
+class TrainingRun:
+    """A run that is ready to train.
+
+    Args:
+        folder: Where results go.
+        settings: How to train.
+        frame: The training frame.
+        state: The run, at its first step or where it stopped.
+        views: Training and test views, in the world.
+        board: TensorBoard's log, if there is to be one.
+    """
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        settings: TrainSettings,
+        frame: TrainingFrame,
+        state: TrainState,
+        views: tuple[Sequence[View], Sequence[View]],
+        board: Board | None = None,
+    ) -> None:
+        self.folder = folder
+        self.settings = settings
+        self.state = state
+        self._frame = frame
+        self._board = board
+        self._saved = time.monotonic()
+        train, test = ([frame.view(view) for view in part] for part in views)
+        self.trainer = Trainer(state, settings, train, test, self._on_record)
+
+    @property
+    def device(self) -> str:
+        """Where it trains, in words."""
+        return device_name(self.trainer.device)
+
+    def train(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
+        """Train to the end, or until the user interrupts: then a checkpoint is there.
+
+        Args:
+            on_step: Told the number of steps done, after each.
+
+        Returns:
+            Whether the last step is done.
+
+        Raises:
+            OutputError: The checkpoint or the curve cannot be written.
+        """
+        done = self.trainer.run(on_step)
+        if self._board:
+            self._board.close()
+        if not done:
+            self._save()
+        return done
+
+    def finish(self, score: Score, progress: Progress = silent) -> dict[str, object]:
+        """Score the test views and write the results; the checkpoint, no longer needed, goes.
+
+        Args:
+            score: What to put into metrics.json about the test views.
+            progress: Told how far writing is.
+
+        Returns:
+            The content of metrics.json.
+
+        Raises:
+            OutputError: A result cannot be written.
+        """
+        progress("score", 0.0)
+        scores = score(self.trainer.render, self.trainer.test_views)
+        world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
+        write_gaussians(self.folder.gaussians, world)
+        self._write_curve()
+        write_curve_png(self.folder.curve_png, self.state.records)
+        self._write_renders(progress)
+        metrics = {**scores, **self._facts()}
+        write_json(self.folder.metrics, metrics)
+        self.folder.checkpoint.unlink(missing_ok=True)
+        return metrics
+
+    def _facts(self) -> dict[str, object]:
+        state = self.state
+        return {
+            "steps": state.step,
+            "train_seconds": round(state.watch.seconds, 3),
+            "num_seeds": self.folder.read_config()["seeds"]["count"],
+            "num_gaussians": len(state.params["means"]),
+            "tests": [
+                {
+                    "step": record.step,
+                    "seconds": record.seconds,
+                    "psnr": record.test_psnr if math.isfinite(record.test_psnr) else None,
+                    "num_gaussians": record.num_gaussians,
+                }
+                for record in state.records
+                if record.test_psnr is not None
+            ],
+        }
+
+    def _on_record(self, record: Record) -> None:
+        if self._board:
+            self._board.add(record)
+        if record.test_psnr is None:
+            return
+        self._write_curve()
+        if time.monotonic() - self._saved > SAVE_EVERY:
+            self._save()
+
+    def _save(self) -> None:
+        save_checkpoint(self.folder.checkpoint, self.state)
+        self._saved = time.monotonic()
+
+    def _write_curve(self) -> None:
+        write_curve_csv(self.folder.curve_csv, self.state.records)
+
+    def _write_renders(self, progress: Progress) -> None:
+        views = self.trainer.test_views
+        for i, view in enumerate(views):
+            picture = beside_truth(view.image, self.trainer.render(view).cpu().numpy())
+            write_picture(self.folder.renders / picture_name(view.name), picture)
+            progress("write", (i + 1) / len(views))
+
+
+def _checked_folder(output: Path, scene: Scene, options: RunOptions) -> RunFolder:
+    """The folder, found fit to be written to; and TensorBoard, found installed if asked for."""
+    if options.tensorboard:
+        require("tensorboard")
+    folder = RunFolder(Path(output))
+    protect = (scene.source.root,) if scene.source else ()
+    folder.check(overwrite=options.overwrite, resume=options.resume, protect=protect)
+    return folder
+
+
+def _state(
+    begun: RunFolder | None,
+    seeds: PointCloud,
+    frame: TrainingFrame,
+    settings: TrainSettings,
+    device: torch.device,
+) -> TrainState:
+    """The state of a run that has begun, if it left a checkpoint, else the first state."""
+    strategy = make_strategy(settings)
+    if begun and begun.checkpoint.is_file():
+        return load_checkpoint(begun.checkpoint, strategy, device)
+    gaussians = initial_gaussians(
+        seeds.replace(xyz=frame.points_from_world(seeds.xyz)),
+        sh_degree=settings.sh_degree,
+        opacity=strategy.opacity,
+        scale_factor=strategy.scale_factor,
+    )
+    params = make_parameters(gaussians, device)
+    return TrainState(params, make_optimizers(params), strategy)

@@ -1,0 +1,129 @@
+"""Everything that changes while a run goes on, and its checkpoints.
+
+Promise: a run that is continued from a checkpoint takes, on the CPU, bit for bit the steps that it
+would have taken: what is random depends on the seed and the step alone, so no generator is kept. A
+checkpoint appears whole or not at all, and loading one executes nothing that is in it.
+"""
+
+from __future__ import annotations
+
+import pickle
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatseed.errors import SceneFormatError
+from splatseed.io.staging import atomic_file
+from splatseed.train.curve import Record
+from splatseed.train.parameters import Optimizers, Parameters, make_optimizers
+from splatseed.train.strategies import Strategy
+
+__all__ = ["Stopwatch", "TrainState", "load_checkpoint", "save_checkpoint"]
+
+FORMAT = 1
+
+
+class Stopwatch:
+    """Seconds spent training; stands still while the rest is done."""
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self.seconds = seconds
+        self._since: float | None = None
+
+    def start(self) -> None:
+        """Begin, or go on."""
+        self._since = time.perf_counter()
+
+    def stop(self) -> None:
+        """Stand still."""
+        if self._since is not None:
+            self.seconds += time.perf_counter() - self._since
+            self._since = None
+
+
+@dataclass
+class TrainState:
+    """A run at a step.
+
+    Args:
+        params: The Gaussians.
+        optimizers: One a parameter.
+        strategy: What changes their number.
+        step: Steps done.
+        records: The curve so far.
+        watch: Time spent training.
+        losses: Of the steps since the last record.
+    """
+
+    params: Parameters
+    optimizers: Optimizers
+    strategy: Strategy
+    step: int = 0
+    records: list[Record] = field(default_factory=list)
+    watch: Stopwatch = field(default_factory=Stopwatch)
+    losses: list[Tensor] = field(default_factory=list)
+
+
+def save_checkpoint(path: Path, state: TrainState) -> None:
+    """Write all of a run's state, replacing an older checkpoint.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    content = {
+        "format": FORMAT,
+        "step": state.step,
+        "seconds": state.watch.seconds,
+        "records": [tuple(record) for record in state.records],
+        "losses": state.losses,
+        "params": {name: value.detach() for name, value in state.params.items()},
+        "optimizers": {name: each.state_dict() for name, each in state.optimizers.items()},
+        "strategy": state.strategy.state,
+    }
+    with atomic_file(path) as partial:
+        torch.save(content, partial)
+
+
+def load_checkpoint(path: Path, strategy: Strategy, device: torch.device) -> TrainState:
+    """The state that ``save_checkpoint`` wrote, on a device.
+
+    Args:
+        path: The checkpoint.
+        strategy: A new one of the run's settings; its state is replaced.
+        device: Where to go on.
+
+    Raises:
+        SceneFormatError: The file is no checkpoint of this version.
+    """
+    content = _load(path, device)
+    params = Parameters(
+        {name: torch.nn.Parameter(value) for name, value in content["params"].items()}
+    )
+    optimizers = make_optimizers(params)
+    for name, optimizer in optimizers.items():
+        optimizer.load_state_dict(content["optimizers"][name])
+    strategy.state = content["strategy"]
+    records = [Record(*row) for row in content["records"]]
+    watch = Stopwatch(content["seconds"])
+    step, losses = content["step"], content["losses"]
+    return TrainState(params, optimizers, strategy, step, records, watch, losses)
+
+
+def _load(path: Path, device: torch.device) -> dict[str, Any]:
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
+        found = f"a file that cannot be read ({type(error).__name__})"
+    else:
+        if isinstance(content, dict) and content.get("format") == FORMAT:
+            return content
+        found = "another kind or version of file"
+    raise SceneFormatError(
+        f"{path} to be a checkpoint of this version of splatseed",
+        found=found,
+        fix="Start the run again with --overwrite.",
+    )

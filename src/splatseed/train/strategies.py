@@ -1,0 +1,177 @@
+"""How Gaussians are added and removed: gsplat's strategies behind one small interface.
+
+Notation: ``info`` is the rasteriser's; ``before`` runs ahead of the backward pass, ``after`` behind
+the optimisers. Promise: gsplat's strategies run as they are, on both backends; ``state`` is all that
+a checkpoint must hold of them. gsplat 1.5.3 never resets opacities (it writes
+``step % reset_every == 0 & step > 0``, which is always false), so that is an option here.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from contextlib import nullcontext
+from typing import Any, ClassVar
+
+import torch
+from gsplat.strategy import DefaultStrategy, MCMCStrategy
+from gsplat.strategy.ops import reset_opa
+from jaxtyping import Float
+from torch import Tensor
+
+from splatseed.train.frame import SCENE_SCALE
+from splatseed.train.parameters import Optimizers, Parameters
+from splatseed.train.relocation import mcmc_on_cpu
+from splatseed.train.settings import MCMC_CAP, TrainSettings
+
+__all__ = ["Strategy", "make_strategy"]
+
+
+class Strategy(ABC):
+    """What changes the number of Gaussians, and how they begin.
+
+    Attributes:
+        state: What it remembers from step to step.
+    """
+
+    opacity: ClassVar[float] = 0.1
+    """Of the first Gaussians."""
+    scale_factor: ClassVar[float] = 1.0
+    """Size of the first Gaussians, as a multiple of the gaps between them."""
+
+    def __init__(self) -> None:
+        self.state: dict[str, Any] = {}
+
+    def regularization(self, params: Parameters) -> Float[Tensor, ""] | None:  # noqa: ARG002
+        """What is added to the loss; nothing by default."""
+        return None
+
+    @abstractmethod
+    def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        """To be called ahead of the backward pass."""
+
+    @abstractmethod
+    def after(
+        self, params: Parameters, optimizers: Optimizers, step: int, info: Any, means_lr: float
+    ) -> None:
+        """To be called behind the optimisers; may replace parameters and their moments."""
+
+
+def make_strategy(settings: TrainSettings) -> Strategy:
+    """The strategy that the settings name, on their schedule."""
+    if settings.strategy == "default":
+        return _Default(settings)
+    if settings.strategy == "mcmc":
+        return _Mcmc(settings)
+    return _Fixed()
+
+
+class _Fixed(Strategy):
+    """The seeds as they are: neither more nor fewer."""
+
+    def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        pass
+
+    def after(
+        self, params: Parameters, optimizers: Optimizers, step: int, info: Any, means_lr: float
+    ) -> None:
+        pass
+
+
+class _Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
+    """gsplat's strategy; with a cap, only the largest image gradients that it leaves room for grow."""
+
+    cap: int | None = None
+    grow_grad2d: float
+
+    def _grow_gs(self, params: Parameters, optimizers: Any, state: Any, step: int) -> Any:
+        wanted = self.grow_grad2d
+        self.grow_grad2d = self._threshold(params, state)
+        try:
+            return super()._grow_gs(params, optimizers, state, step)
+        finally:
+            self.grow_grad2d = wanted
+
+    def _threshold(self, params: Parameters, state: Any) -> float:
+        """A gradient that at most as many exceed as there is room: each one adds one Gaussian."""
+        if self.cap is None:
+            return self.grow_grad2d
+        room = self.cap - len(params["means"])
+        if room <= 0:
+            return math.inf
+        gradients = state["grad2d"] / state["count"].clamp_min(1)
+        if room >= len(gradients):
+            return self.grow_grad2d
+        return max(self.grow_grad2d, float(torch.topk(gradients, room + 1).values[-1]))
+
+
+class _Default(Strategy):
+    """3DGS's densification: clone and split where the image gradient is large, prune the faint."""
+
+    def __init__(self, settings: TrainSettings) -> None:
+        super().__init__()
+        schedule = settings.schedule
+        self.inner = _Capped(
+            refine_start_iter=schedule.refine_start,
+            refine_stop_iter=schedule.refine_stop("default"),
+            refine_every=schedule.refine_every,
+            reset_every=schedule.reset_every,
+        )
+        self.inner.cap = settings.cap
+        self.resets = settings.opacity_reset
+        self.state = self.inner.initialize_state(scene_scale=SCENE_SCALE)
+
+    def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        self.inner.step_pre_backward(params, optimizers, self.state, step, info)
+
+    def after(
+        self,
+        params: Parameters,
+        optimizers: Optimizers,
+        step: int,
+        info: Any,
+        means_lr: float,  # noqa: ARG002  (MCMC's)
+    ) -> None:
+        self.inner.step_post_backward(params, optimizers, self.state, step, info)
+        if self._resets_at(step):
+            reset_opa(params, optimizers, self.state, value=2 * self.inner.prune_opa)
+
+    def _resets_at(self, step: int) -> bool:
+        while_refining = self.resets and 0 < step < self.inner.refine_stop_iter
+        return while_refining and step % self.inner.reset_every == 0
+
+
+class _Mcmc(Strategy):
+    """3DGS as MCMC: move the faint to where there is more to show, add up to a cap, add noise."""
+
+    opacity = 0.5
+    scale_factor = 0.1
+    OPACITY_WEIGHT = 0.01
+    SCALE_WEIGHT = 0.01
+
+    def __init__(self, settings: TrainSettings) -> None:
+        super().__init__()
+        schedule = settings.schedule
+        self.inner = MCMCStrategy(
+            cap_max=settings.cap or MCMC_CAP,
+            refine_start_iter=schedule.refine_start,
+            refine_stop_iter=schedule.refine_stop("mcmc"),
+            refine_every=schedule.refine_every,
+        )
+        self.state = self.inner.initialize_state()
+
+    def regularization(self, params: Parameters) -> Float[Tensor, ""]:
+        opacity = torch.sigmoid(params["opacities"]).mean()
+        return (
+            self.OPACITY_WEIGHT * opacity + self.SCALE_WEIGHT * torch.exp(params["scales"]).mean()
+        )
+
+    def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        pass
+
+    def after(
+        self, params: Parameters, optimizers: Optimizers, step: int, info: Any, means_lr: float
+    ) -> None:
+        on_cpu = params["means"].device.type == "cpu"
+        with mcmc_on_cpu() if on_cpu else nullcontext():
+            self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=means_lr)

@@ -1,0 +1,160 @@
+"""The training loop: show a photograph, compare, improve, change the number of Gaussians.
+
+Notation: a step shows one training view; all cameras are in the training frame. Promise: on the CPU
+equal settings and seeds give equal bytes, whatever the number of threads and however often the run
+was interrupted: the order of the photographs is drawn from (seed, epoch), and PyTorch's generator,
+which the strategies use, is set from (seed, step) before each step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatseed.train.curve import Record
+from splatseed.train.interruption import interruption
+from splatseed.train.losses import photometric_loss, psnr
+from splatseed.train.parameters import MEANS_LR, photograph, render_view
+from splatseed.train.settings import TrainSettings
+from splatseed.train.state import TrainState
+from splatseed.train.views import View
+
+__all__ = ["Trainer"]
+
+RECORDS = 200
+"""Points of the curve of a run."""
+TESTS = 20
+"""How often the test views are rendered during a run."""
+
+
+class Trainer:
+    """Trains a state on views.
+
+    Args:
+        state: The run, at any step; changed in place.
+        settings: Its settings.
+        train_views: What is learnt from, in the training frame.
+        test_views: What is only looked at, likewise.
+        on_record: Told of each record, and whether the test views were rendered for it.
+    """
+
+    def __init__(
+        self,
+        state: TrainState,
+        settings: TrainSettings,
+        train_views: Sequence[View],
+        test_views: Sequence[View],
+        on_record: Callable[[Record], None] = lambda _: None,
+    ) -> None:
+        self.state = state
+        self.settings = settings
+        self.train_views = train_views
+        self.test_views = test_views
+        self.on_record = on_record
+
+    def run(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
+        """Train to the last step, or until the user interrupts.
+
+        Args:
+            on_step: Told the number of steps done, after each.
+
+        Returns:
+            Whether the last step is done.
+        """
+        state = self.state
+        with interruption() as stop, torch.random.fork_rng(self._cuda_devices()):
+            state.watch.start()
+            while state.step < self.settings.max_steps and not stop.requested:
+                render, truth = self._advance(state.step)
+                state.step += 1
+                on_step(state.step)
+                if self._is_due(RECORDS) or self._is_due(TESTS):
+                    self._record(render, truth)
+            state.watch.stop()
+        return state.step >= self.settings.max_steps
+
+    def warm_up(self) -> None:
+        """Render and compare once, so that kernels are compiled before the clock runs."""
+        view = self.train_views[0]
+        render, _ = render_view(self.state.params, view, self.settings.sh_degree)
+        photometric_loss(render, photograph(view, self.device)).backward()
+        for value in self.state.params.values():
+            value.grad = None
+
+    @torch.no_grad()
+    def render(self, view: View) -> Float[Tensor, "H W 3"]:
+        """What a view looks like now."""
+        degree = self.settings.schedule.sh_degree(self.state.step, self.settings.sh_degree)
+        return render_view(self.state.params, view, degree)[0]
+
+    def _advance(self, step: int) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]]:
+        """Take one step; returns the render and the photograph."""
+        state, schedule = self.state, self.settings.schedule
+        params, optimizers, strategy = state.params, state.optimizers, state.strategy
+        torch.manual_seed(_step_seed(self.settings.seed, step))
+        view = self.train_views[self._view_index(step)]
+        truth = photograph(view, self.device)
+        render, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
+        strategy.before(params, optimizers, step, info)
+        loss = photometric_loss(render, truth)
+        state.losses.append(loss.detach())
+        penalty = strategy.regularization(params)
+        (loss if penalty is None else loss + penalty).backward()
+        means_lr = MEANS_LR * schedule.means_lr(step)
+        optimizers["means"].param_groups[0]["lr"] = means_lr
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad()
+        strategy.after(params, optimizers, step, info, means_lr)
+        return render.detach(), truth
+
+    def _record(self, render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> None:
+        """Note how far the run is; the clock stands still meanwhile."""
+        state = self.state
+        loss = float(torch.stack(state.losses).mean(dtype=torch.float64))
+        state.watch.stop()
+        state.losses.clear()
+        tested = round(self.test_psnr(), 4) if self._is_due(TESTS) else None
+        count, shown = len(state.params["means"]), round(psnr(render, truth), 4)
+        record = Record(state.step, round(state.watch.seconds, 3), loss, shown, tested, count)
+        state.records.append(record)
+        self.on_record(record)
+        state.watch.start()
+
+    def test_psnr(self) -> float:
+        """Mean over the test views of each one's PSNR, dB."""
+        values = [psnr(self.render(v), photograph(v, self.device)) for v in self.test_views]
+        return sum(values) / len(values)
+
+    def _is_due(self, times: int) -> bool:
+        """Whether something that happens so many times in a run happens after this step."""
+        step, last = self.state.step, self.settings.max_steps
+        return step * times // last > (step - 1) * times // last
+
+    def _view_index(self, step: int) -> int:
+        epoch, position = divmod(step, len(self.train_views))
+        return int(_epoch_order(self.settings.seed, epoch, len(self.train_views))[position])
+
+    @property
+    def device(self) -> torch.device:
+        """Where the Gaussians are."""
+        means: Tensor = self.state.params["means"]
+        return means.device
+
+    def _cuda_devices(self) -> list[torch.device]:
+        return [self.device] if self.device.type == "cuda" else []
+
+
+@lru_cache(maxsize=2)
+def _epoch_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " V"]:
+    """The order of the photographs in one pass over them."""
+    return np.random.default_rng([seed, epoch]).permutation(count)
+
+
+def _step_seed(seed: int, step: int) -> int:
+    return int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0] >> 1)

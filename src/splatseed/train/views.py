@@ -1,0 +1,174 @@
+"""Views: posed photographs in memory, at the size at which they are trained and scored.
+
+Notation: a view is W x H pixels; ``K`` is in its own pixels, the centre of the top-left one at
+(0.5, 0.5); ``cam_from_world`` maps the scene's world to OpenCV camera axes. Promise: views come
+from pinhole cameras only; a photograph is made smaller by whole factors, once, and never larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from splatseed.camera import CAMERA_MODELS
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image, Scene
+from splatseed.train.photographs import load_photograph
+
+__all__ = ["View", "load_split", "load_views"]
+
+MIN_SIDE = 11
+"""The window of SSIM, in pixels: smaller views cannot be scored."""
+ASPECT_SLACK = 0.02
+"""By how much a file may be stretched against its camera: rounding of a resized copy."""
+READERS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A posed photograph.
+
+    Args:
+        name: The image's name in its scene.
+        image: Its pixels, sRGB, uint8 [H, W, 3].
+        K: Pinhole matrix in pixels of ``image``, float64 [3, 3].
+        width: W.
+        height: H.
+        cam_from_world: World to OpenCV camera axes, float64 [4, 4].
+    """
+
+    name: str
+    image: UInt8[np.ndarray, "H W 3"]
+    K: Float64[np.ndarray, "3 3"]
+    width: int
+    height: int
+    cam_from_world: Float64[np.ndarray, "4 4"]
+
+
+def load_split(
+    scene: Scene,
+    *,
+    data_factor: int = 1,
+    test_every: int = 8,
+    cache_dir: Path | None = None,
+    progress: Progress = silent,
+) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """The training and the test views of a scene: names sorted, every 8th is a test view.
+
+    Args:
+        scene: A scene with images, as read from files.
+        data_factor: By how much photographs are made smaller.
+        test_every: Which views are kept for the test.
+        cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
+        progress: Told how far reading is.
+
+    Raises:
+        SceneNotFoundError: Images are missing, or too few.
+        SceneFormatError: A camera has distortion, or an image cannot be used.
+    """
+    train, test = scene.split(test_every)
+    if not train or not test:
+        raise SceneNotFoundError(
+            "at least two images with a pose, one to train on and one to test",
+            found=f"{len(scene.images)}",
+            fix="Name a scene with photographs: a point cloud alone cannot be trained.",
+        )
+    views = load_views(
+        scene, (*train, *test), data_factor=data_factor, cache_dir=cache_dir, progress=progress
+    )
+    return views[: len(train)], views[len(train) :]
+
+
+def load_views(
+    scene: Scene,
+    images: Sequence[Image],
+    *,
+    data_factor: int = 1,
+    cache_dir: Path | None = None,
+    progress: Progress = silent,
+) -> tuple[View, ...]:
+    """The views of some of a scene's images, in their order.
+
+    Args:
+        scene: Where they belong, for the folder.
+        images: Which.
+        data_factor: By how much photographs are made smaller.
+        cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
+        progress: Told how far reading is.
+
+    Raises:
+        SceneNotFoundError: An image is missing.
+        SceneFormatError: A camera has distortion, or an image cannot be used.
+    """
+    folder = _image_folder(scene)
+    for image in images:
+        _check_lens(image)
+    read = partial(_load_view, folder=folder, data_factor=data_factor, cache_dir=cache_dir)
+    views = []
+    with ThreadPoolExecutor(READERS) as pool:
+        for view in pool.map(read, images):
+            views.append(view)
+            progress("read images", len(views) / len(images))
+    return tuple(views)
+
+
+def _image_folder(scene: Scene) -> Path:
+    folder = scene.source.image_dir if scene.source else None
+    if folder is None:
+        raise SceneNotFoundError(
+            "a folder with the scene's photographs",
+            found="none",
+            fix="Put them beside the model in a folder named images.",
+        )
+    return folder
+
+
+def _check_lens(image: Image) -> None:
+    lens = image.intrinsics
+    if not lens.is_pinhole and any(lens.params[_focal_and_center(lens.model) :]):
+        raise SceneFormatError(
+            "cameras without lens distortion (PINHOLE), which Gaussians are drawn with",
+            found=f"{lens.model} for {image.name}",
+            fix="Undistort the scene first: colmap image_undistorter, or splatseed sfm.",
+        )
+
+
+def _focal_and_center(model: str) -> int:
+    return CAMERA_MODELS[model].num_focal + 2
+
+
+def _load_view(image: Image, folder: Path, data_factor: int, cache_dir: Path | None) -> View:
+    path = folder / image.name
+    pixels, file_size = load_photograph(path, data_factor, cache_dir)
+    height, width = pixels.shape[:2]
+    if min(width, height) < MIN_SIDE:
+        raise SceneFormatError(
+            f"{path} to have at least {MIN_SIDE} pixels a side at --data-factor {data_factor}",
+            found=f"{width} x {height}",
+            fix="Choose a smaller --data-factor.",
+        )
+    camera = image.camera
+    scale = _file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor
+    K = np.diag([*scale, 1.0]) @ camera.K
+    return View(image.name, pixels, K, width, height, camera.cam_from_world)
+
+
+def _file_from_camera(
+    path: Path, file_size: tuple[int, int], camera_size: tuple[int, int]
+) -> Float64[np.ndarray, " 2"]:
+    """How many pixels of the file a pixel of the camera record is, along x and y."""
+    scale = np.array(file_size) / np.array(camera_size)
+    if abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
+        raise SceneFormatError(
+            f"{path} to have the shape of its camera, {camera_size[0]} x {camera_size[1]}",
+            found=f"{file_size[0]} x {file_size[1]}",
+            fix="Use the images that the model was made from, or a resized copy of them.",
+        )
+    return np.asarray(scale)

@@ -1,0 +1,139 @@
+"""``splatseed evaluate``: a run agrees with its own metrics, and any .ply can be scored."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
+pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
+
+from splatseed.evaluate import evaluate_views  # noqa: E402
+from splatseed.io import load_scene  # noqa: E402
+from splatseed.io.ply import write_ply  # noqa: E402
+from splatseed.train.gaussians import initial_gaussians  # noqa: E402
+from splatseed.train.ply import write_gaussians  # noqa: E402
+from splatseed.train.run import prepare_run  # noqa: E402
+from splatseed.train.settings import TrainSettings  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def run_folder(room, tmp_path_factory):
+    """A finished run of a few steps at half size."""
+    path = tmp_path_factory.mktemp("runs") / "run"
+    settings = TrainSettings(max_steps=20, data_factor=2, test_every=4, strategy="none")
+    run = prepare_run(load_scene(room), path, settings)
+    assert run.train()
+    run.finish(lambda render, views: evaluate_views(render, views).to_dict())
+    return path
+
+
+@pytest.fixture
+def model(room, tmp_path):
+    path = tmp_path / "model.ply"
+    write_gaussians(path, initial_gaussians(load_scene(room).points))
+    return path
+
+
+def test_a_run_scores_as_it_did_when_it_was_trained(run_folder, splatseed, tmp_path):
+    run = splatseed("evaluate", run_folder, "-o", tmp_path / "scores.json")
+    assert run.code == 0, run
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    metrics = json.loads((run_folder / "metrics.json").read_text())
+    # What was written is in the world, in single precision: the training frame must be undone.
+    assert scores["psnr"] == pytest.approx(metrics["psnr"], abs=0.01)
+    assert scores["ssim"] == pytest.approx(metrics["ssim"], abs=1e-3)
+    assert scores["num_gaussians"] == metrics["num_gaussians"]
+    assert (scores["data_factor"], scores["test_every"]) == (2, 4)
+    assert [s["name"] for s in scores["per_image"]] == [s["name"] for s in metrics["per_image"]]
+
+
+def test_a_ply_of_another_trainer_is_scored(model, room, splatseed, tmp_path):
+    out = tmp_path / "out"
+    run = splatseed("evaluate", model, "--scene", room, "--renders", out)
+    assert run.code == 0, run
+    test = load_scene(room).split()[1]
+    for image in test:
+        assert image.name in run.out
+        assert (out / image.name).is_file()
+    assert "mean" in run.out
+    assert "LPIPS was not measured" in run.out
+    assert "download.pytorch.org" in run.out
+    assert run.err == ""
+
+
+def _says(run, *texts):
+    assert run.code == 2, run
+    assert run.err.startswith("error: expected ")
+    assert run.err.count("\n") == 1
+    for text in texts:
+        assert str(text) in run.err
+
+
+def test_a_ply_needs_its_scene(model, splatseed):
+    _says(splatseed("evaluate", model), "--scene")
+
+
+def test_seeds_are_not_gaussians(room, splatseed, tmp_path):
+    write_ply(tmp_path / "seeds.ply", load_scene(room).points)
+    _says(splatseed("evaluate", tmp_path / "seeds.ply", "--scene", room), "trained Gaussians")
+
+
+@pytest.mark.parametrize("name", ["nothing", "folder"])
+def test_what_is_no_run_is_refused(name, room, splatseed, tmp_path):
+    (tmp_path / "folder").mkdir()
+    _says(splatseed("evaluate", tmp_path / name, "--scene", room), tmp_path / name, ".ply")
+
+
+def test_a_run_that_has_not_finished_is_refused(run_folder, splatseed, tmp_path):
+    for name in ("config.json", "splatseed.json"):
+        (tmp_path / name).write_bytes((run_folder / name).read_bytes())
+    _says(splatseed("evaluate", tmp_path), "has not finished")
+
+
+def test_a_config_that_is_no_config_is_refused(run_folder, splatseed, tmp_path):
+    for name in ("config.json", "splatseed.json", "point_cloud.ply"):
+        (tmp_path / name).write_bytes((run_folder / name).read_bytes())
+    for content in ("[]", "{", '{"scene": 7}', '{"scene": "x", "data_factor": "two"}'):
+        (tmp_path / "config.json").write_text(content)
+        _says(splatseed("evaluate", tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--data-factor", "0"], "--data-factor"),
+        (["--test-every", "1"], "--test-every"),
+        (["--data-factor", "40"], "smaller --data-factor"),
+        (["--lpips-weights", "nowhere"], "nowhere"),
+        (["--lpips-net", "squeeze"], "--lpips-net"),
+        (["--backend", "cuda"], "GPU"),
+    ],
+)
+def test_bad_options_are_named(words, says, model, room, splatseed):
+    if "cuda" in words and torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    _says(splatseed("evaluate", model, "--scene", room, *words), says)
+
+
+def test_outputs_are_not_overwritten_unless_told_to(model, room, splatseed, tmp_path):
+    scores, renders = tmp_path / "scores.json", tmp_path / "renders"
+    words = ("evaluate", model, "--scene", room, "-o", scores, "--renders", renders)
+    assert splatseed(*words).code == 0
+    before = scores.read_bytes()
+    _says(splatseed(*words), "--overwrite")
+    scores.unlink()
+    _says(splatseed(*words), "--overwrite")
+    assert not scores.exists()
+    assert splatseed(*words, "--overwrite").code == 0
+    names = [s["name"] for s in json.loads(scores.read_text())["per_image"]]
+    assert names == [s["name"] for s in json.loads(before)["per_image"]]
+
+
+def test_a_model_that_is_not_finite_is_refused(room, splatseed, tmp_path):
+    gaussians = initial_gaussians(load_scene(room).points)
+    gaussians.means[3] = np.nan
+    write_gaussians(tmp_path / "model.ply", gaussians)
+    _says(splatseed("evaluate", tmp_path / "model.ply", "--scene", room), "finite")

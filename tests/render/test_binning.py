@@ -1,0 +1,110 @@
+"""Tile lists against every Gaussian meeting every pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles
+
+View = tuple[np.ndarray, np.ndarray, np.ndarray, int, int]
+
+
+def random_view(rng: np.random.Generator, n: int, width: int, height: int) -> View:
+    """Ellipses of all sizes and shapes in and around an image, some of one pixel, some of a thousand."""
+    axes = np.exp(rng.uniform(np.log(0.55), np.log(300.0), (n, 2)))
+    axes[n // 2 :] = axes[n // 2 :].clip(max=4.0)
+    angles = rng.uniform(0.0, np.pi, n)
+    turn = np.stack([np.cos(angles), -np.sin(angles), np.sin(angles), np.cos(angles)], axis=1)
+    half = turn.reshape(n, 2, 2) / axes[:, None, :]
+    inverse = half @ half.transpose(0, 2, 1)
+    conics = np.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], axis=1)
+    means2d = rng.uniform(-30.0, 30.0 + max(width, height), (n, 2))
+    reach = np.log(255.0 * rng.uniform(1 / 255, 1.0, n))
+    return *(each.astype(np.float32) for each in (means2d, conics, reach)), width, height
+
+
+def touched(view: View, slack: float) -> np.ndarray:
+    """Which Gaussian has a pixel of which tile with sigma <= reach + slack: bool [G, rows, columns]."""
+    means2d, conics, reach, width, height = view
+    columns, rows = -(-width // TILE), -(-height // TILE)
+    x = np.arange(columns * TILE)[None, None, :] + 0.5 - means2d[:, 0, None, None].astype(float)
+    y = np.arange(rows * TILE)[None, :, None] + 0.5 - means2d[:, 1, None, None].astype(float)
+    a, b, c = (conics[:, k, None, None].astype(float) for k in range(3))
+    sigma = 0.5 * (a * x * x + c * y * y) + b * x * y
+    inside = sigma <= reach[:, None, None] + slack
+    return inside.reshape(-1, rows, TILE, columns, TILE).any(axis=(2, 4))
+
+
+def listed(lists: TileLists, view: View) -> np.ndarray:
+    """The same, of the lists."""
+    columns, rows = -(-view[3] // TILE), -(-view[4] // TILE)
+    found = np.zeros((len(view[2]), rows * columns), int)
+    tiles = np.repeat(np.arange(rows * columns), np.diff(lists.tile_start))
+    np.add.at(found, (lists.listed_rank, tiles), 1)
+    assert found.max(initial=0) <= 1, "a Gaussian is listed twice in a tile"
+    return found.reshape(-1, rows, columns).astype(bool)
+
+
+def assert_consistent(lists: TileLists, view: View) -> None:
+    """Starts, slots and ranks fit together, and every list is in depth order."""
+    pairs = len(lists.listed_rank)
+    assert lists.slot_start[-1] == lists.tile_start[-1] == pairs
+    assert np.array_equal(np.sort(lists.listed_slot), np.arange(pairs))
+    owner = np.repeat(np.arange(len(view[2])), np.diff(lists.slot_start))
+    assert np.array_equal(owner[lists.listed_slot], lists.listed_rank)
+    for first, last in zip(lists.tile_start[:-1], lists.tile_start[1:], strict=True):
+        assert (np.diff(lists.listed_rank[first:last]) > 0).all()
+
+
+@pytest.mark.parametrize("size", [(40, 33), (8, 8), (3, 5), (1, 1), (200, 9)])
+def test_no_pair_is_missing_and_few_are_in_vain(rng, size: tuple[int, int]) -> None:
+    view = random_view(rng, 300, *size)
+    lists = list_tiles(*view)
+    assert_consistent(lists, view)
+    found, needed = listed(lists, view), touched(view, -1e-4)
+    assert needed.any()
+    assert not (needed & ~found).any()
+    # Exact in the rectangle of pixel centres, not at the centres: an ellipse may pass between them.
+    assert found.sum() <= 1.15 * touched(view, 1e-4).sum() + 10
+
+
+def test_far_fewer_than_the_square_of_three_sigmas(rng) -> None:
+    view = random_view(rng, 300, 200, 160)
+    a, b, c = view[1].T.astype(float)
+    longest = 3 * np.sqrt(2.0 / (a + c - np.sqrt((a - c) ** 2 + 4 * b * b)))
+    low = np.clip((view[0] - longest[:, None]) / TILE, 0, (25, 20)).astype(int)
+    high = np.clip(np.ceil((view[0] + longest[:, None]) / TILE), 0, (25, 20)).astype(int)
+    squares = np.prod(high - low, axis=1).sum()
+    assert len(list_tiles(*view).listed_rank) < 0.6 * squares
+
+
+def test_nothing_to_list() -> None:
+    nothing = np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), np.empty(0, np.float32)
+    lists = list_tiles(*nothing, 20, 10)
+    assert lists.slot_start.tolist() == [0]
+    assert not lists.tile_start.any()
+    assert len(lists.tile_start) == 3 * 2 + 1
+
+
+@pytest.mark.parametrize("conic", [(1e-12, 0.0, 1e-12), (1e-38, 0.0, 1e-38), (0.0, 0.0, 0.0),
+                                   (1e-40, 0.0, 1e-40), (1.0, 1.0, 1.0), (1.0, -1.0001, 1.0)])  # fmt: skip
+def test_giants_and_broken_needles_are_listed_everywhere(conic: tuple[float, ...]) -> None:
+    lists = list_tiles(
+        np.array([[5.0, 7.0]], np.float32), np.array([conic], np.float32),
+        np.array([3.0], np.float32), 40, 24,
+    )  # fmt: skip
+    assert lists.slot_start.tolist() == [0, 15]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.floats(0.0, 2.0**127, width=32, allow_subnormal=True), max_size=40),
+    st.integers(0, 2**31),
+)
+def test_depth_order_is_a_stable_sort(depths: list[float], seed: int) -> None:
+    values = np.array(depths + depths[::2], np.float32)
+    visible = np.random.default_rng(seed).random(len(values)) < 0.7
+    expected = [i for i in np.argsort(values, kind="stable") if visible[i]]
+    assert depth_order(values, visible).tolist() == expected

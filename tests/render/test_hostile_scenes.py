@@ -1,0 +1,203 @@
+"""Whatever the Gaussians are: finite pictures and gradients, and the broken ones harm nobody."""
+
+from __future__ import annotations
+
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings, strategies as st
+from torch import Tensor
+
+from splatseed.render import rasterization
+
+from .scenes import gradients, random_scene
+
+PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "colors")
+BROKEN = st.sampled_from([np.nan, np.inf, -np.inf])
+EXTREME = {
+    "means": st.sampled_from([0.0, -3.0, 1e-6, 1e3, -1e6, 1e12, 3e38]),
+    "quats": st.sampled_from([0.0, 1e-20, -1.0, 1e18]),
+    "scales": st.sampled_from([0.0, 1e-30, 1e-12, 1e-3, 10.0, 1e4, 1e12, 1e20, 3e38]),
+    "opacities": st.sampled_from([0.0, 1.0, 1 / 255, 1.0 - 1e-7, 0.5]),
+    "colors": st.sampled_from([0.0, 1.0, 1e6, -1e6]),
+}
+QUICK = settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+@st.composite
+def replacements(draw: st.DrawFn, broken: bool) -> list[tuple[str, int, int, float]]:
+    """Numbers to put into a scene: (parameter, Gaussian, component, value)."""
+    found = []
+    for _ in range(draw(st.integers(1, 8))):
+        name = draw(st.sampled_from(PER_GAUSSIAN))
+        value = draw(BROKEN if broken else EXTREME[name])
+        found.append((name, draw(st.integers(0, 11)), draw(st.integers(0, 3)), value))
+    return found
+
+
+def with_replacements(scene: dict[str, Any], changes: list[tuple[str, int, int, float]]) -> None:
+    for name, gaussian, component, value in changes:
+        row = scene[name].view(len(scene[name]), -1)[gaussian]
+        row[component % len(row)] = value
+
+
+def scene_of(seed: int, options: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Twelve Gaussians before two cameras, and one of the modes."""
+    scene = random_scene(np.random.default_rng(seed), 12, cameras=2, size=(21, 13))
+    return scene, [
+        {}, {"packed": False}, {"rasterize_mode": "antialiased"}, {"render_mode": "RGB+ED"},
+    ][options]  # fmt: skip
+
+
+def assert_finite(scene: dict[str, Any], **options: Any) -> None:
+    image, alpha, found = gradients(scene, **options)
+    assert image.isfinite().all()
+    assert ((alpha >= 0) & (alpha <= 1)).all()
+    for name, each in found.items():
+        assert each.isfinite().all(), name
+
+
+@QUICK
+@given(replacements(broken=False), st.integers(0, 9), st.integers(0, 3))
+def test_extreme_numbers_stay_finite(
+    changes: list[tuple[str, int, int, float]], seed: int, options: int
+) -> None:
+    scene, chosen = scene_of(seed, options)
+    with_replacements(scene, changes)
+    assert_finite(scene, **chosen)
+
+
+@QUICK
+@given(replacements(broken=True), st.integers(0, 9), st.integers(0, 3))
+def test_broken_gaussians_are_as_if_absent(
+    changes: list[tuple[str, int, int, float]], seed: int, options: int
+) -> None:
+    scene, chosen = scene_of(seed, options)
+    with_replacements(scene, changes)
+    broken = sorted({gaussian for _, gaussian, _, _ in changes})
+    kept = [i for i in range(12) if i not in broken]
+    without = {**scene, **{name: scene[name][kept] for name in PER_GAUSSIAN}}
+    image, alpha, found = gradients(scene, **chosen)
+    expected_image, expected_alpha, expected = gradients(without, **chosen)
+    assert torch.equal(image, expected_image)
+    assert torch.equal(alpha, expected_alpha)
+    for name in PER_GAUSSIAN:
+        assert torch.equal(found[name][kept], expected[name]), name
+        assert not found[name][broken].any(), name
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("degree", [1, 3])
+def test_broken_coefficients(seed: int, degree: int) -> None:
+    scene = random_scene(np.random.default_rng(seed), 12, coefficients=16)
+    scene["colors"][3, 2, 1] = np.nan
+    kept = [i for i in range(12) if i != 3]
+    without = {**scene, **{name: scene[name][kept] for name in PER_GAUSSIAN}}
+    found, expected = (rasterization(**s, sh_degree=degree)[0] for s in (scene, without))
+    assert torch.equal(found, expected)
+
+
+def test_zero_gaussians() -> None:
+    scene = random_scene(np.random.default_rng(0), 3)
+    nothing = {**scene, **{name: scene[name][:0] for name in PER_GAUSSIAN}}
+    for options in ({}, {"packed": False}, {"render_mode": "RGB+ED"}):
+        image, alpha, found = gradients(nothing, **options)
+        assert not alpha.any()
+        assert torch.equal(image[..., :3], scene["backgrounds"][:, None, None].expand_as(
+            image[..., :3]))  # fmt: skip
+        assert found["means"].shape == (0, 3)
+
+
+@pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "ED"}])
+def test_none_visible(options: dict[str, Any]) -> None:
+    scene = random_scene(np.random.default_rng(0), 20)
+    scene["viewmats"][:, 2, 3] = -10.0
+    image, alpha, found = gradients(scene, **options)
+    assert not alpha.any()
+    assert image.isfinite().all()
+    assert not any(found[name].any() for name in (*PER_GAUSSIAN, "viewmats"))
+
+
+def test_on_the_near_plane_and_around_the_camera() -> None:
+    """Gaussians at and about the plane z = 0.01, and some that hold the camera inside them."""
+    scene = random_scene(np.random.default_rng(0), 30)
+    scene["viewmats"] = torch.eye(4)[None]
+    scene["means"][:, :2] *= 0.01
+    scene["means"][:, 2] = 0.01 + torch.linspace(-1e-3, 1e-3, 30)
+    scene["means"][15, 2] = 0.01
+    assert_finite(scene)
+    assert_finite(scene, rasterize_mode="antialiased")
+
+
+@pytest.mark.parametrize("ratio", [1e2, 1e4, 1e6, 1e9])
+def test_needles(ratio: float) -> None:
+    """Very long and thin at any angle: finite, and no brighter than opaque."""
+    scene = random_scene(np.random.default_rng(0), 40, size=(48, 40))
+    scene["scales"] = torch.tensor([[1e-2, 1e-2, 1e-2 * ratio]]).repeat(40, 1)
+    assert_finite(scene)
+    assert_finite(scene, rasterize_mode="antialiased")
+
+
+@pytest.mark.parametrize("scale", [1e2, 1e8, 1e15, 1e19])
+def test_a_giant_covers_everything_and_takes_little_memory(scale: float) -> None:
+    scene = random_scene(np.random.default_rng(0), 1, size=(320, 200))
+    scene.update(means=torch.tensor([[0.1, 0.2, 1.0]]), scales=torch.full((1, 3), scale))
+    scene.update(opacities=torch.tensor([0.5]), viewmats=torch.eye(4)[None])
+    assert_finite(scene)
+    tracemalloc.start()
+    _, alpha, found = gradients(scene)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert np.allclose(alpha.numpy(), 0.5, atol=1e-5)
+    assert peak < 50e6  # a thousand tiles of 64 pixels are 6 MB of image and gradient
+    assert found["opacities"].isfinite().all()
+
+
+def test_memory_grows_with_pairs_not_with_gaussians_times_pixels() -> None:
+    scene = random_scene(np.random.default_rng(0), 20_000, size=(320, 200))
+    scene["scales"] = scene["scales"].clamp(max=0.02)
+    gradients(scene)
+    tracemalloc.start()
+    gradients(scene)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 20_000 * 320 * 200 / 10
+
+
+@pytest.mark.parametrize("opacity", [0.0, 1.0])
+def test_all_transparent_or_all_opaque(opacity: float) -> None:
+    scene = random_scene(np.random.default_rng(0), 40)
+    scene["opacities"] = torch.full((40,), opacity)
+    assert_finite(scene)
+    _, alpha, _ = rasterization(**scene)
+    assert float(alpha.max()) == 0.0 if opacity == 0 else float(alpha.max()) > 0.99
+
+
+def test_opacity_above_one_is_held() -> None:
+    scene = random_scene(np.random.default_rng(0), 40)
+    scene["opacities"] = torch.full((40,), 30.0)
+    assert_finite(scene)
+
+
+def test_inputs_are_left_alone(rng) -> None:
+    scene = random_scene(rng, 20, coefficients=4)
+    before = {k: v.clone() for k, v in scene.items() if isinstance(v, Tensor)}
+    gradients(scene, sh_degree=1)
+    rasterization(**scene, sh_degree=1)
+    assert all(torch.equal(before[name], scene[name]) for name in before)
+
+
+def test_inputs_need_not_be_contiguous(rng) -> None:
+    scene = random_scene(rng, 20)
+    strided = {**scene, "means": scene["means"].T.contiguous().T}
+    strided["colors"] = torch.cat([scene["colors"], scene["colors"]], dim=1)[:, :3]
+    strided["quats"] = scene["quats"].flip(1).contiguous().flip(1)
+    strided["viewmats"] = scene["viewmats"].mT.contiguous().mT
+    expected, found = gradients(scene), gradients(strided)
+    assert torch.equal(expected[0], found[0])
+    assert all(torch.equal(expected[2][name], found[2][name]) for name in found[2])

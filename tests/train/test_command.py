@@ -1,0 +1,94 @@
+"""``splatseed train`` from its words to its exit code."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+
+import pytest
+
+from splatseed.cli import main
+from splatseed.errors import MissingDependencyError
+from splatseed.train import requirements
+
+
+def _run(*words):
+    try:
+        main(["train", *map(str, words)])
+    except SystemExit as stop:
+        return stop.code
+    return 0
+
+
+def test_trains_and_says_what_and_where(room_path, tmp_path, capsys):
+    run = tmp_path / "run"
+    words = (room_path, "--max-steps", "10", "--data-factor", "2", "-o", run)
+    assert _run(*words) == 0
+    said = capsys.readouterr()
+    assert "test PSNR" in said.out
+    assert f"splatseed evaluate {run}" in said.out
+    assert not said.err
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert {"psnr", "ssim", "per_image", "train_seconds", "tests"} <= metrics.keys()
+    assert metrics["tests"][-1]["psnr"] == pytest.approx(metrics["psnr"], abs=1e-3)
+    assert _run(*words) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_interrupted_it_saves_and_says_how_to_go_on(room_path, tmp_path):
+    """A process of its own, interrupted by a signal once it trains."""
+    run = tmp_path / "run"
+    code = (
+        "import os, signal, sys\n"
+        "from splatseed.cli import main\n"
+        "from splatseed.train.trainer import Trainer\n"
+        "advance = Trainer._advance\n"
+        "def step(self, number):\n"
+        "    if number == 3: os.kill(os.getpid(), signal.SIGINT)\n"
+        "    return advance(self, number)\n"
+        "Trainer._advance = step\n"
+        "main(sys.argv[1:])\n"
+    )
+    words = ["train", str(room_path), "--max-steps", "9", "--data-factor", "2", "-o", str(run)]
+    stopped = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, check=False
+    )
+    assert stopped.returncode == 130, stopped.stderr
+    assert "--resume" in stopped.stderr
+    assert "Traceback" not in stopped.stderr
+    assert (run / "checkpoint.pt").is_file()
+    assert _run(room_path, "-o", run, "--resume") == 0
+    assert json.loads((run / "metrics.json").read_text())["steps"] == 9
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--max-steps", "0"), "--max-steps"),
+        (("--strategy", "magic"), "strategy"),
+        (("--data-factor", "50"), "data-factor"),
+    ],
+)
+def test_bad_words_end_in_one_line(room_path, tmp_path, capsys, words, said):
+    assert _run(room_path, "-o", tmp_path / "run", *words) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("error:") == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_missing_packages_are_named_with_the_command(monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(requirements, "find_spec", lambda name: None if name == "gsplat" else found)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'splatseed\[train\]'"):
+        requirements.require("torch", "gsplat")
+
+
+def test_import_and_help_do_not_wait_for_pytorch():
+    code = (
+        "import sys, splatseed, splatseed.commands.train, splatseed.train.views\n"
+        "assert 'torch' not in sys.modules and 'gsplat' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

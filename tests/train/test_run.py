@@ -1,0 +1,232 @@
+"""Runs: they learn, repeat to the byte, go on to the byte, and refuse what they must."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+
+import numba
+import numpy as np
+import pytest
+import torch
+from PIL import Image as PilImage
+
+from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
+from splatseed.train import device
+from splatseed.train.parameters import gaussians_of
+from splatseed.train.ply import read_gaussians
+from splatseed.train.run import RunOptions, prepare_run
+from splatseed.train.settings import TrainSettings
+
+RESUME = RunOptions(resume=True)
+
+
+def _score(render, views):
+    return {"shapes": [list(render(view).shape) for view in views]}
+
+
+def _bytes(run):
+    arrays = gaussians_of(run.state.params).arrays()
+    return {name: np.ascontiguousarray(array).tobytes() for name, array in arrays.items()}
+
+
+def _stop_after(step):
+    """Ctrl-C during that step."""
+
+    def on_step(done):
+        if done == step:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    return on_step
+
+
+@pytest.mark.parametrize(("strategy", "gain"), [("default", 2.0), ("mcmc", 1.0), ("none", 4.0)])
+def test_training_makes_unseen_views_better(begin, strategy, gain):
+    """By at least half of what it gained when this was written; MCMC begins dark and sparse."""
+    run = begin(strategy=strategy, max_steps=100)
+    before = run.trainer.test_psnr()
+    assert run.train()
+    assert run.trainer.test_psnr() > before + gain
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc", "none"])
+def test_going_on_equals_never_having_stopped(begin, strategy):
+    settings = {"strategy": strategy, "cap_max": 700}
+    straight = begin("straight", **settings)
+    assert straight.train()
+    stopped = begin("stopped", **settings)
+    assert not stopped.train(_stop_after(37))
+    assert stopped.state.step == 37
+    assert stopped.folder.checkpoint.is_file()
+    resumed = begin("stopped", RESUME, **settings)
+    assert resumed.state.step == 37
+    assert resumed.train()
+    assert _bytes(resumed) == _bytes(straight)
+    of_both = [[r._replace(seconds=0) for r in run.state.records] for run in (straight, resumed)]
+    assert of_both[0] == of_both[1]
+    grew = straight.state.records[-1].num_gaussians > straight.state.records[0].num_gaussians
+    assert grew == (strategy != "none")
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_bytes_depend_on_the_seed_and_not_on_the_threads(begin, strategy):
+    torch_threads, numba_threads = torch.get_num_threads(), numba.get_num_threads()
+    results = []
+    try:
+        for name, threads, seed in (("a", 1, 0), ("b", 2, 0), ("c", 2, 1)):
+            torch.set_num_threads(threads)
+            numba.set_num_threads(min(threads, numba_threads))
+            run = begin(name, strategy=strategy, cap_max=2000, seed=seed, max_steps=40)
+            run.train()
+            results.append(_bytes(run))
+    finally:
+        torch.set_num_threads(torch_threads)
+        numba.set_num_threads(numba_threads)
+    assert results[0] == results[1]
+    assert results[1] != results[2]
+
+
+def test_the_callers_random_numbers_are_left_alone(begin):
+    run = begin(max_steps=3)
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    run.train()
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_default_strategy_grows_and_stops_at_half(begin):
+    run = begin(max_steps=80)
+    run.train()
+    counts = {record.step: record.num_gaussians for record in run.state.records}
+    assert counts[40] > counts[1]
+    assert counts[41] == counts[80]
+
+
+def test_default_strategy_keeps_to_its_cap(begin):
+    free = begin("free", max_steps=60)
+    free.train()
+    capped = begin("capped", max_steps=60, cap_max=300)
+    capped.train()
+    assert max(record.num_gaussians for record in free.state.records) > 400
+    assert 290 < max(record.num_gaussians for record in capped.state.records) <= 300
+
+
+def test_opacities_are_reset_on_request(begin):
+    run = begin(max_steps=21, opacity_reset=True)  # every 2nd step while refining
+    run.train(lambda done: done)
+    assert run.state.strategy.resets
+    # The last reset, to 0.01, is 10 steps ago: Adam's rate lets a logit grow 0.05 a step at most.
+    assert torch.sigmoid(run.state.params["opacities"]).max() < 0.05
+
+
+def test_mcmc_stays_within_its_cap(begin):
+    run = begin(strategy="mcmc", cap_max=600, max_steps=120)
+    run.train()
+    assert run.state.records[0].num_gaussians <= run.state.records[-1].num_gaussians <= 600
+
+
+def test_more_seeds_than_the_cap_are_thinned_out_and_reported(room, tmp_path):
+    notes = []
+    run = prepare_run(
+        room, tmp_path / "run", TrainSettings(cap_max=100, max_steps=5), note=notes.append
+    )
+    assert len(run.state.params["means"]) == 100
+    assert any("--cap-max 100" in note for note in notes)
+
+
+def test_results_are_whole_and_in_the_scenes_world(begin, room):
+    run = begin(max_steps=20)
+    seeds_in_world = run._frame.points_to_world(gaussians_of(run.state.params).means)
+    assert np.allclose(seeds_in_world, room.points.xyz, atol=1e-4)
+    run.train()
+    metrics = run.finish(_score)
+    folder = run.folder
+    assert json.loads(folder.metrics.read_text()) == metrics
+    assert metrics["shapes"] == [[36, 48, 3]] * 2
+    assert [test["step"] for test in metrics["tests"]] == list(range(1, 21))
+    assert len(read_gaussians(folder.gaussians)) == metrics["num_gaussians"]
+    assert json.loads(folder.config.read_text())["data_factor"] == 2
+    rows = list(csv.DictReader(folder.curve_csv.open()))
+    assert int(rows[-1]["step"]) == 20
+    assert PilImage.open(folder.curve_png).size[0] > 100
+    pictures = sorted(folder.renders.iterdir())
+    assert len(pictures) == 2
+    assert PilImage.open(pictures[0]).size == (3 * 48 + 8, 36)
+    assert not folder.checkpoint.exists()
+    assert not list(folder.path.glob(".*partial*"))
+
+
+def test_tensorboard_logs_what_the_curve_has(begin):
+    pytest.importorskip("tensorboard", reason="an optional package")
+    run = begin(options=RunOptions(tensorboard=True), max_steps=5)
+    run.train()
+    assert [path.stat().st_size > 100 for path in run.folder.tensorboard.iterdir()] == [True]
+
+
+def test_an_earlier_run_is_neither_replaced_nor_repeated_by_accident(begin, room, tmp_path):
+    run = begin(max_steps=3)
+    with pytest.raises(OutputError, match="--resume"):
+        begin(max_steps=3)
+    run.train()
+    run.finish(_score)
+    with pytest.raises(OutputError, match="a finished one"):
+        begin(options=RESUME, max_steps=3)
+    assert begin(options=RunOptions(overwrite=True), max_steps=3).state.step == 0
+    assert not run.folder.metrics.exists()
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("keep")
+    with pytest.raises(OutputError, match="did not write"):
+        begin("mine", RunOptions(overwrite=True))
+    with pytest.raises(OutputError, match="apart from the input"):
+        prepare_run(room, room.source.root / "run", TrainSettings())
+
+
+def test_a_run_goes_on_with_its_own_settings_and_seeds(begin, room, tmp_path):
+    run = begin(max_steps=30, strategy="none", sh_degree=1)
+    run.train(_stop_after(4))
+    resumed = prepare_run(room, tmp_path / "run", TrainSettings(), RESUME)
+    assert resumed.settings == run.settings
+    with pytest.raises(ParameterError, match="--max-steps 30"):
+        begin(options=RESUME, max_steps=31, strategy="none")
+    fewer = room.replace(points=room.points.select(slice(50)))
+    with pytest.raises(ParameterError, match="other points"):
+        prepare_run(fewer, tmp_path / "run", TrainSettings(), RESUME)
+    run.folder.checkpoint.write_bytes(b"damaged")
+    with pytest.raises(SceneFormatError, match="--overwrite"):
+        prepare_run(room, tmp_path / "run", TrainSettings(), RESUME)
+
+
+def test_a_run_killed_before_its_first_checkpoint_starts_again(begin):
+    begin(max_steps=30)
+    assert begin(options=RESUME, max_steps=30).state.step == 0
+
+
+def test_a_failing_checkpoint_leaves_the_last_one(begin, monkeypatch):
+    run = begin(max_steps=30)
+    run.train(_stop_after(4))
+    kept = run.folder.checkpoint.read_bytes()
+
+    def disk_full(_, path):
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", disk_full)
+    with pytest.raises(OutputError, match="No space left"):
+        run._save()
+    assert run.folder.checkpoint.read_bytes() == kept
+
+
+def test_what_does_not_fit_the_memory_is_refused_with_what_would(begin, monkeypatch, tmp_path):
+    monkeypatch.setattr(device, "free_bytes", lambda _: 100 * device.BYTES_EACH)
+    with pytest.raises(PointCloudError, match="--cap-max 100"):
+        begin()
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(begin, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ParameterError, match="--backend cpu"):
+        begin(backend="cuda")
