@@ -144,7 +144,7 @@ def test_duplicates_and_nonfinite_points_are_counted_and_kept(scene_dir):
     assert len(scene.points) == 5
     text = " ".join(scene.warnings)
     assert "2 points are not finite" in text
-    assert "1 points repeat" in text
+    assert "1 point repeats" in text
 
 
 def test_duplicates_are_found_exactly(scene_dir, rng):

@@ -13,8 +13,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from splatseed.pointcloud import GENERATED
 from splatseed.scene import Scene, Tracks
 

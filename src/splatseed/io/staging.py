@@ -173,11 +173,22 @@ def _put_in_place(partial: Path, target: Path) -> None:
         partial.rename(target)
     except BaseException:
         if not target.exists():
-            old.rename(target)
+            _restore(old, target)
         raise
     finally:
-        if old.exists():
+        if old.exists() and target.exists():
             _discard(old, target)
+
+
+def _restore(old: Path, target: Path) -> None:
+    try:
+        old.rename(target)
+    except OSError as error:
+        raise OutputError(
+            f"the earlier output, set aside as {old}, to be put back",
+            found=_reason(error),
+            fix=f"Rename it to {target} yourself.",
+        ) from error
 
 
 def _discard(old: Path, target: Path) -> None:
