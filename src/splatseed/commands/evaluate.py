@@ -199,7 +199,7 @@ def _write_json(path: Path, options: Options, task: _Task, result: EvalResult) -
         "test_every": task.test_every,
         **result.to_dict(),
     }
-    with atomic_file(path, overwrite=options.overwrite) as partial:
+    with atomic_file(path) as partial:
         partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", "utf-8")
 
 
