@@ -103,3 +103,16 @@ def test_finite_needs_all_three():
 def test_arrays_that_do_not_fit(xyz, rgb, source, says):
     with pytest.raises(PointCloudError, match=says):
         PointCloud(xyz, rgb, source)
+
+
+def test_distinct_points_are_finite_and_the_first_at_their_position(rng):
+    xyz = rng.integers(-2, 3, (500, 3)).astype(np.float32)
+    xyz[xyz == 0] *= rng.choice(np.array([1, -1], np.float32), np.count_nonzero(xyz == 0))
+    xyz[::50, 0] = np.nan
+    xyz[::70, 2] = np.inf
+    cloud = PointCloud(xyz, np.zeros((500, 3), np.uint8))
+    seen: set[tuple[float, ...]] = set()
+    for i, row in enumerate(map(tuple, xyz.tolist())):
+        assert cloud.distinct[i] == (np.isfinite(row).all() and row not in seen)
+        seen.add(row)
+    assert not cloud.select(slice(0, 0)).distinct.size

@@ -32,6 +32,17 @@ def test_an_output_knows_its_originals(scene, tmp_path, layout):
     assert len(load_scene(tmp_path / "more").points.originals) == n
 
 
+@pytest.mark.parametrize("layout", ["colmap", "transforms"])
+def test_an_output_is_written_back_byte_for_byte(scene, tmp_path, layout):
+    seeds = upsample(scene, "triangle", ratio=3)
+    write_scene(scene.replace(points=seeds), tmp_path / "out", format=layout)
+    report = write_scene(load_scene(tmp_path / "out"), tmp_path / "again")
+    assert report.layout == layout
+    assert (report.num_original, report.num_points) == (len(scene.points), len(seeds))
+    for name in set(report.files) - {"splatseed.json", "images"}:
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+
+
 @pytest.mark.parametrize(
     "text", ["", "[]", "{}", '{"num_points": 1, "num_original": 1}', '{"num_points": "x"}', "\xff"]
 )

@@ -199,6 +199,30 @@ def test_what_is_no_scene_is_one_error(tmp_path, scene_dir):
         load_scene(scene_dir)
 
 
+def test_a_folder_of_scenes_names_them(scene_dir):
+    shutil.copytree(scene_dir, scene_dir.with_name("another"))
+    (scene_dir.parent / "empty").mkdir()
+    with pytest.raises(SceneNotFoundError, match=r"another, scene\. Name one of them: \S+another"):
+        load_scene(scene_dir.parent)
+
+
+def test_sparse_and_a_file_of_a_model_lead_to_the_scene(scene_dir):
+    scene = load_scene(scene_dir / "sparse")
+    assert scene.source.root == scene_dir
+    assert scene.source.image_dir == scene_dir / "images"
+    for name in ("points3D.bin", "images.bin"):
+        with pytest.raises(SceneFormatError, match=f"Name the scene's folder: {scene_dir}$"):
+            load_scene(scene_dir / "sparse/0" / name)
+
+
+def test_a_ply_without_points_has_no_poses_to_triangulate_from(tmp_path):
+    nothing = PointCloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
+    write_ply(tmp_path / "cloud.ply", nothing)
+    with pytest.raises(SceneNotFoundError, match="PLY that has points") as caught:
+        load_scene(tmp_path / "cloud.ply")
+    assert "sfm" not in str(caught.value)
+
+
 def test_further_models_are_told(scene_dir):
     shutil.copytree(scene_dir / "sparse/0", scene_dir / "sparse/1")
     assert "several models" in warnings_of(scene_dir)

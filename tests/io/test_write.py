@@ -147,6 +147,20 @@ def test_rigs_and_frames_are_copied_byte_for_byte(scene_dir, tmp_path, rng):
     report = write_scene(scene.replace(images=scene.images[1:]), tmp_path / "fewer")
     assert "Rigs" in " ".join(report.notes)
     pycolmap.Reconstruction(str(tmp_path / "fewer/sparse/0"))
+    other = replace(scene.images[0], name="other.jpg")
+    report = write_scene(scene.replace(images=(other, *scene.images[1:])), tmp_path / "renamed")
+    assert "Rigs" in " ".join(report.notes)
+    assert not (tmp_path / "renamed/sparse/0/frames.bin").exists()
+
+
+def test_rigs_as_text_are_left_out_and_told(scene_dir, tmp_path):
+    folder = scene_dir / "sparse/0"
+    pycolmap.Reconstruction(str(folder)).write_text(str(folder))
+    for path in folder.glob("*.bin"):
+        path.unlink()
+    report = write_scene(load_scene(scene_dir), tmp_path / "out")
+    assert "as text" in " ".join(report.notes)
+    assert not list((tmp_path / "out/sparse/0").glob("*.txt"))
 
 
 def test_small_files_that_trainers_read_come_along(scene_dir, tmp_path):
@@ -189,13 +203,14 @@ def test_points_that_replace_the_originals_lose_the_tracks(scene_dir, tmp_path):
 
 
 def test_image_folders_are_linked_absolutely(scene_dir, tmp_path, monkeypatch):
-    for name in ("images_4", "masks", "other"):
+    for name in ("images_4", "masks", "other", "images_backup"):
         (scene_dir / name).mkdir()
     monkeypatch.chdir(scene_dir.parent)
     report = write_scene(load_scene("scene"), "out")
     out = tmp_path / "out"
     assert {"images", "images_4", "masks"} <= set(report.files)
     assert not (out / "other").exists()
+    assert not (out / "images_backup").exists()
     for name in ("images", "images_4", "masks"):
         assert (out / name).is_symlink()
         assert Path(os.readlink(out / name)) == scene_dir / name  # noqa: PTH115  (3.11's returns str)

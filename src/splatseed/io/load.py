@@ -13,7 +13,7 @@ from pathlib import Path
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io._cloud import cloud_warnings
 from splatseed.io._colmap_scene import find_model, read_colmap_scene, scene_root
-from splatseed.io._earlier import mark_generated
+from splatseed.io._earlier import MANIFEST, mark_generated
 from splatseed.io._transforms_scene import read_transforms_scene
 from splatseed.io.ply import read_ply
 from splatseed.scene import Scene, SceneSource
@@ -104,15 +104,16 @@ def _read_file(path: Path) -> Scene:
 
 def _no_scene(path: Path) -> SceneNotFoundError:
     scenes = [each.name for each in sorted(path.iterdir()) if _is_scene(each)]
-    near = sorted(each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix))
-    fix = "Name the scene's folder, or a .ply or .json file itself."
+    files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
+    near = sorted(files - {MANIFEST})
     if scenes:
         found, fix = f"scenes in it: {_some(scenes)}", f"Name one of them: {path / scenes[0]}"
-    elif near:
-        found = f"only {_some(near)}"
     else:
-        found = "none of them"
-        fix += " For photographs alone, run: splatseed sfm IMAGES -o SCENE."
+        found = f"only {_some(near)}" if near else "none of them"
+        fix = (
+            "Name the scene's folder, or a .ply or .json file itself. For photographs alone, run:"
+            " splatseed sfm IMAGES -o SCENE."
+        )
     return SceneNotFoundError(
         f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS} or traj.txt in {path}",
         found=found,
