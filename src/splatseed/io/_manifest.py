@@ -1,4 +1,4 @@
-"""``splatseed.json``: what an output says of itself, and what follows from it.
+"""``splatseed.json``: the list of files by which an output knows its own.
 
 Notation: ``files`` lists paths inside the output with forward slashes; a listed folder stands for
 all that is in it. Promise: a manifest that is missing, damaged or of another kind says nothing and
@@ -13,10 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from splatseed.pointcloud import GENERATED
-from splatseed.scene import Scene, Tracks
-
-__all__ = ["MANIFEST", "add_files", "mark_generated", "unlisted_files"]
+__all__ = ["MANIFEST", "add_files", "unlisted_files"]
 
 MANIFEST = "splatseed.json"
 """The file that marks a folder as written by splatseed: only such a folder is ever replaced."""
@@ -55,30 +52,6 @@ def unlisted_files(folder: Path) -> list[str]:
     return sorted(name for name in found if name.rpartition("/")[2] not in _FILE_MANAGERS)
 
 
-def mark_generated(scene: Scene) -> Scene:
-    """Tell the new points from the originals in a scene that was upsampled before.
-
-    Point files have no place for a point's origin, but the manifest beside them counts how many
-    points, the first ones, are originals. Where its counts fit the cloud, ``source`` of the others
-    becomes ``GENERATED`` and they lose their tracks, which are empty; any other scene is returned
-    as it is.
-    """
-    count = _num_original(scene)
-    if count is None:
-        return scene
-    source = scene.points.source.copy()
-    source[count:] = GENERATED
-    warning = (
-        f"This scene was upsampled before; new points start from its {count:,} originals and"
-        " replace the earlier ones."
-    )
-    return scene.replace(
-        points=scene.points.replace(source=source),
-        tracks=None if scene.tracks is None else _first_tracks(scene.tracks, count),
-        warnings=(*scene.warnings, warning),
-    )
-
-
 def _read(folder: Path) -> dict[str, Any]:
     try:
         content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
@@ -103,26 +76,3 @@ def _files_outside(folder: Path, ours: set[str], prefix: str = "") -> Iterator[s
                 yield from _files_outside(folder, ours, name + "/")
             else:
                 yield name
-
-
-def _num_original(scene: Scene) -> int | None:
-    """How many points are originals by the manifest, where it speaks of this very cloud."""
-    if scene.source is None:
-        return None
-    manifest = _read(scene.source.root)
-    count, total = manifest.get("num_original"), manifest.get("num_points")
-    if type(count) is not int or total != len(scene.points) or not 0 < count < total:
-        return None
-    return count
-
-
-def _first_tracks(tracks: Tracks, count: int) -> Tracks:
-    end = int(tracks.offsets[min(count, len(tracks))])
-    return Tracks(
-        point_ids=tracks.point_ids[:count],
-        xyz=tracks.xyz[:count],
-        errors=tracks.errors[:count],
-        offsets=tracks.offsets[: count + 1],
-        image_ids=tracks.image_ids[:end],
-        point2d_idx=tracks.point2d_idx[:end],
-    )

@@ -13,7 +13,8 @@ from pathlib import Path
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io._cloud import cloud_warnings
 from splatseed.io._colmap_scene import find_model, read_colmap_scene, scene_root
-from splatseed.io._earlier import MANIFEST, mark_generated
+from splatseed.io._earlier import mark_generated
+from splatseed.io._manifest import MANIFEST
 from splatseed.io._transforms_scene import read_transforms_scene
 from splatseed.io.ply import read_ply
 from splatseed.scene import Scene, SceneSource
