@@ -184,10 +184,15 @@ def test_the_version_is_the_same_everywhere():
 
 def test_dependencies_are_those_that_are_imported():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    wanted = {re.split(r"[><=\[;]", line)[0] for line in project["dependencies"]}
-    imported = {name.split(".")[0] for path in SOURCE.rglob("*.py") for name in _imports(path)}
-    needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
-    assert {"pillow" if name == "PIL" else name for name in needed} <= wanted
+    extras = project["optional-dependencies"]
+    base = {re.split(r"[><=\[;]", line)[0] for line in project["dependencies"]}
+    more = {re.split(r"[><=\[;]", line)[0] for e in ("train", "tensorboard") for line in extras[e]}
+    for path in SOURCE.rglob("*.py"):
+        imported = {name.split(".")[0] for name in _imports(path)}
+        needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
+        trains = {"render", "train", "evaluate", "commands"} & set(path.parts)
+        allowed = base | more if trains else base
+        assert {"pillow" if name == "PIL" else name for name in needed} <= allowed, path.name
 
 
 def _tracked():
