@@ -27,6 +27,7 @@ ORDER = (
     "jit",
     "camera",
     "pointcloud",
+    "depthmap",
     "scene",
     "io",
     "upsample",

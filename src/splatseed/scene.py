@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt32
 
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
+from splatseed.depthmap import DepthMaps
 from splatseed.pointcloud import PointCloud
 
 __all__ = ["Image", "Observations", "Scene", "SceneFormat", "SceneSource", "Tracks"]
@@ -139,6 +140,8 @@ class Scene:
         tracks: Tracks of the first ``len(tracks)`` points, which are the originals.
         source: Where it was read from; None for a scene made in memory.
         warnings: What the reader repaired or found odd, one sentence each.
+        depths: Depth maps of some of the images; None where there are none. They are read when asked
+            for.
     """
 
     points: PointCloud
@@ -147,6 +150,7 @@ class Scene:
     tracks: Tracks | None = None
     source: SceneSource | None = None
     warnings: tuple[str, ...] = field(default=())
+    depths: DepthMaps | None = None
 
     def replace(self, **changes: Any) -> Scene:
         """A copy with some fields replaced.

@@ -119,8 +119,9 @@ def upsample(
     rng = _generator(seed)
     if num_new == 0 and len(originals) > 0:
         return originals
-    trusted = trusted_originals(scene) if isinstance(scene, Scene) else None
-    cloud = prepare(originals, trusted, progress)
+    whole = scene if isinstance(scene, Scene) else None
+    trusted = None if whole is None else trusted_originals(whole)
+    cloud = prepare(originals, trusted, progress, whole)
     new = chosen(cloud, num_new, rng, progress)
     _check_finite(new)
     name = method if isinstance(method, str) else _name_of(chosen)

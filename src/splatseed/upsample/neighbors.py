@@ -22,6 +22,7 @@ from splatseed.io import find_usable
 from splatseed.jit import inline, kernel, parallel_range
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.scene import Scene
 
 __all__ = ["Bases", "Neighbors", "PreparedCloud", "draw_bases", "prepare", "sound_bases"]
 
@@ -74,6 +75,8 @@ class PreparedCloud:
         center: Centroid in the world, float64 [3].
         tree: kd-tree over the positions in file order.
         progress: Told how far the neighbour query is.
+        scene: Where the originals come from, for methods that look at more than points; None for a
+            bare cloud.
     """
 
     xyz: Float64[np.ndarray, "n 3"]
@@ -83,6 +86,7 @@ class PreparedCloud:
     center: Float64[np.ndarray, " 3"]
     tree: cKDTree
     progress: Progress = silent
+    scene: Scene | None = None
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -118,7 +122,10 @@ class PreparedCloud:
 
 
 def prepare(
-    points: PointCloud, trusted: Bool[np.ndarray, " N"] | None = None, progress: Progress = silent
+    points: PointCloud,
+    trusted: Bool[np.ndarray, " N"] | None = None,
+    progress: Progress = silent,
+    scene: Scene | None = None,
 ) -> PreparedCloud:
     """Mask, de-duplicate, centre and sort the originals of a cloud.
 
@@ -126,6 +133,7 @@ def prepare(
         points: The cloud; only points with ``source`` 0 take part.
         trusted: Which of the N points may serve as bases; all when left out.
         progress: Called with the stage "neighbours" while neighbours are sought.
+        scene: The scene that the points belong to, if any.
 
     Raises:
         PointCloudError: No finite original is left.
@@ -144,7 +152,9 @@ def prepare(
     rank = np.asarray(tree.indices, np.int64)
     rows = keep_idx[rank]
     trusted_rows = np.ones(len(rows), bool) if trusted is None else trusted[rows]
-    return PreparedCloud(xyz[rank], points.rgb[rows], rank, trusted_rows, center, tree, progress)
+    return PreparedCloud(
+        xyz[rank], points.rgb[rows], rank, trusted_rows, center, tree, progress, scene
+    )
 
 
 @dataclass(frozen=True, eq=False)
