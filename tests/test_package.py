@@ -30,6 +30,7 @@ ORDER = (
     "depthmap",
     "scene",
     "io",
+    "depth",
     "upsample",
     "geometry",
     "viewpoint",

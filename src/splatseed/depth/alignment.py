@@ -1,0 +1,203 @@
+"""The scale (and shift) that takes an image's depth map to the scene's units, by its SfM points.
+
+Notation: at an SfM point that falls into a pixel, ``value`` is the map's and ``z`` the point's planar
+depth. For maps of the kinds "z" and "ray" z = scale value (value divided by the length of the pixel's
+ray for "ray"; the shift is 0), for "inverse" 1 / z = scale value + shift. Promise: an image is left out
+rather than believed when too few points see depth, or when it fits much worse than the others; each
+such image is reported with the reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.camera import Camera
+from splatseed.depth.fits import (
+    least_squares_line,
+    least_squares_scale,
+    median_scale,
+    robust_line,
+)
+from splatseed.depth.planar import map_camera, ray_length
+from splatseed.depth.sightings import find_sightings
+from splatseed.depthmap import DepthKind, DepthMap
+from splatseed.errors import SceneNotFoundError
+from splatseed.progress import Progress, in_threads, silent
+from splatseed.scene import Scene
+
+__all__ = ["Alignment", "Fit", "align", "align_map", "reject_outliers", "values_at"]
+
+Fit = Literal["robust", "least-squares"]
+"""Medians and reweighting, or the paper's equation 7."""
+
+GOOD_RESIDUAL = 0.01
+"""An image that fits this well is never an outlier, however well the others fit."""
+
+MAX_RESIDUAL = 0.25
+"""An image that is off by more at half of its points is not aligned at all."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How an image's depth map is taken to the scene's units.
+
+    Args:
+        scale: Scene units per unit of the map; for inverse depth, its inverse units likewise.
+        shift: Added after scaling; 0 but for inverse depth.
+        num_points: SfM points that see depth.
+        residual: Median of the points' |aligned depth / depth of the point - 1|; NaN without points.
+        rejected: Why the image is left out, in one sentence; None = it is used.
+    """
+
+    scale: float
+    shift: float
+    num_points: int
+    residual: float
+    rejected: str | None = None
+
+
+def align(
+    scene: Scene,
+    *,
+    fit: Fit = "robust",
+    min_points: int = 20,
+    max_residual_ratio: float | None = 3.0,
+    progress: Progress = silent,
+) -> dict[str, Alignment]:
+    """Align every depth map of a scene.
+
+    Args:
+        scene: A scene with ``depths``, images and SfM points.
+        fit: "robust": the median of z / value, or a line by reweighted least squares for inverse
+            depth. "least-squares": the paper's equation 7.
+        min_points: Images with fewer points that see depth are rejected.
+        max_residual_ratio: Images whose residual exceeds this many times the median image's, and 1%,
+            are rejected; None keeps all.
+        progress: Told how many maps are read.
+
+    Returns:
+        By name, in the order of ``scene.images``, all images that have a map; rejected ones too.
+
+    Raises:
+        SceneNotFoundError: The scene has no maps, or a map's file is gone.
+        SceneFormatError: A map cannot be read or has not the shape of its image.
+    """
+    if scene.depths is None:
+        raise SceneNotFoundError(
+            "a scene with depth maps", found="none", fix="Name their folder with --depth."
+        )
+    depths, sightings = scene.depths, find_sightings(scene)
+    images = [image for image in scene.images if image.name in depths]
+    found: list[Alignment | None] = [None] * len(images)
+
+    def work(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            depth = depths.read(images[i].name)
+            xyz = sightings.of(images[i])
+            found[i] = align_map(depth, map_camera(depth, images[i]), xyz, fit, min_points)
+
+    in_threads(work, len(images), 1, "align depth", progress)
+    aligned = {
+        image.name: alignment
+        for image, alignment in zip(images, found, strict=True)
+        if alignment is not None
+    }
+    return reject_outliers(aligned, max_residual_ratio)
+
+
+def align_map(
+    depth: DepthMap, camera: Camera, xyz: Float64[np.ndarray, "M 3"], fit: Fit, min_points: int
+) -> Alignment:
+    """Align one map by the SfM points that its image sees.
+
+    Args:
+        depth: The map.
+        camera: The image's camera in pixels of the map (``DepthMap.camera``).
+        xyz: World positions of the points, [M, 3].
+        fit: As in ``align``.
+        min_points: As in ``align``.
+    """
+    value, z = values_at(depth, camera, xyz)
+    if len(value) < max(min_points, 1):
+        return Alignment(np.nan, 0.0, len(value), np.nan, _too_few(depth, len(value), min_points))
+    scale, shift = _fit(depth.kind, value, z, fit)
+    residual = _residual(depth.kind, value, z, scale, shift)
+    return Alignment(scale, shift, len(value), residual, _misfit(depth.kind, scale, residual))
+
+
+def values_at(
+    depth: DepthMap, camera: Camera, xyz: Float64[np.ndarray, "M 3"]
+) -> tuple[Float64[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
+    """What the map holds where points fall, and their planar depth: [K] each, K <= M see depth.
+
+    A point takes the value of the pixel it falls into. Distances along the ray are turned into planar
+    depth by the ray through that pixel's centre.
+    """
+    uv, z = camera.project(xyz)
+    inside = (z > 0) & ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
+    column, row = uv[inside].astype(np.int64).T
+    value = depth.values[row, column].astype(np.float64)
+    if depth.kind == "ray":
+        value /= ray_length(camera, column, row)
+    known = np.isfinite(value) if depth.kind == "inverse" else value > 0
+    return value[known], z[inside][known]
+
+
+def reject_outliers(
+    alignments: dict[str, Alignment], max_ratio: float | None
+) -> dict[str, Alignment]:
+    """Reject the images that fit much worse than the median of those not yet rejected."""
+    residuals = [a.residual for a in alignments.values() if a.rejected is None]
+    if max_ratio is None or not residuals:
+        return alignments
+    typical = float(np.median(residuals))
+    limit = max(max_ratio * typical, GOOD_RESIDUAL)
+    return {
+        name: replace(a, rejected=f"depth is off by {a.residual:.1%}, typically {typical:.1%}")
+        if a.rejected is None and a.residual > limit
+        else a
+        for name, a in alignments.items()
+    }
+
+
+def _fit(
+    kind: DepthKind, value: Float64[np.ndarray, " M"], z: Float64[np.ndarray, " M"], fit: Fit
+) -> tuple[float, float]:
+    """Scale and shift by the kind of map."""
+    if kind == "inverse":
+        return (robust_line if fit == "robust" else least_squares_line)(value, z)
+    return (median_scale if fit == "robust" else least_squares_scale)(value, z), 0.0
+
+
+def _residual(
+    kind: DepthKind,
+    value: Float64[np.ndarray, " M"],
+    z: Float64[np.ndarray, " M"],
+    scale: float,
+    shift: float,
+) -> float:
+    """Median relative error of depth; a point that would lie behind the camera counts as infinite."""
+    aligned = scale * value + shift
+    if kind == "inverse":
+        aligned = 1.0 / np.where(aligned > 0, aligned, np.nan)
+    error = np.abs(aligned / z - 1.0)
+    return float(np.median(np.where(np.isfinite(error), error, np.inf)))
+
+
+def _too_few(depth: DepthMap, num: int, min_points: int) -> str:
+    if not np.isfinite(depth.values).any():
+        return "the map knows no depth at any pixel"
+    return f"{num} SfM points see depth, and {max(min_points, 1)} are needed"
+
+
+def _misfit(kind: DepthKind, scale: float, residual: float) -> str | None:
+    """Why a fit is none: the wrong kind of map, or one of another scene."""
+    if kind == "inverse" and not scale > 0:
+        return "values rise with depth, so they are not its inverse"
+    if not residual <= MAX_RESIDUAL:
+        return f"depth is off by {residual:.0%} at half of the SfM points"
+    return None

@@ -1,0 +1,85 @@
+"""Which SfM points each image sees: what depth maps are held against.
+
+Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the scene's world.
+Promise: only finite originals take part. Where Structure-from-Motion says which features a point has
+(its track), that is taken; without tracks, points are projected, and of those that fall close together
+in the image only the nearest stay, as the others are probably hidden.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from splatseed.camera import Camera
+from splatseed.pointcloud import ORIGINAL
+from splatseed.scene import Image, Scene
+
+__all__ = ["Sightings", "find_sightings"]
+
+CELLS = 40
+"""Columns and rows of an image within which points are taken to hide each other."""
+
+HIDDEN = 1.1
+"""A point this many times as far as the nearest one of its cell is taken for hidden."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """The points of every image.
+
+    Args:
+        xyz: The finite originals, float64 [N, 3], scene units.
+        point_idx: Rows of ``xyz``, image after image, int64 [T].
+        start: Where each image begins in ``point_idx``, by its id.
+        count: How many each image has, by its id.
+    """
+
+    xyz: Float64[np.ndarray, "N 3"]
+    point_idx: Int64[np.ndarray, " T"]
+    start: dict[int, int]
+    count: dict[int, int]
+
+    def of(self, image: Image) -> Float64[np.ndarray, "M 3"]:
+        """What an image sees, world positions [M, 3]: by tracks, or else by projection."""
+        count = self.count.get(image.image_id, 0)
+        if count:
+            start = self.start[image.image_id]
+            return np.asarray(self.xyz[self.point_idx[start : start + count]])
+        return _in_front(self.xyz, image.camera)
+
+
+def find_sightings(scene: Scene) -> Sightings:
+    """Gather the points of every image once, to be asked for image by image."""
+    usable = np.flatnonzero((scene.points.source == ORIGINAL) & scene.points.finite)
+    xyz = scene.points.xyz[usable].astype(np.float64)
+    tracks = scene.tracks
+    if tracks is None:
+        return Sightings(xyz, np.empty(0, np.int64), {}, {})
+    row = np.full(len(scene.points), -1)
+    row[usable] = np.arange(len(usable))
+    point_idx = row[np.repeat(np.arange(len(tracks)), tracks.lengths)]
+    good = point_idx >= 0
+    image_ids = tracks.image_ids[good]
+    order = np.argsort(image_ids, kind="stable")
+    ids, start, count = np.unique(image_ids[order], return_index=True, return_counts=True)
+    return Sightings(
+        xyz,
+        point_idx[good][order],
+        dict(zip(ids.tolist(), start.tolist(), strict=True)),
+        dict(zip(ids.tolist(), count.tolist(), strict=True)),
+    )
+
+
+def _in_front(xyz: Float64[np.ndarray, "N 3"], camera: Camera) -> Float64[np.ndarray, "M 3"]:
+    """The points within the image that no other one close by hides."""
+    uv, z = camera.project(xyz)
+    size = np.array([camera.width, camera.height])
+    inside = np.flatnonzero((z > 0) & ((uv >= 0) & (uv < size)).all(axis=1))
+    column, row = (uv[inside] * CELLS / size).astype(np.int64).T
+    cell = row * CELLS + column
+    nearest = np.full(CELLS * CELLS, np.inf)
+    np.minimum.at(nearest, cell, z[inside])
+    return np.asarray(xyz[inside[z[inside] <= HIDDEN * nearest[cell]]])
