@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import UInt8
 
-from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import OutputError, ParameterError, SceneFormatError
+from splatseed.io.photograph import decode_photograph, open_photograph, photograph_bytes
 from splatseed.io.staging import atomic_file
 
 if TYPE_CHECKING:
@@ -51,12 +52,13 @@ def load_photograph(
         raise ParameterError(
             "--data-factor of 1 or more", found=f"{factor}", fix="Images are never enlarged."
         )
-    raw = _read(path)
+    raw = photograph_bytes(path)
     kept = None if cache_dir is None or factor == 1 else cache_dir / _key(raw, factor)
     if kept is not None and kept.is_file():
         with suppress(SceneFormatError):  # a damaged copy is made again
-            return np.array(_decode(kept, _read(kept))), _size(path, raw)
-    picture = _decode(path, raw)
+            smaller = decode_photograph(kept, photograph_bytes(kept))
+            return np.array(smaller), open_photograph(path, raw).size
+    picture = decode_photograph(path, raw)
     smaller = _reduce(path, picture, factor)
     if kept is not None:
         _keep(smaller, kept)
@@ -74,54 +76,9 @@ def user_cache_dir() -> Path:
     return Path(base) / "splatseed" / "images"
 
 
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise SceneNotFoundError(
-            f"the image {path}",
-            found="no such file",
-            fix="Put it there, or drop it from the model.",
-        ) from None
-    except OSError as error:
-        raise _unusable(path, error.strerror or type(error).__name__) from None
-
-
 def _key(raw: bytes, factor: int) -> str:
     digest = hashlib.blake2b(raw, digest_size=16, person=FILTER.encode())
     return f"{digest.hexdigest()}_{factor}.png"
-
-
-def _open(path: Path, raw: bytes) -> PilImage.Image:
-    from io import BytesIO  # noqa: PLC0415  (with Pillow, which is slow to import)
-
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415
-
-    try:
-        return Image.open(BytesIO(raw))
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError) as error:
-        raise _unusable(path, type(error).__name__) from None
-
-
-def _size(path: Path, raw: bytes) -> tuple[int, int]:
-    return _open(path, raw).size
-
-
-def _decode(path: Path, raw: bytes) -> PilImage.Image:
-    picture = _open(path, raw)
-    try:
-        if "A" in picture.getbands() or "transparency" in picture.info:
-            return _over_black(picture.convert("RGBA"))
-        return picture.convert("RGB")
-    except (OSError, ValueError, SyntaxError) as error:  # what Pillow's decoders raise
-        raise _unusable(path, f"an image cut short or damaged ({error})") from None
-
-
-def _over_black(picture: PilImage.Image) -> PilImage.Image:
-    from PIL import Image  # noqa: PLC0415
-
-    black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
-    return Image.alpha_composite(black, picture).convert("RGB")
 
 
 def _reduce(path: Path, picture: PilImage.Image, factor: int) -> PilImage.Image:
@@ -140,9 +97,3 @@ def _reduce(path: Path, picture: PilImage.Image, factor: int) -> PilImage.Image:
 def _keep(picture: PilImage.Image, path: Path) -> None:
     with suppress(OutputError), atomic_file(path) as partial:
         picture.save(partial, compress_level=1)
-
-
-def _unusable(path: Path, found: str) -> SceneFormatError:
-    return SceneFormatError(
-        f"{path} to be an image", found=found, fix="Copy or export the image again."
-    )

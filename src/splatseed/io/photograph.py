@@ -1,0 +1,104 @@
+"""A photograph's file: its bytes, its size, its pixels.
+
+Promise: pixels are as stored, before any EXIF rotation, which is how COLMAP counts them; transparent
+ones are laid over black, which Gaussians are drawn on; every failure names the file.
+"""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+
+if TYPE_CHECKING:
+    from PIL import Image as PilImage
+
+__all__ = ["check_photograph", "decode_photograph", "open_photograph", "photograph_bytes"]
+
+_CHECK_SCALE = 8
+"""JPEG is checked at an eighth of its size: all of it is read, a fraction of it is computed."""
+_DECODER_FAILURES = (OSError, ValueError, SyntaxError)
+
+
+def photograph_bytes(path: Path) -> bytes:
+    """The file as it is.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise SceneNotFoundError(
+            f"the image {path}",
+            found="no such file",
+            fix="Put it there, or drop it from the model.",
+        ) from None
+    except OSError as error:
+        raise _unusable(path, error.strerror or type(error).__name__) from None
+
+
+def open_photograph(path: Path, raw: bytes) -> PilImage.Image:
+    """The picture in a file's bytes, of which only the header is decoded yet.
+
+    Raises:
+        SceneFormatError: It is no image.
+    """
+    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415  (slow to import)
+
+    try:
+        return Image.open(BytesIO(raw))
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError) as error:
+        raise _unusable(path, type(error).__name__) from None
+
+
+def decode_photograph(path: Path, raw: bytes) -> PilImage.Image:
+    """The pixels in a file's bytes, as RGB.
+
+    Raises:
+        SceneFormatError: It is no image, or is cut short or damaged.
+    """
+    picture = open_photograph(path, raw)
+    try:
+        if "A" in picture.getbands() or "transparency" in picture.info:
+            return _over_black(picture.convert("RGBA"))
+        return picture.convert("RGB")
+    except _DECODER_FAILURES as error:
+        raise _damaged(path, error) from None
+
+
+def check_photograph(path: Path) -> tuple[int, int]:
+    """Read a photograph to its last byte, keep nothing, and return its width and height.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is no image, or is cut short or damaged.
+    """
+    picture = open_photograph(path, photograph_bytes(path))
+    size = picture.size
+    picture.draft(None, (size[0] // _CHECK_SCALE, size[1] // _CHECK_SCALE))
+    try:
+        picture.load()
+    except _DECODER_FAILURES as error:
+        raise _damaged(path, error) from None
+    return size
+
+
+def _over_black(picture: PilImage.Image) -> PilImage.Image:
+    from PIL import Image  # noqa: PLC0415
+
+    black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
+    return Image.alpha_composite(black, picture).convert("RGB")
+
+
+def _damaged(path: Path, error: Exception) -> SceneFormatError:
+    return _unusable(path, f"an image cut short or damaged ({error})")
+
+
+def _unusable(path: Path, found: str) -> SceneFormatError:
+    return SceneFormatError(
+        f"{path} to be an image", found=found, fix="Copy or export the image again."
+    )
