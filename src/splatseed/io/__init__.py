@@ -1,12 +1,25 @@
 """Reading scenes and writing them, one file a format.
 
 ``load_scene`` finds out what a path holds; ``write_scene`` makes a folder that every 3D Gaussian
-Splatting trainer loads unchanged. Promise: malformed input and failing output raise one error from
+Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a scene's images. Promise: malformed input and failing output raise one error from
 ``splatseed.errors``; importing this package loads neither Numba nor SciPy.
 """
 
 from splatseed.io._cloud import UsablePoints, find_usable
+from splatseed.io.depth_files import DepthFiles
+from splatseed.io.depth_find import find_depths
+from splatseed.io.depth_folder import DepthWriter, depth_folder
 from splatseed.io.load import load_scene
 from splatseed.io.write import WriteReport, write_scene
 
-__all__ = ["UsablePoints", "WriteReport", "find_usable", "load_scene", "write_scene"]
+__all__ = [
+    "DepthFiles",
+    "DepthWriter",
+    "UsablePoints",
+    "WriteReport",
+    "depth_folder",
+    "find_depths",
+    "find_usable",
+    "load_scene",
+    "write_scene",
+]

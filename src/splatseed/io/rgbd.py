@@ -1,6 +1,6 @@
 """RGB-D captures in the layout of NICE-SLAM's Replica: colour images, poses and one camera.
 
-A folder holds ``results/frame*.jpg`` (or .png; ``depth*.png`` lie beside them), ``traj.txt`` with
+A folder holds ``results/frame*.jpg`` (or .png) and ``results/depth*.png``, ``traj.txt`` with
 one row-major 4x4 ``world_from_cam`` in OpenCV axes and metres a line, a line a frame in the order
 of the frames' numbers, and ``cam_params.json``, here or one folder up.
 
@@ -22,6 +22,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.depth_find import search_depths
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 
@@ -32,7 +33,7 @@ _RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
 
 
 def load_rgbd(path: Path) -> Scene:
-    """Read the images and poses of an RGB-D capture; it has no points.
+    """Read the images, poses and depth maps of an RGB-D capture; it has no points.
 
     Frames whose pose is not finite (tracking was lost) are left out and told of in ``warnings``.
 
@@ -40,7 +41,8 @@ def load_rgbd(path: Path) -> Scene:
         path: The folder that holds ``traj.txt`` and ``results/``.
 
     Returns:
-        A scene with posed images, one PINHOLE camera and an empty cloud.
+        A scene with posed images, one PINHOLE camera, an empty cloud, and in ``depths`` the maps
+        that there are (planar z, divided by ``scale`` of ``cam_params.json``).
 
     Raises:
         SceneNotFoundError: ``traj.txt``, ``cam_params.json`` or the frames are missing.
@@ -62,13 +64,14 @@ def load_rgbd(path: Path) -> Scene:
         _posed_image(frames[i], i + 1, intrinsics, trajectory[i])
         for i in np.flatnonzero(tracked).tolist()
     )
-    return Scene(
+    scene = Scene(
         points=PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)),
         images=images,
         intrinsics=(intrinsics,),
         source=SceneSource("rgbd", root, root / "traj.txt", image_dir=root / "results"),
         warnings=_warnings(frames, tracked),
     )
+    return scene.replace(depths=search_depths(scene, root / "results"))
 
 
 def _find_frames(folder: Path) -> list[Path]:
