@@ -22,7 +22,11 @@ from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles
 
 __all__ = ["Blend", "Harmonics", "Lens", "Project"]
 
-FARTHEST = np.log(np.float32(255.0))
+LOG_255 = np.float32(np.log(255.0))
+GREATEST = np.float32(1e6)
+"""Opacities above it count as this much: beyond 1 they only make a Gaussian wider."""
+GOLDEN = 0.6180339887498949
+ALIGNMENT = 64
 
 
 class Lens(NamedTuple):
@@ -123,7 +127,7 @@ class _Prepared(NamedTuple):
     """A view sorted and listed: what forward and backward share."""
 
     order: np.ndarray
-    reach: np.ndarray
+    log_opacities: np.ndarray
     lists: TileLists
     width: int
     height: int
@@ -132,6 +136,14 @@ class _Prepared(NamedTuple):
     def columns(self) -> int:
         """Tiles in a row."""
         return -(-self.width // TILE)
+
+    @property
+    def row_order(self) -> np.ndarray:
+        """Rows of tiles, such that every stretch of them has its share of all parts of the image.
+
+        Threads take stretches of equal length, and images are seldom as busy above as below.
+        """
+        return np.argsort(np.arange(-(-self.height // TILE)) * GOLDEN % 1.0)
 
     @property
     def lanes(self) -> int:
@@ -170,7 +182,7 @@ class Blend(torch.autograd.Function):
         image = np.empty((height, width, channels), np.float32)
         passing = np.empty((height, width), np.float32)
         for first in range(0, channels, blending.CHANNELS):
-            records = _records(prepared, means2d, conics, colors, opacities, first)
+            records = _records(prepared, means2d, conics, colors, first)
             blocks = _forward(prepared, records)
             layout.from_blocks(*blocks, prepared.columns, behind, first, image, passing)  # type: ignore[call-arg]  # star arguments
         ctx.prepared, ctx.on_absgrad, ctx.passing, ctx.image = prepared, on_absgrad, passing, image
@@ -192,9 +204,13 @@ class Blend(torch.autograd.Function):
         # pass takes the gradient of alpha too.
         d_passing = -_array(d_alphas) * passing
         for first in range(0, colors.shape[1], blending.CHANNELS):
-            records = _records(prepared, means2d, conics, colors, opacities, first)
-            totals = _backward(prepared, records, gradient, ctx.image, d_passing, first)
-            layout.scatter(prepared.order, totals, first, *results)  # type: ignore[call-arg]  # star arguments
+            records = _records(prepared, means2d, conics, colors, first)
+            totals = _backward(
+                prepared, records, gradient, ctx.image, d_passing, first, ctx.on_absgrad is not None
+            )
+            layout.scatter(  # type: ignore[call-arg]  # star arguments
+                prepared.order, totals, first, _array(conics), _array(opacities), *results
+            )
             d_passing = np.zeros_like(passing)
         if ctx.on_absgrad is not None:
             ctx.on_absgrad(torch.from_numpy(results[4]))
@@ -220,17 +236,18 @@ def _prepare(
     seen = np.empty(len(alphas), np.bool_)
     layout.mark_visible(_array(radii), alphas, _array(colors), projection.MIN_ALPHA, seen)
     order = depth_order(_array(depths), seen)
-    reach = _reach(alphas[order])
+    log_opacities = np.log(np.minimum(alphas[order], GREATEST), dtype=np.float32)
+    reach = np.maximum(log_opacities + LOG_255, np.float32(0.0))
     lists = list_tiles(_array(means2d)[order], _array(conics)[order], reach, width, height)
-    return _Prepared(order, reach, lists, width, height)
+    return _Prepared(order, log_opacities, lists, width, height)
 
 
-def _reach(opacities: np.ndarray) -> np.ndarray:
-    """log(255 opacity), float32: how large sigma can be for alpha to reach 1/255.
-
-    An opacity above 1 reaches no farther than 1 does, where the kernels' exponential ends.
-    """
-    return np.clip(np.log(255.0 * opacities, dtype=np.float32), 0.0, FARTHEST)
+def _aligned(size: int, *, zero: bool = False) -> np.ndarray:
+    """A float32 array that begins where a vector register's worth of memory does."""
+    make = np.zeros if zero else np.empty
+    array = make(size + ALIGNMENT // 4, np.float32)
+    first = -(array.ctypes.data // 4) % (ALIGNMENT // 4)
+    return array[first : first + size]
 
 
 def _records(
@@ -238,24 +255,22 @@ def _records(
     means2d: Tensor,
     conics: Tensor,
     colors: Tensor,
-    opacities: Tensor,
     first: int,
 ) -> np.ndarray:
     """The Gaussians in depth order as ``blending`` reads them, flat."""
-    records = np.empty(len(prepared.order) * blending.RECORD, np.float32)
-    arrays = [_array(each) for each in (means2d, conics, opacities)]
-    layout.gather(  # type: ignore[call-arg]  # star arguments
-        prepared.order, *arrays, prepared.reach, _array(colors), first, records
-    )
+    records = _aligned(len(prepared.order) * blending.RECORD)
+    layout.gather(
+        prepared.order, _array(means2d), _array(conics), prepared.log_opacities, _array(colors),
+        first, records,
+    )  # fmt: skip
     return records
 
 
 def _forward(prepared: _Prepared, records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The block image and its transmittance."""
-    image = np.empty(prepared.lanes * blending.CHANNELS, np.float32)
-    transmittance = np.empty(prepared.lanes, np.float32)
+    image, transmittance = _aligned(prepared.lanes * blending.CHANNELS), _aligned(prepared.lanes)
     blending.forward(
-        records, prepared.lists.tile_start, prepared.lists.listed_rank, prepared.columns,
+        records, prepared.lists.tile_start, prepared.lists.listed_rank, prepared.row_order,
         blending.COLUMN, blending.ROW, image, transmittance,
     )  # fmt: skip
     return image, transmittance
@@ -268,15 +283,16 @@ def _backward(
     image: np.ndarray,
     d_passing: np.ndarray,
     first: int,
+    absolute: bool,
 ) -> np.ndarray:
     """Gradient sums of every visible Gaussian, by depth rank, [G, 16]."""
     lists, lanes = prepared.lists, prepared.lanes
-    gradient, behind = np.zeros(lanes * blending.CHANNELS, np.float32), np.zeros(lanes, np.float32)
+    gradient, behind = _aligned(lanes * blending.CHANNELS, zero=True), _aligned(lanes, zero=True)
     layout.to_blocks(d_image, image, d_passing, prepared.columns, first, gradient, behind)
-    sums = np.zeros(len(lists.listed_rank) * blending.SUMS, np.float32)
+    sums = _aligned(len(lists.listed_rank) * blending.SUMS, zero=True)
     blending.backward(
-        records, lists.tile_start, lists.listed_rank, lists.listed_slot, prepared.columns,
-        blending.COLUMN, blending.ROW, gradient, behind, sums,
+        records, lists.tile_start, lists.listed_rank, lists.listed_slot, prepared.row_order,
+        blending.COLUMN, blending.ROW, gradient, behind, absolute, sums,
     )  # fmt: skip
     totals = np.empty((len(prepared.order), blending.SUMS), np.float32)
     blending.sum_pairs(lists.slot_start, sums, totals)

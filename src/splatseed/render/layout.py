@@ -42,15 +42,14 @@ def mark_visible(radii, opacities, colors, least, visible):
 
 
 @kernel
-def gather(order, means2d, conics, opacities, reach, colors, first, records):
+def gather(order, means2d, conics, log_opacities, colors, first, records):
     """Gaussians by index to records by depth rank.
 
     Args:
         order: int64 [G].
         means2d: float32 [N, 2].
         conics: float32 [N, 3].
-        opacities: float32 [N].
-        reach: log(255 opacity) by depth rank, float32 [G].
+        log_opacities: By depth rank, float32 [G].
         colors: float32 [N, D].
         first: First channel.
         records: Written, float32 [16 G].
@@ -60,20 +59,26 @@ def gather(order, means2d, conics, opacities, reach, colors, first, records):
         i, r = order[g], RECORD * g
         records[r : r + RECORD] = np.float32(0.0)
         records[r], records[r + 1] = means2d[i, 0], means2d[i, 1]
-        records[r + 2], records[r + 3], records[r + 4] = conics[i, 0], conics[i, 1], conics[i, 2]
-        records[r + 5], records[r + 6] = opacities[i], -reach[g]
+        a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
+        records[r + 2], records[r + 4] = np.float32(-1 / 16) * a, np.float32(-1 / 16) * c
+        records[r + 3] = np.float32(-1 / 8) * b
+        records[r + 5] = np.float32(1 / 8) * log_opacities[g]
         for channel in range(wide):
             records[r + 7 + channel] = colors[i, first + channel]
 
 
 @kernel
-def scatter(order, totals, first, d_means2d, d_conics, d_opacities, d_colors, d_absolute):
-    """Gradients by depth rank to gradients by index; those of what is not visible stay.
+def scatter(
+    order, totals, first, conics, opacities, d_means2d, d_conics, d_opacities, d_colors, d_absolute
+):
+    """Sums by depth rank to gradients by index; those of what is not visible stay.
 
     Args:
         order: int64 [G].
-        totals: float32 [G, 16].
+        totals: ``blending``'s sums over each Gaussian's pairs, float32 [G, 16].
         first: First channel.
+        conics: float32 [N, 3].
+        opacities: float32 [N].
         d_means2d: Added to, float32 [N, 2].
         d_conics: Added to, float32 [N, 3].
         d_opacities: Added to, float32 [N].
@@ -83,12 +88,15 @@ def scatter(order, totals, first, d_means2d, d_conics, d_opacities, d_colors, d_
     wide = min(CHANNELS, d_colors.shape[1] - first)
     for g in parallel_range(len(order)):
         i = order[g]
+        a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
+        d_means2d[i, 0] += a * totals[g, 1] + b * totals[g, 2]
+        d_means2d[i, 1] += b * totals[g, 1] + c * totals[g, 2]
+        d_conics[i, 0] += np.float32(0.5) * totals[g, 3]
+        d_conics[i, 1] += totals[g, 4]
+        d_conics[i, 2] += np.float32(0.5) * totals[g, 5]
+        d_opacities[i] -= totals[g, 0] / opacities[i]
         for k in range(2):
-            d_means2d[i, k] += totals[g, k]
             d_absolute[i, k] = totals[g, 10 + k]
-        for k in range(3):
-            d_conics[i, k] += totals[g, 2 + k]
-        d_opacities[i] += totals[g, 5]
         for channel in range(wide):
             d_colors[i, first + channel] = totals[g, 6 + channel]
 

@@ -26,13 +26,14 @@ __all__ = [
     "add",
     "any_greater",
     "divide",
-    "exp_nonpositive",
+    "exp_of_eighth",
     "fma",
     "lane_sum",
     "lane_sums",
     "load",
     "minimum",
     "multiply",
+    "negative_magnitude",
     "select_greater",
     "splat",
     "store",
@@ -223,29 +224,38 @@ def _add_halves(builder, a, b, width):
     )
 
 
-# exp(x) on [-0.7, 0] to 8e-8 relative (minimax, degree 5); exp(h) = exp(h / 8)^8.
+# exp(x) on [-0.7, 0] to 8e-8 relative (minimax, degree 5).
 _EXP = [
     np.float32(c) for c in (0.99999992, 0.99999255, 0.49988271, 0.16597434, 0.03977302, 0.00584696)
 ]
 
 
 @intrinsic
-def exp_nonpositive(typing_context, h):  # noqa: ARG001
-    """exp(h) for h in [-5.6, 0], to 3e-6 relative; meaningless elsewhere.
+def exp_of_eighth(typing_context, x):  # noqa: ARG001
+    """exp(8 x) for x in [-0.7, 0], to 3e-6 relative; meaningless elsewhere.
 
-    -5.6 is enough: below -log(255) a Gaussian's alpha is under the cut-off whatever its opacity.
+    -5.6 is low enough: an alpha below 1/255 = exp(-5.54) is under the cut-off.
     """
 
     def generate(context, builder, signature, arguments):  # noqa: ARG001
-        def constant(x):
-            return ir.Constant(VECTOR, [float(x)] * LANES)
-
-        x = builder.fmul(arguments[0], constant(0.125))
-        value = constant(_EXP[-1])
+        value = ir.Constant(VECTOR, [float(_EXP[-1])] * LANES)
         for coefficient in reversed(_EXP[:-1]):
-            value = _call(builder, "fma", [value, x, constant(coefficient)])
+            constant = ir.Constant(VECTOR, [float(coefficient)] * LANES)
+            value = _call(builder, "fma", [value, arguments[0], constant])
         for _ in range(3):
             value = builder.fmul(value, value)
         return value
+
+    return f32x16(f32x16), generate
+
+
+@intrinsic
+def negative_magnitude(typing_context, v):  # noqa: ARG001
+    """-|v|: the sign bit set."""
+
+    def generate(context, builder, signature, arguments):  # noqa: ARG001
+        bits = builder.bitcast(arguments[0], INDEX)
+        signs = ir.Constant(INDEX, [1 << 31] * LANES)
+        return builder.bitcast(builder.or_(bits, signs), VECTOR)
 
     return f32x16(f32x16), generate
