@@ -23,6 +23,7 @@ from splatseed.io.depth_arrays import (
     read_npz,
     read_pfm,
 )
+from splatseed.io.depth_lens import Undistortion
 from splatseed.io.depth_pictures import read_exr, read_picture
 
 __all__ = ["FAR", "INTEGER_SCALE", "SUFFIXES", "DepthFiles"]
@@ -55,11 +56,13 @@ class DepthFiles:
         paths: The file of each image that has one, by the image's name.
         kind: What the values are; None: what the file itself says, else planar z.
         scale: Stored units per scene unit; None: 1000 for integers, 1 for floats.
+        lens: What moves the values to the pixels of undistorted photographs; None: they are there.
     """
 
     paths: Mapping[str, Path]
     kind: DepthKind | None = None
     scale: float | None = None
+    lens: Undistortion | None = None
 
     def __contains__(self, name: object) -> bool:
         """Whether there is a file for the image of that name."""
@@ -92,7 +95,8 @@ class DepthFiles:
             )
         stored = _READERS[path.suffix.lower()](path)
         kind = self.kind or stored.kind or "z"
-        return DepthMap(_in_scene_units(stored.values, self.scale, kind), kind)
+        values = _in_scene_units(stored.values, self.scale, kind)
+        return DepthMap(values if self.lens is None else self.lens.apply(name, values), kind)
 
 
 def _in_scene_units(

@@ -12,10 +12,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io._capture import CAMERA_FILE
 from splatseed.io.depth_arrays import KINDS
 from splatseed.io.depth_files import SUFFIXES, DepthFiles
 from splatseed.io.depth_folder import (
@@ -25,6 +27,7 @@ from splatseed.io.depth_folder import (
     read_description,
     safe_parts,
 )
+from splatseed.io.tum import find_tum_depths, is_tum
 from splatseed.scene import Scene
 
 __all__ = ["find_depths", "search_depths"]
@@ -73,7 +76,7 @@ def find_depths(
             found="none" if names else "a scene without images",
             fix="Name maps as their images are, with subfolders and another suffix.",
         )
-    return DepthFiles(found.paths, kind or found.kind, found.scale if scale is None else scale)
+    return replace(found, kind=kind or found.kind, scale=scale or found.scale)
 
 
 def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
@@ -82,6 +85,8 @@ def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
     Raises:
         SceneFormatError: Two images share a map, or the folder's description is damaged.
     """
+    if is_tum(root) and (found := find_tum_depths(scene, root)) is not None:
+        return found
     for folder in (root / name for name in _FOLDERS):
         if folder.is_dir() and (paths := _match(scene, folder)):
             return DepthFiles(paths, *_describe(folder, next(iter(paths.values()))))
@@ -196,6 +201,6 @@ def _describe(folder: Path, example: Path) -> DepthDescription:
         return read_description(folder / DESCRIPTION)
     if _CAPTURED.fullmatch(example.stem):
         for parent in (folder, *folder.resolve().parents[:2]):
-            if (parent / "cam_params.json").is_file():
-                return DepthDescription(scale=read_capture_scale(parent / "cam_params.json"))
+            if (parent / CAMERA_FILE).is_file():
+                return DepthDescription(scale=read_capture_scale(parent / CAMERA_FILE))
     return DepthDescription()

@@ -27,6 +27,7 @@ _PILLOW_FAILURES = (
     *(OverflowError, AttributeError, struct.error, MemoryError),
 )
 _GREY = {"L", "I", "F", "I;16", "I;16B", "I;16L", "I;16N"}
+_EXR_FAILURES = (RuntimeError, OSError, ValueError, TypeError, KeyError)
 _EXR_CHANNELS = ("Z", "depth", "Depth", "D", "Y", "V", "R")
 """Where renderers put depth, first match first; R if it stands for grey, with G and B beside it."""
 
@@ -69,17 +70,16 @@ def read_exr(path: Path) -> StoredDepth:
         raise MissingDependencyError(
             f"the package OpenEXR, to read {path}",
             found="none",
-            fix="Install it: pip install 'splatseed[depth]'. Or convert the maps to .npy or .tiff.",
+            fix="Install it: pip install 'splatseed[exr]'. Or convert the maps to .npy or .tiff.",
         ) from None
     read_bytes(path)  # whether it can be read; the package's own words for that are few
     try:
+        with openexr.File(str(path), header_only=True) as file:
+            _check_windows(path, file.header())
         with openexr.File(str(path), separate_channels=True) as file:
-            header, channels = dict(file.header()), file.channels()
-            values = _channel(path, {name: each.pixels for name, each in channels.items()})
-    except (RuntimeError, OSError, ValueError, TypeError, KeyError, MemoryError) as error:
+            values = _channel(path, {key: each.pixels for key, each in file.channels().items()})
+    except (*_EXR_FAILURES, MemoryError) as error:
         refuse(path, "a readable OpenEXR picture", f"{type(error).__name__}: {error}")
-    if not _is_whole(header):
-        refuse(path, "a data window that is the display window", f"{header.get('dataWindow')}")
     check_stored(path, values.shape, values.dtype)
     return StoredDepth(values)
 
@@ -95,7 +95,10 @@ def _channel(path: Path, channels: Mapping[str, np.ndarray]) -> np.ndarray:
     return next(iter(channels.values()))
 
 
-def _is_whole(header: Mapping[str, Any]) -> bool:
-    """Whether every pixel of the picture is stored, none cropped off."""
-    data, display = header.get("dataWindow"), header.get("displayWindow")
-    return data is None or display is None or np.array_equal(np.array(data), np.array(display))
+def _check_windows(path: Path, header: Mapping[str, Any]) -> None:
+    """Check, before pixels are decoded, that every one is stored and their number can be believed."""
+    data, display = np.array(header["dataWindow"]), np.array(header["displayWindow"])
+    size = (data[1] - data[0] + 1)[::-1].tolist()
+    check_stored(path, tuple(size), np.dtype(np.float32))
+    if not np.array_equal(data, display):
+        refuse(path, f"the pixels of all of its picture {display.tolist()}", f"{data.tolist()}")

@@ -17,6 +17,7 @@ from splatseed.io._earlier import mark_generated
 from splatseed.io._manifest import MANIFEST
 from splatseed.io._transforms_scene import read_transforms_scene
 from splatseed.io.ply import read_ply
+from splatseed.io.tum import is_tum, load_tum
 from splatseed.scene import Scene, SceneSource
 
 __all__ = ["load_scene"]
@@ -30,8 +31,8 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
 
     Args:
         path: A folder with a COLMAP model (``sparse/0``, ``sparse``, ``colmap/sparse/0``, itself
-            the model, or ``0`` in it), with ``transforms.json``, or with an RGB-D capture (``traj.txt``); or a
-            ``.json`` or ``.ply`` file. Where there are several, ``sparse`` goes before
+            the model, or ``0`` in it), with ``transforms.json``, or with an RGB-D capture (``traj.txt``, or
+            ``rgb.txt`` and ``groundtruth.txt``); or a ``.json`` or ``.ply`` file. Where there are several, ``sparse`` goes before
             ``transforms.json``, and that before ``colmap/sparse/0``.
         require_points: Whether a scene without points is an error; else its cloud is empty.
 
@@ -79,6 +80,8 @@ def _read(path: Path) -> Scene:
         from splatseed.io.rgbd import load_rgbd  # noqa: PLC0415  (keeps splatseed.io fast)
 
         return load_rgbd(path)
+    if is_tum(path):
+        return load_tum(path)
     raise _no_scene(path)
 
 
@@ -116,7 +119,7 @@ def _no_scene(path: Path) -> SceneNotFoundError:
             " splatseed sfm IMAGES -o SCENE."
         )
     return SceneNotFoundError(
-        f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS} or traj.txt in {path}",
+        f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt in {path}",
         found=found,
         fix=fix,
     )
@@ -125,7 +128,9 @@ def _no_scene(path: Path) -> SceneNotFoundError:
 def _is_scene(folder: Path) -> bool:
     model_dirs = (folder / "sparse/0", folder / "sparse", folder, folder / "colmap/sparse/0")
     markers = (folder / _TRANSFORMS, folder / "traj.txt")
-    return find_model(*model_dirs) is not None or any(each.is_file() for each in markers)
+    if find_model(*model_dirs) is not None or is_tum(folder):
+        return True
+    return any(each.is_file() for each in markers)
 
 
 def _some(names: Sequence[str]) -> str:

@@ -11,17 +11,21 @@ added. Promise: every image returned exists, has its camera's size and a rigid, 
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
-from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io._capture import (
+    CAMERA_FILE,
+    check_size,
+    find_camera_file,
+    read_intrinsics,
+    read_text,
+)
 from splatseed.io.depth_find import search_depths
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
@@ -57,7 +61,7 @@ def load_rgbd(path: Path) -> Scene:
             found=f"{len(trajectory)} lines",
             fix="Put back the missing frames or lines.",
         )
-    intrinsics = _read_intrinsics(_find_camera_file(root))
+    intrinsics = read_intrinsics(_camera_file(root))
     tracked = np.isfinite(trajectory).all(axis=(1, 2))
     _check_rigid(root / "traj.txt", trajectory, tracked)
     images = tuple(
@@ -94,7 +98,7 @@ def _read_trajectory(path: Path) -> Float64[np.ndarray, "N 4 4"]:
     """The poses ``world_from_cam`` of every line, float64 [N, 4, 4], NaN where so written."""
     lines = [
         (number, line)
-        for number, line in enumerate(_read_text(path).splitlines(), 1)
+        for number, line in enumerate(read_text(path).splitlines(), 1)
         if line.strip()
     ]
     return np.array([_parse_pose(path, number, line) for number, line in lines]).reshape(-1, 4, 4)
@@ -139,42 +143,21 @@ def _bad_line(path: Path, number: int, found: str) -> SceneFormatError:
     )
 
 
-def _find_camera_file(root: Path) -> Path:
-    for folder in (root, root.resolve().parent):
-        if (folder / "cam_params.json").is_file():
-            return folder / "cam_params.json"
+def _camera_file(root: Path) -> Path:
+    path = find_camera_file(root)
+    if path is not None:
+        return path
     raise SceneNotFoundError(
-        f"cam_params.json in {root} or the folder above it",
+        f"{CAMERA_FILE} in {root} or the folder above it",
         found="neither",
         fix='Write {"camera": {"w": ..., "h": ..., "fx": ..., "fy": ..., "cx": ..., "cy": ...}}.',
     )
 
 
-def _read_intrinsics(path: Path) -> Intrinsics:
-    try:
-        camera: Any = json.loads(_read_text(path))["camera"]
-        width, height = int(camera["w"]), int(camera["h"])
-        fx, fy, cx, cy = (float(camera[key]) for key in ("fx", "fy", "cx", "cy"))
-    except (KeyError, OverflowError, TypeError, ValueError) as error:
-        raise SceneFormatError(
-            f'{path} to hold {{"camera": {{w, h, fx, fy, cx, cy}}}} as numbers',
-            found=f"{type(error).__name__}: {error}",
-            fix="Write the camera's size, focal lengths and principal point in pixels.",
-        ) from error
-    values = (width, height, fx, fy)
-    if not (np.isfinite([*values, cx, cy]).all() and min(values) > 0):
-        raise SceneFormatError(
-            f"{path} to hold a positive size and focal lengths",
-            found=f"w={width} h={height} fx={fx} fy={fy} cx={cx} cy={cy}",
-            fix="Write them in pixels.",
-        )
-    return Intrinsics(1, "PINHOLE", width, height, (fx, fy, cx + 0.5, cy + 0.5))
-
-
 def _posed_image(
     path: Path, image_id: int, intrinsics: Intrinsics, world_from_cam: Float64[np.ndarray, "4 4"]
 ) -> Image:
-    _check_size(path, intrinsics)
+    check_size(path, intrinsics)
     cam_from_world_rotation = world_from_cam[:3, :3].T
     return Image(
         name=path.name,
@@ -185,38 +168,8 @@ def _posed_image(
     )
 
 
-def _check_size(path: Path, intrinsics: Intrinsics) -> None:
-    expected = (intrinsics.width, intrinsics.height)
-    try:
-        with PilImage.open(path) as image:
-            size = image.size
-    except (OSError, ValueError, PilImage.DecompressionBombError) as error:
-        raise SceneFormatError(
-            f"{path} to be a readable image", found=str(error), fix="Export the frame again."
-        ) from error
-    if size != expected:
-        raise SceneFormatError(
-            f"{path} to have the size that cam_params.json gives, {expected[0]}x{expected[1]}",
-            found=f"{size[0]}x{size[1]}",
-            fix="Scale the camera's parameters with the images.",
-        )
-
-
 def _warnings(frames: list[Path], tracked: Bool[np.ndarray, " N"]) -> tuple[str, ...]:
     lost = [frames[i].name for i in np.flatnonzero(~tracked)]
     if not lost:
         return ()
     return (f"{len(lost)} frames have no finite pose and are left out, the first is {lost[0]}.",)
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise SceneNotFoundError(
-            f"a file {path}", found="none", fix="Give the folder of an RGB-D capture."
-        ) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise SceneFormatError(
-            f"{path} to be a readable text file", found=str(error), fix="Check the file."
-        ) from error
