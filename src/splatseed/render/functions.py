@@ -177,7 +177,7 @@ class Blend(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         """Run the kernel and keep what backward needs."""
         prepared = _prepare(means2d, conics, colors, opacities, depths, radii, width, height)
-        channels = colors.shape[1]
+        channels, records = colors.shape[1], None
         behind = np.zeros(channels, np.float32) if background is None else _array(background)
         image = np.empty((height, width, channels), np.float32)
         passing = np.empty((height, width), np.float32)
@@ -186,6 +186,7 @@ class Blend(torch.autograd.Function):
             blocks = _forward(prepared, records)
             layout.from_blocks(*blocks, prepared.columns, behind, first, image, passing)  # type: ignore[call-arg]  # star arguments
         ctx.prepared, ctx.on_absgrad, ctx.passing, ctx.image = prepared, on_absgrad, passing, image
+        ctx.records = records if channels <= blending.CHANNELS else None
         ctx.save_for_backward(means2d, conics, colors, opacities, background)
         return torch.from_numpy(image), torch.from_numpy(1.0 - passing)
 
@@ -204,7 +205,9 @@ class Blend(torch.autograd.Function):
         # pass takes the gradient of alpha too.
         d_passing = -_array(d_alphas) * passing
         for first in range(0, colors.shape[1], blending.CHANNELS):
-            records = _records(prepared, means2d, conics, colors, first)
+            records = ctx.records
+            if records is None:  # more passes than would be kept
+                records = _records(prepared, means2d, conics, colors, first)
             totals = _backward(
                 prepared, records, gradient, ctx.image, d_passing, first, ctx.on_absgrad is not None
             )
@@ -236,9 +239,10 @@ def _prepare(
     seen = np.empty(len(alphas), np.bool_)
     layout.mark_visible(_array(radii), alphas, _array(colors), projection.MIN_ALPHA, seen)
     order = depth_order(_array(depths), seen)
-    log_opacities = np.log(np.minimum(alphas[order], GREATEST), dtype=np.float32)
+    log_opacities = np.log(np.minimum(alphas.take(order), GREATEST), dtype=np.float32)
     reach = np.maximum(log_opacities + LOG_255, np.float32(0.0))
-    lists = list_tiles(_array(means2d)[order], _array(conics)[order], reach, width, height)
+    places, shapes = (_array(each).take(order, axis=0) for each in (means2d, conics))
+    lists = list_tiles(places, shapes, reach, width, height)
     return _Prepared(order, log_opacities, lists, width, height)
 
 

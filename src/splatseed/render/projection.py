@@ -60,20 +60,23 @@ def project(  # type: ignore[no-untyped-def]
     for chunk in parallel_range(CHUNKS):
         # One allocation a chunk: one a Gaussian takes as long as all of the arithmetic.
         R, M, V, P = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3))
+        stretch = _stretch(view)
         for i in range(chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS):
             radii[i, 0] = radii[i, 1] = 0
             x, y, z = _to_camera(means[i], view)
             if not near <= z <= far:
                 continue
-            _rotation(quats[i], R)
             J = _jacobian(x, y, z, K, width, height)
+            u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+            if _far_outside(u, v, J, stretch, scales[i], eps2d, width, height):
+                continue
+            _rotation(quats[i], R)
             _factors(R, scales[i], view, J, M, V, P)
             xx, xy, yy = _covariance(P)
             det = (xx + eps2d) * (yy + eps2d) - xy * xy
             compensation = math.sqrt(max((xx * yy - xy * xy) / det, 0.0))
             xx, yy = xx + eps2d, yy + eps2d
             opacity = opacities[i] * compensation if antialiased else np.float64(opacities[i])
-            u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
             if det > 0.0 and det < np.inf and MIN_ALPHA <= opacity < np.inf:
                 sigmas = min(MAX_SIGMAS, math.sqrt(2.0 * math.log(opacity / MIN_ALPHA)))
                 rx, ry = np.ceil(sigmas * math.sqrt(xx)), np.ceil(sigmas * math.sqrt(yy))
@@ -93,6 +96,28 @@ def _to_camera(mean, view):  # type: ignore[no-untyped-def]
         view[1, 0] * m0 + view[1, 1] * m1 + view[1, 2] * m2 + view[1, 3],
         view[2, 0] * m0 + view[2, 1] * m1 + view[2, 2] * m2 + view[2, 3],
     )
+
+
+@always_inline
+def _stretch(view):  # type: ignore[no-untyped-def]
+    """At least the spectral norm of the camera's rotation, which need not be quite one."""
+    total = 0.0
+    for r in range(3):
+        for c in range(3):
+            total += np.float64(view[r, c]) * view[r, c]
+    return math.sqrt(total)
+
+
+@always_inline
+def _far_outside(u, v, J, stretch, scale, eps2d, width, height):  # type: ignore[no-untyped-def]
+    """Whether not even a ball of the greatest scale would reach the image.
+
+    It spares most of those beside the image the rest. Any NaN is false, and left to what follows.
+    """
+    size = stretch * max(scale[0], scale[1], scale[2])
+    across = MAX_SIGMAS * math.sqrt((J[0] * J[0] + J[1] * J[1]) * size * size + eps2d) + 1.0
+    along = MAX_SIGMAS * math.sqrt((J[2] * J[2] + J[3] * J[3]) * size * size + eps2d) + 1.0
+    return u + across < 0 or u - across > width or v + along < 0 or v - along > height
 
 
 @always_inline
