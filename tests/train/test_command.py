@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
+from splatseed import requirements
 from splatseed.cli import main
 from splatseed.errors import MissingDependencyError
-from splatseed.train import requirements
 
 
 def _run(*words):

@@ -33,9 +33,9 @@ from splatseed.io import load_scene, write_scene
 from splatseed.io.staging import atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
+from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.synthetic import Capture, make_capture, write_capture
-from splatseed.train.requirements import require
 from splatseed.upsample import METHODS, planned_size, upsample
 
 if TYPE_CHECKING:  # importing PyTorch takes a while, and it may be absent

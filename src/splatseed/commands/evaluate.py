@@ -18,8 +18,8 @@ from splatseed.errors import (
     SceneNotFoundError,
 )
 from splatseed.io.staging import MANIFEST, atomic_file, check_output, output_folder
+from splatseed.requirements import require
 from splatseed.train.photographs import user_cache_dir
-from splatseed.train.requirements import require
 from splatseed.train.run_folder import RunFolder
 from splatseed.train.settings import Backend, TrainSettings
 

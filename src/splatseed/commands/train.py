@@ -30,8 +30,8 @@ from splatseed.console import (
     stage_display,
 )
 from splatseed.io import load_scene
+from splatseed.requirements import require
 from splatseed.train.photographs import user_cache_dir
-from splatseed.train.requirements import require
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it

@@ -5,7 +5,7 @@
 (``pip install "splatseed[train]"``).
 """
 
-from splatseed.train.requirements import require
+from splatseed.requirements import require
 
 require("torch")  # asked for first, so that its absence is said once and plainly
 

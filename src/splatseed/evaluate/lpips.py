@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.train.requirements import require
+from splatseed.requirements import require
 
 __all__ = ["LPIPS_NETS", "Backbone", "Conv", "Lpips", "LpipsNet", "load_lpips"]
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
+from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.train.config import check_same_seeds, make_config, resumed_settings
 from splatseed.train.curve import Record, write_curve_csv, write_curve_png
@@ -28,7 +29,6 @@ from splatseed.train.gaussians import initial_gaussians
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
 from splatseed.train.pictures import beside_truth, picture_name, write_picture
 from splatseed.train.ply import write_gaussians
-from splatseed.train.requirements import require
 from splatseed.train.run_folder import RunFolder, write_json
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.settings import TrainSettings

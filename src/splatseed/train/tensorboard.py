@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from splatseed.requirements import require
 from splatseed.train.curve import Record
-from splatseed.train.requirements import require
 
 __all__ = ["Board"]
 

@@ -1,0 +1,307 @@
+"""Networks in transformers' format: what they predict, where, and what is refused."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="networks of transformers need PyTorch")
+pytest.importorskip("transformers", reason="needs splatseed[depth]")
+
+import torch
+import transformers
+from safetensors.torch import load_file, save_file
+
+from splatseed.errors import (
+    MissingDependencyError,
+    ParameterError,
+    SceneFormatError,
+    SceneNotFoundError,
+)
+from splatseed.monocular import Preparation, load_network
+from splatseed.monocular.hugging_face import HuggingFaceNetwork
+from splatseed.monocular.network import Meaning
+
+from ..networks import SAVED  # noqa: TID252
+
+KINDS = {
+    "depth_anything": "inverse",
+    "depth_anything_metric": "z",
+    "dpt": "inverse",
+    "dpt_on_dinov2": "z",
+    "glpn": "z",
+    "zoedepth": "z",
+}
+
+
+def _scaled(depth, size):
+    return torch.nn.functional.interpolate(depth[None, None], size, mode="bilinear")[0, 0]
+
+
+@pytest.mark.parametrize("name", SAVED)
+def test_what_a_network_predicts_is_read_from_its_config(name, saved):
+    meaning = load_network(str(saved(name)), device="cpu").meaning
+    assert meaning.kind == KINDS[name]
+    assert len(meaning.reason) > 10
+
+
+def test_the_user_goes_before_the_config(saved):
+    assert load_network(str(saved("dpt")), kind="ray", device="cpu").meaning.kind == "ray"
+
+
+@pytest.mark.parametrize("name", ["depth_anything", "depth_anything_metric", "dpt", "glpn"])
+def test_predictions_are_those_of_transformers_at_the_photographs_size(name, saved, photographs):
+    processor = transformers.AutoImageProcessor.from_pretrained(saved(name), backend="pil")
+    network = transformers.AutoModelForDepthEstimation.from_pretrained(saved(name))
+    with torch.no_grad():
+        outputs = network(**processor(photographs, return_tensors="pt"))
+    found = load_network(str(saved(name)), device="cpu")(photographs)
+    for depth, expected in zip(found, outputs.predicted_depth, strict=True):
+        assert depth.dtype == np.float32
+        np.testing.assert_allclose(depth, _scaled(expected, (60, 90)), atol=1e-5)
+        assert np.ptp(depth) > 0.01  # not an empty comparison
+
+
+class _SeesItself(torch.nn.Module):
+    """Predicts the first channel of its input: where a pixel of a map lies can then be read off it."""
+
+    def __init__(self, config, processor):
+        super().__init__()
+        self.config = config
+        normalises = processor.do_normalize
+        self.mean = processor.image_mean[0] if normalises else 0.0
+        self.std = processor.image_std[0] if normalises else 1.0
+
+    def forward(self, pixel_values):
+        return SimpleNamespace(predicted_depth=(pixel_values[:, 0] * self.std + self.mean) * 255)
+
+
+@pytest.mark.parametrize(
+    ("name", "off"), [(name, 0.3) for name in SAVED if "zoe" not in name] + [("zoedepth", 1.2)]
+)
+def test_a_map_lies_on_its_photograph(name, off, saved, ramp):
+    """Padding is taken off and centres stay in place, to ``off`` pixels along either axis.
+
+    ZoeDepth's processor resizes corners onto corners, which moves its own input by half a pixel.
+    """
+    processor = transformers.AutoImageProcessor.from_pretrained(saved(name), backend="pil")
+    config = transformers.AutoConfig.from_pretrained(saved(name))
+    network = HuggingFaceNetwork(
+        processor, _SeesItself(config, processor), Meaning("z", "made"), torch.device("cpu")
+    )
+    (depth,) = network([ramp])
+    assert depth.shape == ramp.shape[:2]
+    inner = (slice(8, -8), slice(8, -8))
+    assert np.abs(depth - ramp[..., 0])[inner].mean() < off
+
+
+def test_padding_is_what_the_processor_itself_would_add(saved, ramp):
+    processor = transformers.AutoImageProcessor.from_pretrained(
+        saved("dpt_on_dinov2"), backend="pil"
+    )
+    seen = []
+    config = transformers.AutoConfig.from_pretrained(saved("dpt_on_dinov2"))
+    network = _SeesItself(config, processor)
+    network.register_forward_pre_hook(lambda _, __, given: seen.append(given), with_kwargs=True)
+    HuggingFaceNetwork(processor, network, Meaning("z", "made"), torch.device("cpu"))([ramp])
+    expected = processor([ramp], return_tensors="pt")["pixel_values"]
+    assert expected.shape[2:] == (84, 126)
+    torch.testing.assert_close(seen[0]["pixel_values"], expected)
+
+
+def test_a_batch_gives_what_its_images_give_alone(saved, photographs):
+    network = load_network(str(saved("depth_anything")), device="cpu")
+    together = network(photographs)
+    for image, depth in zip(photographs, together, strict=True):
+        np.testing.assert_allclose(network([image])[0], depth, atol=1e-5)
+
+
+def test_the_same_bytes_again(saved, photographs):
+    first, second = (
+        load_network(str(saved("depth_anything")), device="cpu")(photographs) for _ in range(2)
+    )
+    assert np.stack(first).tobytes() == np.stack(second).tobytes()
+
+
+def test_threads_change_no_more_than_rounding(saved, photographs):
+    network, threads = load_network(str(saved("dpt")), device="cpu"), torch.get_num_threads()
+    try:
+        maps = []
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            maps.append(np.stack(network(photographs)))
+    finally:
+        torch.set_num_threads(threads)
+    np.testing.assert_allclose(*maps, atol=1e-5)
+
+
+def test_depth_pro_leaves_its_maps_to_its_processor():
+    """Its scale depends on the field of view that it predicts, as its own post-processing knows."""
+
+    class Processor:
+        do_pad = False
+
+        def __call__(self, images, **_):
+            return {"pixel_values": np.zeros((len(images), 3, 4, 4), np.float32)}
+
+        def post_process_depth_estimation(self, outputs, target_sizes):
+            sizes = zip(outputs.field_of_view, target_sizes, strict=True)
+            return [{"predicted_depth": torch.full(size, float(fov))} for fov, size in sizes]
+
+    class Network(torch.nn.Module):
+        def forward(self, pixel_values):
+            fov = torch.arange(len(pixel_values)) + 40
+            return SimpleNamespace(predicted_depth=pixel_values[:, 0], field_of_view=fov)
+
+    network = HuggingFaceNetwork(Processor(), Network(), Meaning("z", "made"), torch.device("cpu"))
+    first, second = network([np.zeros((6, 9, 3), np.uint8)] * 2)
+    assert first.shape == (6, 9)
+    assert (first == 40).all()
+    assert (second == 41).all()
+
+
+def _copy(saved, tmp_path, name="depth_anything"):
+    return shutil.copytree(saved(name), tmp_path / "copy")
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "said"),
+    [
+        ("config.json", b"{", "not a valid JSON"),
+        ("config.json", None, "no config.json"),
+        ("config.json", b'{"model_type": "bert"}', "type bert, which is not for depth"),
+        ("config.json", b'{"model_type": "unheard"}', "unheard"),
+        ("model.safetensors", None, "model.safetensors"),
+        ("model.safetensors", b"0123456789", "header"),
+        ("preprocessor_config.json", None, "image processor"),
+        ("preprocessor_config.json", b"[1", "not a valid JSON"),
+    ],
+)
+def test_a_damaged_folder_is_one_error(file, content, said, saved, tmp_path):
+    folder = _copy(saved, tmp_path)
+    (folder / file).unlink()
+    if content is not None:
+        (folder / file).write_bytes(content)
+    with pytest.raises(SceneFormatError, match=said) as caught:
+        load_network(str(folder), device="cpu")
+    assert str(folder) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_network_with_random_weights_is_refused(saved, tmp_path):
+    folder = _copy(saved, tmp_path)
+    weights = load_file(folder / "model.safetensors")
+    save_file(
+        {k: v for k, v in weights.items() if not k.startswith("head.")},
+        folder / "model.safetensors",
+    )
+    with pytest.raises(SceneFormatError, match=r"no weights for head\.conv1\.bias and 5 more"):
+        load_network(str(folder), device="cpu")
+
+
+def test_weights_of_another_shape_are_refused(saved, tmp_path):
+    folder = _copy(saved, tmp_path)
+    weights = load_file(folder / "model.safetensors")
+    weights["head.conv1.weight"] = torch.zeros(7, 7, 3, 3)
+    save_file(weights, folder / "model.safetensors")
+    with pytest.raises(SceneFormatError, match="depth network"):
+        load_network(str(folder), device="cpu")
+
+
+def test_weights_that_dpt_never_uses_may_be_missing(saved, tmp_path, photographs):
+    """As in the files that Intel published."""
+    folder = _copy(saved, tmp_path, "dpt")
+    weights = load_file(folder / "model.safetensors")
+    unused = "neck.fusion_stage.layers.0.residual_layer1."
+    kept = {key: value for key, value in weights.items() if not key.startswith(unused)}
+    assert len(kept) < len(weights)
+    save_file(kept, folder / "model.safetensors")
+    found = load_network(str(folder), device="cpu")(photographs)
+    assert np.array_equal(found, load_network(str(saved("dpt")), device="cpu")(photographs))
+
+
+@pytest.mark.usefixtures("offline")
+@pytest.mark.parametrize("model", ["nobody/Depth-Nothing-hf", "nothing", "./gone", "a/b/c", "../x"])
+def test_a_network_that_is_not_here_is_never_looked_for_elsewhere(model, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SceneNotFoundError) as caught:
+        load_network(model)
+    name = model if model.startswith("nobody") else "depth-anything/Depth-Anything-V2-Small-hf"
+    folder = name.partition("/")[2]
+    assert f"hf download {name} --local-dir {folder} and pass --model {folder}" in str(caught.value)
+
+
+def test_a_file_that_is_no_onnx_is_refused(tmp_path):
+    (tmp_path / "weights.pth").write_bytes(b"x")
+    with pytest.raises(SceneFormatError, match=r"not \.onnx.*\.pth, \.pt\) are not read"):
+        load_network(str(tmp_path / "weights.pth"))
+
+
+def test_an_id_is_found_in_the_cache(saved, tmp_path):
+    """In a process of its own: where the cache is, is settled as Hugging Face's package loads."""
+    entry = tmp_path / "hub" / "models--me--tiny"
+    shutil.copytree(saved("dpt"), entry / "snapshots" / ("0" * 40))
+    (entry / "refs").mkdir()
+    (entry / "refs" / "main").write_text("0" * 40)
+    code = (
+        "from splatseed.monocular import load_network; print(load_network('me/tiny').meaning.kind)"
+    )
+    environment = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub")}
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, check=True, text=True, env=environment
+    )
+    assert run.stdout.strip() == "inverse"
+
+
+@pytest.mark.skipif(
+    importlib.util.find_spec("torchvision") is not None, reason="torchvision is here"
+)
+def test_a_processor_that_needs_torchvision_says_so(saved, tmp_path):
+    folder = _copy(saved, tmp_path)
+    (folder / "config.json").write_text('{"model_type": "depth_pro"}')
+    processor = {"image_processor_type": "DepthProImageProcessor"}
+    (folder / "preprocessor_config.json").write_text(json.dumps(processor))
+    with pytest.raises(MissingDependencyError, match="pip install torchvision"):
+        load_network(str(folder), device="cpu")
+
+
+def test_a_type_that_does_not_tell_is_asked_for(saved, tmp_path):
+    folder = _copy(saved, tmp_path)
+    config = json.loads((folder / "config.json").read_text())
+    config["model_type"] = "prompt_depth_anything"
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ParameterError, match="--depth-kind inverse"):
+        load_network(str(folder), device="cpu")
+
+
+def test_an_image_that_the_network_cannot_take_is_one_error(saved, tmp_path):
+    folder = _copy(saved, tmp_path, "dpt_on_dinov2")
+    processor = json.loads((folder / "preprocessor_config.json").read_text())
+    processor["do_pad"] = False
+    (folder / "preprocessor_config.json").write_text(json.dumps(processor))
+    with pytest.raises(SceneFormatError, match="images of 10 x 9 pixels"):
+        load_network(str(folder), device="cpu")([np.zeros((9, 10, 3), np.uint8)])
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_an_error(saved):
+    with pytest.raises(ParameterError, match="--device cpu"):
+        load_network(str(saved("dpt")), device="cuda")
+
+
+def test_how_to_prepare_images_is_the_processors_business(saved):
+    with pytest.raises(ParameterError, match=r"--input-size.*\.onnx files only"):
+        load_network(str(saved("dpt")), preparation=Preparation(input_size=56))
+
+
+def test_loading_and_predicting_say_nothing(saved, photographs, capfd):
+    load_network(str(saved("zoedepth")), device="cpu")(photographs)
+    assert capfd.readouterr() == ("", "")
