@@ -7,7 +7,7 @@ import pytest
 from PIL import Image as PillowImage
 
 from splatseed.errors import OutputError, ParameterError
-from splatseed.io import load_scene
+from splatseed.io import find_depths, load_scene
 from splatseed.synthetic import DEPTH_SCALE, make_capture, write_capture
 from splatseed.synthetic.raycast import visible
 
@@ -182,10 +182,14 @@ def test_a_written_capture_loads_as_the_same_scene(capture, tmp_path):
     np.testing.assert_array_equal(scene.tracks.xyz, capture.scene.tracks.xyz)
     np.testing.assert_array_equal(scene.tracks.image_ids, capture.scene.tracks.image_ids)
     assert [image.name for image in scene.images] == [i.name for i in capture.scene.images]
+    maps = find_depths(scene, path)  # needs no scale: depths.json tells it
     for image, picture, depth in zip(scene.images, capture.images, capture.depths, strict=True):
         np.testing.assert_array_equal(_read(path / "images" / image.name), picture)
         written = _read(path / "depths" / image.name) / DEPTH_SCALE
         np.testing.assert_allclose(written, depth, atol=0.51 / DEPTH_SCALE)
+        read = maps.read(image.name).values
+        np.testing.assert_allclose(read[depth > 0], depth[depth > 0], atol=0.51 / DEPTH_SCALE)
+        assert np.isnan(read[depth == 0]).all()
 
 
 def test_a_capture_is_not_written_over_another_folder(capture, tmp_path):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -43,7 +44,10 @@ _NPY_HEADERS = {
     (1, 0): npy_format.read_array_header_1_0,
     (2, 0): npy_format.read_array_header_2_0,
 }
-_NPY_FAILURES = (ValueError, TypeError, KeyError, SyntaxError, MemoryError, RecursionError)
+_NPY_FAILURES = (
+    *(ValueError, TypeError, KeyError, SyntaxError, MemoryError, RecursionError),
+    tokenize.TokenError,  # of headers that look like Python 2's
+)
 _ZIP_FAILURES = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
 _NPZ_KEYS = ("depth", "arr_0")
 _PFM_HEADER = re.compile(rb"(P[fF])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,32})[ \t]*\r?\n")

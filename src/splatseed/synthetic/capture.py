@@ -18,6 +18,7 @@ from PIL import Image as PillowImage
 from splatseed.camera import Camera, Intrinsics, quat_from_rotation
 from splatseed.errors import ParameterError
 from splatseed.io import write_scene
+from splatseed.io.depth_folder import write_description
 from splatseed.io.staging import add_files, output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene, Tracks
@@ -117,7 +118,8 @@ def make_capture(
 def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False) -> Path:
     """Write a COLMAP scene: ``images/*.png``, ``sparse/0`` and, extra, ``depths/*.png``.
 
-    A depth PNG has 16 bits and holds metres times ``DEPTH_SCALE``; 0 = none.
+    A depth PNG has 16 bits and holds metres times ``DEPTH_SCALE``, as ``depths/depths.json`` says;
+    0 = none.
 
     Args:
         capture: What to write.
@@ -140,6 +142,7 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
             (partial / folder).mkdir()
             for image, array in zip(capture.scene.images, arrays, strict=True):
                 PillowImage.fromarray(array).save(partial / folder / image.name)
+        write_description(partial / "depths", "z", DEPTH_SCALE)
         add_files(partial, ("images", "depths"))
     return Path(path)
 
