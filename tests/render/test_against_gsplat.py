@@ -96,7 +96,7 @@ def test_harmonics(rng, degree: int) -> None:
     weights = torch.tensor(rng.normal(size=(200, 3)))
     ours = [each.clone().requires_grad_() for each in (directions, coefficients)]
     slow = [each.double().requires_grad_() for each in (directions, coefficients)]
-    found = Harmonics.apply(*ours, torch.ones(200, dtype=torch.bool), degree)
+    found = Harmonics.apply(*ours, None, torch.ones(200, dtype=torch.bool), degree)
     expected = _spherical_harmonics(degree, *slow)
     torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=1e-6)
     (found * weights.float()).sum().backward()

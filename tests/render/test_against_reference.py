@@ -78,6 +78,24 @@ def test_coefficients_of_each_camera(rng) -> None:
     assert_agrees(scene, sh_degree=2)
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2])
+def test_a_pair_of_coefficients_is_their_concatenation(rng, degree: int) -> None:
+    scene = random_scene(rng, coefficients=9, cameras=2)
+    whole = scene["colors"].clone().requires_grad_()
+    parts = [
+        part.clone().requires_grad_() for part in (whole[:, :1].detach(), whole[:, 1:].detach())
+    ]
+    weights = torch.rand(2, scene["height"], scene["width"], 3, generator=torch.manual_seed(0))
+    images = []
+    for colors in (whole, tuple(parts)):
+        image, _, _ = rasterization(**{**scene, "colors": colors}, sh_degree=degree)
+        (image * weights).sum().backward()
+        images.append(image)
+    assert torch.equal(*images)
+    assert torch.equal(torch.cat([part.grad for part in parts], dim=1), whole.grad)
+    assert bool(whole.grad[:, : (degree + 1) ** 2].abs().sum() > 0)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_opaque_walls_end_blending_and_hold_alpha(seed: int) -> None:
     """Both cut-offs of opaque scenes: alpha held at 0.999, and the end at a transmittance of 1e-4."""

@@ -62,6 +62,13 @@ REFUSED: dict[str, dict[str, Any]] = {
     "too few coefficients": {"sh_degree": 2, "colors": torch.zeros(N, 8, 3)},
     "coefficients of two channels": {"sh_degree": 0, "colors": torch.zeros(N, 4, 2)},
     "colors for coefficients": {"sh_degree": 0, "colors": torch.zeros(N, 3)},
+    "pair without coefficients": {"colors": (torch.zeros(N, 1, 3), torch.zeros(N, 3, 3))},
+    "pair of others": {"sh_degree": 1, "colors": (torch.zeros(N, 1, 3), torch.zeros(N + 1, 3, 3))},
+    "pair of too few": {"sh_degree": 2, "colors": (torch.zeros(N, 1, 3), torch.zeros(N, 7, 3))},
+    "pair of NumPy": {
+        "sh_degree": 0,
+        "colors": (torch.zeros(N, 1, 3), np.zeros((N, 3, 3), np.float32)),
+    },
     "absgrad of five channels": {"absgrad": True, "colors": torch.zeros(N, 5), "backgrounds": None},
     "batches": {"means": torch.zeros(1, N, 3)},
 }

@@ -94,13 +94,18 @@ def check_numbers(
         _require(value in allowed, f"{name} as one of {', '.join(allowed)}", value)
 
 
-def check_tensors(tensors: Mapping[str, Tensor | None], sh_degree: int | None) -> None:
-    """Check the types and shapes of means, quats, scales, opacities, colors, viewmats, Ks, backgrounds.
+def check_tensors(
+    colors: Tensor | tuple[Tensor, Tensor],
+    tensors: Mapping[str, Tensor | None],
+    sh_degree: int | None,
+) -> None:
+    """Check the types and shapes of colors, means, quats, scales, opacities, viewmats, Ks, backgrounds.
 
     Raises:
         ParameterError: One is not a float32 CPU tensor or its shape does not go with the others'.
     """
-    for name, each in tensors.items():
+    parts = colors if isinstance(colors, tuple) else (colors,)
+    for name, each in (*tensors.items(), *(("colors", part) for part in parts)):
         fits = (
             isinstance(each, Tensor) and each.dtype == torch.float32 and each.device.type == "cpu"
         )
@@ -110,8 +115,11 @@ def check_tensors(tensors: Mapping[str, Tensor | None], sh_degree: int | None) -
     n, cameras = shapes["means"][:1], shapes["viewmats"][:1]
     _require(n, "means of shape [N, 3]", tensors["means"])
     _require(cameras not in {(), (0,)}, "viewmats of at least one camera", tensors["viewmats"])
-    _check_colors(tensors["colors"], n, cameras, sh_degree)
-    channels = shapes["colors"][-1]
+    if isinstance(colors, tuple):
+        _check_pair(colors, n, sh_degree)
+    else:
+        _check_colors(colors, n, cameras, sh_degree)
+    channels = parts[0].shape[-1]
     expected = {
         "means": (*n, 3), "quats": (*n, 4), "scales": (*n, 3), "opacities": n,
         "viewmats": (*cameras, 4, 4), "Ks": (*cameras, 3, 3), "backgrounds": (*cameras, channels),
@@ -134,6 +142,18 @@ def _check_colors(
         fits = shared[1] >= terms and shared[2] == 3
     sizes = f"N = {n[0]}, C = {cameras[0]}"
     _require(fits, f"colors of shape [N, {one}] or [C, N, {one}] ({sizes})", colors)
+
+
+def _check_pair(colors: tuple[Tensor, ...], n: tuple[int, ...], sh_degree: int | None) -> None:
+    """The first coefficient and the rest."""
+    _require(
+        sh_degree is not None and len(colors) == 2, "a pair of colors with sh_degree only", colors
+    )
+    terms = (sh_degree or 0) * ((sh_degree or 0) + 2)
+    base, rest = (tuple(part.shape) for part in colors)
+    fits = base == (*n, 1, 3) and len(rest) == 3 and (rest[0], rest[2]) == (*n, 3)
+    sizes = f"[N, 1, 3] and [N, K >= {terms}, 3] (N = {n[0]})"
+    _require(fits and rest[1] >= terms, f"the pair of colors of shapes {sizes}", list(colors))
 
 
 def check_absgrad(absgrad: bool, channels: int) -> None:

@@ -97,30 +97,47 @@ class Project(torch.autograd.Function):
 
 
 class Harmonics(torch.autograd.Function):
-    """Directions [N, 3], coefficients [N, K, 3], visible [N], degree to colours [N, 3]."""
+    """Directions [N, 3], coefficients, visible [N], degree to colours [N, 3].
+
+    Coefficients come in one tensor [N, K, 3] and None, or in two, [N, 1, 3] and [N, K - 1, 3].
+    """
 
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, directions: Tensor, coefficients: Tensor, visible: Tensor, degree: int
+        ctx: Any,
+        directions: Tensor,
+        base: Tensor,
+        rest: Tensor | None,
+        visible: Tensor,
+        degree: int,
     ) -> Tensor:
         """Run the kernel and keep what backward needs."""
         colors = np.empty((len(directions), 3), np.float32)
-        sh.harmonics(
-            _array(directions), _array(coefficients), _array(visible), (degree + 1) ** 2, colors
-        )
-        ctx.save_for_backward(directions, coefficients, visible)
-        ctx.degree = degree
+        terms = (degree + 1) ** 2
+        sh.harmonics(_array(directions), *_two_arrays(base, rest), _array(visible), terms, colors)
+        ctx.save_for_backward(directions, base, rest, visible)
+        ctx.terms = terms
         return torch.from_numpy(colors)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_colors: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         """Gradients of the inputs."""
-        directions, coefficients, visible = (_array(t) for t in ctx.saved_tensors)
-        results = [np.zeros(each.shape, np.float32) for each in (directions, coefficients)]
-        terms = (ctx.degree + 1) ** 2
-        sh.harmonics_vjp(directions, coefficients, visible, terms, _array(d_colors), *results)
-        return (*(torch.from_numpy(r) for r in results), None, None)
+        directions, base, rest, visible = ctx.saved_tensors
+        d_directions, d_base = (np.zeros(each.shape, np.float32) for each in (directions, base))
+        d_rest = d_base if rest is None else np.zeros(rest.shape, np.float32)
+        sh.harmonics_vjp(  # type: ignore[call-arg]  # star arguments
+            _array(directions), *_two_arrays(base, rest)[1:], _array(visible), ctx.terms,
+            _array(d_colors), d_directions, d_base, d_rest,
+        )  # fmt: skip
+        by_rest = None if rest is None else torch.from_numpy(d_rest)
+        return torch.from_numpy(d_directions), torch.from_numpy(d_base), by_rest, None, None
+
+
+def _two_arrays(base: Tensor, rest: Tensor | None) -> tuple[np.ndarray, np.ndarray, int]:
+    """``base``, ``rest`` and ``shift`` as ``harmonics`` has them."""
+    first = _array(base)
+    return (first, first, 0) if rest is None else (first, _array(rest), 1)
 
 
 class _Prepared(NamedTuple):

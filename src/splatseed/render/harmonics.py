@@ -29,12 +29,14 @@ Y3D, Y3E = 0.3731763325901154, 1.445305721320277
 
 
 @kernel
-def harmonics(directions, coefficients, visible, terms, colors):  # type: ignore[no-untyped-def]
+def harmonics(directions, base, rest, shift, visible, terms, colors):  # type: ignore[no-untyped-def]
     """Colours of N Gaussians.
 
     Args:
         directions: float32 [N, 3], of any length.
-        coefficients: float32 [N, K, 3].
+        base: float32 [N, 1 or K, 3].
+        rest: float32 [N, K - shift, 3].
+        shift: 0 or 1.
         visible: bool [N]; colours of others are 0.
         terms: How many of the K take part: (degree + 1)^2.
         colors: Written, float32 [N, 3].
@@ -47,26 +49,28 @@ def harmonics(directions, coefficients, visible, terms, colors):  # type: ignore
                 x, y, z, _ = _unit(directions[i])
                 _basis(x, y, z, terms, basis)
                 for channel in range(3):
-                    total = 0.0
-                    for k in range(terms):
-                        total += basis[k] * coefficients[i, k, channel]
+                    total = basis[0] * base[i, 0, channel]
+                    for k in range(1, terms):
+                        total += basis[k] * rest[i, k - shift, channel]
                     colors[i, channel] = total
 
 
 @kernel
 def harmonics_vjp(  # type: ignore[no-untyped-def]
-    directions, coefficients, visible, terms, d_colors, d_directions, d_coefficients
+    directions, rest, shift, visible, terms, d_colors, d_directions, d_base, d_rest
 ):
     """Gradients of ``harmonics``.
 
     Args:
         directions: As in ``harmonics``.
-        coefficients: [N, K, 3].
+        rest: [N, K - shift, 3].
+        shift: 0 or 1.
         visible: [N].
         terms: (degree + 1)^2.
         d_colors: d loss / d colors, float32 [N, 3].
         d_directions: Written, float32 [N, 3]; must hold 0.
-        d_coefficients: Written, float32 [N, K, 3]; must hold 0.
+        d_base: Written, float32 [N, 1 or K, 3]; must hold 0.
+        d_rest: Written, float32 like ``rest``; must hold 0.
     """
     for chunk in parallel_range(CHUNKS):
         basis, slope, weight = np.empty(TERMS), np.zeros((3, TERMS)), np.empty(TERMS)
@@ -75,13 +79,15 @@ def harmonics_vjp(  # type: ignore[no-untyped-def]
                 x, y, z, length = _unit(directions[i])
                 _basis(x, y, z, terms, basis)
                 _slopes(x, y, z, terms, slope)
-                for k in range(terms):
+                for channel in range(3):
+                    d_base[i, 0, channel] = basis[0] * d_colors[i, channel]
+                for k in range(1, terms):
                     weight[k] = 0.0
                     for channel in range(3):
-                        d_coefficients[i, k, channel] = basis[k] * d_colors[i, channel]
-                        weight[k] += coefficients[i, k, channel] * np.float64(d_colors[i, channel])
+                        d_rest[i, k - shift, channel] = basis[k] * d_colors[i, channel]
+                        weight[k] += rest[i, k - shift, channel] * np.float64(d_colors[i, channel])
                 dx = dy = dz = 0.0
-                for k in range(terms):
+                for k in range(1, terms):
                     dx += weight[k] * slope[0, k]
                     dy += weight[k] * slope[1, k]
                     dz += weight[k] * slope[2, k]

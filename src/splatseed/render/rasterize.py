@@ -36,7 +36,7 @@ def rasterization(
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | tuple[Tensor, Tensor],
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -63,7 +63,9 @@ def rasterization(
         quats: wxyz rotations of any length but 0, [N, 4].
         scales: Standard deviations (not their logarithms), [N, 3].
         opacities: 0 to 1, [N].
-        colors: [N, D] or [C, N, D]; with ``sh_degree`` coefficients [N, K, 3].
+        colors: [N, D] or [C, N, D]; with ``sh_degree`` coefficients [N, K, 3] or [C, N, K, 3]. Beyond
+            gsplat, the first coefficient [N, 1, 3] and the rest [N, K - 1, 3] may come as a pair, as
+            trainers keep them: joining them would take a quarter of a training step.
         viewmats: cam_from_world, OpenCV axes, [C, 4, 4].
         Ks: Pinhole matrices in px, [C, 3, 3].
         width: Pixels.
@@ -107,8 +109,9 @@ def rasterization(
         from gsplat import rasterization as on_cuda  # noqa: PLC0415  (needs CUDA)
 
         return on_cuda(  # type: ignore[no-any-return]
-            means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane,
-            far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, backgrounds, render_mode,
+            means, quats, scales, opacities,
+            torch.cat(colors, dim=1) if isinstance(colors, tuple) else colors,
+            viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, backgrounds, render_mode,
             sparse_grad, absgrad, rasterize_mode, channel_chunk, **unsupported,
         )  # fmt: skip
     check_unsupported(unsupported)
@@ -117,7 +120,8 @@ def rasterization(
         render_mode=(render_mode, RenderMode), rasterize_mode=(rasterize_mode, RasterizeMode),
     )  # fmt: skip
     check_tensors(
-        {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors,
+        colors,
+        {"means": means, "quats": quats, "scales": scales, "opacities": opacities,
          "viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds},
         sh_degree,
     )  # fmt: skip
@@ -175,19 +179,21 @@ def _project(
 
 def _colors(
     means: Tensor,
-    colors: Tensor,
+    colors: Tensor | tuple[Tensor, Tensor],
     viewmats: Tensor,
     camera: int,
     view: _View,
     sh_degree: int | None,
 ) -> Tensor:
     """Colours of N Gaussians in one camera, [N, D]."""
+    base, rest = colors if isinstance(colors, tuple) else (colors, None)
+    if base.dim() == (3 if sh_degree is None else 4):
+        base = base[camera]
     if sh_degree is None:
-        return colors if colors.dim() == 2 else colors[camera]
+        return base
     # The general inverse, as gsplat takes it: the rigid one has another gradient off the rotations.
     directions = means - torch.linalg.inv_ex(viewmats[camera]).inverse[:3, 3]
-    coefficients = colors if colors.dim() == 3 else colors[camera]
-    shades: Tensor = Harmonics.apply(directions, coefficients, view.seen, sh_degree)  # type: ignore[no-untyped-call]
+    shades: Tensor = Harmonics.apply(directions, base, rest, view.seen, sh_degree)  # type: ignore[no-untyped-call]
     return torch.clamp_min(shades + 0.5, 0.0)
 
 

@@ -97,12 +97,11 @@ def photograph(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
     return torch.tensor(view.image, device=device).to(torch.float32) / 255.0
 
 
-def _harmonics(params: Parameters | Mapping[str, Tensor], sh_degree: int) -> Float[Tensor, "N K 3"]:
-    """The coefficients in use: copying, and optimising, the idle ones would be half of a step."""
-    rest = (sh_degree + 1) ** 2 - 1
-    if rest == 0:
-        return params["sh0"]
-    return torch.cat([params["sh0"], params["shN"][:, :rest]], dim=1)
+def _harmonics(
+    params: Parameters | Mapping[str, Tensor], sh_degree: int
+) -> Tensor | tuple[Tensor, Tensor]:
+    """The coefficients in use: idle ones would be copied and optimised all the same."""
+    return params["sh0"] if sh_degree == 0 else (params["sh0"], params["shN"])
 
 
 def _on_device(matrix: np.ndarray, like: Tensor) -> Tensor:
