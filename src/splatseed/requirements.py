@@ -15,6 +15,7 @@ INSTALL = {
     "tensorboard": "tensorboard",
     "transformers": "depth",
     "onnxruntime": "depth",
+    "OpenEXR": "exr",
 }
 """Which extra of splatseed brings each package."""
 

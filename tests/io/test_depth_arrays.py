@@ -12,8 +12,8 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image as PilImage
 
+from splatseed import requirements
 from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
-from splatseed.io import depth_pictures
 from splatseed.io.depth_arrays import read_colmap_depth, read_npy, read_npz, read_pfm
 from splatseed.io.depth_pictures import read_exr, read_picture
 
@@ -248,10 +248,7 @@ def test_damaged_exr(tmp_path, rng):
 
 
 def test_exr_without_its_package(tmp_path, monkeypatch):
-    def absent(name):
-        raise ImportError(name)
-
-    monkeypatch.setattr(depth_pictures.importlib, "import_module", absent)
+    monkeypatch.setattr(requirements, "find_spec", lambda _: None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'splatseed\[exr\]'"):
         read_exr(tmp_path / "a.exr")
 

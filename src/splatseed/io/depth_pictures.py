@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from splatseed.errors import MissingDependencyError
 from splatseed.io._model import read_bytes
 from splatseed.io.depth_arrays import StoredDepth, check_stored, refuse
+from splatseed.requirements import require
 
 __all__ = ["read_exr", "read_picture"]
 
@@ -64,14 +64,8 @@ def read_exr(path: Path) -> StoredDepth:
         SceneNotFoundError: There is no such file.
         SceneFormatError: It is no such picture, is damaged, or has no channel to take for depth.
     """
-    try:
-        openexr = importlib.import_module("OpenEXR")
-    except ImportError:
-        raise MissingDependencyError(
-            f"the package OpenEXR, to read {path}",
-            found="none",
-            fix="Install it: pip install 'splatseed[exr]'. Or convert the maps to .npy or .tiff.",
-        ) from None
+    require("OpenEXR")
+    openexr = importlib.import_module("OpenEXR")
     read_bytes(path)  # whether it can be read; the package's own words for that are few
     try:
         with openexr.File(str(path), header_only=True) as file:
