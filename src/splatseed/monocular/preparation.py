@@ -121,15 +121,28 @@ def complete(said: Preparation, path: Path) -> InputForm:
 
 
 def json_beside(path: Path, name: str) -> dict[str, Any]:
-    """The JSON object of that name in a file's folder or the one above; empty if there is none."""
+    """The JSON object of that name in a file's folder or the one above; empty if there is none.
+
+    Raises:
+        SceneFormatError: There is such a file, and it holds something else.
+    """
     for folder in (path.parent, path.resolve().parent.parent):
         try:
-            content = json.loads((folder / name).read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+            content = json.loads((folder / name).read_bytes())
+        except OSError:
             continue
-        if isinstance(content, dict):
-            return content
+        except (ValueError, RecursionError) as error:
+            raise _no_object(folder / name, f"{type(error).__name__}: {error}") from error
+        if not isinstance(content, dict):
+            raise _no_object(folder / name, type(content).__name__)
+        return content
     return {}
+
+
+def _no_object(path: Path, found: str) -> SceneFormatError:
+    return SceneFormatError(
+        f"{path} to hold a JSON object", found=found, fix="Fetch it again, or remove it."
+    )
 
 
 def _described(config: Mapping[str, Any]) -> Preparation:

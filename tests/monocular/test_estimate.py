@@ -1,0 +1,187 @@
+"""A scene's photographs through a network: what is written, in which batches, and what stops it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io import find_depths, load_scene
+from splatseed.monocular import Meaning, estimate_depths
+from splatseed.synthetic import make_capture, write_capture
+
+
+@dataclass
+class Brightness:
+    """A network that takes bright for near, and remembers what it was asked."""
+
+    meaning: Meaning = Meaning("inverse", "made")  # noqa: RUF009  (frozen)
+    device: str = "this test"
+    asked: list = field(default_factory=list)
+
+    def __call__(self, images):
+        self.asked.append([image.shape[:2] for image in images])
+        return [image.mean(axis=2).astype(np.float32) + 1 for image in images]
+
+
+@pytest.fixture(scope="module")
+def room_path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("room") / "room"
+    return write_capture(make_capture(0, num_views=5, width=80, height=60), path)
+
+
+@pytest.fixture
+def own_path(room_path, tmp_path):
+    """A copy that a test may spoil."""
+    return shutil.copytree(room_path, tmp_path / "own")
+
+
+@pytest.fixture
+def network():
+    return Brightness()
+
+
+def _tree(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*.npy")}
+
+
+def test_every_image_gets_a_map_that_the_reader_finds(room_path, network, tmp_path):
+    scene, stages = load_scene(room_path), []
+    report = estimate_depths(
+        scene, network, tmp_path / "maps", progress=lambda *each: stages.append(each)
+    )
+    assert (report.num_images, report.flat) == (5, ())
+    assert report.sizes == ((80, 60), (80, 60))
+    depths = find_depths(scene, tmp_path / "maps")
+    assert set(depths) == {image.name for image in scene.images}
+    for image in scene.images:
+        found = depths.read(image.name)
+        assert found.kind == "inverse"
+        with PilImage.open(scene.source.image_dir / image.name) as picture:
+            expected = np.asarray(picture.convert("RGB")).mean(axis=2) + 1
+        np.testing.assert_allclose(found.values, expected, rtol=1e-6)
+    assert ("check images", 1.0) in stages
+    assert stages[-1] == ("predict depth", 1.0)
+
+
+def test_the_batch_changes_no_byte(room_path, tmp_path):
+    scene = load_scene(room_path)
+    for batch in (1, 2, 9):
+        estimate_depths(scene, Brightness(), tmp_path / str(batch), batch=batch)
+    assert _tree(tmp_path / "1") == _tree(tmp_path / "2") == _tree(tmp_path / "9")
+    assert len(_tree(tmp_path / "1")) == 5
+
+
+def test_a_batch_holds_images_of_one_size_and_no_more_than_asked(own_path, network, tmp_path):
+    scene = load_scene(own_path)
+    for image in scene.images[::2]:
+        path = scene.source.image_dir / image.name
+        with PilImage.open(path) as picture:
+            smaller = picture.resize((40, 30))
+        smaller.save(path)
+    report = estimate_depths(scene, network, tmp_path / "maps", batch=2)
+    assert sorted(map(len, network.asked)) == [1, 2, 2]
+    assert all(len(set(batch)) == 1 for batch in network.asked)
+    assert report.sizes == ((40, 30), (80, 60))
+
+
+def test_large_images_are_reduced_and_small_ones_left(room_path, network, tmp_path):
+    scene = load_scene(room_path)
+    estimate_depths(scene, network, tmp_path / "maps", max_size=48)
+    assert {shape for batch in network.asked for shape in batch} == {(36, 48)}
+    found = find_depths(scene, tmp_path / "maps").read(scene.images[0].name)
+    assert found.camera(scene.images[0].camera).width == 48
+
+
+def test_subfolders_and_foreign_suffixes_keep_their_names(own_path, network, tmp_path):
+    scene = load_scene(own_path)
+    first, second, *_ = scene.images
+    for image, name in ((first, "left/a.png"), (second, "right/a.png")):
+        (scene.source.image_dir / name).parent.mkdir()
+        shutil.move(scene.source.image_dir / image.name, scene.source.image_dir / name)
+    from dataclasses import replace  # noqa: PLC0415
+
+    renamed = (replace(first, name="left/a.png"), replace(second, name="right/a.png"))
+    scene = scene.replace(images=renamed)
+    estimate_depths(scene, network, tmp_path / "maps")
+    assert list(find_depths(scene, tmp_path / "maps")) == ["left/a.png", "right/a.png"]
+
+
+def test_a_network_that_fails_on_an_image_is_told_of(room_path, tmp_path):
+    class Failing(Brightness):
+        def __call__(self, images):
+            maps = super().__call__(images)
+            maps[0] = np.full_like(maps[0], 7 if len(self.asked) == 1 else np.inf)
+            return maps
+
+    scene = load_scene(room_path)
+    report = estimate_depths(scene, Failing(), tmp_path / "maps", batch=3)
+    names = sorted(image.name for image in scene.images)
+    assert report.flat == (names[0], names[3])
+    values = find_depths(scene, tmp_path / "maps").read(names[3]).values
+    assert np.isnan(values).all()
+
+
+@pytest.mark.parametrize("damage", ["cut short", "missing", "of another shape", "text"])
+def test_a_bad_photograph_stops_before_the_network_is_run(damage, own_path, network, tmp_path):
+    scene = load_scene(own_path)
+    path = scene.source.image_dir / max(image.name for image in scene.images)
+    if damage == "cut short":
+        path.write_bytes(path.read_bytes()[:-100])
+    elif damage == "of another shape":
+        PilImage.new("RGB", (60, 80)).save(path)
+    elif damage == "text":
+        path.write_text("not an image")
+    else:
+        path.unlink()
+    with pytest.raises((SceneFormatError, SceneNotFoundError), match=path.name):
+        estimate_depths(scene, network, tmp_path / "maps")
+    assert not network.asked
+    assert not (tmp_path / "maps").exists()
+
+
+def test_a_failure_on_the_way_leaves_nothing(room_path, tmp_path):
+    class Broken(Brightness):
+        def __call__(self, images):
+            if len(self.asked) == 3:
+                raise ParameterError("memory", found="none", fix="Buy some.")
+            return super().__call__(images)
+
+    with pytest.raises(ParameterError):
+        estimate_depths(load_scene(room_path), Broken(), tmp_path / "out" / "maps")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["", "maps", "images/maps"])
+def test_the_scene_is_not_written_into(name, own_path, network):
+    with pytest.raises(OutputError, match="apart from the input"):
+        estimate_depths(load_scene(own_path), network, own_path / name)
+    assert not network.asked
+
+
+def test_an_earlier_folder_is_replaced_only_when_asked(room_path, network, tmp_path):
+    scene = load_scene(room_path)
+    estimate_depths(scene, network, tmp_path / "maps", provenance={"model": "a"})
+    assert json.loads((tmp_path / "maps" / "splatseed.json").read_text())["model"] == "a"
+    with pytest.raises(OutputError, match="--overwrite"):
+        estimate_depths(scene, network, tmp_path / "maps")
+    estimate_depths(scene, network, tmp_path / "maps", overwrite=True)
+
+
+@pytest.mark.parametrize("number", [{"batch": 0}, {"max_size": -5}])
+def test_numbers_out_of_range_are_refused(number, room_path, network, tmp_path):
+    with pytest.raises(ParameterError, match="of 1 or more"):
+        estimate_depths(load_scene(room_path), network, tmp_path / "maps", **number)
+
+
+def test_a_scene_without_photographs_is_refused(own_path, network, tmp_path):
+    shutil.rmtree(own_path / "images")
+    with pytest.raises(SceneNotFoundError, match="with photographs"):
+        estimate_depths(load_scene(own_path), network, tmp_path / "maps")
+    with pytest.raises(SceneNotFoundError, match="with photographs"):
+        estimate_depths(load_scene(own_path).replace(images=()), network, tmp_path / "maps")
