@@ -146,14 +146,16 @@ def _check_colors(
 
 def _check_pair(colors: tuple[Tensor, ...], n: tuple[int, ...], sh_degree: int | None) -> None:
     """The first coefficient and the rest."""
-    _require(
-        sh_degree is not None and len(colors) == 2, "a pair of colors with sh_degree only", colors
+    degree = -1 if sh_degree is None else sh_degree
+    base, *others = (tuple(part.shape) for part in colors)
+    fits = degree >= 0 and base == (*n, 1, 3) and len(others) == 1 and len(others[0]) == 3
+    if fits:
+        terms = degree * (degree + 2)
+        fits = others[0][::2] == (*n, 3) and others[0][1] >= terms
+    expected = (
+        "with an sh_degree, a pair of colors of shapes [N, 1, 3] and [N, (sh_degree + 1)^2 - 1, 3]"
     )
-    terms = (sh_degree or 0) * ((sh_degree or 0) + 2)
-    base, rest = (tuple(part.shape) for part in colors)
-    fits = base == (*n, 1, 3) and len(rest) == 3 and (rest[0], rest[2]) == (*n, 3)
-    sizes = f"[N, 1, 3] and [N, K >= {terms}, 3] (N = {n[0]})"
-    _require(fits and rest[1] >= terms, f"the pair of colors of shapes {sizes}", list(colors))
+    _require(fits, f"{expected} (N = {n[0]})", [base, *others])
 
 
 def check_absgrad(absgrad: bool, channels: int) -> None:
