@@ -25,6 +25,7 @@ from splatseed.geometry import spacing
 from splatseed.io.staging import atomic_file
 from splatseed.preview import choose_camera, render_points
 from splatseed.synthetic import Capture, make_capture
+from splatseed.upsample import methods_for
 from splatseed.viewpoint import choose_image, look_at
 
 HERE = Path(__file__).parent
@@ -44,7 +45,8 @@ class Panel(NamedTuple):
 def main() -> None:
     """Make every picture."""
     capture = make_capture()
-    clouds = {name: ss.upsample(capture.scene, name, ratio=RATIO, seed=0) for name in ss.METHODS}
+    methods = methods_for(capture.scene)
+    clouds = {name: ss.upsample(capture.scene, name, ratio=RATIO, seed=0) for name in methods}
     draw_before_after(capture, clouds["mls"])
     draw_overview(capture, clouds)
     draw_errors(capture, clouds)

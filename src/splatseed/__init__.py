@@ -2,7 +2,7 @@
 
 >>> import splatseed as ss
 >>> sorted(ss.METHODS)[:3]
-['linear', 'mls', 'random']
+['depth', 'linear', 'mls']
 """
 
 from splatseed.camera import Camera

@@ -33,7 +33,8 @@ def _bytes(folder):
 @pytest.mark.parametrize("method", METHOD_NAMES)
 def test_every_method_writes_a_scene_that_opens(method, room, tmp_path, splatseed):
     out = tmp_path / "out"
-    run = splatseed("upsample", room, "--method", method, "--ratio", 3, "-o", out)
+    maps = ["--depth", room] if method == "depth" else []
+    run = splatseed("upsample", room, "--method", method, *maps, "--ratio", 3, "-o", out)
     assert (run.code, run.err) == (0, "")
     before, after = load_scene(room), load_scene(out)
     count = len(before.points)

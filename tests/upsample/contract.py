@@ -10,6 +10,8 @@ import numpy as np
 import splatseed as ss
 from splatseed.upsample.method import NewPoints
 
+from .surroundings import scene_around
+
 __all__ = ["KINDS", "Copies", "Kind", "named"]
 
 
@@ -41,7 +43,7 @@ class Kind:
     @property
     def turns_with_the_cloud(self) -> bool:
         """Neither the fit nor the box it samples stands on the world's axes."""
-        if self.method == "random":
+        if self.method in {"random", "depth"}:  # our made scene stands on the axes, too
             return False
         return self.profile == "default" or self.method in {"linear", "triangle", "copies"}
 
@@ -55,9 +57,15 @@ class Kind:
         """One point is enough."""
         return self.method in {"random", "copies"}
 
+    @property
+    def needs_scene(self) -> bool:
+        """Points alone will not do."""
+        return self.method == "depth"
+
     def __call__(self, cloud, **options):
-        """Upsample ``cloud``, four times unless told otherwise."""
-        return ss.upsample(cloud, self.method, profile=self.profile, **options)
+        """Upsample ``cloud``, four times unless told otherwise; in a made scene if it takes one."""
+        whole = scene_around(cloud) if self.needs_scene else cloud
+        return ss.upsample(whole, self.method, profile=self.profile, **options)
 
     def new(self, cloud, num_new, **options):
         """Only the new points."""
@@ -65,7 +73,7 @@ class Kind:
         return seeds.select(slice(len(cloud), None))
 
 
-METHOD_NAMES = ("linear", "triangle", "spline", "mls", "voronoi", "random", "copies")
+METHOD_NAMES = ("linear", "triangle", "spline", "mls", "voronoi", "depth", "random", "copies")
 KINDS = [Kind(method, profile) for method in METHOD_NAMES for profile in ("default", "paper")]
 
 

@@ -13,8 +13,12 @@ from .contract import KINDS, named
 
 pytestmark = pytest.mark.usefixtures("third_party")
 
-every_kind = pytest.mark.parametrize("kind", KINDS, ids=str)
-needs_neighbors = pytest.mark.parametrize("kind", named(takes_any_cloud=False), ids=str)
+# Depth is lifted from images, whatever the shape of the cloud; see tests/depth.
+OF_POINTS = named(needs_scene=False)
+every_kind = pytest.mark.parametrize("kind", OF_POINTS, ids=str)
+needs_neighbors = pytest.mark.parametrize(
+    "kind", [kind for kind in OF_POINTS if not kind.takes_any_cloud], ids=str
+)
 on_flat_sets = pytest.mark.parametrize("kind", named(stays_on_flat_sets=True), ids=str)
 TURN = Rotation.from_euler("xyz", [0.4, 0.9, -0.3])
 SHIFT = np.array([0.5, -2.0, 1.0])
@@ -33,14 +37,14 @@ def untilted(cloud):
     return TURN.inv().apply(cloud.xyz - SHIFT)
 
 
-@every_kind
+@pytest.mark.parametrize("kind", KINDS, ids=str)
 @pytest.mark.parametrize("size", [{}, {"ratio": 1}, {"num_points": 7}], ids=str)
 def test_no_points_are_an_error(kind, size):
     with pytest.raises(PointCloudError, match="at least one original point"):
         kind(cloud_of(np.empty((0, 3))), **size)
 
 
-@every_kind
+@pytest.mark.parametrize("kind", KINDS, ids=str)
 def test_no_finite_points_are_an_error(kind):
     with pytest.raises(PointCloudError, match="finite"):
         kind(cloud_of(np.full((5, 3), np.nan)))

@@ -14,9 +14,10 @@ from splatseed.upsample import Upsampler, configure, planned_size
 from splatseed.upsample.method import NewPoints
 
 from .contract import METHOD_NAMES, Copies
+from .surroundings import scene_around
 
 BUILT_IN = [name for name in METHOD_NAMES if name != "copies"]
-SOURCES = {"linear": 1, "triangle": 2, "spline": 3, "mls": 4, "voronoi": 5, "random": 7}
+SOURCES = {"linear": 1, "triangle": 2, "spline": 3, "mls": 4, "voronoi": 5, "depth": 6, "random": 7}
 
 WRONG_PARAMETERS = [
     ("mls", {"k": 2}, "mls.k of at least 3"),
@@ -42,6 +43,19 @@ WRONG_PARAMETERS = [
     ("voronoi", {"color_k": 26}, "color_k from 1"),
     ("voronoi", {"max_weight": 0.5}, "max_weight of at least 1"),
     ("voronoi", {"cells": "boxes"}, "'clamped' or 'box'"),
+    ("depth", {"fit": "ransac"}, "'robust' or 'least-squares'"),
+    ("depth", {"min_points": 0}, "min_points of at least 1"),
+    ("depth", {"max_residual_ratio": 0.5}, "max_residual_ratio of at least 1"),
+    ("depth", {"region": 0}, "region above 0"),
+    ("depth", {"region": 1.5}, "region above 0"),
+    ("depth", {"placement": "far"}, "'empty' or 'uniform'"),
+    ("depth", {"edge_tolerance": 0}, "edge_tolerance above 0"),
+    ("depth", {"edge_radius": 0}, "edge_radius from 1"),
+    ("depth", {"num_neighbors": 0}, "num_neighbors from 1"),
+    ("depth", {"min_agreeing": 9}, "min_agreeing from 0 to 8"),
+    ("depth", {"tolerance": 1}, "tolerance between 0 and 1"),
+    ("depth", {"color_tolerance": 2}, "color_tolerance above 0"),
+    ("depth", {"hold_out": 1}, "hold_out of 0 or 2"),
 ]
 
 
@@ -99,8 +113,9 @@ def test_sizes_count_the_originals(size, expected, wavy):
 
 @pytest.mark.parametrize("method", BUILT_IN)
 def test_source_says_which_method_made_a_point(method, wavy):
-    by_name = ss.upsample(wavy, method, ratio=2).source
-    by_instance = ss.upsample(wavy, configure(method), ratio=2).source
+    scene = scene_around(wavy)
+    by_name = ss.upsample(scene, method, ratio=2).source
+    by_instance = ss.upsample(scene, configure(method), ratio=2).source
     for source in (by_name, by_instance):
         assert set(source[:160]) == {0}
         assert set(source[160:]) == {SOURCES[method]}
@@ -108,8 +123,9 @@ def test_source_says_which_method_made_a_point(method, wavy):
 
 @pytest.mark.parametrize("method", BUILT_IN)
 def test_an_instance_and_its_name_do_the_same(method, wavy):
-    by_name = ss.upsample(wavy, method, seed=3, profile="paper")
-    by_instance = ss.upsample(wavy, METHODS[method].paper(), seed=3)
+    scene = scene_around(wavy)
+    by_name = ss.upsample(scene, method, seed=3, profile="paper")
+    by_instance = ss.upsample(scene, METHODS[method].paper(), seed=3)
     np.testing.assert_array_equal(by_name.xyz, by_instance.xyz)
 
 
@@ -135,7 +151,9 @@ PAPER_VALUES = [
     ("spline", {"k": 25, "basis": "bicubic"}),
     ("voronoi", {"ball": 0.5, "color_k": 5}),
     *((m, {"frame": "world", "placement": "box", "clamp": None}) for m in ("mls", "spline")),
-    *((m, {"reject_isolated": False}) for m in BUILT_IN if m != "random"),
+    *((m, {"reject_isolated": False}) for m in BUILT_IN if m not in {"depth", "random"}),
+    ("depth", {"fit": "least-squares", "unit_ray": True, "region": 0.5, "placement": "uniform"}),
+    ("depth", {"min_agreeing": 0, "see_through": True, "spread": False, "edge_tolerance": None}),
 ]
 
 

@@ -29,14 +29,14 @@ from splatseed.console import (
 )
 from splatseed.errors import MissingDependencyError, ParameterError
 from splatseed.geometry import GeometryScore, measure, spacing
-from splatseed.io import load_scene, write_scene
+from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.synthetic import Capture, make_capture, write_capture
-from splatseed.upsample import METHODS, planned_size, upsample
+from splatseed.upsample import methods_for, planned_size, upsample
 
 if TYPE_CHECKING:  # importing PyTorch takes a while, and it may be absent
     from splatseed.commands._demo_training import TrainedArm
@@ -82,6 +82,7 @@ def run(arguments: list[str]) -> None:
         capture = make_capture(options.seed, options.views)
         write_capture(capture, folder / "scene")
         scene = load_scene(folder / "scene")
+        scene = scene.replace(depths=find_depths(scene, folder / "scene"))
         clouds = _upsample_all(options, scene, clock)
         scores = _measure_all(capture, scene, clouds, clock)
         clock("write", 0.0)
@@ -109,9 +110,9 @@ def _check(options: Options) -> None:
 
 def _upsample_all(options: Options, scene: Scene, clock: StageClock) -> dict[str, PointCloud]:
     """The scene upsampled by every method."""
-    clouds = {}
-    for done, name in enumerate(METHODS):
-        clock("upsample", done / len(METHODS))
+    clouds, methods = {}, methods_for(scene)
+    for done, name in enumerate(methods):
+        clock("upsample", done / len(methods))
         clouds[name] = upsample(scene, name, ratio=options.ratio, seed=options.seed)
     clock("upsample", 1.0)
     return clouds

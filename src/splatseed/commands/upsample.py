@@ -21,9 +21,10 @@ from splatseed.console import (
     print_pairs,
     stage_display,
 )
-from splatseed.errors import PointCloudError
+from splatseed.depthmap import DepthKind
+from splatseed.errors import ParameterError, PointCloudError, SceneFormatError
 from splatseed.geometry import far_share
-from splatseed.io import WriteReport, find_usable, load_scene, write_scene
+from splatseed.io import WriteReport, find_depths, find_usable, load_scene, write_scene
 from splatseed.io.staging import check_output
 from splatseed.scene import Scene
 from splatseed.trainers import training_commands
@@ -32,6 +33,7 @@ from splatseed.upsample import (
     Profile,
     Upsampler,
     configure,
+    methods_for,
     planned_size,
     upsample,
 )
@@ -47,6 +49,18 @@ def _number(kind: type, default: str) -> Any:
         constructor=kind,
         metavar=kind.__name__.upper(),
         help_behavior_hint=f"(default: {default})",
+    )
+
+
+def _default(stands_in: str) -> Any:
+    """How an optional choice shows in the help: with what stands in for it."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
+
+
+def _depth_folder() -> Any:
+    """The flag --depth; its field has another name, since the method depth has that one."""
+    return tyro.conf.arg(
+        name="depth", constructor=Path, metavar="DIR", help_behavior_hint="(default: the scene's)"
     )
 
 
@@ -68,6 +82,14 @@ class Options:
     """The same seed gives the same bytes."""
     profile: Profile = "default"
     """Defaults of the method flags below: improved ones, or those of the paper's text."""
+    depth_maps: Annotated[Path | None, _depth_folder()] = None
+    """For --method depth: a folder of depth maps, in any layout that docs/formats.md lists."""
+    depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
+    """What their values are: planar depth, distance along the ray, or inverse depth."""
+    depth_scale: Annotated[float | None, _number(float, "what the folder says")] = None
+    """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
+    align: bool = True
+    """For --method depth: --no-align takes metric depth and poses as they are (--depth.no-align)."""
     preview: bool = False
     """Also write preview.png (before and after) and preview_methods.png (every method)."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
@@ -84,7 +106,10 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     if options.profile == "paper":
         # The profile sets the defaults of other flags, so it must be known before they are read.
         options = _parse_with({name: METHODS[name].paper() for name in METHODS}, arguments)
-    return options, {name: getattr(options, name) for name in METHODS}
+    methods = {name: getattr(options, name) for name in METHODS}
+    if not options.align:
+        methods["depth"] = dataclasses.replace(methods["depth"], align=False)
+    return options, methods
 
 
 def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
@@ -108,21 +133,26 @@ def run(arguments: list[str]) -> None:
     options, methods = parse(arguments)
     method = methods[options.method]
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
-    check_output(options.output, overwrite=options.overwrite, protect=(options.scene,))
+    inputs = [path for path in (options.scene, options.depth_maps) if path is not None]
+    check_output(options.output, overwrite=options.overwrite, protect=inputs)
     with stage_display() as clock:
         clock("read", 0.0)
-        scene = load_scene(options.scene)
-        scene = scene.replace(points=scene.points.originals)
+        scene = _read(options, method)
         usable = find_usable(scene.points)
         total = planned_size(int(usable.keep.sum()), options.ratio, options.num_points)
     _announce(options, scene, method, total, _idle(options, methods))
+    notes: list[str] = []
     with stage_display(clock):
         # Points that writing leaves out are asked for on top, so that the output has ``total``.
         asked = total + int((~usable.keep).sum())
-        seeds = upsample(scene, method, num_points=asked, seed=options.seed, progress=clock)
+        seeds = upsample(
+            scene, method, num_points=asked, seed=options.seed, progress=clock, note=notes.append
+        )
         clock("check", 0.0)
         new = seeds.xyz[len(scene.points) :]
-        far = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
+        far = None
+        if usable.keep.any():
+            far = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
         clock("write", 0.0)
         report = _write(options, scene.replace(points=seeds), method)
         if options.preview:
@@ -130,6 +160,26 @@ def run(arguments: list[str]) -> None:
             _write_previews(options, shown, total, methods, clock)
         seconds = clock.seconds()
     _summarise(options, scene, report, seconds, far)
+    for sentence in notes:
+        print_note(sentence)
+
+
+def _read(options: Options, method: Upsampler) -> Scene:
+    """The scene's originals, and its depth maps if their folder is named."""
+    scene = load_scene(options.scene, require_points=getattr(method, "needs_points", True))
+    scene = scene.replace(points=scene.points.originals)
+    if options.depth_maps is not None:
+        maps = find_depths(
+            scene, options.depth_maps, kind=options.depth_kind, scale=options.depth_scale
+        )
+        return scene.replace(depths=maps)
+    if options.depth_kind is not None or options.depth_scale is not None:
+        raise ParameterError(
+            "--depth DIR, whose maps --depth-kind and --depth-scale speak of",
+            found="none",
+            fix="Name the folder.",
+        )
+    return scene
 
 
 def _announce(
@@ -139,7 +189,7 @@ def _announce(
     for warning in scene.warnings:
         print_note(warning)
     for name in idle:
-        print_note(f"--{name}.* flags change nothing with --method {options.method}.")
+        print_note(f"The flags of {name} change nothing with --method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
     parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]
     OUT.print(
@@ -157,7 +207,10 @@ def _idle(options: Options, methods: dict[str, Upsampler]) -> list[str]:
     if options.preview:  # draws them all
         return []
     plain = {name: configure(name, options.profile) for name in methods}
-    return [n for n in methods if n != options.method and methods[n] != plain[n]]
+    changed = {name for name in methods if methods[name] != plain[name]}
+    if options.depth_maps is not None:
+        changed.add("depth")
+    return [name for name in methods if name in changed - {options.method}]
 
 
 def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
@@ -178,6 +231,7 @@ def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
         "method": options.method,
         "profile": options.profile,
         "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]
+        "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
         "ratio": options.ratio,
         "num_points_asked": options.num_points,
         "seed": options.seed,
@@ -195,11 +249,11 @@ def _write_previews(
     from splatseed.preview import preview_methods, preview_pair  # noqa: PLC0415  (Pillow)
 
     clouds = {}
-    for name, method in methods.items():
-        # Too few points for one of the methods: the others are still worth showing.
-        with suppress(PointCloudError):
+    for name in methods_for(scene):
+        # Too few points for one of the methods, or depth that does not fit: show the others.
+        with suppress(PointCloudError, SceneFormatError):
             clouds[name] = upsample(
-                scene, method, num_points=total, seed=options.seed, progress=clock
+                scene, methods[name], num_points=total, seed=options.seed, progress=clock
             )
     clock("preview", 0.0)
     shown = clouds[options.method]
@@ -210,17 +264,23 @@ def _write_previews(
 
 
 def _summarise(
-    options: Options, scene: Scene, report: WriteReport, seconds: dict[str, float], far: float
+    options: Options,
+    scene: Scene,
+    report: WriteReport,
+    seconds: dict[str, float],
+    far: float | None,
 ) -> None:
     """The closing table and the commands to go on with."""
     dropped = report.dropped_nonfinite + report.dropped_duplicates
     rows = [
         ("points in", f"{len(scene.points):,}"),
         ("points out", f"{report.num_points:,}"),
-        ("far from any original", f"{far:.2%} of the new points lie over 3 spacings away"),
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(options.output)),
     ]
+    if far is not None:
+        share = f"{far:.2%} of the new points lie over 3 spacings away"
+        rows.insert(2, ("far from any original", share))
     if dropped:
         rows.insert(
             2,

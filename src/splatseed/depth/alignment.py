@@ -29,7 +29,7 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
 
-__all__ = ["Alignment", "Fit", "align", "align_map", "reject_outliers", "values_at"]
+__all__ = ["Alignment", "Fit", "align", "align_map", "reject_outliers", "trust_units", "values_at"]
 
 Fit = Literal["robust", "least-squares"]
 """Medians and reweighting, or the paper's equation 7."""
@@ -39,6 +39,11 @@ GOOD_RESIDUAL = 0.01
 
 MAX_RESIDUAL = 0.25
 """An image that is off by more at half of its points is not aligned at all."""
+
+
+UNIT_POINTS = 20
+UNIT_SLACK = 1.25
+"""A map that is not aligned is refused where this many SfM points say that it is off by this factor."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,28 @@ def align_map(
     scale, shift = _fit(depth.kind, value, z, fit)
     residual = _residual(depth.kind, value, z, scale, shift)
     return Alignment(scale, shift, len(value), residual, _misfit(depth.kind, scale, residual))
+
+
+def trust_units(depth: DepthMap, camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Alignment:
+    """Take a map as it is, in scene units, and hold it against the SfM points if there are some.
+
+    Args:
+        depth: The map.
+        camera: The image's camera in pixels of the map.
+        xyz: World positions of the points that the image sees, [M, 3].
+    """
+    value, z = values_at(depth, camera, xyz)
+    plain = Alignment(1.0, 0.0, len(value), np.nan)
+    if not np.isfinite(depth.values).any():
+        return replace(plain, rejected=_too_few(depth, 0, 0))
+    if len(value) < UNIT_POINTS:
+        return plain
+    plain = replace(plain, residual=_residual(depth.kind, value, z, 1.0, 0.0))
+    with np.errstate(divide="ignore"):
+        ratio = float(np.median((1.0 / value if depth.kind == "inverse" else value) / z))
+    if 1.0 / UNIT_SLACK < ratio < UNIT_SLACK:
+        return plain
+    return replace(plain, rejected=f"its depth is {ratio:.3g} times that of the SfM points")
 
 
 def values_at(

@@ -1,7 +1,7 @@
 """Which SfM points each image sees: what depth maps are held against.
 
 Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the scene's world.
-Promise: only finite originals take part. Where Structure-from-Motion says which features a point has
+Promise: only distinct finite originals take part. Where Structure-from-Motion says which features a point has
 (its track), that is taken; without tracks, points are projected, and of those that fall close together
 in the image only the nearest stay, as the others are probably hidden.
 """
@@ -31,7 +31,7 @@ class Sightings:
     """The points of every image.
 
     Args:
-        xyz: The finite originals, float64 [N, 3], scene units.
+        xyz: The distinct finite originals, float64 [N, 3], scene units.
         point_idx: Rows of ``xyz``, image after image, int64 [T].
         start: Where each image begins in ``point_idx``, by its id.
         count: How many each image has, by its id.
@@ -53,7 +53,7 @@ class Sightings:
 
 def find_sightings(scene: Scene) -> Sightings:
     """Gather the points of every image once, to be asked for image by image."""
-    usable = np.flatnonzero((scene.points.source == ORIGINAL) & scene.points.finite)
+    usable = np.flatnonzero((scene.points.source == ORIGINAL) & scene.points.distinct)
     xyz = scene.points.xyz[usable].astype(np.float64)
     tracks = scene.tracks
     if tracks is None:

@@ -8,6 +8,7 @@ number of threads; new points are finite.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, Literal
 
 import numpy as np
@@ -27,6 +28,7 @@ __all__ = [
     "Profile",
     "Upsampler",
     "configure",
+    "methods_for",
     "planned_size",
     "upsample",
     "upsample_points",
@@ -70,6 +72,18 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
     return dataclasses.replace(chosen, **parameters)  # type: ignore[type-var]
 
 
+def methods_for(scene: Scene | PointCloud) -> tuple[str, ...]:
+    """The names of the methods that a scene can be upsampled by: some need its depth maps.
+
+    Example:
+        >>> cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
+        >>> "depth" in METHODS, "depth" in methods_for(cloud)
+        (True, False)
+    """
+    has_depth = isinstance(scene, Scene) and scene.depths is not None
+    return tuple(n for n in METHODS if has_depth or not getattr(METHODS[n], "needs_depth", False))
+
+
 def upsample(
     scene: Scene | PointCloud,
     method: str | Upsampler = "mls",
@@ -79,6 +93,7 @@ def upsample(
     seed: int = 0,
     profile: Profile = "default",
     progress: Progress = silent,
+    note: Callable[[str], None] = lambda _: None,
     **parameters: Any,
 ) -> PointCloud:
     """Upsample the points of a scene.
@@ -92,6 +107,7 @@ def upsample(
         seed: The same seed gives the same bytes, whatever the number of threads.
         profile: "default", or "paper" for the paper's text to the letter.
         progress: Told each stage and the fraction done.
+        note: Told what the method left out or made do with, one sentence each.
         parameters: Fields of the method, such as ``k=12``.
 
     Returns:
@@ -100,6 +116,8 @@ def upsample(
     Raises:
         ParameterError: An unknown method, profile or parameter, or a value or size out of range.
         PointCloudError: Too few distinct finite points for the method.
+        SceneNotFoundError: The method needs photographs or depth maps that are not there.
+        SceneFormatError: One of these files is damaged, or they do not fit the scene.
 
     Example:
         >>> import numpy as np, splatseed as ss
@@ -121,9 +139,18 @@ def upsample(
         return originals
     whole = scene if isinstance(scene, Scene) else None
     trusted = None if whole is None else trusted_originals(whole)
-    cloud = prepare(originals, trusted, progress, whole)
+    allow_none = not getattr(chosen, "needs_points", True)
+    cloud = prepare(originals, trusted, progress, whole, allow_none=allow_none)
+    if num_new == 0:  # and no originals, of which a ratio could be
+        raise ParameterError(
+            "a number of points where there are no originals",
+            found="a ratio, or 0",
+            fix="Give --num-points.",
+        )
     new = chosen(cloud, num_new, rng, progress)
     _check_finite(new)
+    for sentence in new.notes:
+        note(sentence)
     name = method if isinstance(method, str) else _name_of(chosen)
     source = np.full(num_new, source_code(name), np.uint8)
     return PointCloud.concatenate(originals, PointCloud(new.xyz, new.rgb, source))

@@ -42,7 +42,15 @@ class Linear(NearestMethod):
         progress("linear", 0.0)
         new = NewPoints(np.empty((num_new, 3), np.float32), np.empty((num_new, 3), np.uint8))
         _blend(
-            cloud.xyz, cloud.rgb, cloud.center, neighbors.idx, bases.start, bases.count, alpha, *new
+            cloud.xyz,
+            cloud.rgb,
+            cloud.center,
+            neighbors.idx,
+            bases.start,
+            bases.count,
+            alpha,
+            new.xyz,
+            new.rgb,
         )
         progress("linear", 1.0)
         return new

@@ -43,6 +43,8 @@ class NewPoints(NamedTuple):
     """World positions, float32 [M, 3]."""
     rgb: UInt8[np.ndarray, "M 3"]
     """Colours, uint8 [M, 3]."""
+    notes: tuple[str, ...] = ()
+    """What the user should know of them, one sentence each."""
 
 
 @runtime_checkable

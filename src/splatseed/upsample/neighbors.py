@@ -126,6 +126,8 @@ def prepare(
     trusted: Bool[np.ndarray, " N"] | None = None,
     progress: Progress = silent,
     scene: Scene | None = None,
+    *,
+    allow_none: bool = False,
 ) -> PreparedCloud:
     """Mask, de-duplicate, centre and sort the originals of a cloud.
 
@@ -134,19 +136,20 @@ def prepare(
         trusted: Which of the N points may serve as bases; all when left out.
         progress: Called with the stage "neighbours" while neighbours are sought.
         scene: The scene that the points belong to, if any.
+        allow_none: Whether the cloud may be empty; it then has no neighbours, and the center 0.
 
     Raises:
         PointCloudError: No finite original is left.
     """
     originals = np.flatnonzero(points.source == ORIGINAL)
     keep_idx = originals[find_usable(points.select(originals)).keep]
-    if len(keep_idx) == 0:
+    if len(keep_idx) == 0 and not allow_none:
         raise PointCloudError(
             "at least one original point with finite coordinates",
             found=f"{len(points)} points, none of them finite and original",
             fix="Check that the scene holds the point cloud you meant.",
         )
-    center = points.xyz[keep_idx].mean(axis=0, dtype=np.float64)
+    center = points.xyz[keep_idx].sum(axis=0, dtype=np.float64) / max(len(keep_idx), 1)
     xyz = points.xyz[keep_idx].astype(np.float64) - center
     tree = cKDTree(xyz, balanced_tree=False)
     rank = np.asarray(tree.indices, np.int64)

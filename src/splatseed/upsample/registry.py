@@ -26,11 +26,20 @@ BUILT_IN = {
     "spline": "splatseed.upsample.spline:Spline",
     "mls": "splatseed.upsample.mls:Mls",
     "voronoi": "splatseed.upsample.voronoi:Voronoi",
+    "depth": "splatseed.upsample.depth:Depth",
     "random": "splatseed.upsample.bounding_box:BoundingBox",
 }
 
-SOURCE_CODES = {"linear": 1, "triangle": 2, "spline": 3, "mls": 4, "voronoi": 5, "random": 7}
-"""What ``PointCloud.source`` holds for the points of each built-in method; 6 is kept for depth."""
+SOURCE_CODES = {
+    "linear": 1,
+    "triangle": 2,
+    "spline": 3,
+    "mls": 4,
+    "voronoi": 5,
+    "depth": 6,
+    "random": 7,
+}
+"""What ``PointCloud.source`` holds for the points of each built-in method."""
 
 
 class MethodRegistry(Mapping[str, type[Upsampler]]):

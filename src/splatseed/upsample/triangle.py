@@ -46,7 +46,15 @@ class Triangle(NearestMethod):
         progress("triangle", 0.0)
         new = NewPoints(np.empty((num_new, 3), np.float32), np.empty((num_new, 3), np.uint8))
         _blend(
-            cloud.xyz, cloud.rgb, cloud.center, neighbors.idx, bases.start, bases.count, draws, *new
+            cloud.xyz,
+            cloud.rgb,
+            cloud.center,
+            neighbors.idx,
+            bases.start,
+            bases.count,
+            draws,
+            new.xyz,
+            new.rgb,
         )
         progress("triangle", 1.0)
         return new

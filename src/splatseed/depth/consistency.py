@@ -1,0 +1,139 @@
+"""Whether other views confirm a point, or look through it.
+
+Notation: at a point that falls into another view's frame at planar depth z, that view's own depth d is
+known at the four grid points around it. The view *confirms* the point if |d - z| <= tolerance z and the
+colours of both views there are close; it *looks through* the point if even the nearest of the four d is
+clearly farther. A point that lies behind what the view sees is hidden from it, and nothing follows.
+Promise: only reduced copies are read, so no file is opened again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from splatseed.depth.settings import Settings
+from splatseed.depth.views import Reduced, View
+from splatseed.jit import inline
+
+__all__ = ["Support", "find_support"]
+
+THROUGH = 2.0
+"""Clearly farther: by this many tolerances, as both depths have errors."""
+
+SAYS_NOTHING, CONFIRMS, LOOKS_THROUGH = range(3)
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """What other views say of a view's candidates.
+
+    Args:
+        agreeing: How many confirm each, uint8 [C].
+        seen_through: Which some view looks through, bool [C].
+    """
+
+    agreeing: UInt8[np.ndarray, " C"]
+    seen_through: Bool[np.ndarray, " C"]
+
+
+def find_support(view: View, neighbors: Sequence[View], settings: Settings) -> Support:
+    """Ask the neighbours about a view's candidates."""
+    agreeing = np.zeros(len(view.xyz), np.uint8)
+    seen_through = np.zeros(len(view.xyz), np.bool_)
+    if view.reduced is None:
+        return Support(agreeing, seen_through)
+    limit = np.inf if settings.color_tolerance is None else 3 * 255 * settings.color_tolerance
+    rgb = np.empty((len(view.xyz), 3), np.uint8)
+    _own_colors(view.xyz, *_arrays(view.reduced)[1:], rgb)
+    for neighbor in neighbors:
+        if neighbor.reduced is not None:
+            arrays = _arrays(neighbor.reduced)
+            _ask(view.xyz, rgb, *arrays, settings.tolerance, limit, agreeing, seen_through)
+    return Support(agreeing, seen_through)
+
+
+def _arrays(reduced: Reduced) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    return reduced.z, reduced.grid_from_world, reduced.rgb, reduced.rgb_from_grid
+
+
+@inline
+def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[no-untyped-def]
+    """The colours of a view's own reduced photograph at its candidates: as smooth as the others'."""
+    for k in range(len(xyz)):
+        column, row, _ = _project(xyz[k], grid_from_world)
+        p, q = _block(column, row, rgb_from_grid, rgb.shape)
+        for channel in range(3):
+            out[k, channel] = rgb[p, q, channel]
+
+
+@inline
+def _ask(  # type: ignore[no-untyped-def]
+    xyz, own, z, grid_from_world, rgb, rgb_from_grid, tolerance, limit, agreeing, seen_through
+):
+    """One neighbour's word on all candidates, added to what is known of them."""
+    height, width = z.shape
+    for k in range(len(xyz)):
+        column, row, depth = _project(xyz[k], grid_from_world)
+        if depth > 0.0 and -0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5:
+            verdict = _compare(z, column, row, depth, tolerance)
+            if verdict == LOOKS_THROUGH:
+                seen_through[k] = True
+            elif verdict == CONFIRMS:
+                p, q = _block(column, row, rgb_from_grid, rgb.shape)
+                agreeing[k] += _color_error(own[k], rgb[p, q]) <= limit
+
+
+@inline
+def _compare(z, column, row, depth, tolerance):  # type: ignore[no-untyped-def]
+    """What the map of a view says of a depth at a place of its grid."""
+    x0 = min(max(int(np.floor(column)), 0), max(z.shape[1] - 2, 0))
+    y0 = min(max(int(np.floor(row)), 0), max(z.shape[0] - 2, 0))
+    x1, y1 = min(x0 + 1, z.shape[1] - 1), min(y0 + 1, z.shape[0] - 1)
+    a, b, c, d = z[y0, x0], z[y0, x1], z[y1, x0], z[y1, x1]
+    error = min(_distance(a, depth), _distance(b, depth), _distance(c, depth), _distance(d, depth))
+    if a > 0 and b > 0 and c > 0 and d > 0:  # else some are unknown, and any may confirm
+        nearest, farthest = min(a, b, c, d), max(a, b, c, d)
+        if nearest > depth * (1.0 + THROUGH * tolerance):
+            return LOOKS_THROUGH
+        if farthest - nearest <= THROUGH * tolerance * depth:  # one surface, not two
+            s, t = min(max(column - x0, 0.0), 1.0), min(max(row - y0, 0.0), 1.0)
+            between = (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)
+            error = abs(between - depth)
+    return CONFIRMS if error <= tolerance * depth else SAYS_NOTHING
+
+
+@inline
+def _distance(known, depth):  # type: ignore[no-untyped-def]
+    """Between two depths; infinite where one is unknown."""
+    return abs(known - depth) if known > 0 else np.inf
+
+
+@inline
+def _project(point, m):  # type: ignore[no-untyped-def]
+    """Column, row and depth of a world point on a grid; it is behind the camera if depth <= 0."""
+    x, y, z = np.float64(point[0]), np.float64(point[1]), np.float64(point[2])
+    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
+    row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+    return column, row, depth
+
+
+@inline
+def _block(column, row, rgb_from_grid, shape):  # type: ignore[no-untyped-def]
+    """Row and column of the reduced photograph at a place of the grid."""
+    p = int(np.floor(row * rgb_from_grid[1, 0] + rgb_from_grid[1, 1]))
+    q = int(np.floor(column * rgb_from_grid[0, 0] + rgb_from_grid[0, 1]))
+    return min(max(p, 0), shape[0] - 1), min(max(q, 0), shape[1] - 1)
+
+
+@inline
+def _color_error(first, second):  # type: ignore[no-untyped-def]
+    """Sum of the channels' differences."""
+    total = np.int64(0)
+    for channel in range(3):
+        total += abs(np.int64(first[channel]) - np.int64(second[channel]))
+    return total

@@ -1,0 +1,190 @@
+"""Which pixels of a map to lift: known ones, away from jumps in depth, where SfM found little.
+
+Notation: a map is H x W; ``cells`` are squares of ``step`` pixels with a weight each; a pixel's number is
+row * W + column. w = 1 / depth, which is linear in the image on a plane at any slant, so that
+w(-k) + w(+k) = 2 w(0) there and a jump shows as what is left of it. Promise: no pixel is drawn twice;
+as many are drawn as are asked for, or all there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+from scipy.ndimage import distance_transform_edt
+
+from splatseed.depth.settings import Settings
+from splatseed.jit import inline
+
+__all__ = ["Drawn", "draw_pixels"]
+
+CELLS = 128
+"""Cells along the longer side of a map, at most."""
+
+ROUNDS = 4
+LEAST_DISTANCE = 0.5
+"""Of a cell that has points, in cells: it is not closed to new ones."""
+
+SURPLUS = 1.3
+"""More is drawn than is missing, for some will be unknown or near a jump."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """Pixels of one map.
+
+    Args:
+        pixel: Their numbers, int64 [C].
+        edge: Which lie near a jump of depth, bool [C]: taken only when nothing else is left.
+    """
+
+    pixel: Int64[np.ndarray, " C"]
+    edge: Bool[np.ndarray, " C"]
+
+
+def draw_pixels(
+    values: Float32[np.ndarray, "H W"],
+    num: int,
+    points: Float64[np.ndarray, "M 2"],
+    settings: Settings,
+    rng: np.random.Generator,
+) -> Drawn:
+    """Draw ``num`` distinct pixels with depth, fewer if there are not so many.
+
+    Args:
+        values: The map: positive where known, else NaN.
+        num: How many.
+        points: Where SfM points are, in pixels of the map.
+        settings: Region, placement and edges.
+        rng: Draws them.
+    """
+    box = _region(values.shape, settings.region)
+    step = -(-max(values.shape) // CELLS)
+    weight = _cell_weights(values.shape, step, points, settings)
+    cumulative = np.cumsum(weight, dtype=np.float64)
+    taken = np.zeros(values.shape, np.bool_)
+    edges = _edges(settings)
+    pixel = np.empty(0, np.int64)
+    for _ in range(ROUNDS):
+        missing = num - len(pixel)
+        if missing <= 0:
+            break
+        picks = _picks(int(SURPLUS * missing) + 1, settings.placement, rng) * cumulative[-1]
+        jitter = rng.random((len(picks), 2), dtype=np.float32)
+        part = np.empty(len(picks), np.int64)
+        found = _draw(
+            values, taken, cumulative, weight.shape[1], step, box, picks, jitter, *edges, part
+        )
+        pixel = np.concatenate([pixel, part[:found]])
+    if len(pixel) > num:
+        pixel = np.sort(rng.choice(pixel, num, replace=False, shuffle=False))
+    if len(pixel) < num:
+        return _with_rest(values, pixel, num, box, edges, rng)
+    return Drawn(pixel, np.zeros(len(pixel), np.bool_))
+
+
+def _region(shape: tuple[int, int], share: float) -> tuple[int, int, int, int]:
+    """Top, left, bottom and right of the central share of each dimension, in pixels."""
+    top, left = (round(0.5 * (1.0 - share) * size) for size in shape)
+    return top, left, shape[0] - top, shape[1] - left
+
+
+def _edges(settings: Settings) -> tuple[int, float]:
+    """Radius and tolerance of the test for jumps; radius 0 passes all."""
+    if settings.edge_tolerance is None:
+        return 0, np.inf
+    return settings.edge_radius, settings.edge_tolerance
+
+
+def _cell_weights(
+    shape: tuple[int, int], step: int, points: Float64[np.ndarray, "M 2"], settings: Settings
+) -> Float64[np.ndarray, "R C"]:
+    """Weight of every cell: its distance to the nearest that has an SfM point, or 1."""
+    rows, columns = -(-shape[0] // step), -(-shape[1] // step)
+    if settings.placement == "uniform" or not len(points):
+        return np.ones((rows, columns))
+    empty = np.ones((rows, columns), bool)
+    column, row = (points // step).astype(np.int64).T
+    empty[row, column] = False
+    return np.asarray(np.maximum(distance_transform_edt(empty), LEAST_DISTANCE))
+
+
+def _picks(num: int, placement: str, rng: np.random.Generator) -> Float64[np.ndarray, " num"]:
+    """Ascending numbers of [0, 1): independent ones, or one in each of ``num`` equal parts."""
+    if placement == "uniform":
+        return np.sort(rng.random(num))
+    return (np.arange(num) + rng.random(num)) / num
+
+
+def _with_rest(
+    values: Float32[np.ndarray, "H W"],
+    pixel: Int64[np.ndarray, " C"],
+    num: int,
+    box: tuple[int, int, int, int],
+    edges: tuple[int, float],
+    rng: np.random.Generator,
+) -> Drawn:
+    """The drawn pixels and as many others as are missing, whatever their weight."""
+    top, left, bottom, right = box
+    free = np.zeros(values.shape, bool)
+    free[top:bottom, left:right] = values[top:bottom, left:right] > 0
+    free.ravel()[pixel] = False
+    rest = np.flatnonzero(free)
+    missing = num - len(pixel)
+    if missing < len(rest):
+        rest = rng.choice(rest, missing, replace=False, shuffle=False)
+    pixel = np.sort(np.concatenate([pixel, rest]))
+    edge = np.empty(len(pixel), np.bool_)
+    _mark_edges(values, pixel, *edges, edge)
+    return Drawn(pixel, edge)
+
+
+@inline
+def _draw(values, taken, cumulative, columns, step, box, picks, jitter, radius, tolerance, out):  # type: ignore[no-untyped-def]
+    """Pixels in the cells that ascending ``picks`` fall into; returns how many of them will do."""
+    top, left, bottom, right = box
+    cell, found = 0, 0
+    for k in range(len(picks)):
+        while cell < len(cumulative) - 1 and cumulative[cell] <= picks[k]:
+            cell += 1
+        row = cell // columns * step + int(jitter[k, 0] * step)
+        column = cell % columns * step + int(jitter[k, 1] * step)
+        if row < top or row >= bottom or column < left or column >= right:
+            continue
+        if taken[row, column] or not values[row, column] > 0:
+            continue
+        taken[row, column] = True
+        if radius == 0 or not _near_edge(values, row, column, radius, tolerance):
+            out[found] = row * values.shape[1] + column
+            found += 1
+    return found
+
+
+@inline
+def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyped-def]
+    """Which of the pixels lie near a jump of depth."""
+    width = values.shape[1]
+    for k in range(len(pixel)):
+        row, column = pixel[k] // width, pixel[k] % width
+        out[k] = radius > 0 and _near_edge(values, row, column, radius, tolerance)
+
+
+@inline
+def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyped-def]
+    """Whether 1 / depth bends within ``radius``, across, down or diagonally, or is mostly unknown."""
+    height, width = values.shape
+    here = 2.0 / values[row, column]
+    known, pairs = 0, 0
+    for k in range(1, radius + 1):
+        for dy, dx in ((0, k), (k, 0), (k, k), (k, -k)):
+            y0, x0, y1, x1 = row - dy, column - dx, row + dy, column + dx
+            if y0 < 0 or y1 >= height or min(x0, x1) < 0 or max(x0, x1) >= width:
+                continue
+            pairs += 1
+            before, after = values[y0, x0], values[y1, x1]
+            if before > 0 and after > 0:
+                known += 1
+                if abs(1.0 / before + 1.0 / after - here) > 0.5 * tolerance * here:
+                    return True
+    return 2 * known < pairs

@@ -1,0 +1,212 @@
+"""Depth-guided lifting, from the images of a scene to new points.
+
+Notation: every image gives *candidates*; a candidate is *sound* if enough views confirm it, none looks
+through it, and no jump of depth is near. Promise: exactly the number asked for, or one error that says
+how many there can be; sound candidates first, then those that too few views confirm, then those near
+jumps, and none that a view looks through (unless that is allowed). A note says when it came to that.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from splatseed.depth.alignment import reject_outliers
+from splatseed.depth.candidates import NEAR_EDGE, UNCONFIRMED, choose, gather
+from splatseed.depth.settings import Settings
+from splatseed.depth.sightings import find_sightings
+from splatseed.depth.views import Reader, View
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.pointcloud import ORIGINAL
+from splatseed.progress import Progress, in_threads, silent
+from splatseed.scene import Image, Scene
+
+__all__ = ["Lifted", "lift"]
+
+OVERSAMPLING = 2.0
+"""Candidates a new point, where views are compared or points spread."""
+MAX_OVERSAMPLING = 16.0
+"""Candidates a new point, at most; a round of reading multiplies them by up to ``MAX_GROWTH``."""
+MAX_GROWTH = 8.0
+SURPLUS = 1.25
+"""More candidates than seem to be needed, lest another round be."""
+NAMED = 3
+"""Images that a note names."""
+
+
+class Lifted(NamedTuple):
+    """New points, and what is to be said of them."""
+
+    xyz: Float32[np.ndarray, "M 3"]
+    """World positions, float32 [M, 3], image after image."""
+    rgb: UInt8[np.ndarray, "M 3"]
+    """Colours, uint8 [M, 3]."""
+    notes: tuple[str, ...]
+    """What was left out or made do with, one sentence each."""
+
+
+def lift(
+    scene: Scene,
+    num: int,
+    settings: Settings,
+    rng: np.random.Generator,
+    progress: Progress = silent,
+) -> Lifted:
+    """Lift ``num`` pixels of a scene's images into its world.
+
+    Each image and its map are read once; again only if too few of the candidates are sound.
+
+    Args:
+        scene: A scene with images in a folder, and depth maps.
+        num: How many points.
+        settings: The method's choices.
+        rng: The source of all random numbers.
+        progress: Told how far reading, checking and choosing are.
+
+    Raises:
+        SceneNotFoundError: There are no maps or no photographs, or a file is gone.
+        SceneFormatError: A file is damaged or does not fit, or no map can be aligned.
+        PointCloudError: The maps cannot give so many points.
+    """
+    images = _images_with_maps(scene, settings.hold_out)
+    reader = _reader(scene, settings)
+    factor = OVERSAMPLING if settings.compares_views or settings.spread else SURPLUS
+    views = _read_all(reader, images, factor * num, rng, progress)
+    notes = _missing_notes(scene, len(images), settings.hold_out)
+    images, views, more = _leave_out(images, views, settings.max_residual_ratio)
+    candidates = gather(views, settings, progress)
+    while candidates.num_sound < num and factor < MAX_OVERSAMPLING and not _exhausted(views):
+        growth = SURPLUS * num / max(candidates.num_sound, 1)
+        factor = min(factor * min(growth, MAX_GROWTH), MAX_OVERSAMPLING)
+        views = _read_all(reader, images, factor * num, rng, progress)
+        candidates = gather(views, settings, progress)
+    chosen = choose(candidates, _originals(scene), num, settings, rng, progress)
+    notes = (*notes, *more, *_relaxed_notes(candidates.tier[chosen], settings))
+    return Lifted(candidates.xyz[chosen], candidates.rgb[chosen], notes)
+
+
+def _images_with_maps(scene: Scene, hold_out: int) -> list[Image]:
+    """The images to lift from, in the order of the scene."""
+    depths = scene.depths
+    used = set(_sources(scene, hold_out))
+    images = [image for image in scene.images if image.name in used]
+    if depths is None or not images:
+        raise SceneNotFoundError(
+            "a scene with depth maps of its images",
+            found=f"{len(scene.images)} images, and maps of none of them",
+            fix="Name the folder with the maps: --depth DIR.",
+        )
+    return images
+
+
+def _sources(scene: Scene, hold_out: int) -> list[str]:
+    """Names of the images that have a map and are not held out."""
+    names = sorted({image.name for image in scene.images})
+    held = set(names[::hold_out]) if hold_out else set()
+    return [n for n in names if n not in held and scene.depths is not None and n in scene.depths]
+
+
+def _reader(scene: Scene, settings: Settings) -> Reader:
+    folder = scene.source.image_dir if scene.source else None
+    if folder is None or scene.depths is None:
+        raise SceneNotFoundError(
+            "a folder with the scene's photographs, from which points take their colours",
+            found="none",
+            fix="Put them beside the model in a folder named images.",
+        )
+    return Reader(folder, scene.depths, find_sightings(scene), settings)
+
+
+def _read_all(
+    reader: Reader,
+    images: Sequence[Image],
+    num: float,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> list[View]:
+    """The views of all images, which share the number of candidates equally."""
+    per_image = math.ceil(num / len(images))
+    seeds = rng.integers(0, 1 << 63, len(images))
+    views: list[View | None] = [None] * len(images)
+
+    def work(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            views[i] = reader.read(images[i], per_image, np.random.default_rng(seeds[i]))
+
+    in_threads(work, len(images), 1, "read images", progress)
+    return [view for view in views if view is not None]
+
+
+def _leave_out(
+    images: Sequence[Image], views: Sequence[View], max_ratio: float | None
+) -> tuple[list[Image], list[View], tuple[str, ...]]:
+    """The images and views whose maps are aligned, and what to say of the others.
+
+    Raises:
+        SceneFormatError: No map is.
+    """
+    alignments = reject_outliers(
+        {image.name: view.alignment for image, view in zip(images, views, strict=True)}, max_ratio
+    )
+    reasons = {name: a.rejected for name, a in alignments.items() if a.rejected is not None}
+    if len(reasons) == len(alignments):
+        name, reason = next(iter(reasons.items()))
+        raise SceneFormatError(
+            "depth maps that fit the SfM points of their images",
+            found=f"none among {len(images)}; {name}: {reason}",
+            fix="Look at them with splatseed info SCENE --depth DIR; check --depth-kind and "
+            "--depth-scale.",
+        )
+    used = [
+        (image, view)
+        for image, view in zip(images, views, strict=True)
+        if image.name not in reasons
+    ]
+    return (
+        [image for image, _ in used],
+        [view for _, view in used],
+        _left_out_notes(reasons, images),
+    )
+
+
+def _left_out_notes(reasons: Mapping[str, str], images: Sequence[Image]) -> tuple[str, ...]:
+    if not reasons:
+        return ()
+    named = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:NAMED])
+    more = ", ..." if len(reasons) > NAMED else ""
+    return (f"{len(reasons)} of {len(images)} depth maps are left out ({named}{more}).",)
+
+
+def _missing_notes(scene: Scene, num_used: int, hold_out: int) -> tuple[str, ...]:
+    names = sorted({image.name for image in scene.images})
+    expected = len(names) - (len(names[::hold_out]) if hold_out else 0)
+    if num_used >= expected:
+        return ()
+    return (f"{expected - num_used} of {expected} images have no depth map and give no points.",)
+
+
+def _exhausted(views: Sequence[View]) -> bool:
+    return all(view.exhausted for view in views)
+
+
+def _originals(scene: Scene) -> Float32[np.ndarray, "N 3"]:
+    points = scene.points
+    return np.asarray(points.xyz[(points.source == ORIGINAL) & points.finite])
+
+
+def _relaxed_notes(tier: UInt8[np.ndarray, " M"], settings: Settings) -> tuple[str, ...]:
+    """What had to be made do with."""
+    unconfirmed, edge = (int(np.count_nonzero(tier == t)) for t in (UNCONFIRMED, NEAR_EDGE))
+    notes = []
+    if unconfirmed:
+        notes.append(
+            f"{unconfirmed:,} of {len(tier):,} new points are confirmed by fewer than "
+            f"{settings.min_agreeing} other views: there are no more that are."
+        )
+    if edge:
+        notes.append(f"{edge:,} of {len(tier):,} new points lie near jumps of depth.")
+    return tuple(notes)

@@ -1,0 +1,54 @@
+"""How pixels are lifted: every choice of the method, each of which can be turned off.
+
+A ``Settings`` is the method's parameters; the flags of the command line are its fields.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+__all__ = ["Settings"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The choices of depth-guided lifting; the defaults treat the traps of the paper's text."""
+
+    align: bool = True
+    """Fit the scale (for inverse depth, and shift) of each map to the SfM points."""
+    fit: Literal["robust", "least-squares"] = "robust"
+    """How: medians and reweighting, or the paper's equation 7 (paper: least-squares)."""
+    min_points: int = 20
+    """SfM points an image must see, or it is left out (paper: 1)."""
+    max_residual_ratio: float | None = 3.0
+    """Leave out images that fit this many times worse than the median one (paper: none)."""
+    unit_ray: bool = False
+    """Take z for the distance along the ray, as equation 9 says; this bends walls (paper: yes)."""
+    region: float = 1.0
+    """Central share of the width, and of the height, that pixels are drawn from (paper: 0.5)."""
+    placement: Literal["empty", "uniform"] = "empty"
+    """Draw pixels by their distance to the nearest SfM point, or all alike (paper: uniform)."""
+    edge_tolerance: float | None = 0.03
+    """Avoid pixels near jumps of depth by more than this share of it (paper: none)."""
+    edge_radius: int = 3
+    """How near, in pixels of the map."""
+    min_agreeing: int = 2
+    """Other views whose depth and colour must confirm a point; 0 = none (paper: 0)."""
+    see_through: bool = False
+    """Keep points that another view looks through (paper: yes)."""
+    num_neighbors: int = 8
+    """Other views that are asked, at most."""
+    tolerance: float = 0.02
+    """Relative difference at which two depths agree."""
+    color_tolerance: float | None = 0.15
+    """Mean difference of a colour, 0 to 1, at which two views agree; none = not compared."""
+    spread: bool = True
+    """Take points as evenly apart as their number allows, whatever image they are from (paper: no)."""
+    hold_out: int = 0
+    """Leave out every so many-th image by name, as trainers do for the test (8); 0 = use all."""
+
+    @property
+    def compares_views(self) -> bool:
+        """Whether points are held against other views at all."""
+        return self.min_agreeing > 0 or not self.see_through

@@ -1,0 +1,193 @@
+"""A given number of points out of many candidates, as far apart as that number allows.
+
+Notation: space is cut into cubes of one *side*; the key of a cube is its place, three numbers of 21 bits,
+scrambled so that any bits of it are as good as random ones. Promise: one candidate at most is taken of each cube, that of
+the finest footprint, and none where an original lies; the side is the largest that gives the number, to
+about a hundredth; the result does not depend on threads.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from splatseed.jit import inline, kernel, parallel_range
+
+__all__ = ["spread_points"]
+
+BUCKETS = 16
+"""Parts of the hash's range, worked on in parallel."""
+SAMPLED = 2
+"""Parts that are looked at to find the side; all of them if there are few candidates."""
+FEW = 1 << 16
+STEPS = 24
+SLACK = 0.01
+EMPTY, BLOCKED = -1, -2
+"""What a slot holds in place of a candidate."""
+BITS = 21
+OUTSIDE = 2.0**20 + 2
+FINEST = 2.0**-20
+"""The smallest side, as a share of the candidates' extent: places fit into the bits."""
+
+
+def spread_points(
+    xyz: Float32[np.ndarray, "C 3"],
+    footprint: Float32[np.ndarray, " C"],
+    originals: Float32[np.ndarray, "N 3"],
+    num: int,
+    rng: np.random.Generator,
+) -> Int64[np.ndarray, " num"]:
+    """Choose ``num`` of the candidates, ascending indices [num].
+
+    Args:
+        xyz: The candidates, at least ``num``.
+        footprint: Size of a pixel at each: the finer is the better of two.
+        originals: Points that are there already.
+        num: How many.
+        rng: Draws which of a few too many are dropped, and fills up where candidates coincide.
+    """
+    cubes = _Cubes(xyz, footprint, originals)
+    side = _largest_side(cubes, num)
+    taken = cubes.take(side)
+    if np.count_nonzero(taken) < num:  # the estimate was a little too large
+        taken = cubes.take(side * (1.0 - 2 * SLACK))
+    chosen = np.flatnonzero(taken)
+    if len(chosen) < num:
+        rest = rng.choice(np.flatnonzero(~taken), num - len(chosen), replace=False)
+        return np.sort(np.concatenate([chosen, rest]))
+    return np.sort(rng.choice(chosen, num, replace=False, shuffle=False))
+
+
+def _largest_side(cubes: _Cubes, num: int) -> float:
+    """The largest side at which about ``num`` cubes hold a candidate."""
+    extent = cubes.extent
+    least, most = FINEST * extent, extent
+    side = extent / math.sqrt(num)
+    for _ in range(STEPS):
+        count = cubes.count(side)
+        if num <= count <= num * (1.0 + SLACK):
+            return side
+        if count > num:
+            least = side
+        else:
+            most = side
+        # Points on surfaces: the number goes with the square of 1 / side.
+        guess = side * math.sqrt(count / (num * (1.0 + 0.5 * SLACK)))
+        side = guess if least < guess < most else math.sqrt(least * most)
+    return least
+
+
+@dataclass(frozen=True, eq=False)
+class _Cubes:
+    """Candidates and originals, to be put into cubes of any side."""
+
+    xyz: Float32[np.ndarray, "C 3"]
+    footprint: Float32[np.ndarray, " C"]
+    originals: Float32[np.ndarray, "N 3"]
+
+    @cached_property
+    def low(self) -> Float64[np.ndarray, " 3"]:
+        """The lower corner of the candidates' bounding box."""
+        return np.asarray(self.xyz.min(axis=0).astype(np.float64))
+
+    @cached_property
+    def extent(self) -> float:
+        """Its longest edge."""
+        return float((self.xyz.max(axis=0) - self.low).max()) or 1.0
+
+    def count(self, side: float) -> float:
+        """Estimate how many cubes hold a candidate and no original."""
+        buckets = BUCKETS if len(self.xyz) < FEW else SAMPLED
+        taken = np.zeros(len(self.xyz), np.bool_)
+        found = self._take(side, buckets, taken)
+        return found * (BUCKETS / buckets)
+
+    def take(self, side: float) -> Bool[np.ndarray, " C"]:
+        """Mark the candidate that each cube gives."""
+        taken = np.zeros(len(self.xyz), np.bool_)
+        self._take(side, BUCKETS, taken)
+        return taken
+
+    def _take(self, side: float, buckets: int, taken: Bool[np.ndarray, " C"]) -> int:
+        keys = np.empty(len(self.xyz), np.uint64)
+        blocked = np.empty(len(self.originals), np.uint64)
+        _find_cubes(self.xyz, self.low, side, keys)
+        _find_cubes(self.originals, self.low, side, blocked)
+        return int(_take_best(keys, blocked, self.footprint, buckets, taken))
+
+
+@kernel
+def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]
+    """The key of each point's cube; those outside of the candidates' box share keys that no other has."""
+    for k in parallel_range(len(xyz)):
+        key = np.uint64(0)
+        for axis in range(3):
+            place = np.floor((np.float64(xyz[k, axis]) - low[axis]) / side)
+            inside = min(max(place, -1.0), OUTSIDE)
+            key = (key << np.uint64(BITS)) | np.uint64(inside + 1.0)
+        out[k] = _mix(key)
+
+
+@inline
+def _mix(x):  # type: ignore[no-untyped-def]
+    """Scramble, one to one: the finaliser of splitmix64 (Steele, Lea and Flood, 2014)."""
+    x += np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+@kernel
+def _take_best(keys, blocked, footprint, buckets, taken):  # type: ignore[no-untyped-def]
+    """Mark the finest candidate of every cube in some buckets; returns how many there are."""
+    found = np.zeros(buckets, np.int64)
+    for b in parallel_range(buckets):
+        found[b] = _take_bucket(np.uint64(b), keys, blocked, footprint, taken)
+    return found.sum()
+
+
+@inline
+def _take_bucket(bucket, keys, blocked, footprint, taken):  # type: ignore[no-untyped-def]
+    """One bucket, by a hash table with open addressing; the earlier of equals wins."""
+    shift = np.uint64(60)  # the top 4 bits: BUCKETS is 16
+    size = 0
+    for key in keys:
+        size += key >> shift == bucket
+    for key in blocked:
+        size += key >> shift == bucket
+    slots = 16
+    while slots < 2 * size:
+        slots *= 2
+    table = np.empty(slots, np.uint64)
+    owner = np.full(slots, EMPTY, np.int64)
+    for key in blocked:
+        if key >> shift == bucket:
+            slot = _find(key, table, owner)
+            table[slot], owner[slot] = key, BLOCKED
+    found = 0
+    for k in range(len(keys)):
+        if keys[k] >> shift == bucket:
+            slot = _find(keys[k], table, owner)
+            if owner[slot] == EMPTY:
+                table[slot], owner[slot] = keys[k], k
+                found += 1
+            elif owner[slot] != BLOCKED and footprint[k] < footprint[owner[slot]]:
+                owner[slot] = k
+    for slot in range(slots):
+        if owner[slot] >= 0:
+            taken[owner[slot]] = True
+    return found
+
+
+@inline
+def _find(key, table, owner):  # type: ignore[no-untyped-def]
+    """The slot of a key, or the free one where it belongs."""
+    last = np.uint64(len(table) - 1)
+    slot = key & last
+    while owner[slot] != EMPTY and table[slot] != key:
+        slot = (slot + np.uint64(1)) & last
+    return slot

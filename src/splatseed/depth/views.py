@@ -1,0 +1,219 @@
+"""One image at a time: align its map, draw pixels, lift them, colour them; keep a reduced copy.
+
+Notation: a *view* is what stays of an image once its files are closed: C candidates, and the map and
+the photograph reduced to ``GRID`` pixels at most along the longer side, with which other images'
+candidates are compared. Promise: each file is read once; the candidates depend on the image, the seed
+and the settings alone, not on threads or other images.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+
+from splatseed.camera import CAMERA_MODELS, Camera
+from splatseed.depth.alignment import Alignment, align_map, trust_units
+from splatseed.depth.drawing import draw_pixels
+from splatseed.depth.planar import map_camera, planar_depth
+from splatseed.depth.settings import Settings
+from splatseed.depth.sightings import Sightings
+from splatseed.depthmap import ASPECT_SLACK, DepthMap, DepthMaps
+from splatseed.errors import SceneFormatError
+from splatseed.io.photograph import decode_photograph, photograph_bytes
+from splatseed.scene import Image
+
+if TYPE_CHECKING:
+    from PIL import Image as PilImage
+
+__all__ = ["Reader", "Reduced", "View"]
+
+GRID = 256
+"""Pixels along the longer side of a reduced copy: at most 7 bytes x 256 x 256 an image are kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """An image's depth and colours on a coarse grid.
+
+    Args:
+        z: Planar depth in scene units at the grid's points, float32 [h, w]; NaN where unknown.
+        grid_from_world: World to (column z, row z, z) of the grid, whose points are at whole
+            numbers, float64 [3, 4].
+        rgb: The photograph's means over squares, uint8 [p, q, 3].
+        rgb_from_grid: Factor and offset from columns of the grid to those of ``rgb``, then of rows,
+            float64 [2, 2].
+    """
+
+    z: Float32[np.ndarray, "h w"]
+    grid_from_world: Float64[np.ndarray, "3 4"]
+    rgb: UInt8[np.ndarray, "p q 3"]
+    rgb_from_grid: Float64[np.ndarray, "2 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What stays of an image.
+
+    Args:
+        alignment: Of its map; where it is rejected, all below is empty.
+        center: The camera's position, float64 [3].
+        xyz: Candidates in the world, float32 [C, 3].
+        rgb: Their pixels' colours, uint8 [C, 3].
+        footprint: Size of a pixel at their depth, scene units, float32 [C].
+        edge: Which lie near a jump of depth, bool [C].
+        exhausted: Whether the map has no more pixels to give.
+        reduced: Its coarse copy; None where views are not compared.
+    """
+
+    alignment: Alignment
+    center: Float64[np.ndarray, " 3"]
+    xyz: Float32[np.ndarray, "C 3"]
+    rgb: UInt8[np.ndarray, "C 3"]
+    footprint: Float32[np.ndarray, " C"]
+    edge: Bool[np.ndarray, " C"]
+    exhausted: bool
+    reduced: Reduced | None
+
+
+@dataclass(frozen=True, eq=False)
+class Reader:
+    """Turns images into views.
+
+    Args:
+        folder: Where the photographs are.
+        depths: Their maps.
+        sightings: The SfM points that each image sees.
+        settings: The method's choices.
+    """
+
+    folder: Path
+    depths: DepthMaps
+    sightings: Sightings
+    settings: Settings
+
+    def read(self, image: Image, num: int, rng: np.random.Generator) -> View:
+        """Read an image and its map, and draw ``num`` candidates.
+
+        Raises:
+            SceneNotFoundError: A file is gone.
+            SceneFormatError: A file is damaged or of another shape, or the lens has distortion.
+        """
+        check_lens(image)
+        depth = self.depths.read(image.name)
+        camera = map_camera(depth, image)
+        points = self.sightings.of(image)
+        alignment = self._align(depth, camera, points)
+        if alignment.rejected is not None:
+            return _nothing(alignment, camera)
+        values, scale = planar_depth(
+            depth, camera, alignment.scale, alignment.shift, unit_ray=self.settings.unit_ray
+        )
+        uv = _inside(camera, points)
+        drawn = draw_pixels(values, num, uv, self.settings, rng)
+        row, column = np.divmod(drawn.pixel, camera.width)
+        z = values[row, column] * np.float64(scale)
+        uv = np.stack([column + 0.5, row + 0.5], axis=1)
+        photograph = _Photograph.read(self.folder / image.name, camera)
+        return View(
+            alignment,
+            camera.center,
+            camera.unproject(uv, z).astype(np.float32),
+            photograph.pixels[photograph.rows[row], photograph.columns[column]],
+            (z / camera.K[0, 0]).astype(np.float32),
+            drawn.edge,
+            len(drawn.pixel) < num,
+            _reduce(values, scale, camera, photograph) if self.settings.compares_views else None,
+        )
+
+    def _align(
+        self, depth: DepthMap, camera: Camera, points: Float64[np.ndarray, "M 3"]
+    ) -> Alignment:
+        if not self.settings.align:
+            return trust_units(depth, camera, points)
+        return align_map(depth, camera, points, self.settings.fit, self.settings.min_points)
+
+
+def check_lens(image: Image) -> None:
+    """Refuse a lens with distortion: pixels would be lifted along wrong rays.
+
+    Raises:
+        SceneFormatError: It has some.
+    """
+    lens = image.intrinsics
+    if not lens.is_pinhole and any(lens.params[CAMERA_MODELS[lens.model].num_focal + 2 :]):
+        raise SceneFormatError(
+            "cameras without lens distortion (PINHOLE), along whose rays pixels are lifted",
+            found=f"{lens.model} for {image.name}",
+            fix="Undistort the scene first: colmap image_undistorter, or splatseed sfm.",
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Photograph:
+    """A photograph, and for each row and column of the map the one of its pixels."""
+
+    picture: PilImage.Image
+    pixels: UInt8[np.ndarray, "h w 3"]
+    rows: Int64[np.ndarray, " H"]
+    columns: Int64[np.ndarray, " W"]
+
+    @classmethod
+    def read(cls, path: Path, camera: Camera) -> _Photograph:
+        picture = decode_photograph(path, photograph_bytes(path))
+        scale = np.array([picture.width / camera.width, picture.height / camera.height])
+        if abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
+            raise SceneFormatError(
+                f"{path} to have the shape of its camera and map, {camera.width} x {camera.height}",
+                found=f"{picture.width} x {picture.height}",
+                fix="Use the images that the model was made from, or a resized copy of them.",
+            )
+        columns, rows = (
+            ((np.arange(size) + 0.5) * each).astype(np.int64)
+            for size, each in zip((camera.width, camera.height), scale, strict=True)
+        )
+        return cls(picture, np.asarray(picture), rows, columns)
+
+
+def _inside(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "K 2"]:
+    """Where points fall in the image, those that do, in pixels."""
+    uv, _ = camera.project(xyz)
+    return uv[((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)]
+
+
+def _reduce(
+    values: Float32[np.ndarray, "H W"], scale: float, camera: Camera, photograph: _Photograph
+) -> Reduced:
+    """Every f-th pixel of the map, for means would bridge edges, and the means of the photograph."""
+    factor = -(-max(values.shape) // GRID)
+    first = factor // 2
+    z = values[first::factor, first::factor] * np.float32(scale)
+    grid_from_map = (
+        np.array([[1.0, 0.0, -(first + 0.5)], [0.0, 1.0, -(first + 0.5)], [0.0, 0.0, factor]])
+        / factor
+    )
+    blocks = -(-max(photograph.picture.size) // GRID)
+    block_from_map = np.array(photograph.picture.size) / [camera.width, camera.height] / blocks
+    return Reduced(
+        z,
+        grid_from_map @ camera.K @ camera.cam_from_world[:3],
+        np.asarray(photograph.picture.reduce(blocks)),
+        block_from_map[:, None] * [[factor, first + 0.5]],
+    )
+
+
+def _nothing(alignment: Alignment, camera: Camera) -> View:
+    """The view of an image that is left out."""
+    return View(
+        alignment,
+        camera.center,
+        np.empty((0, 3), np.float32),
+        np.empty((0, 3), np.uint8),
+        np.empty(0, np.float32),
+        np.empty(0, np.bool_),
+        exhausted=True,
+        reduced=None,
+    )

@@ -1,0 +1,89 @@
+"""Depth-guided lifting (paper, eqs. 7-9): pixels become points where a map says how far they are.
+
+P = c + z v, with c the camera's centre, v the ray through the pixel's centre and z its depth, scaled to the
+scene by the SfM points of the image. The work is done in ``splatseed.depth``; here are the method's
+parameters and their limits. Promise: every new point is the centre of a pixel of a map, at its depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+
+from splatseed.depth.settings import Settings
+from splatseed.errors import SceneNotFoundError
+from splatseed.progress import Progress
+from splatseed.upsample.method import NewPoints, check_fields, require
+from splatseed.upsample.neighbors import PreparedCloud
+
+__all__ = ["Depth"]
+
+MAX_VIEWS = 255
+
+
+@dataclass(frozen=True)
+class Depth(Settings):
+    """Pixels lifted by depth maps (eqs. 7-9), which fills what has no texture."""
+
+    name: ClassVar[str] = "depth"
+    needs_depth: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        require(self.min_points >= 1, "depth.min_points of at least 1", self.min_points)
+        require(0 < self.region <= 1, "depth.region above 0, 1 at most", self.region)
+        ratio = self.max_residual_ratio
+        require(ratio is None or ratio >= 1, "depth.max_residual_ratio of at least 1", ratio)
+        edge = self.edge_tolerance
+        require(edge is None or edge > 0, "depth.edge_tolerance above 0", edge)
+        require(1 <= self.edge_radius <= 100, "depth.edge_radius from 1 to 100", self.edge_radius)
+        views = self.num_neighbors
+        require(1 <= views <= MAX_VIEWS, f"depth.num_neighbors from 1 to {MAX_VIEWS}", views)
+        agreeing = self.min_agreeing
+        require(0 <= agreeing <= views, f"depth.min_agreeing from 0 to {views}", agreeing)
+        require(0 < self.tolerance < 1, "depth.tolerance between 0 and 1", self.tolerance)
+        color = self.color_tolerance
+        require(color is None or 0 < color <= 1, "depth.color_tolerance above 0, 1 at most", color)
+        require(
+            self.hold_out != 1 and self.hold_out >= 0,
+            "depth.hold_out of 0 or 2 and more",
+            self.hold_out,
+        )
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether there must be originals: maps in scene units need none."""
+        return self.align
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The parameters that follow the paper to the letter."""
+        return cls(
+            fit="least-squares",
+            min_points=1,
+            max_residual_ratio=None,
+            unit_ray=True,
+            region=0.5,
+            placement="uniform",
+            edge_tolerance=None,
+            min_agreeing=0,
+            see_through=True,
+            color_tolerance=None,
+            spread=False,
+        )
+
+    def __call__(
+        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+    ) -> NewPoints:
+        """Lift ``num_new`` pixels."""
+        from splatseed.depth.lifting import lift  # noqa: PLC0415  (its kernels load with its use)
+
+        if cloud.scene is None:
+            raise SceneNotFoundError(
+                "a scene with images and depth maps for the method depth",
+                found="a cloud of points alone",
+                fix="Load the scene, and name its maps with --depth DIR.",
+            )
+        return NewPoints(*lift(cloud.scene, num_new, self, rng, progress))
