@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -182,6 +183,16 @@ def test_triangulate_repeats_itself_and_undistorts(
     assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
     for name in files_below(first) - {"splatseed.json"}:
         assert (first / name).read_bytes() == (second / name).read_bytes(), name
+
+
+def test_a_known_lens_is_believed(posed: Scene, photos: Path, tmp_path: Path) -> None:
+    """Coefficients above 1, as a Kinect's, which COLMAP takes for a calibration gone wrong."""
+    cancel = (0.0, 0.0, 0.0, 0.0, 1.2, 0.0, 0.0, 1.2)  # the rational model's k3 = k6
+    lens = Intrinsics(7, "FULL_OPENCV", WIDTH, HEIGHT, (*PINHOLE.params, *cancel))
+    images = tuple(replace(image, intrinsics=lens) for image in posed.images)
+    report = triangulate(photos, posed.replace(images=images), tmp_path / "scene")
+    assert report.num_points > 100
+    assert report.mean_reprojection_error < 1
 
 
 def test_fewer_than_half_registered_is_an_error_that_names_them(

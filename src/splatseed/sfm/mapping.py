@@ -5,6 +5,7 @@ Both functions return the folder of a COLMAP model in the run's scratch folder.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,7 @@ def triangulate_points(
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = run.settings.threads
     options.random_seed = run.settings.seed
+    options.max_extra_param = math.inf  # a known lens is believed: Kinects have a k3 above 1
     model_dir = run.work / "model"
     model_dir.mkdir()
     posed = _posed_model(pycolmap, cameras, images, poses)
