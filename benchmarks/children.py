@@ -1,0 +1,80 @@
+"""A measurement in a process of its own.
+
+Promise: the child has the number of threads asked for from its first import on, in Numba, PyTorch and
+BLAS alike; idle threads sleep, as they do under the command line; nothing of the parent's caches,
+memory or settings is in what it measures.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from splatseed.errors import SplatseedError
+
+__all__ = ["avx2_environment", "call"]
+
+THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+AVX2 = {"NUMBA_CPU_NAME": "x86-64-v3", "ATEN_CPU_CAPABILITY": "avx2"}
+
+
+class ChildError(SplatseedError):
+    """A child process failed."""
+
+
+def call(
+    function: str, *, threads: int, environment: Mapping[str, str] | None = None, **arguments: Any
+) -> Any:
+    """What a function of a module beside this file returns in a fresh process.
+
+    Args:
+        function: ``module:name``; it takes and returns what JSON can hold.
+        threads: How many it may use.
+        environment: Further variables.
+        arguments: Its arguments.
+
+    Raises:
+        ChildError: It failed; what it wrote to stderr is in the message.
+    """
+    settings = {name: str(threads) for name in THREADS} | {"OMP_WAIT_POLICY": "passive"}
+    done = subprocess.run(
+        [sys.executable, __file__, function, json.dumps(arguments)],
+        env={**os.environ, **settings, **(environment or {})},
+        capture_output=True, check=False, text=True,
+    )  # fmt: skip
+    if done.returncode:
+        raise ChildError(
+            f"{function} to run on {threads} threads", found=done.stderr[-2000:], fix="See there."
+        )
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def avx2_environment() -> dict[str, str] | None:
+    """Variables that have Numba and PyTorch compile for, and use, AVX2; None where that is no less.
+
+    Kernels then go to a cache of their own: Numba keys its cache on the processor's features.
+    """
+    from llvmlite.binding import get_host_cpu_features  # noqa: PLC0415  (asks the processor)
+
+    features = get_host_cpu_features()
+    if not features.get("avx512f") or not features.get("avx2"):
+        return None
+    for name in features:
+        if name.startswith(("avx512", "avx10", "evex512")):
+            features[name] = False
+    return {**AVX2, "NUMBA_CPU_FEATURES": features.flatten()}
+
+
+def _main(function: str, arguments: str) -> None:
+    module, name = function.split(":")
+    result = getattr(importlib.import_module(module), name)(**json.loads(arguments))
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])
