@@ -180,6 +180,12 @@ def test_rgbd_capture_by_the_frames_numbers(tmp_path, name):
     )
 
 
+def test_the_scale_of_a_capture_is_that_of_its_integers(tmp_path):
+    put(tmp_path / "results/depth7.npy", 2)
+    (tmp_path / "cam_params.json").write_text('{"camera": {"scale": 250.0}}')
+    assert find_depths(scene_of("frame7.jpg"), tmp_path).read("frame7.jpg").values[0, 0] == 2
+
+
 def test_7scenes_names(tmp_path):
     put(tmp_path / "frame-000003.depth.png", 1500)
     (tmp_path / "frame-000003.color.png").touch()
@@ -359,7 +365,7 @@ def test_real_captures_need_no_flags(scenes, name, scale, count):
     assert np.isnan(values[raw == 0]).all()
 
 
-def test_manifest_of_a_capture_without_a_scale(tmp_path):
+def test_capture_without_a_scale(tmp_path):
     put(tmp_path / "results/depth0.png", 2000)
     (tmp_path / "cam_params.json").write_text(json.dumps({"camera": {"w": 4}}))
     assert find_depths(scene_of("frame0.jpg"), tmp_path).read("frame0.jpg").values[0, 0] == 2

@@ -94,6 +94,20 @@ def test_missing_files(capture: Path) -> None:
         (capture / "elsewhere").rename(capture / name)
 
 
+def test_depth_of_the_frames_comes_along(capture: Path) -> None:
+    for number, value in (("000001", 500), ("02", 1000), ("11", 2000)):
+        picture = PilImage.new("I;16", (40, 30), value)
+        picture.save(capture / "results" / f"depth{number}.png")
+    depths = load_rgbd(capture).depths
+    assert depths is not None
+    assert list(depths) == ["frame000001.png", "frame2.jpg"]
+    assert np.unique(depths.read("frame000001.png").values).tolist() == [0.5]
+    assert np.unique(depths.read("frame2.jpg").values).tolist() == [1.0]
+    for path in (capture / "results").glob("depth*.png"):
+        path.unlink()
+    assert load_rgbd(capture).depths is None
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -137,6 +151,7 @@ def test_mirrored_pose_is_refused(capture: Path) -> None:
         json.dumps({"camera": CAMERA | {"fx": 0}}),
         json.dumps({"camera": CAMERA | {"w": float("inf")}}),
         json.dumps({"camera": CAMERA | {"cx": float("nan")}}),
+        json.dumps({"camera": CAMERA | {"scale": 0}}),
     ],
 )
 def test_bad_camera_files(capture: Path, text: str) -> None:

@@ -91,6 +91,21 @@ def test_camera_of_the_series(capture):
     assert "focal length 525" in scene.warnings[0]
 
 
+@pytest.mark.parametrize("name", ["afr1", "freiburg12", "france1", "freiburg"])
+def test_no_series_in_the_name(capture, name):
+    assert load_tum(capture.rename(capture.with_name(name))).intrinsics[0].params[0] == 525
+
+
+def test_the_folder_of_depth_images_leads_to_its_capture(capture):
+    scene = load_tum(capture)
+    depths = find_depths(scene, capture / "depth")
+    assert depths.paths == {n: p.resolve() for n, p in scene.depths.paths.items()}
+    assert depths.scale == 5000
+    np.save(capture / "depth" / f"{START:.6f}.npy", np.ones((3, 4)))  # the user's own go first
+    assert list(find_depths(scene, capture / "depth")) == [f"{START:.6f}.png"]
+    assert find_depths(scene, capture / "depth").scale is None
+
+
 @pytest.mark.parametrize("where", [".", ".."])
 def test_camera_file_goes_first(capture, where):
     camera = {"w": 640, "h": 480, "fx": 500, "fy": 510, "cx": 319.5, "cy": 239.5, "scale": 1000}

@@ -90,7 +90,8 @@ def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
     for folder in (root / name for name in _FOLDERS):
         if folder.is_dir() and (paths := _match(scene, folder)):
             return DepthFiles(paths, *_describe(folder, next(iter(paths.values()))))
-    return None
+    capture = root.resolve().parent  # the folder of depth images alone was named
+    return find_tum_depths(scene, capture) if is_tum(capture) else None
 
 
 def _check_options(kind: DepthKind | None, scale: float | None) -> None:
@@ -199,7 +200,7 @@ def _describe(folder: Path, example: Path) -> DepthDescription:
     """What the folder says of its maps: ``depths.json``, or the camera file of a capture."""
     if (folder / DESCRIPTION).is_file():
         return read_description(folder / DESCRIPTION)
-    if _CAPTURED.fullmatch(example.stem):
+    if _CAPTURED.fullmatch(example.stem) and example.suffix.lower() == ".png":
         for parent in (folder, *folder.resolve().parents[:2]):
             if (parent / CAMERA_FILE).is_file():
                 return DepthDescription(scale=read_capture_scale(parent / CAMERA_FILE))

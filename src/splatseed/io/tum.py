@@ -34,7 +34,7 @@ DEPTH_SCALE = 5000.0
 """Stored units per metre."""
 
 _SIZE = (640, 480)
-_SERIES = re.compile(r"(?:freiburg|fr)_?([123])(?!\d)", re.IGNORECASE)
+_SERIES = re.compile(r"(?:freiburg|(?<![a-z])fr)_?([123])(?!\d)", re.IGNORECASE)
 _COLOR_CAMERAS: dict[str, tuple[float, ...]] = {
     "1": (517.3, 516.5, 318.6, 255.3, 0.2624, -0.9531, -0.0054, 0.0026, 1.1633),
     "2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
