@@ -26,6 +26,8 @@ from splatseed.viewpoint import choose_camera, choose_image
 __all__ = [
     "Tile",
     "choose_camera",
+    "color_bar",
+    "heat",
     "preview_errors",
     "preview_methods",
     "preview_pair",
@@ -203,14 +205,14 @@ def preview_errors(
         PointCloudError: Distances and points differ in number.
     """
     colored = {
-        label: cloud.replace(rgb=_heat(_matching(distances[label], cloud, label) / limit))
+        label: cloud.replace(rgb=heat(_matching(distances[label], cloud, label) / limit))
         for label, cloud in clouds.items()
     }
     tiles = [
         Tile(f"{tile.label}: mean error {distances[label].mean():.2f} {unit}", tile.picture)
         for label, tile in zip(colored, _cloud_tiles(colored, camera, GRID_SIDE), strict=True)
     ]
-    bar = _color_bar(limit, unit)
+    bar = color_bar(f"0 {unit}", f"{limit:g} {unit} or more from the surface")
     return write_grid(tiles, path, columns=_columns(len(tiles)), footer=bar)
 
 
@@ -224,7 +226,7 @@ def _matching(distances: np.ndarray, cloud: PointCloud, label: str) -> np.ndarra
     return np.asarray(distances)
 
 
-def _heat(values: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
+def heat(values: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
     """Colours of values 0..1: blue is good, yellow bad, and both are told apart in grey print."""
     from matplotlib import colormaps  # noqa: PLC0415  (slow to import, needed here alone)
 
@@ -261,15 +263,14 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size=size)
 
 
-def _color_bar(limit: float, unit: str) -> UInt8[np.ndarray, "H W 3"]:
-    """A strip of the heat colours with its two ends written beside it."""
-    strip = np.tile(_heat(np.linspace(0.0, 1.0, 240)), (20, 1, 1))
+def color_bar(low: str, high: str) -> UInt8[np.ndarray, "H W 3"]:
+    """A strip of the heat colours with what its two ends mean written beside it."""
+    strip = np.tile(heat(np.linspace(0.0, 1.0, 240)), (20, 1, 1))
     bar = PillowImage.new("RGB", (GRID_SIDE, 44), PAPER)
     bar.paste(PillowImage.fromarray(strip), (70, 12))
     draw = ImageDraw.Draw(bar)
-    draw.text((58, 22), f"0 {unit}", fill=INK, font=_font(18), anchor="rm")
-    text = f"{limit:g} {unit} or more from the surface"
-    draw.text((322, 22), text, fill=INK, font=_font(18), anchor="lm")
+    draw.text((58, 22), low, fill=INK, font=_font(18), anchor="rm")
+    draw.text((322, 22), high, fill=INK, font=_font(18), anchor="lm")
     return np.asarray(bar)
 
 

@@ -7,12 +7,16 @@ import shlex
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
+from splatseed.commands._depth_numbers import print_depth
+from splatseed.commands._depth_picture import write_depth_picture
 from splatseed.commands._options import parse_options
-from splatseed.console import OUT, print_commands, print_pairs, stage_display
+from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
+from splatseed.depth import Alignment, align
+from splatseed.depthmap import DepthKind
 from splatseed.diagnostics import (
     CloudStatistics,
     EmptyRegions,
@@ -22,7 +26,8 @@ from splatseed.diagnostics import (
     find_problems,
     track_statistics,
 )
-from splatseed.io import load_scene
+from splatseed.errors import ParameterError
+from splatseed.io import find_depths, load_scene
 from splatseed.scene import Scene
 
 __all__ = ["run"]
@@ -31,12 +36,32 @@ KINDS_SHOWN = 3
 """Kinds of cameras listed; collections of photographs from the web have one a photograph."""
 
 
+def _path(metavar: str) -> Any:
+    """How an optional path shows in the help."""
+    return tyro.conf.arg(constructor=Path, metavar=metavar, help_behavior_hint="")
+
+
+def _default(stands_in: str) -> Any:
+    """How an option that may be left out shows in the help: with what stands in for it."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
+
+
 @dataclass(frozen=True)
 class Options:
-    """Show what is in a scene: cameras, images, points, tracks, and problems."""
+    """Show what is in a scene: cameras, images, points, tracks, depth maps, and problems."""
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """A COLMAP scene folder, a folder with transforms.json, or a .ply."""
+    """A COLMAP scene folder, a folder with transforms.json, an RGB-D capture, or a .ply."""
+    depth: Annotated[Path | None, _path("DIR")] = None
+    """Also hold a folder of depth maps, in any layout of docs/formats.md, against the SfM points."""
+    depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
+    """What their values are: planar depth, distance along the ray, or inverse depth."""
+    depth_scale: Annotated[float | None, _default("what the folder says")] = None
+    """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
+    picture: Annotated[Path | None, _path("FILE")] = None
+    """Write a PNG of depth beside photographs, and of where the two disagree."""
+    list_all: Annotated[bool, tyro.conf.arg(name="all")] = False
+    """List the depth of all images, not of the worst alone."""
 
 
 def run(arguments: list[str]) -> None:
@@ -44,23 +69,57 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "info", arguments)
     with stage_display() as clock:
         clock("read", 0.0)
-        scene = load_scene(options.scene, require_points=False)
+        scene = _read(options)
         cloud = cloud_statistics(scene, clock)
         tracks = track_statistics(scene)
         regions = empty_regions(scene, clock)
+        alignments = _alignments(options, scene, clock)
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
     print_pairs(str(options.scene), rows)
+    if alignments is not None:
+        print_depth(str(options.depth or "depth"), scene, alignments, list_all=options.list_all)
     problems = find_problems(scene, cloud, regions)
     OUT.print("\n[bold]problems[/bold]" if problems else "\nno problems found")
     for problem in problems:
         OUT.print(f"  - {problem}", soft_wrap=True, highlight=False, markup=False)
+    if options.picture is not None:
+        print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
-        print_commands("next", [("", _next_command(options.scene, scene))])
+        print_commands("next", [("", _next_command(options, scene))])
 
 
-def _next_command(path: Path, scene: Scene) -> str:
+def _read(options: Options) -> Scene:
+    """The scene, with the depth maps that the user names, or else its own."""
+    scene = load_scene(options.scene, require_points=False)
+    if options.depth is not None:
+        maps = find_depths(scene, options.depth, kind=options.depth_kind, scale=options.depth_scale)
+        return scene.replace(depths=maps)
+    if options.depth_kind is not None or options.depth_scale is not None or options.picture:
+        raise ParameterError(
+            "--depth DIR, whose maps --depth-kind, --depth-scale and --picture speak of",
+            found="none",
+            fix="Name the folder.",
+        )
+    return scene
+
+
+def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment] | None:
+    """How each map fits the SfM points, drawn if so asked; None where no maps were named."""
+    if options.depth is None:
+        return None
+    alignments = align(scene, progress=clock)
+    if options.picture is not None:
+        clock("draw picture", 0.0)
+        write_depth_picture(scene, alignments, options.picture)
+    return alignments
+
+
+def _next_command(options: Options, scene: Scene) -> str:
     """What to run on the scene: points can be upsampled once there are some."""
-    quoted = shlex.quote(str(path))
+    quoted = shlex.quote(str(options.scene))
+    if options.depth is not None and len(scene.points):
+        maps = shlex.quote(str(options.depth))
+        return f"splatseed upsample {quoted} --method depth --depth {maps} --ratio 16 -o OUT"
     if len(scene.points):
         return f"splatseed upsample {quoted} --method mls --ratio 8 -o OUT"
     images = scene.source.image_dir if scene.source else None
@@ -75,10 +134,12 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
         cameras.append(f"{len(sizes) - KINDS_SHOWN:,} kinds more")
     train, test = scene.split()
     images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test)"
+    maps = [] if scene.depths is None else [("depth maps", f"{len(scene.depths):,}")]
     return [
         ("format", scene.source.format if scene.source else "memory"),
         ("cameras", ", ".join(cameras) or "none"),
         ("images", images if scene.images else "none"),
+        *maps,
     ]
 
 

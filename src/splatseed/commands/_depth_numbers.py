@@ -1,0 +1,109 @@
+"""What ``splatseed info --depth`` says of a scene's depth maps, in words and numbers.
+
+Promise: images are listed worst first: those left out, then by residual; all of them only if asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from rich.markup import escape
+
+from splatseed.console import OUT, print_pairs, print_table
+from splatseed.depth import Alignment
+from splatseed.depthmap import DepthKind, DepthMap, DepthMaps
+from splatseed.scene import Scene
+
+__all__ = ["print_depth"]
+
+ROWS = 12
+"""Images listed without --all."""
+
+
+def print_depth(
+    title: str, scene: Scene, alignments: Mapping[str, Alignment], *, list_all: bool
+) -> None:
+    """Print a summary, a table of images, and why those left out are left out.
+
+    Args:
+        title: What stands above the summary.
+        scene: A scene with depth maps.
+        alignments: Of its images, by name.
+        list_all: Whether to list every image.
+    """
+    example = _example(scene)
+    kind: DepthKind = example.kind if example else "z"
+    print_pairs(title, _summary(scene, example, alignments))
+    ordered = sorted(alignments, key=lambda name: _badness(name, alignments[name]))
+    listed = ordered if list_all else ordered[:ROWS]
+    header = ["image", "points", "scale", *(["shift"] if kind == "inverse" else []), "residual"]
+    rows = [_row(name, alignments[name], len(header)) for name in listed]
+    some = "" if len(listed) == len(ordered) else f", the {len(listed)} worst; --all lists all"
+    print_table(f"depth against SfM points{some}", header, rows)
+    _print_rejections(alignments, listed)
+
+
+def _example(scene: Scene) -> DepthMap | None:
+    """The first map of an image of the scene."""
+    depths: DepthMaps | None = scene.depths
+    names = (image.name for image in scene.images if depths is not None and image.name in depths)
+    first = next(names, None)
+    return None if first is None or depths is None else depths.read(first)
+
+
+def _summary(
+    scene: Scene, example: DepthMap | None, alignments: Mapping[str, Alignment]
+) -> list[tuple[str, str]]:
+    used = [a for a in alignments.values() if a.rejected is None]
+    maps = f"{len(alignments):,} of {len(scene.images):,} images"
+    if example is not None:
+        maps += f", the first {example.width} x {example.height}, kind {example.kind}"
+    rows = [
+        ("maps", maps),
+        ("left out", f"{len(alignments) - len(used):,}"),
+        ("SfM points an image", _spread((a.num_points for a in alignments.values()), ".0f")),
+    ]
+    if used:
+        rows += [("scale", _spread((a.scale for a in used), ".4g"))]
+        if example is not None and example.kind == "inverse":
+            rows += [("shift", _spread((a.shift for a in used), ".4g"))]
+        rows += [("residual", _spread((a.residual for a in used), ".2%"))]
+    return rows
+
+
+def _spread(values: Iterable[float], style: str) -> str:
+    found = np.array([value for value in values if not math.isnan(value)])
+    if not found.size:
+        return "unknown"
+    low, median, high = np.percentile(found, [5, 50, 95])
+    return f"median {median:{style}}, 5/95% {low:{style}} {high:{style}}"
+
+
+def _badness(name: str, alignment: Alignment) -> tuple[bool, float, str]:
+    """What to sort by: left out first, then the largest residual."""
+    residual = -math.inf if math.isnan(alignment.residual) else -alignment.residual
+    return alignment.rejected is None, residual, name
+
+
+def _row(name: str, alignment: Alignment, columns: int) -> list[str]:
+    numbers = [_number(alignment.scale, ".4g")]
+    if columns == 5:
+        numbers.append(_number(alignment.shift, ".4g") if numbers != ["-"] else "-")
+    return [escape(name), f"{alignment.num_points:,}", *numbers, _number(alignment.residual, ".2%")]
+
+
+def _number(value: float, style: str) -> str:
+    return "-" if math.isnan(value) else f"{value:{style}}"
+
+
+def _print_rejections(alignments: Mapping[str, Alignment], listed: Sequence[str]) -> None:
+    rejected = [(name, alignments[name].rejected) for name in listed]
+    sentences = [f"{name}: {reason}" for name, reason in rejected if reason is not None]
+    if not sentences:
+        return
+    OUT.print("\n[bold]left out[/bold]")
+    more = sum(a.rejected is not None for a in alignments.values()) - len(sentences)
+    for sentence in [*sentences, *([f"and {more:,} more"] if more else [])]:
+        OUT.print(f"  - {sentence}", soft_wrap=True, highlight=False, markup=False)
