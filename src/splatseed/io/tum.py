@@ -71,8 +71,7 @@ def load_tum(path: Path) -> Scene:
     """
     root = Path(path)
     times, names = read_list(root / "rgb.txt")
-    folder = _common_folder(names)
-    intrinsics, warnings = _camera(root)
+    intrinsics, guessed = _camera(root)
     quats, centers, near = poses_at(read_track(root / "groundtruth.txt"), times)
     present = np.array([(root / name).is_file() for name in names], bool)
     used = np.flatnonzero(near & present).tolist()
@@ -82,22 +81,21 @@ def load_tum(path: Path) -> Scene:
             found=f"{int(present.sum())} of {len(names)} images, {int(near.sum())} with a pose",
             fix="Put the images back, and check that both files count time alike.",
         )
-    for i in used:
-        check_size(root / names[i], intrinsics)
+    folder = _common_folder(names)
     images = tuple(
-        _image(
-            str(PurePosixPath(names[i]).relative_to(folder)), i, intrinsics, quats[i], centers[i]
-        )
-        for i in used
+        _image(root, folder, names[i], i + 1, intrinsics, quats[i], centers[i]) for i in used
     )
-    warnings += _left_out("no pose near their time", [names[i] for i in np.flatnonzero(~near)])
-    warnings += _left_out("no file", [names[i] for i in np.flatnonzero(near & ~present)])
     scene = Scene(
         empty_cloud(),
         images,
         (intrinsics,),
         source=SceneSource("rgbd", root, root / "groundtruth.txt", image_dir=root / folder),
-        warnings=(*warnings, *lens_warnings(images)),
+        warnings=(
+            *guessed,
+            *_left_out("no pose near their time", [names[i] for i in np.flatnonzero(~near)]),
+            *_left_out("no file", [names[i] for i in np.flatnonzero(near & ~present)]),
+            *lens_warnings(images),
+        ),
     )
     return scene.replace(depths=find_tum_depths(scene, root))
 
@@ -177,15 +175,19 @@ def _is_copy(path: Path, original: Path) -> bool:
 
 
 def _image(
-    name: str,
-    index: int,
+    root: Path,
+    folder: PurePosixPath,
+    path: str,
+    image_id: int,
     intrinsics: Intrinsics,
     quat: Float64[np.ndarray, " 4"],
     center: Float64[np.ndarray, " 3"],
 ) -> Image:
-    """An image from its ``world_from_cam``."""
+    """An image, checked, from its ``world_from_cam``; its name is relative to ``folder``."""
+    check_size(root / path, intrinsics)
     quat = quat * [1, -1, -1, -1]  # the inverse rotation
-    return Image(name, index + 1, intrinsics, quat, -rotation_from_quat(quat) @ center)
+    name = str(PurePosixPath(path).relative_to(folder))
+    return Image(name, image_id, intrinsics, quat, -rotation_from_quat(quat) @ center)
 
 
 def _common_folder(names: Sequence[str]) -> PurePosixPath:
