@@ -21,7 +21,7 @@ import numpy as np
 
 import splatseed as ss
 
-__all__ = ["peak_bytes_per_output"]
+__all__ = ["peak_bytes_per_output", "status_bytes"]
 
 STATUS = Path("/proc/self/status")
 RESET = Path("/proc/self/clear_refs")
@@ -54,12 +54,15 @@ def _measure(path: str, options: dict[str, Any]) -> float:
         cloud = ss.PointCloud(arrays["xyz"], arrays["rgb"])
     ss.upsample(cloud.select(slice(WARM_UP_POINTS)), **options)
     RESET.write_text(RESET_PEAK, encoding="ascii")
-    before = _status_bytes("VmRSS")
+    before = status_bytes("VmRSS")
     seeds = ss.upsample(cloud, **options)
-    return (_status_bytes("VmHWM") - before) / len(seeds)
+    return (status_bytes("VmHWM") - before) / len(seeds)
 
 
-def _status_bytes(field: str) -> int:
+def status_bytes(field: str) -> int:
+    """Memory of this process by one of the kernel's names; -1 off Linux."""
+    if not STATUS.exists():
+        return -1
     line = next(row for row in STATUS.read_text("ascii").splitlines() if row.startswith(field))
     return 1024 * int(line.split()[1])
 
