@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image as PillowImage
 
 from splatseed.io import load_scene
 from splatseed.upsample import METHODS
@@ -72,3 +73,18 @@ def test_compare_methods(run):
 
 def test_your_own_method(run):
     assert run("04_your_own_method.py") == "500 points -> 2000, 500 of them the originals\n"
+
+
+def test_render_on_a_cpu(run, tmp_path):
+    out = run("05_render_on_a_cpu.py", 40)
+    first, *_, last = re.findall(r"([\d.]+) dB", out)
+    assert float(last) > float(first) + 3
+    with PillowImage.open(tmp_path / "fitted.png") as picture:
+        assert picture.size == (320, 120)
+
+
+def test_train_and_score(run, tmp_path):
+    out = run("06_train_and_score.py", "example_room", 40)
+    counts = [int(n.replace(",", "")) for n in re.findall(r"([\d,]+) Gaussians", out)]
+    assert counts[1] == 4 * counts[0]
+    assert (tmp_path / "runs" / "mls_4x" / "point_cloud.ply").is_file()

@@ -22,6 +22,7 @@ from splatseed.render.arguments import (
     check_unsupported,
 )
 from splatseed.render.functions import Blend, Harmonics, Lens, Project
+from splatseed.requirements import require
 
 __all__ = ["rasterization"]
 
@@ -93,6 +94,7 @@ def rasterization(
     Raises:
         ParameterError: An argument that the CPU rasteriser does not support, or tensors that are not
             float32 or whose shapes do not go together.
+        MissingDependencyError: CUDA tensors, and no gsplat.
 
     Example:
         >>> import torch
@@ -106,6 +108,7 @@ def rasterization(
         (torch.Size([1, 16, 16, 3]), 0.7)
     """
     if isinstance(means, Tensor) and means.is_cuda:
+        require("gsplat")
         from gsplat import rasterization as on_cuda  # noqa: PLC0415  (needs CUDA)
 
         return on_cuda(  # type: ignore[no-any-return]

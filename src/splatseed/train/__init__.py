@@ -1,5 +1,31 @@
-"""Training: from a scene and its seeds to Gaussians that look like the photographs."""
+"""Training: from a scene and its seeds to Gaussians that look like the photographs.
+
+``prepare_run`` reads what a run needs and opens its folder; the ``TrainingRun`` that it returns
+trains and writes the results. ``TrainSettings`` alone can be used without PyTorch: the rest is
+imported when it is first asked for (``pip install "splatseed[train]"``).
+"""
 
 from __future__ import annotations
 
-__all__: list[str] = []
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from splatseed.requirements import require
+from splatseed.train.settings import TrainSettings
+
+if TYPE_CHECKING:
+    from splatseed.train.run import RunOptions, TrainingRun, prepare_run
+
+__all__ = ["RunOptions", "TrainSettings", "TrainingRun", "prepare_run"]
+
+
+def __getattr__(name: str) -> Any:
+    """The parts that need PyTorch and gsplat.
+
+    Raises:
+        MissingDependencyError: One of them is absent.
+    """
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    require("torch", "gsplat")
+    return getattr(import_module("splatseed.train.run"), name)
