@@ -44,6 +44,7 @@ ORDER = (
     "render",
     "train",
     "evaluate",
+    "bench",
     "console",
     "commands",
     "cli",

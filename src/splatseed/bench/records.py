@@ -1,0 +1,215 @@
+"""What a run of the benchmark is asked for, and what came of it.
+
+Notation: an *arm* is everything about a run but its scene and its repeat: two runs are *paired* when
+those two are equal. Promise: ``RunSpec.key`` depends on all that determines the result and on nothing
+else (not on where the scene lies), so that a run that is in the ledger need never be repeated.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any, Literal, Self
+
+from splatseed.train.settings import Backend, StrategyName, TrainSettings
+from splatseed.upsample import Profile
+
+__all__ = ["SFM", "Arm", "CurvePoint", "ImageScore", "RunResult", "RunRow", "RunSpec", "RunStatus"]
+
+SFM = "sfm"
+"""The method that leaves the cloud of Structure-from-Motion as it is; its ratio is 1."""
+
+RunStatus = Literal["pending", "running", "done", "failed"]
+
+
+@dataclass(frozen=True)
+class Arm:
+    """How a scene is seeded and trained.
+
+    Args:
+        method: ``SFM``, or a key of ``splatseed.METHODS``.
+        profile: "default" or "paper".
+        ratio: Points in all, per original.
+        strategy: The densification strategy.
+    """
+
+    method: str
+    profile: Profile
+    ratio: float
+    strategy: StrategyName
+
+    @property
+    def label(self) -> str:
+        """In a few words, such as ``mls 8x`` or ``mls 8x (paper)``; the strategy is left out."""
+        if self.method == SFM:
+            return SFM
+        return f"{self.method} {self.ratio:g}x" + (" (paper)" if self.profile == "paper" else "")
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """One run: everything that determines its result, and where its scene lies.
+
+    Args:
+        scene: The scene's name in tables.
+        scene_digest: Fingerprint of its points, cameras and image files.
+        arm: How it is seeded and trained.
+        parameters: The method's parameters that differ from its profile's.
+        repeat: From 0; seeds both upsampling and training.
+        max_steps: Training steps.
+        data_factor: By how much photographs are made smaller.
+        test_every: Every so many-th image is kept for the test.
+        cap_max: Most Gaussians; None for the strategy's own.
+        sh_degree: Degree of spherical harmonics.
+        backend: Where it is trained: results differ in their last digits.
+        opacity_reset: Whether strategy default resets opacities.
+        depth_digest: Fingerprint of the depth maps, for the method depth; empty without.
+        version: The package's version.
+        scene_path: Where the scene lies; not part of the key.
+        depth_path: Where its depth maps lie, if any; not part of the key.
+    """
+
+    scene: str
+    scene_digest: str
+    arm: Arm
+    repeat: int
+    max_steps: int
+    data_factor: int = 1
+    test_every: int = 8
+    cap_max: int | None = None
+    sh_degree: int = 3
+    backend: Backend = "cpu"
+    opacity_reset: bool = False
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    depth_digest: str = ""
+    version: str = ""
+    scene_path: str = ""
+    depth_path: str = ""
+
+    @property
+    def key(self) -> str:
+        """Fingerprint of what determines the result: 32 hexadecimal digits."""
+        told = {k: v for k, v in asdict(self).items() if k not in {"scene_path", "depth_path"}}
+        text = json.dumps(told, sort_keys=True, separators=(",", ":"))
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+    @property
+    def settings(self) -> TrainSettings:
+        """How to train."""
+        return TrainSettings(
+            strategy=self.arm.strategy,
+            max_steps=self.max_steps,
+            data_factor=self.data_factor,
+            seed=self.repeat,
+            cap_max=self.cap_max,
+            backend=self.backend,
+            sh_degree=self.sh_degree,
+            test_every=self.test_every,
+            opacity_reset=self.opacity_reset,
+        )
+
+    def to_json(self) -> str:
+        """As one line of JSON."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """What ``to_json`` wrote."""
+        values = json.loads(text)
+        return cls(**{**values, "arm": Arm(**values["arm"])})
+
+
+@dataclass(frozen=True)
+class ImageScore:
+    """One test view's scores: PSNR in dB, SSIM, LPIPS or None."""
+
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """The test views on the way: steps done, seconds of training, mean PSNR in dB, Gaussians."""
+
+    step: int
+    seconds: float
+    psnr: float
+    num_gaussians: int
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run gave.
+
+    Args:
+        psnr: Mean over test images of each one's PSNR, dB.
+        ssim: Mean SSIM.
+        lpips: Mean LPIPS; None where it was not measured.
+        per_image: One score a test view.
+        curve: The test views on the way, in order of steps.
+        num_seeds: Points that training began with.
+        num_gaussians: Gaussians at the end.
+        model_bytes: Bytes of their parameters as float32.
+        upsample_seconds: Wall time of making the seeds; 0 for ``SFM``.
+        train_seconds: Wall time of the training steps alone.
+        render_seconds: Wall time of rendering a test view, on average.
+        peak_bytes: Most memory the process held; None where the system does not tell.
+        device: Where it was trained, in words.
+    """
+
+    psnr: float
+    ssim: float
+    lpips: float | None
+    per_image: tuple[ImageScore, ...]
+    curve: tuple[CurvePoint, ...]
+    num_seeds: int
+    num_gaussians: int
+    model_bytes: int
+    upsample_seconds: float
+    train_seconds: float
+    render_seconds: float
+    peak_bytes: int | None
+    device: str
+
+    def to_json(self) -> str:
+        """As one line of JSON."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """What ``to_json`` wrote."""
+        values = json.loads(text)
+        images = tuple(ImageScore(**each) for each in values["per_image"])
+        curve = tuple(CurvePoint(**each) for each in values["curve"])
+        known = {each.name for each in fields(cls)}
+        rest = {k: v for k, v in values.items() if k in known - {"per_image", "curve"}}
+        return cls(per_image=images, curve=curve, **rest)
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """A run as the ledger has it.
+
+    Args:
+        spec: What was asked for.
+        status: How far it is.
+        result: What it gave; only when done.
+        error: Why it failed; only when failed.
+        attempts: How often it was begun.
+        worker: Who has it or had it last: host and process.
+        started: When it was last begun, seconds since 1970; None before.
+        finished: When it ended, likewise.
+    """
+
+    spec: RunSpec
+    status: RunStatus = "pending"
+    result: RunResult | None = None
+    error: str = ""
+    attempts: int = 0
+    worker: str = ""
+    started: float | None = None
+    finished: float | None = None
