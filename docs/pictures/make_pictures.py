@@ -13,18 +13,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from matplotlib import colormaps
 from PIL import Image as PillowImage, ImageDraw, ImageFont
+from scipy.ndimage import gaussian_filter
 
 import splatseed as ss
+from splatseed.commands._depth_picture import write_depth_picture
+from splatseed.depth import align
 from splatseed.geometry import spacing
+from splatseed.io import depth_folder, find_depths
 from splatseed.io.staging import atomic_file
 from splatseed.preview import choose_camera, render_points
-from splatseed.synthetic import Capture, make_capture
+from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.upsample import methods_for
 from splatseed.viewpoint import choose_image, look_at
 
@@ -52,6 +57,7 @@ def main() -> None:
     draw_errors(capture, clouds)
     for name, cloud in clouds.items():
         draw_method(capture.scene, name, cloud)
+    draw_depth()
 
 
 def draw_before_after(capture: Capture, upsampled: ss.PointCloud) -> None:
@@ -89,6 +95,33 @@ def draw_errors(capture: Capture, clouds: Mapping[str, ss.PointCloud]) -> None:
     bar = np.tile(heat(np.linspace(0.0, 1.0, 320)), (14, 1, 1))
     ends = [Panel("distance to the surface: 0 ... 1 h or more", bar)]
     write_grid([panels[:3], panels[3:], ends], HERE / "errors.png", colors=48)
+
+
+def draw_depth() -> None:
+    """``splatseed info --depth --picture``, on depth that is blurred and bent as a network's is."""
+    rng = np.random.default_rng(0)
+    with TemporaryDirectory() as folder:
+        room, maps = Path(folder, "room"), Path(folder, "maps")
+        scene = ss.load_scene(write_capture(make_capture(num_views=12), room))
+        depths = find_depths(scene, room / "depths")
+        with depth_folder(maps, "inverse") as writer:
+            for name in depths:
+                writer.write(name, as_predicted(depths.read(name).values, rng))
+        scene = scene.replace(depths=find_depths(scene, maps))
+        write_depth_picture(scene, align(scene), HERE / "depth_check.png")
+    with PillowImage.open(HERE / "depth_check.png") as picture:
+        smaller = picture.convert("RGB").reduce(2).quantize(200)
+    smaller.save(HERE / "depth_check.png", optimize=True)
+
+
+def as_predicted(
+    z: Float32[np.ndarray, "H W"], rng: np.random.Generator
+) -> Float32[np.ndarray, "H W"]:
+    """Depth as a relative network would have it: inverse, of any scale and shift, soft, and bent."""
+    inverse = gaussian_filter(1 / np.nan_to_num(z, nan=np.inf), 2.0)
+    bent = gaussian_filter(rng.normal(size=z.shape), 40.0)
+    bent *= rng.uniform(0.02, 0.12) / np.abs(bent).max()
+    return np.float32((inverse * (1 + bent) - rng.uniform(0, 0.1)) * rng.uniform(2, 9))
 
 
 def draw_method(scene: ss.Scene, name: str, cloud: ss.PointCloud) -> None:
