@@ -29,6 +29,7 @@ from splatseed.scene import Image
 from splatseed.train.gaussians import SH_C0
 from splatseed.train.ply import write_gaussians
 from splatseed.train.views import View
+from stopwatch import Clock
 
 __all__ = ["seconds_per_step"]
 
@@ -38,13 +39,16 @@ SHORT, LONG = 2, 8
 NEVER = 1_000_000
 
 
-def seconds_per_step(program: Path, workload: Workload, threads: int) -> float:
-    """Wall seconds of one training step.
+def seconds_per_step(
+    program: Path, workload: Workload, threads: int, clock: Clock = "wall"
+) -> float:
+    """Seconds of one training step.
 
     Args:
         program: OpenSplat's executable.
         workload: What to train on what.
         threads: How many PyTorch's C++ library may use.
+        clock: Whose seconds; of ``cpu``, those of all threads over their number, in its favour.
 
     Raises:
         MissingDependencyError: There is no such program, or it failed.
@@ -53,7 +57,8 @@ def seconds_per_step(program: Path, workload: Workload, threads: int) -> float:
         scene, gaussians = Path(folder) / "scene", Path(folder) / "gaussians.ply"
         _write_scene(workload, scene)
         _write_gaussians(workload, gaussians)
-        short, long = (_run(program, scene, gaussians, steps, threads) for steps in (SHORT, LONG))
+        commands = [_command(program, scene, gaussians, steps) for steps in (SHORT, LONG)]
+        short, long = (_seconds(command, threads, clock) for command in commands)
     return (long - short) / (LONG - SHORT)
 
 
@@ -90,17 +95,18 @@ def _write_gaussians(workload: Workload, path: Path) -> None:
     path.write_bytes(b"\n".join([magic, layout, comment, rest]))
 
 
-def _run(program: Path, scene: Path, gaussians: Path, steps: int, threads: int) -> float:
-    """Wall seconds of a run that takes so many steps."""
+def _command(program: Path, scene: Path, gaussians: Path, steps: int) -> list[str]:
+    """A run that takes so many steps."""
     last, result = FIRST_STEP - 1 + steps, scene.with_name("result.ply")
     options = ["--cpu", "-n", last, "-d", 1, "--num-downscales", 0, "--warmup-length", NEVER]
     options += ["--resume", gaussians, "--keep-crs", "-o", result]
-    return _seconds([str(program), str(scene), *map(str, options)], threads)
+    return [str(program), str(scene), *map(str, options)]
 
 
-def _seconds(command: Sequence[str], threads: int) -> float:
+def _seconds(command: Sequence[str], threads: int, clock: Clock) -> float:
+    """How long a command takes."""
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    started = time.perf_counter()
+    started, before = time.perf_counter(), os.times()
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
     except (OSError, subprocess.CalledProcessError) as error:
@@ -110,4 +116,7 @@ def _seconds(command: Sequence[str], threads: int) -> float:
             found=said.strip()[-500:],
             fix="Build it for the CPU from its repository, or leave out --opensplat.",
         ) from error
-    return time.perf_counter() - started
+    took, after = time.perf_counter() - started, os.times()
+    busy = after.children_user + after.children_system
+    busy -= before.children_user + before.children_system
+    return took if clock == "wall" else busy / threads

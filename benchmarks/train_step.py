@@ -41,7 +41,7 @@ from splatseed.train.state import TrainState
 from splatseed.train.strategies import make_strategy
 from splatseed.train.trainer import Trainer
 from splatseed.train.views import load_split
-from stopwatch import RENDER_STAGES, Place, timed
+from stopwatch import RENDER_STAGES, Clock, Place, Stopwatch, timed
 
 __all__: list[str] = []
 
@@ -51,6 +51,7 @@ THREADS = (1, 2)
 SIZES = {(50_000, 400, 300): 30.0, (200_000, 800, 600): 110.0}
 """Gaussians, width and height, and the target in ms on two cores."""
 IMPORT_TARGET = 0.3
+WARM_UP = 8
 SMALL = (1_000, 64, 48)
 PARTS = {
     "project": ("project", "project backward"),
@@ -83,32 +84,37 @@ class Settings:
     """Also the time to import, and to the first step with and without compiled kernels on disk."""
     opensplat: Path | None = None
     """OpenSplat's program, to be timed on the same Gaussians and photographs."""
+    clock: Clock = "wall"
+    """On a machine that is not idle, cpu: the busiest thread's time on a core, stage by stage."""
 
 
-def measure(path: str, steps: int) -> dict[str, Any]:
-    """Seconds of each step and each stage of it, bytes at the peak, useful pairs a pixel."""
+def measure(path: str, steps: int, clock: Clock) -> dict[str, Any]:
+    """Seconds of each stage of each step, bytes at the peak, useful pairs a pixel."""
     trainer = _trainer(Workload.load(Path(path)))
-    params = trainer.state.params
-    before = {name: value.detach().clone() for name, value in params.items()}
     pairs = _pairs_per_pixel(trainer)
-    laps = []
-    with timed(_stages(trainer)) as watch:
-        for i in range(WARM_UP + steps):
-            with torch.no_grad():
-                for name, value in params.items():
-                    value.copy_(before[name])
-            watch.lap()
-            started = time.perf_counter()
-            trainer._advance(FIRST_STEP + i % (LAST_STEP - FIRST_STEP))  # noqa: SLF001
-            laps.append(_with_rest(watch.lap(), time.perf_counter() - started))
-    return {"laps": laps[WARM_UP:], "peak": status_bytes("VmHWM"), "pairs": pairs}
+    before = {name: value.detach().clone() for name, value in trainer.state.params.items()}
+    for i in range(WARM_UP):
+        _step(trainer, i, before, Stopwatch())
+    with timed(_stages(trainer), clock) as watch:
+        laps = [_step(trainer, WARM_UP + i, before, watch) for i in range(steps)]
+    return {"laps": laps, "peak": status_bytes("VmHWM"), "pairs": pairs}
 
 
-WARM_UP = 8
+@torch.no_grad()
+def _put_back(params: Mapping[str, torch.Tensor], before: Mapping[str, torch.Tensor]) -> None:
+    for name, value in params.items():
+        value.copy_(before[name])
 
 
-def _with_rest(lap: dict[str, float], whole: float) -> dict[str, float]:
-    return {**lap, "rest": whole - sum(lap.values()), "whole": whole}
+def _step(
+    trainer: Trainer, i: int, before: Mapping[str, torch.Tensor], watch: Stopwatch
+) -> dict[str, float]:
+    """Take a step from where all steps begin; its seconds by stage, the rest and the whole."""
+    _put_back(trainer.state.params, before)
+    watch.lap()
+    watch.wrap("rest", trainer._advance)(FIRST_STEP + i % (LAST_STEP - FIRST_STEP))  # noqa: SLF001
+    lap = watch.lap()
+    return {**lap, "whole": sum(lap.values())}
 
 
 def _trainer(workload: Workload) -> Trainer:
@@ -204,14 +210,17 @@ def scene_name(settings: Settings) -> str:
     return "" if settings.scene is None else settings.scene.resolve().name
 
 
-def measured_runs(name: str, workload: Workload, target: float | None, steps: int) -> list[Run]:
+def measured_runs(
+    name: str, workload: Workload, target: float | None, settings: Settings
+) -> list[Run]:
     """One thread and two."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.npz"
         workload.save(path)
         return [
             Run(name, threads, target, **call(
-                "train_step:measure", threads=threads, path=str(path), steps=steps
+                "train_step:measure", threads=threads, path=str(path), steps=settings.steps,
+ clock=settings.clock
             ))
             for threads in THREADS
         ]  # fmt: skip
@@ -290,13 +299,13 @@ def import_seconds(repeats: int) -> float:
 
 
 def print_opensplat(
-    program: Path, workloads: Sequence[tuple[str, Workload]], runs: Sequence[Run]
+    program: Path, workloads: Sequence[tuple[str, Workload]], runs: Sequence[Run], clock: Clock
 ) -> None:
     """The same Gaussians and photographs through OpenSplat."""
     rows = []
     for name, workload in workloads:
         for run in (run for run in runs if run.name == name):
-            theirs = 1e3 * seconds_per_step(program, workload, run.threads)
+            theirs = 1e3 * seconds_per_step(program, workload, run.threads, clock)
             ours = run.median("whole")
             rows.append(
                 [name, str(run.threads), f"{theirs:.0f}", f"{ours:.1f}", f"{theirs / ours:.1f}x"]
@@ -313,15 +322,16 @@ def print_opensplat(
 
 def main(settings: Settings) -> None:
     """Measure and print."""
-    print(f"{describe()}, torch {torch.__version__}\n")
-    warn_if_busy()
+    print(f"{describe()}, torch {torch.__version__}; clock: {settings.clock}\n")
+    if settings.clock == "wall":
+        warn_if_busy()
     if settings.scene is None:
         workloads = [(*room_workload(size), SIZES.get(size)) for size in settings.sizes]
     else:
         workloads = [(*scene_workload(settings), None)]
     runs = [
         run for name, work, target in workloads
-        for run in measured_runs(name, work, target, settings.steps)
+        for run in measured_runs(name, work, target, settings)
     ]  # fmt: skip
     print_steps(runs)
     print_parts(runs)
@@ -329,7 +339,7 @@ def main(settings: Settings) -> None:
         print_start_up()
     if settings.opensplat is not None:
         program, made = settings.opensplat, [(name, work) for name, work, _ in workloads]
-        _or_skip("OpenSplat", lambda: print_opensplat(program, made, runs))
+        _or_skip("OpenSplat", lambda: print_opensplat(program, made, runs, settings.clock))
 
 
 def _or_skip(what: str, measure_it: Callable[[], None]) -> None:
