@@ -78,6 +78,19 @@ def test_coefficients_of_each_camera(rng) -> None:
     assert_agrees(scene, sh_degree=2)
 
 
+def test_a_render_may_be_changed_in_place(rng) -> None:
+    scene = random_scene(rng)
+    scene["means"].requires_grad_()
+    found = []
+    for change in (torch.sqrt, torch.sqrt_):
+        image, _, _ = rasterization(**scene)
+        change(image).sum().backward()
+        found.append(scene["means"].grad.clone())
+        scene["means"].grad = None
+    assert torch.equal(*found)
+    assert float(found[0].abs().sum()) > 0
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2])
 def test_a_pair_of_coefficients_is_their_concatenation(rng, degree: int) -> None:
     scene = random_scene(rng, coefficients=9, cameras=2)

@@ -222,7 +222,7 @@ def _info(views: Sequence[_View], packed: bool, **facts: int) -> dict[str, Any]:
     info["gaussian_ids"] = None
     if not packed:
         for name in _View._fields:
-            info[name] = torch.stack([getattr(view, name) for view in views])
+            info[name] = _stacked([getattr(view, name) for view in views])
         return info
     ids = [torch.nonzero(view.seen)[:, 0] for view in views]
     for name in _View._fields:
@@ -255,7 +255,13 @@ def _blend(
         )  # fmt: skip
         images.append(image)
         alphas.append(alpha[..., None])
+    # Copies also of one: backward reads the image, and who changes it in place must not disturb that.
     return torch.stack(images), torch.stack(alphas)
+
+
+def _stacked(tensors: Sequence[Tensor]) -> Tensor:
+    """Camera by camera along a new axis; what is of one camera is not copied."""
+    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
 
 
 def _keep_absgrad(means2d: Any, rows: Any, gradient: Tensor) -> None:
