@@ -26,7 +26,12 @@ def test_results_survive_json():
 
 
 def test_where_a_scene_lies_is_no_part_of_the_key():
-    assert dataclasses.replace(SPEC, scene_path="/a", depth_path="/b").key == SPEC.key
+    there = dataclasses.replace(SPEC, scene_path="/a", depth_path="/b", images="images_4")
+    assert there.key == SPEC.key
+
+
+def test_a_whole_ratio_may_be_written_either_way():
+    assert dataclasses.replace(SPEC, arm=Arm("mls", "default", 8.0, "none")).key == SPEC.key
 
 
 @pytest.mark.parametrize(

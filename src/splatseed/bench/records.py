@@ -23,6 +23,9 @@ SFM = "sfm"
 
 RunStatus = Literal["pending", "running", "done", "failed"]
 
+WHERE = {"scene_path", "depth_path", "images"}
+"""Fields of a specification that say where things lie, and nothing about what they are."""
+
 
 @dataclass(frozen=True)
 class Arm:
@@ -39,6 +42,10 @@ class Arm:
     profile: Profile
     ratio: float
     strategy: StrategyName
+
+    def __post_init__(self) -> None:
+        # 8 and 8.0 are the same ratio, and must give the same key.
+        object.__setattr__(self, "ratio", float(self.ratio))
 
     @property
     def label(self) -> str:
@@ -69,6 +76,8 @@ class RunSpec:
         version: The package's version.
         scene_path: Where the scene lies; not part of the key.
         depth_path: Where its depth maps lie, if any; not part of the key.
+        images: The folder of photographs within the scene's, such as ``images_4``; empty for the
+            one that is found. Not part of the key either: the fingerprint is of its files.
     """
 
     scene: str
@@ -87,11 +96,12 @@ class RunSpec:
     version: str = ""
     scene_path: str = ""
     depth_path: str = ""
+    images: str = ""
 
     @property
     def key(self) -> str:
         """Fingerprint of what determines the result: 32 hexadecimal digits."""
-        told = {k: v for k, v in asdict(self).items() if k not in {"scene_path", "depth_path"}}
+        told = {k: v for k, v in asdict(self).items() if k not in WHERE}
         text = json.dumps(told, sort_keys=True, separators=(",", ":"))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -159,6 +169,7 @@ class RunResult:
         render_seconds: Wall time of rendering a test view, on average.
         peak_bytes: Most memory the process held; None where the system does not tell.
         device: Where it was trained, in words.
+        peak_gpu_bytes: Most memory that PyTorch held on the GPU; None without one.
     """
 
     psnr: float
@@ -174,6 +185,7 @@ class RunResult:
     render_seconds: float
     peak_bytes: int | None
     device: str
+    peak_gpu_bytes: int | None = None
 
     def to_json(self) -> str:
         """As one line of JSON."""

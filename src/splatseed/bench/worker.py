@@ -1,0 +1,63 @@
+"""Workers: processes that have runs, and whether they are still there.
+
+Notation: a worker is named ``HOST:PID@SPACE``, where SPACE tells apart sets of process numbers: those
+of another boot, or of another container on the same host. Promise: a worker is held to be gone only if
+its process number is free where it ran, or if it gave no sign of life for ``STALE_SECONDS``.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+from functools import cache
+from pathlib import Path
+
+__all__ = ["HEARTBEAT_SECONDS", "STALE_SECONDS", "is_gone", "worker_name"]
+
+HEARTBEAT_SECONDS = 10.0
+STALE_SECONDS = 180.0
+"""Many heartbeats: clocks of two machines differ, and a busy disk makes a heartbeat late."""
+
+
+def worker_name() -> str:
+    """This process as a worker."""
+    return f"{socket.gethostname()}:{os.getpid()}@{_space()}"
+
+
+def is_gone(worker: str, heartbeat: float | None, now: float) -> bool:
+    """Whether a worker is no longer there.
+
+    Args:
+        worker: As ``worker_name`` said there.
+        heartbeat: Its last sign of life, seconds since 1970.
+        now: The time, likewise.
+    """
+    if heartbeat is None or now - heartbeat > STALE_SECONDS:
+        return True
+    place, _, space = worker.partition("@")
+    host, _, number = place.rpartition(":")
+    if (host, space) != (socket.gethostname(), _space()) or not number.isdecimal():
+        return False
+    return not _exists(int(number))
+
+
+def _exists(process: int) -> bool:
+    if os.name != "posix":  # elsewhere os.kill would end it
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # another user's
+        return True
+    return True
+
+
+@cache
+def _space() -> str:
+    """Which set of process numbers this process's is one of; empty where the system does not tell."""
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii")[:8]
+        return f"{boot}-{Path('/proc/self/ns/pid').stat().st_ino}"
+    except OSError:
+        return ""
