@@ -12,12 +12,14 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+import time
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from clocks import Clock
 from splatseed.errors import SplatseedError
 
-__all__ = ["avx2_environment", "call"]
+__all__ = ["avx2_environment", "call", "seconds_of"]
 
 THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 AVX2 = {"NUMBA_CPU_NAME": "x86-64-v3", "ATEN_CPU_CAPABILITY": "avx2"}
@@ -52,6 +54,28 @@ def call(
             f"{function} to run on {threads} threads", found=done.stderr[-2000:], fix="See there."
         )
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def seconds_of(
+    command: Sequence[str],
+    clock: Clock,
+    *,
+    threads: int = 1,
+    environment: Mapping[str, str] | None = None,
+) -> float:
+    """How long a program runs; by clock ``cpu`` the time of all its threads over their number.
+
+    Raises:
+        OSError: There is no such program.
+        subprocess.CalledProcessError: It failed.
+    """
+    everything = {**os.environ, **(environment or {})}
+    started, before = time.perf_counter(), os.times()
+    subprocess.run(command, check=True, capture_output=True, text=True, env=everything)
+    took, after = time.perf_counter() - started, os.times()
+    busy = after.children_user - before.children_user
+    busy += after.children_system - before.children_system
+    return took if clock == "wall" else busy / threads
 
 
 def avx2_environment() -> dict[str, str] | None:

@@ -10,16 +10,16 @@ Compare speed, not quality: the CPU build of that version sorts by a depth that 
 
 from __future__ import annotations
 
-import os
 import subprocess
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image as PillowImage
 
+from children import seconds_of
+from clocks import Clock
 from splats import Workload
 from splatseed import PointCloud, Scene
 from splatseed.camera import Intrinsics, quat_from_rotation
@@ -29,7 +29,6 @@ from splatseed.scene import Image
 from splatseed.train.gaussians import SH_C0
 from splatseed.train.ply import write_gaussians
 from splatseed.train.views import View
-from stopwatch import Clock
 
 __all__ = ["seconds_per_step"]
 
@@ -104,11 +103,11 @@ def _command(program: Path, scene: Path, gaussians: Path, steps: int) -> list[st
 
 
 def _seconds(command: Sequence[str], threads: int, clock: Clock) -> float:
-    """How long a command takes."""
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads)}
-    started, before = time.perf_counter(), os.times()
+    """How long a run takes."""
     try:
-        subprocess.run(command, check=True, capture_output=True, text=True, env=environment)
+        return seconds_of(
+            command, clock, threads=threads, environment={"OMP_NUM_THREADS": str(threads)}
+        )
     except (OSError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", None) or getattr(error, "stdout", None) or str(error)
         raise MissingDependencyError(
@@ -116,7 +115,3 @@ def _seconds(command: Sequence[str], threads: int, clock: Clock) -> float:
             found=said.strip()[-500:],
             fix="Build it for the CPU from its repository, or leave out --opensplat.",
         ) from error
-    took, after = time.perf_counter() - started, os.times()
-    busy = after.children_user + after.children_system
-    busy -= before.children_user + before.children_system
-    return took if clock == "wall" else busy / threads

@@ -20,12 +20,13 @@ import tyro
 from torch import Tensor
 
 from children import avx2_environment, call
+from clocks import Clock
 from machine import describe, warn_if_busy
 from markdown import table
 from splats import Workload, make_workload, useful_pairs
 from splatseed.errors import SplatseedError
 from splatseed.render import rasterization
-from stopwatch import RENDER_STAGES, Clock, Stopwatch, timed
+from stopwatch import RENDER_STAGES, Stopwatch, timed
 from torch_rasterizer import rasterize
 
 __all__: list[str] = []

@@ -1,31 +1,24 @@
 """Where the time of a render or a training step goes, without a change to what is timed.
 
 Notation: a *stage* is some of the package's functions; its time is its own, less that of stages that
-it calls. Clock ``wall`` is the wall's. Clock ``cpu`` is for a machine that others use too (Linux): of
-every stage the time that the busiest thread was on a core, which is what the wall's would be were
-nothing else running. Promise: functions are replaced by ones that call them and look at the clock,
-and put back afterwards; a stage that never ran is an error, so that a renamed function cannot read as
-no time.
+it calls, by one of ``clocks``. Promise: functions are replaced by ones that call them and look at the
+clock, and put back afterwards; a stage that never ran is an error, so that a renamed function cannot
+read as no time.
 """
 
 from __future__ import annotations
 
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
-
+from clocks import Clock, start_clock
 from splatseed.render import blending, functions
 from splatseed.render.functions import Blend, Harmonics, Project
 
-__all__ = ["RENDER_STAGES", "Clock", "Stopwatch", "timed"]
-
-Clock = Literal["wall", "cpu"]
+__all__ = ["RENDER_STAGES", "Stopwatch", "timed"]
 
 Place = tuple[Any, str]
 """An object and the name of the function in it."""
@@ -54,7 +47,7 @@ class Stopwatch:
     def __init__(self, clock: Clock = "wall") -> None:
         self.seconds: dict[str, float] = defaultdict(float)
         self.ever: set[str] = set()
-        self._now = _wall if clock == "wall" else _cpu_clock()
+        self._now = start_clock(clock)
         self._inner: list[Any] = []
 
     def lap(self) -> dict[str, float]:
@@ -78,18 +71,6 @@ class Stopwatch:
                     self._inner[-1] += took
 
         return timed_function
-
-
-def _wall() -> np.ndarray:
-    return np.array([time.perf_counter()])
-
-
-def _cpu_clock() -> Callable[[], np.ndarray]:
-    """A clock of the seconds that each thread of this process has been on a core."""
-    # A thread's clock by its number, as Linux' clock_getcpuclockid makes it.
-    threads = sorted(int(each.name) for each in Path("/proc/self/task").iterdir())
-    clocks = [~thread << 3 | 6 for thread in threads]
-    return lambda: np.array([time.clock_gettime(clock) for clock in clocks])
 
 
 @contextmanager

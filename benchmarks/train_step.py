@@ -9,10 +9,8 @@ of its own. Each table is Markdown. See README.md for what is and is not measure
 from __future__ import annotations
 
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +20,8 @@ import numpy as np
 import torch
 import tyro
 
-from children import call
-from end_to_end import interpreter_seconds
+from children import call, seconds_of
+from clocks import Clock
 from machine import describe, warn_if_busy
 from markdown import table
 from memory import status_bytes
@@ -41,7 +39,7 @@ from splatseed.train.state import TrainState
 from splatseed.train.strategies import make_strategy
 from splatseed.train.trainer import Trainer
 from splatseed.train.views import load_split
-from stopwatch import RENDER_STAGES, Clock, Place, Stopwatch, timed
+from stopwatch import RENDER_STAGES, Place, Stopwatch, timed
 
 __all__: list[str] = []
 
@@ -52,6 +50,7 @@ SIZES = {(50_000, 400, 300): 30.0, (200_000, 800, 600): 110.0}
 """Gaussians, width and height, and the target in ms on two cores."""
 IMPORT_TARGET = 0.3
 WARM_UP = 8
+STARTS = 7
 SMALL = (1_000, 64, 48)
 PARTS = {
     "project": ("project", "project backward"),
@@ -159,12 +158,12 @@ def _pairs_per_pixel(trainer: Trainer) -> float:
     return pairs / pixels
 
 
-def first_step(path: str) -> float:
-    """Seconds of the first render, loss and backward of a process."""
+def first_step(path: str, clock: Clock) -> float:
+    """Seconds of the first render, loss and backward of a process, modules being imported."""
     trainer = _trainer(Workload.load(Path(path)))
-    started = time.perf_counter()
-    trainer.warm_up()
-    return time.perf_counter() - started
+    watch = Stopwatch(clock)
+    watch.wrap("first", trainer.warm_up)()
+    return watch.lap()["first"]
 
 
 @dataclass(frozen=True)
@@ -254,48 +253,34 @@ def _part(run: Run, forward: str, backward: str) -> str:
     return f"{both:.1f} ({run.median(backward):.1f})" if backward else f"{both:.1f}"
 
 
-def print_start_up(repeats: int = 5) -> None:
+def print_start_up(clock: Clock) -> None:
     """Import, and the first step with a cold and a warm cache of compiled kernels."""
-    rows = [
-        [
-            "import splatseed, less the interpreter",
-            f"{import_seconds(repeats):.2f}",
-            f"{IMPORT_TARGET:g}",
-        ]
-    ]
+    text = "import splatseed, less an interpreter that does nothing"
+    rows = [[text, f"{import_seconds(clock):.2f}", f"{IMPORT_TARGET:g}"]]
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "scene.npz"
+        path, cache = Path(folder) / "scene.npz", {"NUMBA_CACHE_DIR": str(Path(folder) / "cache")}
         make_workload(*SMALL).save(path)
-        for name in ("nothing on disk: compile", "compiled kernels on disk"):
-            seconds, inner = _timed_child(path, Path(folder) / "cache")
-            rows.append([f"first step, {name}", f"{inner:.1f}", ""])
-            rows.append(["- from the start of the process", f"{seconds:.1f}", ""])
+        for name in ("nothing on disk, so compiling", "compiled kernels on disk"):
+            seconds = call(
+                "train_step:first_step", threads=THREADS[-1], environment=cache,
+                path=str(path), clock=clock,
+            )  # fmt: skip
+            rows.append([f"first step of a process, {name}", f"{seconds:.2f}", ""])
     print(f"### Starting up\n\n{table(['', 's', 'target s'], rows)}\n")
 
 
-def _timed_child(path: Path, cache: Path) -> tuple[float, float]:
-    started = time.perf_counter()
-    environment = {"NUMBA_CACHE_DIR": str(cache)}
-    inner = call(
-        "train_step:first_step", threads=THREADS[-1], environment=environment, path=str(path)
-    )
-    return time.perf_counter() - started, float(inner)
-
-
-def import_seconds(repeats: int) -> float:
+def import_seconds(clock: Clock) -> float:
     """Best seconds to ``import splatseed``, less those of an interpreter that does nothing.
 
     Raises:
-        RuntimeError: It imports PyTorch.
+        subprocess.CalledProcessError: It imports PyTorch.
     """
     probe = "import sys, splatseed; sys.exit('torch' in sys.modules)"
-    seconds = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        if subprocess.run([sys.executable, "-c", probe], check=False).returncode:
-            raise RuntimeError("import splatseed failed, or imported torch")
-        seconds.append(time.perf_counter() - started)
-    return min(seconds) - min(interpreter_seconds(repeats))
+    imports, nothing = (
+        min(seconds_of([sys.executable, "-c", code], clock) for _ in range(STARTS))
+        for code in (probe, "pass")
+    )
+    return imports - nothing
 
 
 def print_opensplat(
@@ -336,7 +321,7 @@ def main(settings: Settings) -> None:
     print_steps(runs)
     print_parts(runs)
     if settings.start_up:
-        print_start_up()
+        print_start_up(settings.clock)
     if settings.opensplat is not None:
         program, made = settings.opensplat, [(name, work) for name, work, _ in workloads]
         _or_skip("OpenSplat", lambda: print_opensplat(program, made, runs, settings.clock))

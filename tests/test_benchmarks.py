@@ -21,6 +21,7 @@ FOLDER = Path(__file__).parents[1] / "benchmarks"
 MODULES = (
     "splats",
     "children",
+    "clocks",
     "stopwatch",
     "torch_rasterizer",
     "opensplat",
@@ -153,7 +154,7 @@ def test_time_counts_once_and_functions_are_put_back(bench, monkeypatch):
 
     clock = iter(range(10))
     fake = SimpleNamespace(perf_counter=lambda: next(clock))
-    monkeypatch.setattr(bench.stopwatch, "time", fake)
+    monkeypatch.setattr(bench.clocks, "time", fake)
     owner = SimpleNamespace(inner=int, outer=outer)
     before = dict(vars(owner))
     with bench.stopwatch.timed({"a": [(owner, "outer")], "b": [(owner, "inner")]}) as watch:
