@@ -291,6 +291,28 @@ def test_an_image_that_the_network_cannot_take_is_one_error(saved, tmp_path):
         load_network(str(folder), device="cpu")([np.zeros((9, 10, 3), np.uint8)])
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB."),
+        RuntimeError(
+            "[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried 9 bytes"
+        ),
+    ],
+)
+def test_too_little_memory_names_the_flags(error, saved, ramp):
+    class Greedy(torch.nn.Module):
+        config = transformers.AutoConfig.from_pretrained(saved("dpt"))
+
+        def forward(self, **_):
+            raise error
+
+    processor = transformers.AutoImageProcessor.from_pretrained(saved("dpt"), backend="pil")
+    network = HuggingFaceNetwork(processor, Greedy(), Meaning("z", "made"), torch.device("cpu"))
+    with pytest.raises(ParameterError, match=r"for 2 images of 32 x 32.*smaller --batch"):
+        network([ramp, ramp])
+
+
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_an_error(saved):
     with pytest.raises(ParameterError, match="--device cpu"):

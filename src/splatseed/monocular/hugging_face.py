@@ -132,18 +132,8 @@ class HuggingFaceNetwork:
     def _run(self, values: Float[Tensor, "B 3 h w"]) -> Any:
         try:
             return self._network(pixel_values=values.to(self._device))
-        except torch.cuda.OutOfMemoryError as error:
-            raise ParameterError(
-                f"a batch that fits the memory of the GPU, {list(values.shape)}",
-                found=str(error).partition(".")[0],
-                fix="Pass a smaller --batch, or --device cpu.",
-            ) from None
-        except (RuntimeError, ValueError, AttributeError) as error:
-            raise SceneFormatError(
-                f"a network that takes images of {values.shape[3]} x {values.shape[2]} pixels",
-                found=one_line(error),
-                fix="Its preprocessor_config.json may belong to another network.",
-            ) from error
+        except (RuntimeError, ValueError) as error:
+            raise _failed(error, values) from error
 
 
 def load_hugging_face(
@@ -169,6 +159,22 @@ def load_hugging_face(
         meaning = meaning_of(_read_config(model).to_dict(), model, kind)
         processor, network = _load(model)
     return HuggingFaceNetwork(processor, network, meaning, where)
+
+
+def _failed(error: Exception, values: Float[Tensor, "B 3 h w"]) -> SplatseedError:
+    """What to tell of a network that stopped; PyTorch's word for memory on the CPU is "allocate"."""
+    batch, _, height, width = values.shape
+    if isinstance(error, torch.cuda.OutOfMemoryError) or "allocate" in str(error):
+        return ParameterError(
+            f"enough memory for {batch} images of {width} x {height} at once",
+            found=one_line(error).partition(". ")[0],
+            fix="Pass a smaller --batch or --max-size, or another --device.",
+        )
+    return SceneFormatError(
+        f"a network that takes images of {width} x {height} pixels",
+        found=one_line(error),
+        fix="Its preprocessor_config.json may belong to another network.",
+    )
 
 
 def _pick_device(device: DeviceName) -> torch.device:
@@ -243,7 +249,7 @@ def _load(model: str) -> tuple[Any, Any]:
 
 
 def _unloadable(model: str, error: Exception) -> SplatseedError:
-    if "torchvision" in str(error) and find_spec("torchvision") is None:
+    if "torchvision" in str(error).lower() and find_spec("torchvision") is None:
         return MissingDependencyError(
             f"torchvision, which the image processor of {model} needs",
             found="none",
