@@ -22,7 +22,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.train.photographs import load_photograph
 
-__all__ = ["View", "load_split", "load_views"]
+__all__ = ["View", "check_lens", "load_split", "load_views"]
 
 MIN_SIDE = 11
 """The window of SSIM, in pixels: smaller views cannot be scored."""
@@ -109,7 +109,7 @@ def load_views(
     """
     folder = _image_folder(scene)
     for image in images:
-        _check_lens(image)
+        check_lens(image)
     read = partial(_load_view, folder=folder, data_factor=data_factor, cache_dir=cache_dir)
     views = []
     with ThreadPoolExecutor(READERS) as pool:
@@ -130,7 +130,12 @@ def _image_folder(scene: Scene) -> Path:
     return folder
 
 
-def _check_lens(image: Image) -> None:
+def check_lens(image: Image) -> None:
+    """Refuse an image whose camera has lens distortion.
+
+    Raises:
+        SceneFormatError: It has.
+    """
     lens = image.intrinsics
     if not lens.is_pinhole and any(lens.params[_focal_and_center(lens.model) :]):
         raise SceneFormatError(

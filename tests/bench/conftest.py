@@ -1,0 +1,44 @@
+"""A small scene on disk, and plans for it."""
+
+from __future__ import annotations
+
+import os
+
+# Set before PyTorch loads its thread pool, as the command line does: see splatseed.cli.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import shutil
+
+import pytest
+
+from splatseed.bench.plan import Plan, PlannedScene
+from splatseed.synthetic import make_capture, write_capture
+
+
+@pytest.fixture(scope="session")
+def room_path(tmp_path_factory):
+    """A COLMAP scene of 9 views of 64 x 48 with depth maps, not to be written to."""
+    path = tmp_path_factory.mktemp("room") / "room"
+    return write_capture(make_capture(0, num_views=9, width=64, height=48), path)
+
+
+@pytest.fixture
+def own_room(room_path, tmp_path):
+    """A copy that a test may spoil."""
+    return shutil.copytree(room_path, tmp_path / "own room")
+
+
+@pytest.fixture
+def small_plan(room_path):
+    """Four runs of three steps."""
+    return Plan(
+        scenes=(PlannedScene(str(room_path)),),
+        methods=("sfm", "linear"),
+        ratios=(2,),
+        strategies=("none",),
+        repeats=2,
+        max_steps=3,
+        test_every=4,
+        sh_degree=0,
+        backend="cpu",
+    )
