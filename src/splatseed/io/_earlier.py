@@ -29,8 +29,8 @@ def mark_generated(scene: Scene) -> Scene:
     source = np.full(total, GENERATED, np.uint8)
     source[:num_original] = 0
     warning = (
-        f"This scene was upsampled before: new points start from its {num_original:,} originals "
-        f"and replace the {total - num_original:,} made then."
+        f"{total - num_original:,} of the points were added by splatseed to {num_original:,} originals;"
+        " upsampling again would replace them."
     )
     return replace(
         scene,
