@@ -19,7 +19,7 @@ from typing import Any
 from clocks import Clock
 from splatseed.errors import SplatseedError
 
-__all__ = ["avx2_environment", "call", "seconds_of"]
+__all__ = ["avx2_environment", "call", "seconds_of", "thread_settings"]
 
 THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 AVX2 = {"NUMBA_CPU_NAME": "x86-64-v3", "ATEN_CPU_CAPABILITY": "avx2"}
@@ -43,10 +43,9 @@ def call(
     Raises:
         ChildError: It failed; what it wrote to stderr is in the message.
     """
-    settings = {name: str(threads) for name in THREADS} | {"OMP_WAIT_POLICY": "passive"}
     done = subprocess.run(
         [sys.executable, __file__, function, json.dumps(arguments)],
-        env={**os.environ, **settings, **(environment or {})},
+        env={**os.environ, **thread_settings(threads), **(environment or {})},
         capture_output=True, check=False, text=True,
     )  # fmt: skip
     if done.returncode:
@@ -54,6 +53,11 @@ def call(
             f"{function} to run on {threads} threads", found=done.stderr[-2000:], fix="See there."
         )
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def thread_settings(threads: int) -> dict[str, str]:
+    """Variables for so many threads, idle ones asleep."""
+    return {name: str(threads) for name in THREADS} | {"OMP_WAIT_POLICY": "passive"}
 
 
 def seconds_of(

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image as PillowImage
 
-from children import seconds_of
+from children import seconds_of, thread_settings
 from clocks import Clock
 from splats import Workload
 from splatseed import PointCloud, Scene
@@ -105,9 +105,7 @@ def _command(program: Path, scene: Path, gaussians: Path, steps: int) -> list[st
 def _seconds(command: Sequence[str], threads: int, clock: Clock) -> float:
     """How long a run takes."""
     try:
-        return seconds_of(
-            command, clock, threads=threads, environment={"OMP_NUM_THREADS": str(threads)}
-        )
+        return seconds_of(command, clock, threads=threads, environment=thread_settings(threads))
     except (OSError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", None) or getattr(error, "stdout", None) or str(error)
         raise MissingDependencyError(
