@@ -17,7 +17,7 @@ from PIL import Image as PilImage, ImageDraw
 
 from splatseed.camera import Camera
 from splatseed.depth import Alignment
-from splatseed.depth.planar import map_camera, planar_depth
+from splatseed.depth.planar import PlanarDepth, map_camera
 from splatseed.depth.sightings import find_sightings
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
@@ -146,8 +146,7 @@ def _depth_colors(
 
 def _planar(depth: DepthMap, camera: Camera, alignment: Alignment) -> Float64[np.ndarray, "H W"]:
     """Planar depth in scene units; NaN where unknown."""
-    values, factor = planar_depth(depth, camera, alignment.scale, alignment.shift, unit_ray=False)
-    return values * np.float64(factor)
+    return PlanarDepth.of(depth, camera, alignment.scale, alignment.shift, unit_ray=False).whole()
 
 
 def _range(values: Float64[np.ndarray, "H W"] | Float32[np.ndarray, "H W"]) -> tuple[float, float]:

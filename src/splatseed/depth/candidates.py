@@ -8,42 +8,46 @@ tier, points are spread evenly in space, or every image gives the same number as
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatseed.depth.consistency import Support, find_support
+from splatseed.depth.harmony import harmonize
 from splatseed.depth.neighbors import choose_neighbors
+from splatseed.depth.planar import lift_pixels
 from splatseed.depth.settings import Settings
 from splatseed.depth.spreading import spread_points
-from splatseed.depth.views import View
+from splatseed.depth.views import Reduced, View
 from splatseed.errors import PointCloudError
 from splatseed.progress import Progress, in_threads
 
 __all__ = ["DISTRUSTED", "NEAR_EDGE", "UNCONFIRMED", "Candidates", "choose", "gather"]
 
 SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
+PIECE = 4
+"""Views that a thread takes at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Points that could be added, image after image.
+    """Points that could be added, view after view.
 
     Args:
         xyz: World positions, float32 [C, 3].
         rgb: Colours, uint8 [C, 3].
         footprint: Size of a pixel at their depth, scene units, float32 [C].
-        image_idx: Which view each comes from, int32 [C].
         tier: How far each can be trusted, uint8 [C].
+        counts: How many are of each view, int64 [V].
     """
 
     xyz: Float32[np.ndarray, "C 3"]
     rgb: UInt8[np.ndarray, "C 3"]
     footprint: Float32[np.ndarray, " C"]
-    image_idx: Int32[np.ndarray, " C"]
     tier: UInt8[np.ndarray, " C"]
+    counts: Int64[np.ndarray, " V"]
 
     @cached_property
     def num_sound(self) -> int:
@@ -52,16 +56,57 @@ class Candidates:
 
 
 def gather(views: Sequence[View], settings: Settings, progress: Progress) -> Candidates:
-    """Put the views' candidates together, held against other views if the settings say so."""
-    tiers = _tiers(views, settings, progress)
-    counts = [len(view.xyz) for view in views]
-    return Candidates(
-        np.concatenate([view.xyz for view in views]),
+    """Lift the views' candidates, and hold them against other views if the settings say so."""
+    counts = np.array([len(view) for view in views])
+    neighbors = choose_neighbors(views, settings.num_neighbors)
+    factors = np.ones(len(views))
+    if settings.harmonizes:
+        factors = harmonize(views, neighbors, progress)
+    copies = _rescaled(views, factors)
+    total, start_of = int(counts.sum()), np.cumsum(counts) - counts
+    found = Candidates(
+        np.empty((total, 3), np.float32),
         np.concatenate([view.rgb for view in views]),
-        np.concatenate([view.footprint for view in views]),
-        np.repeat(np.arange(len(views), dtype=np.int32), counts),
-        np.concatenate(tiers),
+        np.empty(total, np.float32),
+        np.zeros(total, np.uint8),
+        counts,
     )
+
+    def work(first: int, last: int) -> None:
+        for i in range(first, last):
+            mine = slice(start_of[i], start_of[i] + counts[i])
+            _fill(found, mine, views[i], float(factors[i]))
+            asked = [copy for j in neighbors[i] if j >= 0 and (copy := copies[j]) is not None]
+            own = copies[i]
+            if settings.compares_views and own is not None:
+                support = find_support(found.xyz[mine], own, asked, settings)
+                found.tier[mine] = _tier(views[i], support, settings)
+
+    in_threads(work, len(views), PIECE, "compare views", progress)
+    return found
+
+
+def _fill(found: Candidates, mine: slice, view: View, factor: float) -> None:
+    """Write a view's candidates where they belong."""
+    lift_pixels(view.pixel, view.z, view.camera, found.xyz[mine], factor)
+    np.multiply(view.z, factor / view.camera.K[0, 0], out=found.footprint[mine])
+    found.tier[mine][view.edge] = NEAR_EDGE
+
+
+def _rescaled(views: Sequence[View], factors: Float64[np.ndarray, " V"]) -> list[Reduced | None]:
+    """The reduced copies, with depth multiplied."""
+    return [
+        view.reduced and replace(view.reduced, factor=view.reduced.factor * factor)
+        for view, factor in zip(views, factors.tolist(), strict=True)
+    ]
+
+
+def _tier(view: View, support: Support, settings: Settings) -> UInt8[np.ndarray, " C"]:
+    tier = np.where(support.agreeing >= settings.min_agreeing, SOUND, UNCONFIRMED).astype(np.uint8)
+    tier[view.edge] = NEAR_EDGE
+    if not settings.see_through:
+        tier[support.seen_through] = DISTRUSTED
+    return tier
 
 
 def choose(
@@ -93,18 +138,19 @@ def choose(
             found=f"{usable:,} that no other view looks through" if usable else "none",
             fix="Ask for fewer, or allow more with --depth.see-through or a larger --depth.region.",
         )
-    chosen = np.empty(0, np.int64)
+    taken = np.zeros(len(candidates.tier), bool)
+    missing = num
     for tier in range(DISTRUSTED):
         members = np.flatnonzero(candidates.tier == tier)
-        missing = num - len(chosen)
         if missing < len(members):
-            taken = np.concatenate([originals, candidates.xyz[chosen]])
-            members = members[_pick(candidates, members, taken, missing, settings, rng)]
-        chosen = np.concatenate([chosen, members])
-        if len(chosen) == num:
+            there = np.concatenate([originals, candidates.xyz[taken]])
+            members = members[_pick(candidates, members, there, missing, settings, rng)]
+        taken[members] = True
+        missing -= len(members)
+        if missing == 0:
             break
     progress("choose points", 1.0)
-    return np.sort(chosen)
+    return np.flatnonzero(taken)
 
 
 def _pick(
@@ -119,42 +165,17 @@ def _pick(
     if settings.spread:
         xyz, footprint = candidates.xyz[members], candidates.footprint[members]
         return spread_points(xyz, footprint, taken, num, rng)
-    return _even_shares(candidates.image_idx[members], num, rng)
+    view_idx = np.repeat(np.arange(len(candidates.counts)), candidates.counts)
+    return _even_shares(view_idx[members], num, rng)
 
 
 def _even_shares(
-    image_idx: Int32[np.ndarray, " C"], num: int, rng: np.random.Generator
+    view_idx: Int64[np.ndarray, " C"], num: int, rng: np.random.Generator
 ) -> Int64[np.ndarray, " num"]:
-    """``num`` of C indices, as many of every image as it and the others have."""
-    order = rng.permutation(len(image_idx))
-    order = order[np.argsort(image_idx[order], kind="stable")]
-    counts = np.bincount(image_idx)
+    """``num`` of C indices, as many of every view as it and the others have."""
+    order = rng.permutation(len(view_idx))
+    order = order[np.argsort(view_idx[order], kind="stable")]
+    counts = np.bincount(view_idx)
     place = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
-    # The first of every image, then the second of every image, and so on.
+    # The first of every view, then the second of every view, and so on.
     return np.asarray(order[np.argsort(place, kind="stable")[:num]])
-
-
-def _tiers(
-    views: Sequence[View], settings: Settings, progress: Progress
-) -> list[UInt8[np.ndarray, " C"]]:
-    """The tiers of every view's candidates."""
-    if not settings.compares_views:
-        return [np.where(view.edge, NEAR_EDGE, SOUND).astype(np.uint8) for view in views]
-    neighbors = choose_neighbors(views, settings.num_neighbors)
-    tiers: list[UInt8[np.ndarray, " C"]] = [np.empty(0, np.uint8)] * len(views)
-
-    def work(start: int, stop: int) -> None:
-        for i in range(start, stop):
-            asked = [views[j] for j in neighbors[i] if j >= 0]
-            tiers[i] = _tier(views[i], find_support(views[i], asked, settings), settings)
-
-    in_threads(work, len(views), 1, "compare views", progress)
-    return tiers
-
-
-def _tier(view: View, support: Support, settings: Settings) -> UInt8[np.ndarray, " C"]:
-    tier = np.where(support.agreeing >= settings.min_agreeing, SOUND, UNCONFIRMED)
-    tier[view.edge] = NEAR_EDGE
-    if not settings.see_through:
-        tier[support.seen_through] = DISTRUSTED
-    return tier.astype(np.uint8)

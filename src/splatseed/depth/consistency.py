@@ -13,10 +13,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from splatseed.depth.settings import Settings
-from splatseed.depth.views import Reduced, View
+from splatseed.depth.views import Reduced
 from splatseed.jit import inline
 
 __all__ = ["Support", "find_support"]
@@ -32,7 +32,7 @@ class Support:
     """What other views say of a view's candidates.
 
     Args:
-        agreeing: How many confirm each, uint8 [C].
+        agreeing: How many confirm each, counted up to the number that is asked for, uint8 [C].
         seen_through: Which some view looks through, bool [C].
     """
 
@@ -40,24 +40,38 @@ class Support:
     seen_through: Bool[np.ndarray, " C"]
 
 
-def find_support(view: View, neighbors: Sequence[View], settings: Settings) -> Support:
-    """Ask the neighbours about a view's candidates."""
-    agreeing = np.zeros(len(view.xyz), np.uint8)
-    seen_through = np.zeros(len(view.xyz), np.bool_)
-    if view.reduced is None:
-        return Support(agreeing, seen_through)
+def find_support(
+    xyz: Float32[np.ndarray, "C 3"], own: Reduced, others: Sequence[Reduced], settings: Settings
+) -> Support:
+    """Ask other views about candidates.
+
+    Args:
+        xyz: The candidates of one view, in the world.
+        own: Its reduced copy.
+        others: Those to ask.
+        settings: How many must confirm, and the tolerances.
+    """
+    agreeing = np.zeros(len(xyz), np.uint8)
+    seen_through = np.zeros(len(xyz), np.bool_)
     limit = np.inf if settings.color_tolerance is None else 3 * 255 * settings.color_tolerance
-    rgb = np.empty((len(view.xyz), 3), np.uint8)
-    _own_colors(view.xyz, *_arrays(view.reduced)[1:], rgb)
-    for neighbor in neighbors:
-        if neighbor.reduced is not None:
-            arrays = _arrays(neighbor.reduced)
-            _ask(view.xyz, rgb, *arrays, settings.tolerance, limit, agreeing, seen_through)
+    rgb = np.empty((len(xyz), 3), np.uint8)
+    _own_colors(xyz, own.grid_from_world, own.rgb, own.rgb_from_grid, rgb)
+    for other in others:
+        _ask(
+            xyz,
+            rgb,
+            other.z,
+            other.factor,
+            other.grid_from_world,
+            other.rgb,
+            other.rgb_from_grid,
+            settings.tolerance,
+            limit,
+            settings.min_agreeing,
+            agreeing,
+            seen_through,
+        )
     return Support(agreeing, seen_through)
-
-
-def _arrays(reduced: Reduced) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    return reduced.z, reduced.grid_from_world, reduced.rgb, reduced.rgb_from_grid
 
 
 @inline
@@ -72,17 +86,28 @@ def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[
 
 @inline
 def _ask(  # type: ignore[no-untyped-def]
-    xyz, own, z, grid_from_world, rgb, rgb_from_grid, tolerance, limit, agreeing, seen_through
+    xyz,
+    own,
+    z,
+    factor,
+    grid_from_world,
+    rgb,
+    rgb_from_grid,
+    tolerance,
+    limit,
+    enough,
+    agreeing,
+    seen_through,
 ):
     """One neighbour's word on all candidates, added to what is known of them."""
     height, width = z.shape
     for k in range(len(xyz)):
         column, row, depth = _project(xyz[k], grid_from_world)
         if depth > 0.0 and -0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5:
-            verdict = _compare(z, column, row, depth, tolerance)
+            verdict = _compare(z, column, row, depth / factor, tolerance)
             if verdict == LOOKS_THROUGH:
                 seen_through[k] = True
-            elif verdict == CONFIRMS:
+            elif verdict == CONFIRMS and agreeing[k] < enough:
                 p, q = _block(column, row, rgb_from_grid, rgb.shape)
                 agreeing[k] += _color_error(own[k], rgb[p, q]) <= limit
 

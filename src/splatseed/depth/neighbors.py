@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Int64
 
 from splatseed.depth.views import View
 from splatseed.jit import inline, kernel, parallel_range
@@ -36,27 +36,24 @@ def choose_neighbors(views: Sequence[View], num: int) -> Int64[np.ndarray, "V nu
         views: All of them; those without a reduced copy neither ask nor answer.
         num: How many.
     """
-    usable = [i for i, view in enumerate(views) if view.reduced is not None and len(view.xyz)]
+    usable = [i for i, view in enumerate(views) if view.reduced is not None and len(view)]
     chosen = np.full((len(views), num), -1)
     if len(usable) < 2:
         return chosen
-    per_view = np.clip(WORK // len(usable) ** 2, MIN_SAMPLES, SAMPLES)
-    samples = np.stack([_samples(views[i], int(per_view)) for i in usable])
+    per_view = int(np.clip(WORK // len(usable) ** 2, MIN_SAMPLES, SAMPLES))
+    samples = np.full((len(usable), per_view, 3), np.inf, np.float32)  # seen by nobody
+    for i, k in enumerate(usable):
+        own = views[k].samples(per_view)
+        samples[i, : len(own)] = own
     grids = [reduced for i in usable if (reduced := views[i].reduced) is not None]
     matrices = np.stack([grid.grid_from_world for grid in grids])
     sizes = np.array([grid.z.shape for grid in grids])
-    centers = np.stack([views[i].center for i in usable])
+    centers = np.stack([views[i].camera.center for i in usable])
     found = np.full((len(usable), num), -1)
     _rank(samples, matrices, sizes, centers, found)
     lookup = np.array([*usable, -1])  # an index of -1 stays one
     chosen[usable] = lookup[found]
     return chosen
-
-
-def _samples(view: View, num: int) -> Float64[np.ndarray, "num 3"]:
-    """Candidates spread evenly over the image: they are in the order of its rows."""
-    places = ((np.arange(num) + 0.5) * (len(view.xyz) / num)).astype(np.int64)
-    return view.xyz[places].astype(np.float64)
 
 
 @kernel
@@ -80,9 +77,13 @@ def _score(i, j, samples, matrices, sizes, centers):  # type: ignore[no-untyped-
     total = 0.0
     m = matrices[j]
     for s in range(samples.shape[1]):
-        x, y, z = samples[i, s]
+        x, y, z = (
+            np.float64(samples[i, s, 0]),
+            np.float64(samples[i, s, 1]),
+            np.float64(samples[i, s, 2]),
+        )
         depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        if depth <= 0.0:
+        if not 0.0 < depth < np.inf:
             continue
         column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
         row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth

@@ -23,6 +23,8 @@ class Settings:
     """SfM points an image must see, or it is left out (paper: 1)."""
     max_residual_ratio: float | None = 3.0
     """Leave out images that fit this many times worse than the median one (paper: none)."""
+    harmonize: bool = True
+    """Then scale the maps, each by one factor, to agree with each other (paper: no)."""
     unit_ray: bool = False
     """Take z for the distance along the ray, as equation 9 says; this bends walls (paper: yes)."""
     region: float = 1.0
@@ -47,6 +49,11 @@ class Settings:
     """Take points as evenly apart as their number allows, whatever image they are from (paper: no)."""
     hold_out: int = 0
     """Leave out every so many-th image by name, as trainers do for the test (8); 0 = use all."""
+
+    @property
+    def harmonizes(self) -> bool:
+        """Whether maps are scaled to each other; those in scene units are left as they are."""
+        return self.align and self.harmonize
 
     @property
     def compares_views(self) -> bool:

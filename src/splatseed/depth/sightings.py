@@ -63,6 +63,8 @@ def find_sightings(scene: Scene) -> Sightings:
     point_idx = row[np.repeat(np.arange(len(tracks)), tracks.lengths)]
     good = point_idx >= 0
     image_ids = tracks.image_ids[good]
+    if len(image_ids) and image_ids.max() < 1 << 16:
+        image_ids = image_ids.astype(np.uint16)  # which is sorted by radix, ten times as fast
     order = np.argsort(image_ids, kind="stable")
     ids, start, count = np.unique(image_ids[order], return_index=True, return_counts=True)
     return Sightings(

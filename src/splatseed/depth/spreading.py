@@ -3,7 +3,7 @@
 Notation: space is cut into cubes of one *side*; the key of a cube is its place, three numbers of 21 bits,
 scrambled so that any bits of it are as good as random ones. Promise: one candidate at most is taken of each cube, that of
 the finest footprint, and none where an original lies; the side is the largest that gives the number, to
-about a hundredth; the result does not depend on threads.
+about a fiftieth; the result does not depend on threads.
 """
 
 from __future__ import annotations
@@ -19,13 +19,15 @@ from splatseed.jit import inline, kernel, parallel_range
 
 __all__ = ["spread_points"]
 
-BUCKETS = 16
+BUCKETS = 32
 """Parts of the hash's range, worked on in parallel."""
 SAMPLED = 2
 """Parts that are looked at to find the side; all of them if there are few candidates."""
 FEW = 1 << 16
 STEPS = 24
-SLACK = 0.01
+LEAST_POWER = 0.2
+"""Of the number of cubes as a power of 1 / side, lest a step be too long."""
+SLACK = 0.02
 EMPTY, BLOCKED = -1, -2
 """What a slot holds in place of a candidate."""
 BITS = 21
@@ -55,28 +57,31 @@ def spread_points(
     taken = cubes.take(side)
     if np.count_nonzero(taken) < num:  # the estimate was a little too large
         taken = cubes.take(side * (1.0 - 2 * SLACK))
-    chosen = np.flatnonzero(taken)
-    if len(chosen) < num:
-        rest = rng.choice(np.flatnonzero(~taken), num - len(chosen), replace=False)
-        return np.sort(np.concatenate([chosen, rest]))
-    return np.sort(rng.choice(chosen, num, replace=False, shuffle=False))
+    surplus = np.count_nonzero(taken) - num
+    if surplus > 0:
+        taken[rng.choice(np.flatnonzero(taken), surplus, replace=False, shuffle=False)] = False
+    else:
+        taken[rng.choice(np.flatnonzero(~taken), -surplus, replace=False, shuffle=False)] = True
+    return np.flatnonzero(taken)
 
 
 def _largest_side(cubes: _Cubes, num: int) -> float:
     """The largest side at which about ``num`` cubes hold a candidate."""
-    extent = cubes.extent
-    least, most = FINEST * extent, extent
-    side = extent / math.sqrt(num)
+    least, most = FINEST * cubes.extent, cubes.extent
+    side, power = (
+        cubes.extent / math.sqrt(num),
+        2.0,
+    )  # points on surfaces; fewer cubes when saturated
+    known: tuple[float, float] | None = None
     for _ in range(STEPS):
-        count = cubes.count(side)
+        count = max(cubes.count(side), 1.0)
         if num <= count <= num * (1.0 + SLACK):
             return side
-        if count > num:
-            least = side
-        else:
-            most = side
-        # Points on surfaces: the number goes with the square of 1 / side.
-        guess = side * math.sqrt(count / (num * (1.0 + 0.5 * SLACK)))
+        least, most = (side, most) if count > num else (least, side)
+        if known is not None and count != known[1]:
+            power = math.log(count / known[1]) / math.log(known[0] / side)
+        known = side, count
+        guess = side * (count / (num * (1.0 + 0.5 * SLACK))) ** (1.0 / max(power, LEAST_POWER))
         side = guess if least < guess < most else math.sqrt(least * most)
     return least
 
@@ -92,12 +97,12 @@ class _Cubes:
     @cached_property
     def low(self) -> Float64[np.ndarray, " 3"]:
         """The lower corner of the candidates' bounding box."""
-        return np.asarray(self.xyz.min(axis=0).astype(np.float64))
+        return np.array([column.min() for column in self.xyz.T], np.float64)
 
     @cached_property
     def extent(self) -> float:
         """Its longest edge."""
-        return float((self.xyz.max(axis=0) - self.low).max()) or 1.0
+        return float((np.array([column.max() for column in self.xyz.T]) - self.low).max()) or 1.0
 
     def count(self, side: float) -> float:
         """Estimate how many cubes hold a candidate and no original."""
@@ -153,7 +158,7 @@ def _take_best(keys, blocked, footprint, buckets, taken):  # type: ignore[no-unt
 @inline
 def _take_bucket(bucket, keys, blocked, footprint, taken):  # type: ignore[no-untyped-def]
     """One bucket, by a hash table with open addressing; the earlier of equals wins."""
-    shift = np.uint64(60)  # the top 4 bits: BUCKETS is 16
+    shift = np.uint64(59)  # the top 5 bits: BUCKETS is 32
     size = 0
     for key in keys:
         size += key >> shift == bucket

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from splatseed.camera import CAMERA_MODELS, Camera
 from splatseed.depth.alignment import Alignment, align_map, trust_units
 from splatseed.depth.drawing import draw_pixels
-from splatseed.depth.planar import map_camera, planar_depth
+from splatseed.depth.planar import PlanarDepth, lift_pixels, map_camera
 from splatseed.depth.settings import Settings
 from splatseed.depth.sightings import Sightings
 from splatseed.depthmap import ASPECT_SLACK, DepthMap, DepthMaps
@@ -40,7 +40,8 @@ class Reduced:
     """An image's depth and colours on a coarse grid.
 
     Args:
-        z: Planar depth in scene units at the grid's points, float32 [h, w]; NaN where unknown.
+        z: Planar depth at the grid's points, float32 [h, w]; NaN where unknown.
+        factor: Scene units a unit of ``z``.
         grid_from_world: World to (column z, row z, z) of the grid, whose points are at whole
             numbers, float64 [3, 4].
         rgb: The photograph's means over squares, uint8 [p, q, 3].
@@ -49,6 +50,7 @@ class Reduced:
     """
 
     z: Float32[np.ndarray, "h w"]
+    factor: float
     grid_from_world: Float64[np.ndarray, "3 4"]
     rgb: UInt8[np.ndarray, "p q 3"]
     rgb_from_grid: Float64[np.ndarray, "2 2"]
@@ -56,27 +58,38 @@ class Reduced:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What stays of an image.
+    """What stays of an image; where its map is rejected, nothing but the alignment.
 
     Args:
-        alignment: Of its map; where it is rejected, all below is empty.
-        center: The camera's position, float64 [3].
-        xyz: Candidates in the world, float32 [C, 3].
-        rgb: Their pixels' colours, uint8 [C, 3].
-        footprint: Size of a pixel at their depth, scene units, float32 [C].
+        alignment: Of its map.
+        camera: In pixels of the map.
+        pixel: Candidates, by their numbers row * W + column, int64 [C], ascending.
+        z: Their planar depth in scene units, float32 [C].
+        rgb: Their colours, uint8 [C, 3].
         edge: Which lie near a jump of depth, bool [C].
         exhausted: Whether the map has no more pixels to give.
-        reduced: Its coarse copy; None where views are not compared.
+        reduced: The coarse copy; None where views are not compared.
     """
 
     alignment: Alignment
-    center: Float64[np.ndarray, " 3"]
-    xyz: Float32[np.ndarray, "C 3"]
+    camera: Camera
+    pixel: Int64[np.ndarray, " C"]
+    z: Float32[np.ndarray, " C"]
     rgb: UInt8[np.ndarray, "C 3"]
-    footprint: Float32[np.ndarray, " C"]
     edge: Bool[np.ndarray, " C"]
     exhausted: bool
     reduced: Reduced | None
+
+    def __len__(self) -> int:
+        """How many candidates there are."""
+        return len(self.pixel)
+
+    def samples(self, num: int) -> Float32[np.ndarray, "num 3"]:
+        """The positions of up to ``num`` candidates spread evenly over the image, which has one."""
+        num = min(num, len(self))
+        which = ((np.arange(num) + 0.5) * (len(self) / num)).astype(np.int64)
+        out = np.empty((num, 3), np.float32)
+        return lift_pixels(self.pixel[which], self.z[which], self.camera, out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +109,7 @@ class Reader:
     settings: Settings
 
     def read(self, image: Image, num: int, rng: np.random.Generator) -> View:
-        """Read an image and its map, and draw ``num`` candidates.
+        """Read an image and its map, and draw ``num`` candidates, or a few more.
 
         Raises:
             SceneNotFoundError: A file is gone.
@@ -109,24 +122,21 @@ class Reader:
         alignment = self._align(depth, camera, points)
         if alignment.rejected is not None:
             return _nothing(alignment, camera)
-        values, scale = planar_depth(
+        planar = PlanarDepth.of(
             depth, camera, alignment.scale, alignment.shift, unit_ray=self.settings.unit_ray
         )
-        uv = _inside(camera, points)
-        drawn = draw_pixels(values, num, uv, self.settings, rng)
-        row, column = np.divmod(drawn.pixel, camera.width)
-        z = values[row, column] * np.float64(scale)
-        uv = np.stack([column + 0.5, row + 0.5], axis=1)
+        drawn = draw_pixels(planar.values, num, _inside(camera, points), self.settings, rng)
         photograph = _Photograph.read(self.folder / image.name, camera)
+        keep = self.settings.compares_views or self.settings.harmonizes
         return View(
             alignment,
-            camera.center,
-            camera.unproject(uv, z).astype(np.float32),
-            photograph.pixels[photograph.rows[row], photograph.columns[column]],
-            (z / camera.K[0, 0]).astype(np.float32),
+            camera,
+            drawn.pixel,
+            planar.at(drawn.pixel),
+            photograph.colors(drawn.pixel),
             drawn.edge,
-            len(drawn.pixel) < num,
-            _reduce(values, scale, camera, photograph) if self.settings.compares_views else None,
+            exhausted=len(drawn.pixel) < num,
+            reduced=_reduce(planar, photograph) if keep else None,
         )
 
     def _align(
@@ -177,6 +187,11 @@ class _Photograph:
         )
         return cls(picture, np.asarray(picture), rows, columns)
 
+    def colors(self, pixel: Int64[np.ndarray, " C"]) -> UInt8[np.ndarray, "C 3"]:
+        """The colours of pixels of the map."""
+        row, column = np.divmod(pixel, len(self.columns))
+        return np.asarray(self.pixels[self.rows[row], self.columns[column]])
+
 
 def _inside(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "K 2"]:
     """Where points fall in the image, those that do, in pixels."""
@@ -184,13 +199,11 @@ def _inside(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarr
     return uv[((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)]
 
 
-def _reduce(
-    values: Float32[np.ndarray, "H W"], scale: float, camera: Camera, photograph: _Photograph
-) -> Reduced:
+def _reduce(planar: PlanarDepth, photograph: _Photograph) -> Reduced:
     """Every f-th pixel of the map, for means would bridge edges, and the means of the photograph."""
-    factor = -(-max(values.shape) // GRID)
+    camera = planar.camera
+    factor = -(-max(planar.values.shape) // GRID)
     first = factor // 2
-    z = values[first::factor, first::factor] * np.float32(scale)
     grid_from_map = (
         np.array([[1.0, 0.0, -(first + 0.5)], [0.0, 1.0, -(first + 0.5)], [0.0, 0.0, factor]])
         / factor
@@ -198,7 +211,8 @@ def _reduce(
     blocks = -(-max(photograph.picture.size) // GRID)
     block_from_map = np.array(photograph.picture.size) / [camera.width, camera.height] / blocks
     return Reduced(
-        z,
+        planar.every(first, factor),
+        planar.scale,
         grid_from_map @ camera.K @ camera.cam_from_world[:3],
         np.asarray(photograph.picture.reduce(blocks)),
         block_from_map[:, None] * [[factor, first + 0.5]],
@@ -209,10 +223,10 @@ def _nothing(alignment: Alignment, camera: Camera) -> View:
     """The view of an image that is left out."""
     return View(
         alignment,
-        camera.center,
-        np.empty((0, 3), np.float32),
-        np.empty((0, 3), np.uint8),
+        camera,
+        np.empty(0, np.int64),
         np.empty(0, np.float32),
+        np.empty((0, 3), np.uint8),
         np.empty(0, np.bool_),
         exhausted=True,
         reduced=None,

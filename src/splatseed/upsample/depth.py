@@ -64,6 +64,7 @@ class Depth(Settings):
             fit="least-squares",
             min_points=1,
             max_residual_ratio=None,
+            harmonize=False,
             unit_ray=True,
             region=0.5,
             placement="uniform",
