@@ -13,7 +13,7 @@ import torch
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.train.settings import Backend
 
-__all__ = ["check_fits", "device_name", "free_bytes", "pick_device"]
+__all__ = ["check_fits", "device_name", "free_bytes", "peak_gpu_bytes", "pick_device"]
 
 BYTES_EACH = 2000
 """A Gaussian's 59 numbers, their gradients and two moments (944 bytes), and as much again for the
@@ -66,6 +66,11 @@ def free_bytes(device: torch.device) -> int | None:
         return torch.cuda.mem_get_info(device)[0]
     known = [free for free in (_free_of_machine(), _free_of_container()) if free is not None]
     return min(known, default=None)
+
+
+def peak_gpu_bytes(device: torch.device) -> int | None:
+    """Most bytes that PyTorch held on a GPU so far; None for the CPU."""
+    return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
 
 
 def _free_of_machine() -> int | None:

@@ -23,7 +23,7 @@ from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.train.config import check_same_seeds, make_config, resumed_settings
 from splatseed.train.curve import Record, write_curve_csv, write_curve_png
-from splatseed.train.device import check_fits, device_name, pick_device
+from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
 from splatseed.train.frame import TrainingFrame, training_frame
 from splatseed.train.gaussians import initial_gaussians
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
@@ -153,6 +153,11 @@ class TrainingRun:
     def device(self) -> str:
         """Where it trains, in words."""
         return device_name(self.trainer.device)
+
+    @property
+    def peak_gpu_bytes(self) -> int | None:
+        """Most bytes that PyTorch held on the GPU so far; None on the CPU."""
+        return peak_gpu_bytes(self.trainer.device)
 
     def train(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
         """Train to the end, or until the user interrupts: then a checkpoint is there.
