@@ -19,7 +19,7 @@ from splatseed.bench.records import SFM, RunResult, RunRow, RunSpec
 from splatseed.train.settings import StrategyName
 from splatseed.upsample import METHODS
 
-__all__ = ["Cell", "Study", "Variant", "studies", "variant_of"]
+__all__ = ["BASELINE", "Cell", "Study", "Variant", "studies", "variant_of"]
 
 SETTINGS = (
     "max_steps",
@@ -141,10 +141,36 @@ class Study:
         return tuple((base[r], other[r]) for r in sorted(base.keys() & other.keys()))
 
     @property
+    def description(self) -> str:
+        """The settings in words."""
+        told = self.settings
+        factor = told["data_factor"]
+        size = (
+            ", ".join(f"{scene} {_size(each)}" for scene, each in factor.items())
+            if isinstance(factor, Mapping)
+            else f"photographs {_size(factor)}"
+        )
+        words = [
+            f"{told['max_steps']:,} steps",
+            size,
+            f"every {told['test_every']}th view tested",
+            f"at most {told['cap_max']:,} Gaussians" if told["cap_max"] else "",
+            f"spherical harmonics of degree {told['sh_degree']}" if told["sh_degree"] != 3 else "",
+            "opacities reset" if told["opacity_reset"] else "",
+            f"backend {told['backend']}",
+            f"splatseed {told['version']}" if told["version"] else "",
+        ]
+        return ", ".join(word for word in words if word)
+
+    @property
     def repeats(self) -> tuple[int, int]:
         """Fewest and most repeats of a cell."""
         counts = [len(cell) for cell in self.cells.values()]
         return min(counts), max(counts)
+
+
+def _size(factor: object) -> str:
+    return "at full size" if factor == 1 else f"at 1/{factor} of their size"
 
 
 def studies(rows: Iterable[RunRow]) -> tuple[Study, ...]:

@@ -1,0 +1,66 @@
+"""Ledgers' rows with known gains in them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from splatseed.bench.records import SFM, Arm, CurvePoint, ImageScore, RunResult, RunRow, RunSpec
+
+SCENES = ("bonsai", "fox", "room0", "treehill")
+GAINS = {(SFM, 1): 0.0, ("linear", 8): 0.3, ("mls", 4): 0.2, ("mls", 8): 0.5, ("random", 8): -0.4}
+"""The gain that is planted for each method and ratio, dB."""
+NOISE = 0.02
+
+
+def result(psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, **changes):
+    """A result whose curve rises to ``psnr`` in a straight line, ``early`` of the way sooner."""
+    rise = [min(1.0, (i + 1) / points / (1 - early)) for i in range(points)]
+    curve = tuple(
+        CurvePoint(
+            steps * (i + 1) // points, 2.0 * (i + 1), psnr - 10 + 10 * rise[i], num_gaussians
+        )
+        for i in range(points)
+    )
+    values = {
+        "psnr": psnr,
+        "ssim": 0.8,
+        "lpips": None,
+        "per_image": (ImageScore("a.png", psnr, 0.8, None),),
+        "curve": curve,
+        "num_seeds": num_gaussians,
+        "num_gaussians": num_gaussians,
+        "model_bytes": num_gaussians * 236,
+        "upsample_seconds": 0.5,
+        "train_seconds": 20.0,
+        "render_seconds": 0.01,
+        "peak_bytes": 5 * 10**8,
+        "device": "CPU",
+    }
+    return RunResult(**{**values, **changes})
+
+
+def spec(scene, method, ratio, *, strategy="none", repeat=0, profile="default", **changes):
+    values = {"max_steps": 1000, "backend": "cpu", "version": "0.1.0", "data_factor": 4}
+    arm = Arm(method, profile, ratio, strategy)
+    return RunSpec(scene, f"{scene}0123", arm, repeat, **{**values, **changes})
+
+
+def rows(
+    scenes=SCENES, gains=GAINS, strategies=("none",), repeats=3, noise=NOISE, seed=0, **changes
+):
+    """All runs of a plan, done; every scene has its level, every repeat its own, every run noise."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for strategy in strategies:
+        for i, scene in enumerate(scenes):
+            level = 24.0 + i + 0.05 * rng.standard_normal(repeats)
+            for (method, ratio), gain in gains.items():
+                for repeat in range(repeats):
+                    psnr = level[repeat] + gain + noise * rng.standard_normal()
+                    count = 5000 if strategy == "mcmc" else int(5000 * math.sqrt(ratio))
+                    made = result(float(psnr), num_gaussians=count, early=0.1 if gain > 0 else 0.0)
+                    run = spec(scene, method, ratio, strategy=strategy, repeat=repeat, **changes)
+                    found.append(RunRow(run, "done", made, started=0.0, finished=25.0))
+    return found
