@@ -42,7 +42,7 @@ STAGES = {
     "backward": ("project", "harmonics", "blend layout", "blend kernel"),
 }
 THREADS = (1, 2)
-PEER_REPEATS = 5
+PEER_REPEATS = 3
 
 
 @dataclass(frozen=True)
@@ -82,13 +82,14 @@ def measure_peer(path: str, clock: Clock) -> dict[str, Any]:
     workload = Workload.load(Path(path))
     inputs, weights = _inputs(workload), _weights(workload)
     _passes(Stopwatch(), rasterization, inputs, weights)
-    peer, theirs = _passes(Stopwatch(clock), rasterize, inputs, weights)
-    repeats = [
-        _passes(Stopwatch(clock), rasterization, inputs, weights) for _ in range(PEER_REPEATS)
-    ]
-    ours = {way: min(seconds[way] for seconds, _ in repeats) for way in STAGES}
-    gap = float((theirs["image"] - repeats[0][1]["image"]).abs().max())
-    return {"peer": peer, "ours": ours, "gap": gap, "pairs": _pairs(repeats[0][1])}
+    found, images = {}, []
+    for name, function in (("peer", rasterize), ("ours", rasterization)):
+        passes = [_passes(Stopwatch(clock), function, inputs, weights) for _ in range(PEER_REPEATS)]
+        found[name] = {way: min(seconds[way] for seconds, _ in passes) for way in STAGES}
+        info = passes[0][1]
+        images.append(info["image"])
+    gap = float((images[0] - images[1]).abs().max())
+    return {**found, "gap": gap, "pairs": _pairs(info)}
 
 
 def _weights(workload: Workload) -> Tensor:
