@@ -7,6 +7,7 @@ they are is looked up, not assumed from the strategy.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from statistics import fmean
 
 from splatseed.bench.gains import Gains, gains
@@ -32,7 +33,7 @@ def ratio_table(study: Study) -> Table:
         found = gains(study, strategy)
         by_method: dict[str, dict[float, Variant]] = {}
         for variant in found.variants:
-            by_method.setdefault(_without_ratio(variant), {})[variant.ratio] = variant
+            by_method.setdefault(replace(variant, ratio=0.0).label, {})[variant.ratio] = variant
         for method, at in by_method.items():
             cells = [gain_cell(found.on_these[at[r]]) if r in at else Cell() for r in ratios]
             rows.append((words(strategy), words(method), *cells))
@@ -49,10 +50,6 @@ NOTE = (
     "dB ± the standard error of training these scenes again. ~: within noise (Holm-corrected over the"
     " variants of a strategy). Means are over the scenes that a variant has."
 )
-
-
-def _without_ratio(variant: Variant) -> str:
-    return variant.label.replace(f" {variant.ratio:g}x", "", 1)
 
 
 def strategy_table(study: Study) -> Table:

@@ -8,7 +8,6 @@ versions are never compared; a run whose PSNR is not finite is set aside and cou
 
 from __future__ import annotations
 
-import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -44,7 +43,7 @@ class Variant:
     Args:
         method: ``SFM``, or a key of ``splatseed.METHODS``.
         profile: "default" or "paper".
-        ratio: Points in all, per original.
+        ratio: Points in all, per original; 0 for any.
         parameters: What differs from the profile, as words such as ``k=12``.
     """
 
@@ -58,8 +57,9 @@ class Variant:
         """In a few words, such as ``mls 8x`` or ``mls 8x (paper) k=12``."""
         if self.method == SFM:
             return SFM
+        ratio = f" {self.ratio:g}x" if self.ratio else ""
         profile = " (paper)" if self.profile == "paper" else ""
-        return " ".join([f"{self.method} {self.ratio:g}x{profile}", *self.parameters])
+        return " ".join([f"{self.method}{ratio}{profile}", *self.parameters])
 
     @property
     def order(self) -> tuple[int, str, str, float, tuple[str, ...]]:
@@ -80,9 +80,10 @@ def variant_of(spec: RunSpec) -> Variant:
     """
     if spec.arm.method == SFM:
         return BASELINE
-    words = tuple(
-        f"{k}={json.dumps(v)}".replace('"', "") for k, v in sorted(spec.parameters.items())
-    )
+    told = dict(spec.parameters)
+    if told.get("hold_out") == spec.test_every:  # what a plan always asks of the method depth
+        del told["hold_out"]
+    words = tuple(f"{name}={value}" for name, value in sorted(told.items()))
     return Variant(spec.arm.method, spec.arm.profile, float(spec.arm.ratio), words)
 
 
