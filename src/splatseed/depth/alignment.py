@@ -170,7 +170,7 @@ def values_at(
     value = depth.values[row, column].astype(np.float64)
     if depth.kind == "ray":
         value /= ray_length(camera, column, row)
-    known = np.isfinite(value) if depth.kind == "inverse" else value > 0
+    known = np.isfinite(value) & ((value > 0) | (depth.kind == "inverse"))
     return value[known], z[inside][known]
 
 

@@ -1,9 +1,9 @@
 """Whether other views confirm a point, or look through it.
 
-Notation: at a point that falls into another view's frame at planar depth z, that view's own depth d is
-known at the four grid points around it. The view *confirms* the point if |d - z| <= tolerance z and the
-colours of both views there are close; it *looks through* the point if even the nearest of the four d is
-clearly farther. A point that lies behind what the view sees is hidden from it, and nothing follows.
+Notation: at a point that falls into another view's frame at planar depth z, that view has its own depth d
+at the four grid points around it. The view *confirms* the point if |d - z| <= tolerance z for one of them
+and the colours of both views there are close; it *looks through* the point if all four d are clearly
+farther. A point that lies behind what the view sees is hidden from it, and nothing follows.
 Promise: only reduced copies are read, so no file is opened again.
 """
 
@@ -114,27 +114,23 @@ def _ask(  # type: ignore[no-untyped-def]
 
 @inline
 def _compare(z, column, row, depth, tolerance):  # type: ignore[no-untyped-def]
-    """What the map of a view says of a depth at a place of its grid."""
+    """What the map of a view says of a depth at a place of its grid; NaN says nothing."""
     x0 = min(max(int(np.floor(column)), 0), max(z.shape[1] - 2, 0))
     y0 = min(max(int(np.floor(row)), 0), max(z.shape[0] - 2, 0))
     x1, y1 = min(x0 + 1, z.shape[1] - 1), min(y0 + 1, z.shape[0] - 1)
     a, b, c, d = z[y0, x0], z[y0, x1], z[y1, x0], z[y1, x1]
-    error = min(_distance(a, depth), _distance(b, depth), _distance(c, depth), _distance(d, depth))
-    if a > 0 and b > 0 and c > 0 and d > 0:  # else some are unknown, and any may confirm
-        nearest, farthest = min(a, b, c, d), max(a, b, c, d)
-        if nearest > depth * (1.0 + THROUGH * tolerance):
-            return LOOKS_THROUGH
-        if farthest - nearest <= THROUGH * tolerance * depth:  # one surface, not two
-            s, t = min(max(column - x0, 0.0), 1.0), min(max(row - y0, 0.0), 1.0)
-            between = (1 - t) * ((1 - s) * a + s * b) + t * ((1 - s) * c + s * d)
-            error = abs(between - depth)
-    return CONFIRMS if error <= tolerance * depth else SAYS_NOTHING
-
-
-@inline
-def _distance(known, depth):  # type: ignore[no-untyped-def]
-    """Between two depths; infinite where one is unknown."""
-    return abs(known - depth) if known > 0 else np.inf
+    near = tolerance * depth
+    if (
+        abs(a - depth) <= near
+        or abs(b - depth) <= near
+        or abs(c - depth) <= near
+        or abs(d - depth) <= near
+    ):
+        return CONFIRMS
+    far = depth + THROUGH * near
+    if a > far and b > far and c > far and d > far:
+        return LOOKS_THROUGH
+    return SAYS_NOTHING
 
 
 @inline
@@ -142,8 +138,9 @@ def _project(point, m):  # type: ignore[no-untyped-def]
     """Column, row and depth of a world point on a grid; it is behind the camera if depth <= 0."""
     x, y, z = np.float64(point[0]), np.float64(point[1]), np.float64(point[2])
     depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-    column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-    row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
+    inverse = 1.0 / depth
+    column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * inverse
+    row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * inverse
     return column, row, depth
 
 

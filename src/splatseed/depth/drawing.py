@@ -19,7 +19,7 @@ from splatseed.jit import inline
 
 __all__ = ["Drawn", "draw_pixels"]
 
-CELLS = 96
+CELLS = 64
 """Cells along the longer side of a map, at most."""
 
 ROUNDS = 4
@@ -28,6 +28,8 @@ LEAST_DISTANCE = 0.5
 
 SURPLUS = 1.15
 """More is drawn than is missing, for some will be unknown or near a jump."""
+LEAST_SHARE = 0.05
+"""Of what is drawn, that is taken to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +67,20 @@ def draw_pixels(
     cumulative = np.cumsum(weight, dtype=np.float64)
     taken = np.zeros(values.shape, np.bool_)
     edges = _edges(settings)
-    pixel = np.empty(0, np.int64)
+    pixel, tried = np.empty(0, np.int64), 0
     for _ in range(ROUNDS):
         missing = num - len(pixel)
         if missing <= 0:
             break
-        picks = _picks(int(SURPLUS * missing) + 1, settings.placement, rng) * cumulative[-1]
+        will_do = max(len(pixel) / tried, LEAST_SHARE) if tried else 1.0
+        picks = _picks(int(SURPLUS * missing / will_do) + 1, settings.placement, rng)
+        picks *= cumulative[-1]
         jitter = rng.random((len(picks), 2), dtype=np.float32)
         part = np.empty(len(picks), np.int64)
         found = _draw(
             values, taken, cumulative, weight.shape[1], step, box, picks, jitter, *edges, part
         )
-        pixel = np.concatenate([pixel, part[:found]])
+        pixel, tried = np.concatenate([pixel, part[:found]]), tried + len(picks)
     if len(pixel) < num:
         return _with_rest(values, pixel, num, box, edges, rng)
     return Drawn(pixel, np.zeros(len(pixel), np.bool_))
@@ -127,19 +131,18 @@ def _with_rest(
     edges: tuple[int, float],
     rng: np.random.Generator,
 ) -> Drawn:
-    """The drawn pixels and as many others as are missing, whatever their weight."""
+    """The drawn pixels and as many others as are missing, whatever their weight, edges last."""
     top, left, bottom, right = box
     free = np.zeros(values.shape, bool)
-    free[top:bottom, left:right] = values[top:bottom, left:right] > 0
+    inner = values[top:bottom, left:right]
+    free[top:bottom, left:right] = (inner > 0) & (inner < np.inf)
     free.ravel()[pixel] = False
-    rest = np.flatnonzero(free)
-    missing = num - len(pixel)
-    if missing < len(rest):
-        rest = rng.choice(rest, missing, replace=False, shuffle=False)
-    pixel = np.sort(np.concatenate([pixel, rest]))
-    edge = np.empty(len(pixel), np.bool_)
-    _mark_edges(values, pixel, *edges, edge)
-    return Drawn(pixel, edge)
+    rest = rng.permutation(np.flatnonzero(free))
+    edge = np.empty(len(rest), np.bool_)
+    _mark_edges(values, rest, *edges, edge)
+    chosen = np.argsort(edge, kind="stable")[: num - len(pixel)]
+    edge = np.concatenate([np.zeros(len(pixel), np.bool_), edge[chosen]])
+    return Drawn(np.concatenate([pixel, rest[chosen]]), edge)
 
 
 @inline
@@ -154,7 +157,7 @@ def _draw(values, taken, cumulative, columns, step, box, picks, jitter, radius, 
         column = cell % columns * step + int(jitter[k, 1] * step)
         if row < top or row >= bottom or column < left or column >= right:
             continue
-        if taken[row, column] or not values[row, column] > 0:
+        if taken[row, column] or not 0 < values[row, column] < np.inf:
             continue
         taken[row, column] = True
         if radius == 0 or not _near_edge(values, row, column, radius, tolerance):
@@ -185,8 +188,8 @@ def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyp
                 continue
             pairs += 1
             before, after = values[y0, x0], values[y1, x1]
-            if before > 0 and after > 0:
+            if 0 < before < np.inf and 0 < after < np.inf:
                 known += 1
                 if abs(1.0 / before + 1.0 / after - here) > 0.5 * tolerance * here:
                     return True
-    return 2 * known < pairs
+    return 2 * known <= pairs

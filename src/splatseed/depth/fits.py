@@ -11,7 +11,13 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-__all__ = ["least_squares_line", "least_squares_scale", "median_scale", "robust_line"]
+__all__ = [
+    "SIGMA_OF_MEDIAN",
+    "least_squares_line",
+    "least_squares_scale",
+    "median_scale",
+    "robust_line",
+]
 
 PAIRS = 256
 GOLDEN = np.array([0.7548776662466927, 0.5698402909980532])

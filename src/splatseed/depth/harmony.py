@@ -22,6 +22,7 @@ from jaxtyping import Float64, Int64
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import spsolve
 
+from splatseed.depth.fits import SIGMA_OF_MEDIAN
 from splatseed.depth.views import View
 from splatseed.jit import inline
 from splatseed.progress import Progress, in_threads
@@ -35,6 +36,8 @@ FAR = 0.25
 """Logarithms of ratios beyond this are of other surfaces."""
 LEAST_SIGMA = 0.005
 """No pair and no SfM cloud is believed to more than this."""
+INDEPENDENT = 0.1
+"""Share of the samples that is taken to be independent: neighbouring ones err alike."""
 HUBER = 1.345
 STEPS = 12
 CONVERGED = 1e-4
@@ -70,24 +73,13 @@ def _compare_all(
             for k, j in enumerate(neighbors[i].tolist()):
                 other = views[j].reduced if j >= 0 else None
                 if other is not None:
-                    logs = np.empty((2, len(samples)))
+                    found[i, k, :2] = i, j
                     m, factor = other.grid_from_world, other.factor
-                    count = _look_up(samples, center, other.z, factor, m, logs)
-                    found[i, k] = (i, j, *_summary(logs[:, :count]))
+                    _compare_pair(samples, center, other.z, factor, m, found[i, k, 2:])
 
     in_threads(work, len(views), PIECE, "harmonize depth", progress)
     rows = found.reshape(-1, 5)
     return np.asarray(rows[np.isfinite(rows).all(axis=1)])
-
-
-def _summary(logs: Float64[np.ndarray, "2 K"]) -> tuple[float, float, float]:
-    """Medians of the logarithms and slopes, and the standard error of the former."""
-    if logs.shape[1] < LEAST_SAMPLES:
-        return np.nan, np.nan, np.nan
-    a, b = np.median(logs[0]), np.median(logs[1])
-    spread = 1.4826 * np.median(np.abs(logs[0] - a))
-    # Neighbouring samples err alike; a tenth of them is taken to be independent.
-    return float(a), float(b), float(max(spread / np.sqrt(0.1 * logs.shape[1]), LEAST_SIGMA))
 
 
 def _solve(
@@ -115,8 +107,9 @@ def _solve(
 
 
 @inline
-def _look_up(samples, center, z, factor, m, out):  # type: ignore[no-untyped-def]
-    """Logarithm of known over expected depth, and the slope of the latter; returns how many are known."""
+def _compare_pair(samples, center, z, factor, m, out):  # type: ignore[no-untyped-def]
+    """Medians a and b of a pair, and the standard error of a; leaves NaN where too little overlaps."""
+    logs, slopes = np.empty(len(samples)), np.empty(len(samples))
     count = 0
     for k in range(len(samples)):
         x, y, w = np.float64(samples[k, 0]), np.float64(samples[k, 1]), np.float64(samples[k, 2])
@@ -125,18 +118,15 @@ def _look_up(samples, center, z, factor, m, out):  # type: ignore[no-untyped-def
             continue
         column = int(np.floor((m[0, 0] * x + m[0, 1] * y + m[0, 2] * w + m[0, 3]) / depth + 0.5))
         row = int(np.floor((m[1, 0] * x + m[1, 1] * y + m[1, 2] * w + m[1, 3]) / depth + 0.5))
-        if (
-            column < 0
-            or row < 0
-            or column >= z.shape[1]
-            or row >= z.shape[0]
-            or not z[row, column] > 0
-        ):
+        if not (0 <= column < z.shape[1] and 0 <= row < z.shape[0] and z[row, column] > 0):
             continue
         log = np.log(factor * z[row, column] / depth)
         if abs(log) <= FAR:
             x, y, w = x - center[0], y - center[1], w - center[2]
-            out[0, count] = log
-            out[1, count] = (m[2, 0] * x + m[2, 1] * y + m[2, 2] * w) / depth
+            logs[count] = log
+            slopes[count] = (m[2, 0] * x + m[2, 1] * y + m[2, 2] * w) / depth
             count += 1
-    return count
+    if count >= LEAST_SAMPLES:
+        out[0], out[1] = np.median(logs[:count]), np.median(slopes[:count])
+        spread = SIGMA_OF_MEDIAN * np.median(np.abs(logs[:count] - out[0]))
+        out[2] = max(spread / np.sqrt(INDEPENDENT * count), LEAST_SIGMA)

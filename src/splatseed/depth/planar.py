@@ -88,6 +88,7 @@ class PlanarDepth:
         if self.along_ray:
             row, column = (np.arange(first, size, step) for size in self.values.shape)
             z /= ray_length(self.camera, column, row[:, None]).astype(np.float32)
+        z[~(z < np.inf)] = np.nan
         return np.asarray(z)
 
     def whole(self) -> Float64[np.ndarray, "H W"]:

@@ -63,7 +63,7 @@ class View:
     Args:
         alignment: Of its map.
         camera: In pixels of the map.
-        pixel: Candidates, by their numbers row * W + column, int64 [C], ascending.
+        pixel: Candidates, by their numbers row * W + column, int64 [C], about row by row.
         z: Their planar depth in scene units, float32 [C].
         rgb: Their colours, uint8 [C, 3].
         edge: Which lie near a jump of depth, bool [C].

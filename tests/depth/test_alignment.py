@@ -1,0 +1,155 @@
+"""Aligning the maps of a whole scene: what is recovered, what is left out, and why."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatseed.depth import align
+from splatseed.depth.alignment import align_map
+from splatseed.depth.planar import ray_length
+from splatseed.depth.sightings import find_sightings
+from splatseed.depthmap import DepthMap
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+
+SCALES = 1.5 ** np.linspace(-3, 3, 12)
+
+
+def with_outliers(scene, share=0.2):
+    """The scene with some of its points moved far off."""
+    rng = np.random.default_rng(5)
+    xyz = scene.points.xyz.copy()
+    wrong = rng.permutation(len(xyz))[: int(share * len(xyz))]
+    xyz[wrong] += rng.normal(scale=2.0, size=(len(wrong), 3))
+    tracks = scene.tracks
+    return scene.replace(points=scene.points.replace(xyz=xyz), tracks=tracks)
+
+
+def lengths(image):
+    camera = image.camera
+    return ray_length(camera, np.arange(camera.width), np.arange(camera.height)[:, None])
+
+
+@pytest.mark.parametrize("tracked", [True, False], ids=["tracks", "projected"])
+@pytest.mark.parametrize("kind", ["z", "ray"])
+def test_a_planted_scale_of_every_image_is_found(kind, tracked, exact, make_maps):
+    rays = [lengths(image) if kind == "ray" else 1.0 for image in exact.images]
+    maps = make_maps(kind, lambda z, i: z * rays[i] / SCALES[i])
+    scene = with_outliers(exact.replace(depths=maps))
+    if not tracked:
+        scene = scene.replace(tracks=None)
+    found = align(scene, max_residual_ratio=None)
+    assert list(found) == [image.name for image in exact.images]
+    for alignment, scale in zip(found.values(), SCALES, strict=True):
+        assert alignment.scale == pytest.approx(scale, rel=0.005)
+        assert (alignment.shift, alignment.rejected) == (0.0, None)
+        assert 0 < alignment.residual < 0.05
+
+
+def test_a_planted_scale_and_shift_of_inverse_depth_are_found(exact, make_maps):
+    maps = make_maps("inverse", lambda z, i: (1.0 / z - 0.02 * i) / SCALES[i])
+    scene = with_outliers(exact.replace(depths=maps))
+    for i, alignment in enumerate(align(scene, max_residual_ratio=None).values()):
+        image, z = exact.images[i], 1.0 / (maps[exact.images[i].name].values * SCALES[i] + 0.02 * i)
+        fitted = 1.0 / (maps[image.name].values * alignment.scale + alignment.shift)
+        known = np.isfinite(z)
+        assert np.median(np.abs(fitted[known] / z[known] - 1)) < 0.005
+        assert alignment.scale == pytest.approx(SCALES[i], rel=0.02)
+
+
+def test_a_point_takes_the_pixel_it_falls_into(exact):
+    """Centres are at +0.5: on a map of noise, half a pixel to any side is another value altogether."""
+    image, rng = exact.images[0], np.random.default_rng(0)
+    values = rng.uniform(1.0, 5.0, (120, 160)).astype(np.float32)
+    row, column = rng.integers(0, (120, 160), (200, 2)).T
+    corner = np.stack([column, row], axis=1)
+    for inside in (0.01, 0.3, 0.7, 0.99):
+        xyz = image.camera.unproject(corner + inside, values[row, column])
+        found = align_map(DepthMap(values), image.camera, xyz, "robust", 20)
+        assert (found.num_points, found.rejected) == (200, None)
+        assert found.residual < 1e-6
+        for dx, dy in ((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0), (0.0, -0.5)):
+            if not (0 < inside + dx < 1 and 0 < inside + dy < 1):
+                off = image.camera.unproject(corner + inside + (dx, dy), values[row, column])
+                assert align_map(DepthMap(values), image.camera, off, "robust", 20).residual > 0.1
+
+
+def test_images_are_left_out_for_a_reason(exact, make_maps):
+    def change(z, i):
+        if i == 0:
+            return np.full_like(z, np.nan)
+        if i == 1:
+            return np.where(np.arange(z.shape[1]) < 3, z, np.nan)  # hardly any point there
+        if i == 2:
+            return z * np.random.default_rng(0).uniform(0.2, 3.0, z.shape)
+        if i == 3:
+            return z * np.random.default_rng(0).uniform(0.9, 1.1, z.shape)
+        return z
+
+    found = list(align(exact.replace(depths=make_maps("z", change))).values())
+    reasons = [alignment.rejected for alignment in found]
+    assert reasons[0] == "the map knows no depth at any pixel"
+    assert "SfM points see depth, and 20 are needed" in reasons[1]
+    assert "at half of the SfM points" in reasons[2]
+    assert "typically" in reasons[3]
+    assert set(reasons[4:]) == {None}
+    kept = list(
+        align(exact.replace(depths=make_maps("z", change)), max_residual_ratio=None).values()
+    )
+    assert kept[3].rejected is None
+
+
+def test_depth_given_for_its_inverse_is_refused(exact, make_maps):
+    found = align(exact.replace(depths=make_maps("inverse")))
+    assert all("rise with depth" in alignment.rejected for alignment in found.values())
+    found = align(exact.replace(depths=make_maps("z", lambda z, _: 1 / z))).values()
+    good = align(exact).values()
+    assert np.median([a.residual for a in found]) > 10 * np.median([a.residual for a in good])
+
+
+def test_only_images_with_a_map_are_named(exact, make_maps):
+    maps = make_maps()
+    for name in list(maps)[::2]:
+        del maps[name]
+    assert set(align(exact.replace(depths=maps))) == set(maps)
+
+
+def test_a_smaller_map_is_read_in_its_own_pixels(exact, make_maps):
+    maps = make_maps("z", lambda z, _: z[::2, ::2])
+    found = align(exact.replace(depths=maps)).values()
+    assert all(a.scale == pytest.approx(1.0, rel=0.01) and not a.rejected for a in found)
+
+
+def test_a_map_of_another_shape_is_an_error(exact, make_maps):
+    name = exact.images[4].name
+    maps = make_maps()
+    maps[name] = DepthMap(maps[name].values[:, :100])
+    with pytest.raises(SceneFormatError, match=rf"{name}.*160 x 120; found 100 x 120"):
+        align(exact.replace(depths=maps))
+
+
+def test_no_maps_are_an_error(exact):
+    with pytest.raises(SceneNotFoundError, match="--depth"):
+        align(exact.replace(depths=None))
+
+
+def test_duplicates_and_new_points_have_no_say(exact):
+    points = exact.points
+    more = points.replace(xyz=points.xyz + 1, source=np.full(len(points), 4, np.uint8))
+    cloud = type(points).concatenate(points, points, more)
+    twice = exact.replace(points=cloud)
+    assert twice.tracks is not None
+    assert align(twice) == align(exact)
+    none = exact.replace(tracks=None)
+    assert align(twice.replace(tracks=None)) == align(none)
+
+
+def test_of_points_that_hide_each_other_the_nearest_counts(exact):
+    image = exact.images[0]
+    camera = image.camera
+    uv = np.array([[80.2, 60.3], [80.4, 60.1], [20.0, 20.0]])
+    xyz = camera.unproject(uv, np.array([2.0, 5.0, 5.0])).astype(np.float32)
+    behind = camera.unproject(uv[:1], np.array([-1.0])).astype(np.float32)
+    points = type(exact.points)(np.concatenate([xyz, behind]), np.zeros((4, 3), np.uint8))
+    seen = find_sightings(exact.replace(points=points, tracks=None)).of(image)
+    np.testing.assert_allclose(seen, xyz[[0, 2]], rtol=1e-6)

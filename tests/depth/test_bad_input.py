@@ -1,0 +1,145 @@
+"""What cannot be lifted, and what is said of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+
+import numpy as np
+import pytest
+
+import splatseed as ss
+from splatseed.camera import Intrinsics
+from splatseed.depthmap import DepthMap
+from splatseed.errors import (
+    ParameterError,
+    PointCloudError,
+    SceneFormatError,
+    SceneNotFoundError,
+)
+
+
+def upsample(scene, **options):
+    return ss.upsample(scene, "depth", ratio=2, **options)
+
+
+def test_a_cloud_alone_will_not_do(exact):
+    with pytest.raises(SceneNotFoundError, match=r"cloud of points alone.*--depth DIR"):
+        upsample(exact.points)
+
+
+def test_maps_must_be_named(exact):
+    for scene in (exact.replace(depths=None), exact.replace(depths={}), exact.replace(images=())):
+        with pytest.raises(SceneNotFoundError, match=r"maps of none of them.*--depth DIR"):
+            upsample(scene)
+
+
+def test_photographs_must_be_there(exact, tmp_path):
+    with pytest.raises(SceneNotFoundError, match="photographs, from which points take"):
+        upsample(exact.replace(source=None))
+    folder = tmp_path / "images"
+    shutil.copytree(exact.source.image_dir, folder)
+    (folder / "view_004.png").unlink()
+    moved = exact.replace(source=dataclasses.replace(exact.source, image_dir=folder))
+    with pytest.raises(SceneNotFoundError, match=r"view_004\.png; found no such file"):
+        upsample(moved)
+    (folder / "view_004.png").write_bytes(b"no image")
+    with pytest.raises(SceneFormatError, match=r"view_004\.png to be an image"):
+        upsample(moved)
+
+
+def test_a_photograph_of_another_shape_is_refused(exact, tmp_path):
+    from PIL import Image as PilImage  # noqa: PLC0415
+
+    folder = tmp_path / "images"
+    shutil.copytree(exact.source.image_dir, folder)
+    with PilImage.open(folder / "view_002.png") as picture:
+        picture.load()
+    picture.resize((120, 160)).save(folder / "view_002.png")
+    moved = exact.replace(source=dataclasses.replace(exact.source, image_dir=folder))
+    with pytest.raises(SceneFormatError, match=r"view_002\.png.*160 x 120; found 120 x 160"):
+        upsample(moved)
+    picture.resize((320, 240)).save(folder / "view_002.png")  # another size is no harm
+    assert upsample(moved).finite.all()
+
+
+def test_a_lens_with_distortion_is_refused(exact):
+    lens = exact.images[0].intrinsics
+    f, cx, cy = lens.params[0], *lens.params[2:]
+    for k, refused in ((0.1, True), (0.0, False)):
+        bent = Intrinsics(1, "SIMPLE_RADIAL", 160, 120, (f, cx, cy, k))
+        images = tuple(dataclasses.replace(image, intrinsics=bent) for image in exact.images)
+        if refused:
+            with pytest.raises(SceneFormatError, match="SIMPLE_RADIAL for view_000"):
+                upsample(exact.replace(images=images))
+        else:
+            assert upsample(exact.replace(images=images)).finite.all()
+
+
+def test_maps_that_know_nothing_are_an_error(exact, make_maps):
+    empty = exact.replace(depths=make_maps("z", lambda z, _: z * np.nan))
+    for options in ({}, {"align": False}, {"profile": "paper"}):
+        with pytest.raises(SceneFormatError, match=r"none among 12; view_000.*knows no depth"):
+            upsample(empty, **options)
+
+
+def test_units_a_thousand_times_too_large_are_aligned_or_refused(exact, make_maps):
+    scene = exact.replace(depths=make_maps("z", lambda z, _: 1000 * z))
+    aligned = upsample(scene)
+    plain = upsample(exact)
+    assert np.median(np.linalg.norm(aligned.xyz - plain.xyz, axis=1)) < 0.01
+    with pytest.raises(SceneFormatError, match=r"1e\+03 times.*--depth-scale"):
+        upsample(scene, align=False)
+
+
+def test_infinities_zeros_and_negatives_are_never_lifted(exact, make_maps):
+    def change(z, i):
+        z = z.copy()
+        z[::3] = (np.inf, 0.0, -1.0)[i % 3]
+        return z
+
+    for profile in ("default", "paper"):
+        seeds = upsample(exact.replace(depths=make_maps("z", change)), profile=profile)
+        assert seeds.finite.all()
+        assert np.abs(seeds.xyz).max() < 10
+
+
+def test_more_than_the_maps_have_is_an_error_that_says_how_many(exact):
+    with pytest.raises(PointCloudError, match=r"can give 1,000,000 points; found 2[12]\d,\d{3}"):
+        ss.upsample(exact, "depth", num_points=len(exact.points) + 1_000_000)
+
+
+@pytest.mark.parametrize("names", [["b.png", "a.png"], ["x/10.png", "x/9.png"]])
+def test_names_need_no_order(names, exact, tmp_path):
+    images = []
+    maps = type(exact.depths)()
+    for name, image in zip(names, exact.images, strict=False):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(exact.source.image_dir / image.name, tmp_path / name)
+        images.append(dataclasses.replace(image, name=name))
+        maps[name] = exact.depths.read(image.name)
+    source = dataclasses.replace(exact.source, image_dir=tmp_path)
+    scene = exact.replace(images=tuple(images), depths=dict_of(maps), source=source)
+    assert upsample(scene).finite.all()
+
+
+def dict_of(maps):
+    """Maps in the order of another container, which must not matter."""
+    return type(maps)(reversed(maps.items()))
+
+
+def test_a_parameter_is_checked_before_anything_is_read(exact):
+    class Untouchable(dict):
+        def read(self, name):
+            raise AssertionError(name)
+
+    scene = exact.replace(depths=Untouchable(exact.depths))
+    with pytest.raises(ParameterError, match="tolerance"):
+        upsample(scene, tolerance=2.0)
+
+
+def test_a_tiny_map_is_enough(exact, make_maps):
+    scene = exact.replace(depths=make_maps("z", lambda z, _: z[::40, ::40]))
+    assert DepthMap(scene.depths.read("view_000.png").values).width == 4
+    seeds = ss.upsample(scene, "depth", num_points=len(exact.points) + 20, align=False)
+    assert seeds.finite.all()

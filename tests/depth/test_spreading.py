@@ -1,0 +1,106 @@
+"""Spreading: one point a cube, held to a dictionary of cubes."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from scipy.spatial import cKDTree
+
+from splatseed.depth.spreading import _Cubes, spread_points
+
+
+def sheet(rng, num):
+    """Points on a bent sheet 2 wide, dense on its left."""
+    u, v = rng.random((2, num)) ** [[2], [1]] * 2
+    return np.stack([u, v, 0.2 * np.sin(3 * u)], axis=1).astype(np.float32)
+
+
+def reference(xyz, footprint, originals, side):
+    """The finest candidate of every cube without an original, one by one."""
+    low = xyz.min(axis=0).astype(np.float64)
+    there = {tuple(np.floor((p - low) / side)) for p in originals.astype(np.float64)}
+    best: dict[tuple[float, ...], int] = {}
+    for k, point in enumerate(xyz.astype(np.float64)):
+        cube = tuple(np.floor((point - low) / side))
+        if cube not in there and (cube not in best or footprint[k] < footprint[best[cube]]):
+            best[cube] = k
+    return sorted(best.values())
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.003, 3.0))
+@settings(max_examples=30, deadline=None)
+def test_cubes_are_those_of_a_dictionary(seed, side):
+    rng = np.random.default_rng(seed)
+    xyz, originals = sheet(rng, 400), rng.normal(size=(60, 3)).astype(np.float32)
+    footprint = rng.integers(0, 5, 400).astype(np.float32)  # ties, which the first wins
+    cubes = _Cubes(xyz, footprint, originals)
+    expected = reference(xyz, footprint, originals, side)
+    assert np.flatnonzero(cubes.take(side)).tolist() == expected
+    assert cubes.count(side) == len(expected)
+
+
+@pytest.mark.parametrize("num", [1, 7, 500, 4000, 5000])
+def test_exactly_so_many_come_out(num, rng):
+    xyz = sheet(rng, 5000)
+    chosen = spread_points(xyz, np.ones(5000, np.float32), xyz[:0], num, rng)
+    assert len(chosen) == num == len(np.unique(chosen))
+    assert (np.diff(chosen) > 0).all()
+
+
+def test_points_come_apart(rng):
+    xyz = sheet(rng, 20_000)
+    chosen = xyz[spread_points(xyz, np.ones(20_000, np.float32), xyz[:0], 1000, rng)]
+    random = xyz[rng.choice(20_000, 1000, replace=False)]
+    places = sheet(rng, 3000) * [1, 1, 1]
+    gap = [cKDTree(cloud).query(places)[0].max() for cloud in (chosen, random)]
+    assert gap[0] < 0.6 * gap[1]
+
+
+def test_originals_keep_their_surroundings(rng):
+    xyz = sheet(rng, 20_000)
+    originals = xyz[xyz[:, 0] < 0.5][::4]
+    chosen = xyz[spread_points(xyz, np.ones(20_000, np.float32), originals, 500, rng)]
+    assert (chosen[:, 0] < 0.5).mean() < 0.1
+
+
+def test_many_candidates_are_estimated_from_some(rng):
+    xyz = rng.random((100_000, 3)).astype(np.float32)
+    cubes = _Cubes(xyz, np.ones(100_000, np.float32), xyz[:0])
+    for side in (0.5, 0.02, 0.001):
+        exact = np.count_nonzero(cubes.take(side))
+        assert cubes.count(side) == pytest.approx(exact, rel=0.05, abs=40)
+    chosen = spread_points(xyz, np.ones(100_000, np.float32), xyz[:0], 20_000, rng)
+    assert len(chosen) == 20_000
+
+
+@pytest.mark.parametrize("copies", [1, 50])
+def test_one_place_fills_up(copies, rng):
+    xyz = np.tile(np.float32([[1, 2, 3]]), (copies, 1))
+    chosen = spread_points(xyz, np.ones(copies, np.float32), xyz[:0], copies, rng)
+    assert len(chosen) == copies
+
+
+def test_threads_do_not_matter(rng):
+    xyz = sheet(rng, 80_000)
+    footprint = rng.random(80_000).astype(np.float32)
+    available, results = numba.config.NUMBA_NUM_THREADS, []
+    try:
+        for threads in (1, available):
+            numba.set_num_threads(threads)
+            results.append(
+                spread_points(xyz, footprint, xyz[:100], 9000, np.random.default_rng(1)).tobytes()
+            )
+    finally:
+        numba.set_num_threads(available)
+    assert len(set(results)) == 1
+
+
+def test_far_outliers_do_not_spoil_it(rng):
+    xyz = np.concatenate([sheet(rng, 5000), np.float32([[1e4, 0, 0], [0, -1e4, 0]])])
+    chosen = spread_points(xyz, np.ones(5002, np.float32), xyz[:0], 1000, rng)
+    near = xyz[chosen][np.abs(xyz[chosen]).max(axis=1) < 10]
+    assert len(near) >= 998
+    distance = cKDTree(near).query(near, 2)[0][:, 1]
+    assert np.median(distance) > 0.02
