@@ -103,7 +103,7 @@ def test_a_slanted_plane_has_no_jumps_and_a_step_within_tolerance_is_none(rng):
 def test_what_is_mostly_unknown_around_comes_last(rng):
     values = slanted(rng, holes=0.0)
     values[:, 40:] = np.nan
-    values[::6, 43::6] = 2.0  # sparse, as a lidar's
+    values[::6, 43:79:6] = 2.0  # sparse, as a lidar's
     settings = Settings(placement="uniform")
     known = int((values > 0).sum())
     some = draw_pixels(values, known // 2, NOWHERE, settings, rng)

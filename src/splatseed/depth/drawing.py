@@ -192,4 +192,4 @@ def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyp
                 known += 1
                 if abs(1.0 / before + 1.0 / after - here) > 0.5 * tolerance * here:
                     return True
-    return 2 * known <= pairs
+    return 2 * known < pairs
