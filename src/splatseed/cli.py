@@ -21,6 +21,7 @@ VERBS = {
     "upsample": "Add points to a scene and write it for any 3DGS trainer.",
     "train": "Train 3D Gaussians on a scene, on a GPU or on the CPU.",
     "evaluate": "Score a trained model: PSNR, SSIM, LPIPS.",
+    "bench": "Compare methods by training: many runs, resumable, then a report.",
     "depth": "Predict depth maps of the photographs, by a network you have.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",

@@ -1,0 +1,62 @@
+"""What a benchmark was run with: machine, system, versions, and the words of the command."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import socket
+from collections.abc import Sequence
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+__all__ = ["describe_environment", "package_version"]
+
+PACKAGES = ("splatseed", "torch", "gsplat", "torchmetrics", "numpy", "scipy", "numba", "ray")
+
+
+def describe_environment(words: Sequence[str]) -> dict[str, Any]:
+    """What is to be known of a call of the command, as plain values.
+
+    Args:
+        words: What followed ``splatseed bench``.
+    """
+    return {
+        "command": shlex.join(["splatseed", "bench", *words]),
+        "folder": str(Path.cwd()),
+        "host": socket.gethostname(),
+        "system": platform.platform(),
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "memory_bytes": _memory(),
+        "python": platform.python_version(),
+        "versions": {name: found for name in PACKAGES if (found := package_version(name))},
+    }
+
+
+def package_version(package: str) -> str:
+    """An installed package's version; empty for one that is not, or that is run from its source."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def _cpu() -> str:
+    """The processor's name."""
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
+        for line in lines:
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def _memory() -> int | None:
+    """Bytes of the machine's memory; None where the system does not tell."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # not on Windows
+        return None

@@ -1,0 +1,110 @@
+"""From a plan to its runs: looking at every scene before any is run."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+from splatseed.bench.environment import package_version
+from splatseed.bench.folder import make_demo_scene
+from splatseed.bench.plan import DEPTH, Plan, PlannedScene, plan_runs
+from splatseed.bench.records import SFM, RunSpec
+from splatseed.bench.scenes import SceneFacts, survey
+from splatseed.commands._bench_options import Asked
+from splatseed.errors import SceneNotFoundError
+from splatseed.progress import Progress
+from splatseed.train.settings import Backend
+
+__all__ = ["Prepared", "local_backend", "prepare"]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A benchmark that can be run.
+
+    Args:
+        plan: Its plan, with the scenes that are there.
+        scenes: What was found of them.
+        runs: Its runs, in order.
+        notes: What the user should know, one sentence each.
+    """
+
+    plan: Plan
+    scenes: Sequence[SceneFacts]
+    runs: Sequence[RunSpec]
+    notes: Sequence[str]
+
+    @property
+    def keys(self) -> frozenset[str]:
+        """The keys of its runs."""
+        return frozenset(spec.key for spec in self.runs)
+
+
+def prepare(asked: Asked, backend: Backend, made: Path, progress: Progress) -> Prepared:
+    """Look at all scenes of a plan, and list its runs.
+
+    Args:
+        asked: What the user asks for.
+        backend: Where runs are trained: not "auto".
+        made: Where a made-up scene is put.
+        progress: Told how far this is.
+
+    Raises:
+        SceneNotFoundError: A scene is not there; for a preset, none is.
+        SceneFormatError: A file of one is not what its format promises.
+    """
+    notes = [f"not there: {', '.join(asked.missing)}"] if asked.missing else []
+    found: list[tuple[PlannedScene, SceneFacts]] = []
+    for scene in asked.plan.scenes:
+        try:
+            found.append((scene, _survey(scene, asked.plan, made, progress)))
+        except SceneNotFoundError as error:
+            if not asked.lenient:
+                raise
+            notes.append(f"{scene.label} is left out: {error}")
+    if not found:
+        raise SceneNotFoundError("scenes to run", found="; ".join(notes), fix="See above.")
+    plan = dataclasses.replace(asked.plan, scenes=tuple(scene for scene, _ in found))
+    scenes = [facts for _, facts in found]
+    runs = plan_runs(plan, scenes, backend, package_version("splatseed"))
+    return Prepared(plan, scenes, runs, [*notes, *_notes(plan, scenes)])
+
+
+def local_backend(backend: Backend) -> Backend:
+    """Where "auto" trains on this machine; without PyTorch, which is missed later, the CPU."""
+    if backend != "auto" or find_spec("torch") is None:
+        return "cpu" if backend == "auto" else backend
+    from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
+
+    return "cuda" if pick_device("auto").type == "cuda" else "cpu"
+
+
+def _survey(scene: PlannedScene, plan: Plan, made: Path, progress: Progress) -> SceneFacts:
+    if scene.is_demo:
+        progress("make the demo scene", 0.0)
+    return survey(
+        make_demo_scene(made) if scene.is_demo else Path(scene.path),
+        scene.label,
+        images=scene.images,
+        depth=Path(scene.depth) if scene.depth else None,
+        with_depth=DEPTH in plan.methods,
+        progress=progress,
+    )
+
+
+def _notes(plan: Plan, scenes: Sequence[SceneFacts]) -> Iterator[str]:
+    for scene in scenes:
+        yield from (f"{scene.name}: {warning}" for warning in scene.warnings)
+    bare = [scene.name for scene in scenes if not scene.depth_digest]
+    if DEPTH in plan.methods and bare:
+        yield f"without depth maps, and so without the method depth: {', '.join(bare)} (--depth DIR)"
+    if SFM not in plan.methods:
+        yield "Without sfm among the methods there is nothing to compare with."
+    if len(plan.profiles) > 1:
+        labels = [arm for arm in plan.arms(plan.strategies[0]) if arm.method != SFM]
+        same = [m for m in plan.methods if len({a.profile for a in labels if a.method == m}) == 1]
+        if same:
+            yield f"run once, as both profiles are the same: {', '.join(same)}"
