@@ -17,6 +17,14 @@ def sheet(rng, num):
     return np.stack([u, v, 0.2 * np.sin(3 * u)], axis=1).astype(np.float32)
 
 
+def spread(xyz, num, rng, originals=None, footprint=None):
+    """Indices of the chosen, by default with nothing to tell candidates apart."""
+    every = np.ones(len(xyz), bool)
+    footprint = every.astype(np.float32) if footprint is None else footprint
+    originals = xyz[:0] if originals is None else originals
+    return np.flatnonzero(spread_points(xyz, footprint, every, originals, num, rng))
+
+
 def reference(xyz, footprint, originals, side):
     """The finest candidate of every cube without an original, one by one."""
     low = xyz.min(axis=0).astype(np.float64)
@@ -35,7 +43,7 @@ def test_cubes_are_those_of_a_dictionary(seed, side):
     rng = np.random.default_rng(seed)
     xyz, originals = sheet(rng, 400), rng.normal(size=(60, 3)).astype(np.float32)
     footprint = rng.integers(0, 5, 400).astype(np.float32)  # ties, which the first wins
-    cubes = _Cubes(xyz, footprint, originals)
+    cubes = _Cubes(xyz, footprint, np.ones(400, bool), originals)
     expected = reference(xyz, footprint, originals, side)
     assert np.flatnonzero(cubes.take(side)).tolist() == expected
     assert cubes.count(side) == len(expected)
@@ -44,14 +52,21 @@ def test_cubes_are_those_of_a_dictionary(seed, side):
 @pytest.mark.parametrize("num", [1, 7, 500, 4000, 5000])
 def test_exactly_so_many_come_out(num, rng):
     xyz = sheet(rng, 5000)
-    chosen = spread_points(xyz, np.ones(5000, np.float32), xyz[:0], num, rng)
+    chosen = spread(xyz, num, rng)
     assert len(chosen) == num == len(np.unique(chosen))
     assert (np.diff(chosen) > 0).all()
 
 
+def test_only_the_eligible_are_chosen(rng):
+    xyz, eligible = sheet(rng, 3000), rng.random(3000) < 0.5
+    taken = spread_points(xyz, np.ones(3000, np.float32), eligible, xyz[:0], 800, rng)
+    assert np.count_nonzero(taken) == 800
+    assert eligible[taken].all()
+
+
 def test_points_come_apart(rng):
     xyz = sheet(rng, 20_000)
-    chosen = xyz[spread_points(xyz, np.ones(20_000, np.float32), xyz[:0], 1000, rng)]
+    chosen = xyz[spread(xyz, 1000, rng)]
     random = xyz[rng.choice(20_000, 1000, replace=False)]
     places = sheet(rng, 3000) * [1, 1, 1]
     gap = [cKDTree(cloud).query(places)[0].max() for cloud in (chosen, random)]
@@ -61,24 +76,25 @@ def test_points_come_apart(rng):
 def test_originals_keep_their_surroundings(rng):
     xyz = sheet(rng, 20_000)
     originals = xyz[xyz[:, 0] < 0.5][::4]
-    chosen = xyz[spread_points(xyz, np.ones(20_000, np.float32), originals, 500, rng)]
+    chosen = xyz[spread(xyz, 500, rng, originals)]
     assert (chosen[:, 0] < 0.5).mean() < 0.1
 
 
 def test_many_candidates_are_estimated_from_some(rng):
     xyz = rng.random((100_000, 3)).astype(np.float32)
-    cubes = _Cubes(xyz, np.ones(100_000, np.float32), xyz[:0])
+    every = np.ones(100_000, bool)
+    cubes = _Cubes(xyz, every.astype(np.float32), every, xyz[:0])
     for side in (0.5, 0.02, 0.001):
         exact = np.count_nonzero(cubes.take(side))
         assert cubes.count(side) == pytest.approx(exact, rel=0.05, abs=40)
-    chosen = spread_points(xyz, np.ones(100_000, np.float32), xyz[:0], 20_000, rng)
+    chosen = spread(xyz, 20_000, rng)
     assert len(chosen) == 20_000
 
 
 @pytest.mark.parametrize("copies", [1, 50])
 def test_one_place_fills_up(copies, rng):
     xyz = np.tile(np.float32([[1, 2, 3]]), (copies, 1))
-    chosen = spread_points(xyz, np.ones(copies, np.float32), xyz[:0], copies, rng)
+    chosen = spread(xyz, copies, rng)
     assert len(chosen) == copies
 
 
@@ -90,7 +106,7 @@ def test_threads_do_not_matter(rng):
         for threads in (1, available):
             numba.set_num_threads(threads)
             results.append(
-                spread_points(xyz, footprint, xyz[:100], 9000, np.random.default_rng(1)).tobytes()
+                spread(xyz, 9000, np.random.default_rng(1), xyz[:100], footprint).tobytes()
             )
     finally:
         numba.set_num_threads(available)
@@ -99,7 +115,7 @@ def test_threads_do_not_matter(rng):
 
 def test_far_outliers_do_not_spoil_it(rng):
     xyz = np.concatenate([sheet(rng, 5000), np.float32([[1e4, 0, 0], [0, -1e4, 0]])])
-    chosen = spread_points(xyz, np.ones(5002, np.float32), xyz[:0], 1000, rng)
+    chosen = spread(xyz, 1000, rng)
     near = xyz[chosen][np.abs(xyz[chosen]).max(axis=1) < 10]
     assert len(near) >= 998
     distance = cKDTree(near).query(near, 2)[0][:, 1]

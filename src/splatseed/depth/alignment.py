@@ -19,6 +19,7 @@ from splatseed.camera import Camera
 from splatseed.depth.fits import (
     least_squares_line,
     least_squares_scale,
+    median,
     median_scale,
     robust_line,
 )
@@ -212,7 +213,7 @@ def _residual(
     if kind == "inverse":
         aligned = 1.0 / np.where(aligned > 0, aligned, np.nan)
     error = np.abs(aligned / z - 1.0)
-    return float(np.median(np.where(np.isfinite(error), error, np.inf)))
+    return float(median(np.where(np.isfinite(error), error, np.inf)))
 
 
 def _too_few(depth: DepthMap, num: int, min_points: int) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.depth.consistency import Support, find_support
 from splatseed.depth.harmony import harmonize
@@ -141,12 +141,12 @@ def choose(
     taken = np.zeros(len(candidates.tier), bool)
     missing = num
     for tier in range(DISTRUSTED):
-        members = np.flatnonzero(candidates.tier == tier)
-        if missing < len(members):
+        members = candidates.tier == tier
+        if missing < np.count_nonzero(members):
             there = np.concatenate([originals, candidates.xyz[taken]])
-            members = members[_pick(candidates, members, there, missing, settings, rng)]
-        taken[members] = True
-        missing -= len(members)
+            members = _pick(candidates, members, there, missing, settings, rng)
+        taken |= members
+        missing -= int(np.count_nonzero(members))
         if missing == 0:
             break
     progress("choose points", 1.0)
@@ -155,18 +155,21 @@ def choose(
 
 def _pick(
     candidates: Candidates,
-    members: Int64[np.ndarray, " C"],
-    taken: Float32[np.ndarray, "N 3"],
+    members: Bool[np.ndarray, " C"],
+    there: Float32[np.ndarray, "N 3"],
     num: int,
     settings: Settings,
     rng: np.random.Generator,
-) -> Int64[np.ndarray, " num"]:
-    """Which ``num`` of the members of a tier to take."""
+) -> Bool[np.ndarray, " C"]:
+    """Which ``num`` of the members of a tier to take, beside the points that are there."""
     if settings.spread:
-        xyz, footprint = candidates.xyz[members], candidates.footprint[members]
-        return spread_points(xyz, footprint, taken, num, rng)
+        xyz, footprint = candidates.xyz, candidates.footprint
+        return spread_points(xyz, footprint, members, there, num, rng)
+    which = np.flatnonzero(members)
     view_idx = np.repeat(np.arange(len(candidates.counts)), candidates.counts)
-    return _even_shares(view_idx[members], num, rng)
+    picked = np.zeros(len(members), bool)
+    picked[which[_even_shares(view_idx[which], num, rng)]] = True
+    return picked
 
 
 def _even_shares(

@@ -65,7 +65,6 @@ def draw_pixels(
     step = -(-max(values.shape) // CELLS)
     weight = _cell_weights(values.shape, step, points, settings)
     cumulative = np.cumsum(weight, dtype=np.float64)
-    taken = np.zeros(values.shape, np.bool_)
     edges = _edges(settings)
     pixel, tried = np.empty(0, np.int64), 0
     for _ in range(ROUNDS):
@@ -77,10 +76,9 @@ def draw_pixels(
         picks *= cumulative[-1]
         jitter = rng.random((len(picks), 2), dtype=np.float32)
         part = np.empty(len(picks), np.int64)
-        found = _draw(
-            values, taken, cumulative, weight.shape[1], step, box, picks, jitter, *edges, part
-        )
-        pixel, tried = np.concatenate([pixel, part[:found]]), tried + len(picks)
+        found = _draw(values, cumulative, weight.shape[1], step, box, picks, jitter, *edges, part)
+        pixel = part[:found] if not tried else np.unique(np.concatenate([pixel, part[:found]]))
+        tried += len(picks)
     if len(pixel) < num:
         return _with_rest(values, pixel, num, box, edges, rng)
     return Drawn(pixel, np.zeros(len(pixel), np.bool_))
@@ -146,24 +144,34 @@ def _with_rest(
 
 
 @inline
-def _draw(values, taken, cumulative, columns, step, box, picks, jitter, radius, tolerance, out):  # type: ignore[no-untyped-def]
-    """Pixels in the cells that ascending ``picks`` fall into; returns how many of them will do."""
+def _draw(values, cumulative, columns, step, box, picks, jitter, radius, tolerance, out):  # type: ignore[no-untyped-def]
+    """Pixels in the cells that ascending ``picks`` fall into; returns how many will do."""
     top, left, bottom, right = box
-    cell, found = 0, 0
+    cell, found, first = 0, 0, 0  # out[first:found] are of this cell
     for k in range(len(picks)):
         while cell < len(cumulative) - 1 and cumulative[cell] <= picks[k]:
             cell += 1
+            first = found
         row = cell // columns * step + int(jitter[k, 0] * step)
         column = cell % columns * step + int(jitter[k, 1] * step)
         if row < top or row >= bottom or column < left or column >= right:
             continue
-        if taken[row, column] or not 0 < values[row, column] < np.inf:
+        pixel = row * values.shape[1] + column
+        if not 0 < values[row, column] < np.inf or _contains(out[first:found], pixel):
             continue
-        taken[row, column] = True
         if radius == 0 or not _near_edge(values, row, column, radius, tolerance):
-            out[found] = row * values.shape[1] + column
+            out[found] = pixel
             found += 1
     return found
+
+
+@inline
+def _contains(numbers, number):  # type: ignore[no-untyped-def]
+    """Whether a few numbers have one among them."""
+    for each in numbers:  # noqa: SIM110  (Numba has no any() of a generator)
+        if each == number:
+            return True
+    return False
 
 
 @inline
@@ -177,19 +185,24 @@ def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyp
 
 @inline
 def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyped-def]
-    """Whether 1 / depth bends within ``radius``, across, down or diagonally, or is mostly unknown."""
-    height, width = values.shape
+    """Whether 1 / depth bends within ``radius``, across, down or diagonally, or is mostly unknown.
+
+    All distances are looked at along the row, where memory is near, and the largest alone elsewhere:
+    there, a jump that is passed twice can be missed.
+    """
     here = 2.0 / values[row, column]
     known, pairs = 0, 0
-    for k in range(1, radius + 1):
-        for dy, dx in ((0, k), (k, 0), (k, k), (k, -k)):
-            y0, x0, y1, x1 = row - dy, column - dx, row + dy, column + dx
-            if y0 < 0 or y1 >= height or min(x0, x1) < 0 or max(x0, x1) >= width:
-                continue
-            pairs += 1
-            before, after = values[y0, x0], values[y1, x1]
-            if 0 < before < np.inf and 0 < after < np.inf:
-                known += 1
-                if abs(1.0 / before + 1.0 / after - here) > 0.5 * tolerance * here:
-                    return True
+    for k in range(1, radius + 4):
+        dy, dx = 0, k
+        if k > radius:
+            dy, dx = radius, radius * (k - radius - 2)
+        y0, x0, y1, x1 = row - dy, column - dx, row + dy, column + dx
+        if y0 < 0 or y1 >= values.shape[0] or min(x0, x1) < 0 or max(x0, x1) >= values.shape[1]:
+            continue
+        pairs += 1
+        before, after = values[y0, x0], values[y1, x1]
+        if 0 < before < np.inf and 0 < after < np.inf:
+            known += 1
+            if abs(1.0 / before + 1.0 / after - here) > 0.5 * tolerance * here:
+                return True
     return 2 * known < pairs

@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
+from splatseed.jit import inline
+
 __all__ = [
     "SIGMA_OF_MEDIAN",
     "least_squares_line",
@@ -31,6 +33,12 @@ SIGMA_OF_MEDIAN = 1.4826
 Values = Float64[np.ndarray, " M"]
 
 
+@inline
+def median(values):  # type: ignore[no-untyped-def]
+    """As NumPy's, of float64 without NaN, without what that costs for a thousand values."""
+    return np.median(values)
+
+
 def least_squares_scale(value: Values, z: Values) -> float:
     """The s that minimises sum (s value - z)^2: the paper's equation 7."""
     return float(value @ z / (value @ value))
@@ -38,7 +46,7 @@ def least_squares_scale(value: Values, z: Values) -> float:
 
 def median_scale(value: Values, z: Values) -> float:
     """The median of z / value: up to half of the points may be wrong."""
-    return float(np.median(z / value))
+    return float(median(z / value))
 
 
 def least_squares_line(value: Values, z: Values) -> tuple[float, float]:

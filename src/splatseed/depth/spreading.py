@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float32, Float64
 
 from splatseed.jit import inline, kernel, parallel_range
 
@@ -39,20 +39,22 @@ FINEST = 2.0**-20
 def spread_points(
     xyz: Float32[np.ndarray, "C 3"],
     footprint: Float32[np.ndarray, " C"],
+    eligible: Bool[np.ndarray, " C"],
     originals: Float32[np.ndarray, "N 3"],
     num: int,
     rng: np.random.Generator,
-) -> Int64[np.ndarray, " num"]:
-    """Choose ``num`` of the candidates, ascending indices [num].
+) -> Bool[np.ndarray, " C"]:
+    """Mark ``num`` of the candidates.
 
     Args:
-        xyz: The candidates, at least ``num``.
+        xyz: The candidates, [C, 3].
         footprint: Size of a pixel at each: the finer is the better of two.
+        eligible: Of which to choose: at least ``num``.
         originals: Points that are there already.
         num: How many.
         rng: Draws which of a few too many are dropped, and fills up where candidates coincide.
     """
-    cubes = _Cubes(xyz, footprint, originals)
+    cubes = _Cubes(xyz, footprint, eligible, originals)
     side = _largest_side(cubes, num)
     taken = cubes.take(side)
     if np.count_nonzero(taken) < num:  # the estimate was a little too large
@@ -61,8 +63,9 @@ def spread_points(
     if surplus > 0:
         taken[rng.choice(np.flatnonzero(taken), surplus, replace=False, shuffle=False)] = False
     else:
-        taken[rng.choice(np.flatnonzero(~taken), -surplus, replace=False, shuffle=False)] = True
-    return np.flatnonzero(taken)
+        rest = np.flatnonzero(eligible & ~taken)
+        taken[rng.choice(rest, -surplus, replace=False, shuffle=False)] = True
+    return taken
 
 
 def _largest_side(cubes: _Cubes, num: int) -> float:
@@ -92,6 +95,7 @@ class _Cubes:
 
     xyz: Float32[np.ndarray, "C 3"]
     footprint: Float32[np.ndarray, " C"]
+    eligible: Bool[np.ndarray, " C"]
     originals: Float32[np.ndarray, "N 3"]
 
     @cached_property
@@ -122,7 +126,7 @@ class _Cubes:
         blocked = np.empty(len(self.originals), np.uint64)
         _find_cubes(self.xyz, self.low, side, keys)
         _find_cubes(self.originals, self.low, side, blocked)
-        return int(_take_best(keys, blocked, self.footprint, buckets, taken))
+        return int(_take_best(keys, self.eligible, blocked, self.footprint, buckets, taken))
 
 
 @kernel
@@ -147,16 +151,16 @@ def _mix(x):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _take_best(keys, blocked, footprint, buckets, taken):  # type: ignore[no-untyped-def]
+def _take_best(keys, eligible, blocked, footprint, buckets, taken):  # type: ignore[no-untyped-def]
     """Mark the finest candidate of every cube in some buckets; returns how many there are."""
     found = np.zeros(buckets, np.int64)
     for b in parallel_range(buckets):
-        found[b] = _take_bucket(np.uint64(b), keys, blocked, footprint, taken)
+        found[b] = _take_bucket(np.uint64(b), keys, eligible, blocked, footprint, taken)
     return found.sum()
 
 
 @inline
-def _take_bucket(bucket, keys, blocked, footprint, taken):  # type: ignore[no-untyped-def]
+def _take_bucket(bucket, keys, eligible, blocked, footprint, taken):  # type: ignore[no-untyped-def]
     """One bucket, by a hash table with open addressing; the earlier of equals wins."""
     shift = np.uint64(59)  # the top 5 bits: BUCKETS is 32
     size = 0
@@ -175,7 +179,7 @@ def _take_bucket(bucket, keys, blocked, footprint, taken):  # type: ignore[no-un
             table[slot], owner[slot] = key, BLOCKED
     found = 0
     for k in range(len(keys)):
-        if keys[k] >> shift == bucket:
+        if keys[k] >> shift == bucket and eligible[k]:
             slot = _find(keys[k], table, owner)
             if owner[slot] == EMPTY:
                 table[slot], owner[slot] = keys[k], k

@@ -8,7 +8,7 @@ and the settings alone, not on threads or other images.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.camera import CAMERA_MODELS, Camera
 from splatseed.depth.alignment import Alignment, align_map, trust_units
-from splatseed.depth.drawing import draw_pixels
+from splatseed.depth.drawing import Drawn, draw_pixels
 from splatseed.depth.planar import PlanarDepth, lift_pixels, map_camera
 from splatseed.depth.settings import Settings
 from splatseed.depth.sightings import Sightings
@@ -116,28 +116,42 @@ class Reader:
             SceneFormatError: A file is damaged or of another shape, or the lens has distortion.
         """
         check_lens(image)
+        seen = self._read_map(image, num, rng)  # the map is let go before the photograph is read
+        if seen.alignment.rejected is not None:
+            return _nothing(seen.alignment, seen.camera)
+        photograph = decode_photograph(
+            self.folder / image.name, photograph_bytes(self.folder / image.name)
+        )
+        _check_shape(self.folder / image.name, photograph, seen.camera)
+        return View(
+            seen.alignment,
+            seen.camera,
+            seen.drawn.pixel,
+            seen.z,
+            _colors_at(photograph, seen.drawn.pixel, seen.camera),
+            seen.drawn.edge,
+            exhausted=len(seen.drawn.pixel) < num,
+            reduced=None if seen.coarse is None else _reduce(seen, seen.coarse, photograph),
+        )
+
+    def _read_map(self, image: Image, num: int, rng: np.random.Generator) -> _Seen:
+        """Everything that is asked of a map."""
         depth = self.depths.read(image.name)
         camera = map_camera(depth, image)
         points = self.sightings.of(image)
         alignment = self._align(depth, camera, points)
         if alignment.rejected is not None:
-            return _nothing(alignment, camera)
+            nothing = np.empty(0, np.int64)
+            return _Seen(alignment, camera, Drawn(nothing, nothing > 0), np.empty(0, np.float32))
         planar = PlanarDepth.of(
             depth, camera, alignment.scale, alignment.shift, unit_ray=self.settings.unit_ray
         )
         drawn = draw_pixels(planar.values, num, _inside(camera, points), self.settings, rng)
-        photograph = _Photograph.read(self.folder / image.name, camera)
-        keep = self.settings.compares_views or self.settings.harmonizes
-        return View(
-            alignment,
-            camera,
-            drawn.pixel,
-            planar.at(drawn.pixel),
-            photograph.colors(drawn.pixel),
-            drawn.edge,
-            exhausted=len(drawn.pixel) < num,
-            reduced=_reduce(planar, photograph) if keep else None,
-        )
+        seen = _Seen(alignment, camera, drawn, planar.at(drawn.pixel))
+        if not (self.settings.compares_views or self.settings.harmonizes):
+            return seen
+        factor = -(-max(planar.values.shape) // GRID)
+        return replace(seen, coarse=planar.every(factor // 2, factor), unit=planar.scale)
 
     def _align(
         self, depth: DepthMap, camera: Camera, points: Float64[np.ndarray, "M 3"]
@@ -163,34 +177,35 @@ def check_lens(image: Image) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Photograph:
-    """A photograph, and for each row and column of the map the one of its pixels."""
+class _Seen:
+    """What is taken from a map: the fields of ``View``, and every so many-th pixel in some unit."""
 
-    picture: PilImage.Image
-    pixels: UInt8[np.ndarray, "h w 3"]
-    rows: Int64[np.ndarray, " H"]
-    columns: Int64[np.ndarray, " W"]
+    alignment: Alignment
+    camera: Camera
+    drawn: Drawn
+    z: Float32[np.ndarray, " C"]
+    coarse: Float32[np.ndarray, "h w"] | None = None
+    unit: float = 1.0
 
-    @classmethod
-    def read(cls, path: Path, camera: Camera) -> _Photograph:
-        picture = decode_photograph(path, photograph_bytes(path))
-        scale = np.array([picture.width / camera.width, picture.height / camera.height])
-        if abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
-            raise SceneFormatError(
-                f"{path} to have the shape of its camera and map, {camera.width} x {camera.height}",
-                found=f"{picture.width} x {picture.height}",
-                fix="Use the images that the model was made from, or a resized copy of them.",
-            )
-        columns, rows = (
-            ((np.arange(size) + 0.5) * each).astype(np.int64)
-            for size, each in zip((camera.width, camera.height), scale, strict=True)
+
+def _check_shape(path: Path, photograph: PilImage.Image, camera: Camera) -> None:
+    stretch = photograph.width / camera.width / (photograph.height / camera.height)
+    if abs(stretch - 1) > ASPECT_SLACK:
+        raise SceneFormatError(
+            f"{path} to have the shape of its camera and map, {camera.width} x {camera.height}",
+            found=f"{photograph.width} x {photograph.height}",
+            fix="Use the images that the model was made from, or a resized copy of them.",
         )
-        return cls(picture, np.asarray(picture), rows, columns)
 
-    def colors(self, pixel: Int64[np.ndarray, " C"]) -> UInt8[np.ndarray, "C 3"]:
-        """The colours of pixels of the map."""
-        row, column = np.divmod(pixel, len(self.columns))
-        return np.asarray(self.pixels[self.rows[row], self.columns[column]])
+
+def _colors_at(
+    photograph: PilImage.Image, pixel: Int64[np.ndarray, " C"], camera: Camera
+) -> UInt8[np.ndarray, "C 3"]:
+    """The colours that a photograph of any size has at the centres of a map's pixels."""
+    row, column = np.divmod(pixel, camera.width)
+    row_of = ((np.arange(camera.height) + 0.5) * (photograph.height / camera.height)).astype(int)
+    column_of = ((np.arange(camera.width) + 0.5) * (photograph.width / camera.width)).astype(int)
+    return np.asarray(np.asarray(photograph)[row_of[row], column_of[column]])
 
 
 def _inside(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "K 2"]:
@@ -199,23 +214,20 @@ def _inside(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarr
     return uv[((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)]
 
 
-def _reduce(planar: PlanarDepth, photograph: _Photograph) -> Reduced:
+def _reduce(seen: _Seen, coarse: Float32[np.ndarray, "h w"], photograph: PilImage.Image) -> Reduced:
     """Every f-th pixel of the map, for means would bridge edges, and the means of the photograph."""
-    camera = planar.camera
-    factor = -(-max(planar.values.shape) // GRID)
-    first = factor // 2
-    grid_from_map = (
-        np.array([[1.0, 0.0, -(first + 0.5)], [0.0, 1.0, -(first + 0.5)], [0.0, 0.0, factor]])
-        / factor
-    )
-    blocks = -(-max(photograph.picture.size) // GRID)
-    block_from_map = np.array(photograph.picture.size) / [camera.width, camera.height] / blocks
+    camera = seen.camera
+    factor = -(-max(camera.width, camera.height) // GRID)
+    first = factor // 2 + 0.5
+    grid_from_map = np.array([[1, 0, -first], [0, 1, -first], [0, 0, factor]]) / factor
+    blocks = -(-max(photograph.size) // GRID)
+    block_from_map = np.array(photograph.size) / [camera.width, camera.height] / blocks
     return Reduced(
-        planar.every(first, factor),
-        planar.scale,
+        coarse,
+        seen.unit,
         grid_from_map @ camera.K @ camera.cam_from_world[:3],
-        np.asarray(photograph.picture.reduce(blocks)),
-        block_from_map[:, None] * [[factor, first + 0.5]],
+        np.asarray(photograph.reduce(blocks)),
+        block_from_map[:, None] * [[factor, first]],
     )
 
 
