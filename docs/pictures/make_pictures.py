@@ -25,10 +25,12 @@ from scipy.ndimage import gaussian_filter
 import splatseed as ss
 from splatseed.commands._depth_picture import write_depth_picture
 from splatseed.depth import align
+from splatseed.depth.sightings import find_sightings
 from splatseed.geometry import spacing
 from splatseed.io import depth_folder, find_depths
 from splatseed.io.staging import atomic_file
 from splatseed.preview import choose_camera, render_points
+from splatseed.scene import Image
 from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.upsample import methods_for
 from splatseed.viewpoint import choose_image, look_at
@@ -50,13 +52,17 @@ class Panel(NamedTuple):
 def main() -> None:
     """Make every picture."""
     capture = make_capture()
-    methods = methods_for(capture.scene)
-    clouds = {name: ss.upsample(capture.scene, name, ratio=RATIO, seed=0) for name in methods}
+    with TemporaryDirectory() as folder:
+        # Depth is lifted from files; all else is as in memory.
+        scene = ss.load_scene(write_capture(capture, Path(folder) / "room"))
+        scene = scene.replace(depths=find_depths(scene, Path(folder) / "room"))
+        clouds = {n: ss.upsample(scene, n, ratio=RATIO, seed=0) for n in methods_for(scene)}
+        draw_lifting(capture, scene, clouds["depth"])
     draw_before_after(capture, clouds["mls"])
     draw_overview(capture, clouds)
     draw_errors(capture, clouds)
-    for name, cloud in clouds.items():
-        draw_method(capture.scene, name, cloud)
+    for name in methods_for(capture.scene):
+        draw_method(capture.scene, name, clouds[name])
     draw_depth()
 
 
@@ -74,12 +80,12 @@ def draw_before_after(capture: Capture, upsampled: ss.PointCloud) -> None:
 
 def draw_overview(capture: Capture, clouds: Mapping[str, ss.PointCloud]) -> None:
     """Every method in one grid."""
-    width, originals = 270, capture.scene.points
+    width, originals = 350, capture.scene.points
     labelled = {f"originals, {len(originals):,}": originals}
     labelled |= {f"{name}, {len(cloud):,}": cloud for name, cloud in clouds.items()}
     panels = [Panel("photograph", photograph(capture, width))]
     panels += cloud_panels(labelled, choose_camera(capture.scene), width, point_size=1.0)
-    write_grid([panels[:4], panels[4:]], HERE / "methods.png", colors=64)
+    write_grid([panels[:3], panels[3:6], panels[6:]], HERE / "methods.png", colors=64)
 
 
 def draw_errors(capture: Capture, clouds: Mapping[str, ss.PointCloud]) -> None:
@@ -91,10 +97,10 @@ def draw_errors(capture: Capture, clouds: Mapping[str, ss.PointCloud]) -> None:
         new = cloud.select(slice(len(originals), None))
         distance = capture.surfaces.distance(new.xyz) / h
         colored[f"{name}: median {np.median(distance):.2g} h"] = new.replace(rgb=heat(distance))
-    panels = cloud_panels(colored, choose_camera(capture.scene), 320, point_size=1.2)
-    bar = np.tile(heat(np.linspace(0.0, 1.0, 320)), (14, 1, 1))
-    ends = [Panel("distance to the surface: 0 ... 1 h or more", bar)]
-    write_grid([panels[:3], panels[3:], ends], HERE / "errors.png", colors=48)
+    panels = cloud_panels(colored, choose_camera(capture.scene), 270, point_size=1.0)
+    bar = np.tile(heat(np.linspace(0.0, 1.0, 270)), (14, 1, 1))
+    ends = [Panel("distance to the surface: 0 ... 1 h", bar)]
+    write_grid([panels[:4], panels[4:], ends], HERE / "errors.png", colors=48)
 
 
 def draw_depth() -> None:
@@ -136,6 +142,50 @@ def draw_method(scene: ss.Scene, name: str, cloud: ss.PointCloud) -> None:
     shown = [Panel(label, construction(name, eye, width)) for label, eye in eyes.items()]
     rows = [cloud_panels(room, camera, width, point_size=2.6), shown]
     write_grid(rows, HERE / f"{name}.png", colors=64)
+
+
+def draw_lifting(capture: Capture, scene: ss.Scene, cloud: ss.PointCloud) -> None:
+    """Lifting: what an image gives, and the cloud that comes of all of them, as in the paper's figure 2."""
+    width, camera = 350, choose_camera(scene)
+    image = choose_image(scene)
+    pixels = lifted_from(scene, image, cloud)
+    depth = scene.depths.read(image.name).values
+    nearness = np.nan_to_num(np.nanmin(depth) / depth)
+    sizes = {"size": (width, camera.height * width // camera.width)}
+    shown = PillowImage.fromarray(heat(nearness.ravel()).reshape(*depth.shape, 3))
+    seen = [
+        Panel("photograph", photograph(capture, width)),
+        Panel("its depth, near to far", np.asarray(shown.resize(resample=0, **sizes))),
+        Panel("lifted pixels (blue), SfM points (black)", pixels),
+    ]
+    paper = ss.upsample(scene, "depth", ratio=RATIO, seed=0, profile="paper")
+    clouds = {
+        f"SfM: {len(scene.points):,} points": scene.points,
+        f"depth, paper: {RATIO}x": paper,
+        f"depth, default: {RATIO}x": cloud,
+    }
+    rows = [seen, cloud_panels(clouds, camera, width, point_size=1.3)]
+    write_grid(rows, HERE / "depth.png", colors=96)
+
+
+def lifted_from(scene: ss.Scene, image: Image, cloud: ss.PointCloud) -> Picture:
+    """Where in an image its SfM points are, and the centres of pixels that new points came from."""
+    camera, width = image.camera, 350
+    new = cloud.select(cloud.source != 0)
+    uv, z = camera.project(new.xyz)
+    inside = (z > 0) & ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
+    column, row = np.floor(np.where(inside[:, None], uv, 0.0)).astype(int).T
+    centred = np.abs(uv - np.floor(uv) - 0.5).max(axis=1) < 2e-3
+    own = inside & centred & (np.abs(scene.depths.read(image.name).values[row, column] - z) < 1e-2)
+    sfm = find_sightings(scene).of(image).astype(np.float32)
+    blue = new.select(own).replace(rgb=np.full((own.sum(), 3), (60, 130, 200), np.uint8))
+    black = ss.PointCloud(sfm, np.zeros((len(sfm), 3), np.uint8))
+    scale = width / camera.width
+    layers = [
+        render_points(each, camera, scale=scale, point_size=size)
+        for each, size in ((blue, 2.0), (black, 2.0))
+    ]
+    return np.minimum(*layers)
 
 
 def construction(name: str, eye: Float64[np.ndarray, " 3"], width: int) -> Picture:
