@@ -16,6 +16,7 @@ INSTALL = {
     "transformers": "depth",
     "onnxruntime": "depth",
     "OpenEXR": "exr",
+    "ray": "cluster",
 }
 """Which extra of splatseed brings each package."""
 

@@ -148,7 +148,7 @@ def test_a_dry_run_prints_a_plan_and_writes_nothing(bench, plan_path, tmp_path, 
     plan = plan_path(profiles=("default", "paper"), methods=("sfm", "linear", "random"))
     code, out, err = bench("--plan", plan, "--repeats", 7, "--dry-run", "-o", "B")
     assert (code, err) == (0, "")
-    assert "# 28 runs; 1 at a time, on the CPU" in out
+    assert "# 28 runs; this machine, 1 at a time, on the CPU" in out
     assert re.search(r"# about .* \(by a rough model.*\), .* kept", out)
     assert "# run once, as both profiles are the same: random" in out
     again = tmp_path / "again.toml"

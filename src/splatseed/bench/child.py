@@ -106,6 +106,9 @@ class Child:
                     progress(message["stage"], message["fraction"])
         except (BrokenPipeError, ValueError):  # it died before or while it spoke
             pass
+        except BaseException:  # we shall wait no longer
+            self.kill()
+            raise
         finally:
             code = self._process.wait()
             self._process.stdout.close()

@@ -99,7 +99,7 @@ class LocalExecutor(Executor):
             self.stopping.set()
             for child in self._children.values():
                 child.stop()
-        self.watcher.stopping()
+        self.watcher.stopping("runs in training save a checkpoint; again Ctrl-C to stop at once")
 
     def _kill(self) -> None:
         with self._lock:

@@ -25,5 +25,5 @@ class Watcher:
     def handed_back(self, spec: RunSpec, reason: str) -> None:
         """A run has been stopped, and will be taken up again."""
 
-    def stopping(self) -> None:
-        """The user asked to stop."""
+    def stopping(self, words: str) -> None:
+        """The user asked to stop; the words say what becomes of the runs."""

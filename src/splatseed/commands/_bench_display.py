@@ -89,12 +89,9 @@ class RunDisplay(Watcher):
             self._ended -= 1
             self._say(f"{describe(spec)}: {reason}; to be taken up again", count=False)
 
-    def stopping(self) -> None:
+    def stopping(self, words: str) -> None:
         """Say what the user waits for."""
-        ERR.print(
-            "stopping: runs in training save a checkpoint (again Ctrl-C to stop at once)",
-            highlight=False,
-        )
+        ERR.print(f"stopping: {words}", highlight=False, markup=False)
 
     def _end(self, spec: RunSpec) -> float:
         """Take a run off the display; returns the seconds it took."""

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 from splatseed.bench.job import JobOptions
 from splatseed.bench.ledger import Ledger
 from splatseed.bench.local import LocalExecutor, cores, slot_environment
 from splatseed.bench.watcher import Watcher
 from splatseed.commands._bench_options import Options
-from splatseed.commands._bench_prepare import local_backend
+from splatseed.requirements import require
 from splatseed.train.settings import Backend
 
-__all__ = ["Machine", "find_machine"]
+if TYPE_CHECKING:
+    from splatseed.bench.ray_cluster import Cluster
+
+__all__ = ["Machine", "open_machine"]
+
+Run: TypeAlias = Callable[[Ledger, Path, Collection[str], JobOptions, Watcher], bool]
 
 
 @dataclass(frozen=True)
@@ -23,63 +30,64 @@ class Machine:
     """Where runs go.
 
     Args:
-        backend: What they train on: not "auto".
+        name: What it is.
+        backend: What runs train on: not "auto".
         jobs: How many at a time.
         threads: Threads of each on the CPU.
-        gpus: Names of the GPUs that are shared out; none to leave the choice to PyTorch.
+        run: Does those runs of a ledger that have one of these keys; whether it went to the end.
     """
 
+    name: str
     backend: Backend
     jobs: int
     threads: int
-    gpus: Sequence[str] = ()
+    run: Run
 
     @property
     def words(self) -> str:
         """In words."""
+        each = f"{self.threads} thread{'' if self.threads == 1 else 's'} each"
         on = "on a GPU" if self.backend == "cuda" else "on the CPU"
-        threads = "1 thread" if self.threads == 1 else f"{self.threads} threads"
-        return f"{self.jobs} at a time, {on}, {threads} each"
-
-    def run(
-        self,
-        ledger: Ledger,
-        bench: Path,
-        keys: Collection[str],
-        options: JobOptions,
-        watcher: Watcher,
-    ) -> bool:
-        """Do the runs; whether it went to the end.
-
-        Raises:
-            OutputError: The ledger or a folder cannot be written.
-        """
-        environments = [
-            slot_environment(self.threads, self.gpus[i % len(self.gpus)] if self.gpus else "")
-            for i in range(self.jobs)
-        ]
-        return LocalExecutor(ledger, bench, environments, options, watcher).run(keys)
+        return f"{self.name}, {self.jobs} at a time, {on}, {each}"
 
 
-def find_machine(options: Options, backend: Backend) -> Machine:
-    """What there is to run on.
+@contextmanager
+def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
+    """What there is to run on, while the block runs.
 
     Args:
         options: What the user asks for.
         backend: Of the plan.
 
     Raises:
-        ParameterError: A GPU is asked for and there is none.
+        ParameterError: A GPU is asked for and there is none, or there is no such cluster.
+        MissingDependencyError: PyTorch, gsplat or Ray is absent.
     """
-    backend = local_backend(backend)
-    gpus = _gpus() if backend == "cuda" else []
+    require("torch", "gsplat")
+    if options.executor == "ray":
+        from splatseed.bench.ray_cluster import ray_cluster  # noqa: PLC0415  (an extra)
+
+        with ray_cluster(options.address) as cluster:
+            yield _ray_machine(options, backend, cluster)
+    else:
+        yield _local_machine(options, backend)
+
+
+def _local_machine(options: Options, backend: Backend) -> Machine:
+    from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
+
+    found: Backend = "cuda" if pick_device(backend).type == "cuda" else "cpu"
+    gpus = _gpus() if found == "cuda" else []
     jobs = options.jobs or max(len(gpus), 1)
-    return Machine(
-        backend,
-        jobs,
-        options.threads or max(1, cores() // jobs),
-        gpus if len(gpus) > 1 else (),
-    )
+    threads = options.threads or max(1, cores() // jobs)
+    environments = [slot_environment(threads, _gpu_of(slot, gpus)) for slot in range(jobs)]
+
+    def run(
+        ledger: Ledger, bench: Path, keys: Collection[str], how: JobOptions, watcher: Watcher
+    ) -> bool:
+        return LocalExecutor(ledger, bench, environments, how, watcher).run(keys)
+
+    return Machine("this machine", found, jobs, threads, run)
 
 
 def _gpus() -> list[str]:
@@ -88,3 +96,27 @@ def _gpus() -> list[str]:
 
     named = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each]
     return named or [f"{i}" for i in range(torch.cuda.device_count())]
+
+
+def _gpu_of(slot: int, gpus: Sequence[str]) -> str:
+    """The GPU of a slot; the choice is left to PyTorch where there is none."""
+    return gpus[slot % len(gpus)] if len(gpus) > 1 else ""
+
+
+def _ray_machine(options: Options, backend: Backend, cluster: Cluster) -> Machine:
+    from splatseed.bench.ray_cluster import RayExecutor  # noqa: PLC0415  (an extra)
+
+    found: Backend = "cuda" if backend == "cuda" or cluster.has_gpus else "cpu"
+    found = "cpu" if backend == "cpu" else found
+    share = cluster.share(options.threads, gpu=found == "cuda")
+    jobs = min(options.jobs or cluster.capacity(share), cluster.capacity(share))
+
+    def run(
+        ledger: Ledger, bench: Path, keys: Collection[str], how: JobOptions, watcher: Watcher
+    ) -> bool:
+        executor = RayExecutor(
+            ledger, bench, share, jobs=options.jobs, options=how, watcher=watcher
+        )
+        return executor.run(keys)
+
+    return Machine("Ray", found, jobs, share.threads, run)

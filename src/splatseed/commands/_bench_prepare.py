@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 from splatseed.bench.environment import package_version
@@ -18,7 +17,7 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress
 from splatseed.train.settings import Backend
 
-__all__ = ["Prepared", "local_backend", "prepare"]
+__all__ = ["Prepared", "prepare"]
 
 
 @dataclass(frozen=True)
@@ -71,15 +70,6 @@ def prepare(asked: Asked, backend: Backend, made: Path, progress: Progress) -> P
     scenes = [facts for _, facts in found]
     runs = plan_runs(plan, scenes, backend, package_version("splatseed"))
     return Prepared(plan, scenes, runs, [*notes, *_notes(plan, scenes)])
-
-
-def local_backend(backend: Backend) -> Backend:
-    """Where "auto" trains on this machine; without PyTorch, which is missed later, the CPU."""
-    if backend != "auto" or find_spec("torch") is None:
-        return "cpu" if backend == "auto" else backend
-    from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
-
-    return "cuda" if pick_device("auto").type == "cuda" else "cpu"
 
 
 def _survey(scene: PlannedScene, plan: Plan, made: Path, progress: Progress) -> SceneFacts:

@@ -18,14 +18,13 @@ from splatseed.bench.plan import Plan
 from splatseed.bench.plan_file import plan_text
 from splatseed.bench.records import RunRow, RunSpec
 from splatseed.commands._bench_display import run_display, spoken_time
-from splatseed.commands._bench_machine import Machine, find_machine
+from splatseed.commands._bench_machine import Machine, open_machine
 from splatseed.commands._bench_options import PLAN, Asked, Options, asked_plan
 from splatseed.commands._bench_prepare import Prepared, prepare
 from splatseed.commands._bench_summary import print_summary
 from splatseed.commands._options import parse_options
 from splatseed.console import OUT, print_note, stage_display
 from splatseed.io.staging import atomic_file
-from splatseed.requirements import require
 
 __all__ = ["run"]
 
@@ -49,28 +48,34 @@ def run(arguments: list[str]) -> None:
 
 
 def _run(options: Options, asked: Asked, bench: Path, arguments: Sequence[str]) -> None:
-    require("torch", "gsplat")
     check_bench_folder(bench, _folders(asked.plan))
-    job_options = _job_options(asked.plan)
-    machine = find_machine(options, asked.plan.backend)
-    with stage_display() as clock:
-        prepared = prepare(asked, machine.backend, bench / "scenes", clock)
-    ledger = _enter(bench, prepared, arguments, retry=options.retry_failed)
-    rows = _rows(ledger, prepared)
-    to_do = [row.spec for row in rows if row.status in {"pending", "running"}]
-    estimator = Estimator(prepared.scenes, rows, machine.threads)
-    _announce(bench, prepared, machine, rows, estimator)
-    expected = {spec.key: estimator.seconds(spec) for spec in to_do}
-    ended = True
-    if to_do:
-        with run_display(expected, len(rows) - len(to_do), machine.jobs) as display:
-            ended = machine.run(ledger, bench, prepared.keys, job_options, display)
+    with open_machine(options, asked.plan.backend) as machine:
+        job_options = _job_options(asked.plan)
+        with stage_display() as clock:
+            prepared = prepare(asked, machine.backend, bench / "scenes", clock)
+        ledger = _enter(bench, prepared, arguments, retry=options.retry_failed)
+        ended = _run_all(bench, prepared, machine, ledger, job_options)
     rows = _rows(ledger, prepared)
     print_summary(bench, rows)
     if not ended:
         sys.exit(INTERRUPTED)
     if any(row.status == "failed" for row in rows):
         sys.exit(SOME_FAILED)
+
+
+def _run_all(
+    bench: Path, prepared: Prepared, machine: Machine, ledger: Ledger, options: JobOptions
+) -> bool:
+    """Do what is to be done; whether it went to the end."""
+    rows = _rows(ledger, prepared)
+    to_do = [row.spec for row in rows if row.status in {"pending", "running"}]
+    estimator = Estimator(prepared.scenes, rows, machine.threads)
+    _announce(bench, prepared, machine, rows, estimator)
+    if not to_do:
+        return True
+    expected = {spec.key: estimator.seconds(spec) for spec in to_do}
+    with run_display(expected, len(rows) - len(to_do), machine.jobs) as display:
+        return machine.run(ledger, bench, prepared.keys, options, display)
 
 
 def _folders(plan: Plan) -> list[Path]:
@@ -153,8 +158,11 @@ def _size(count: float) -> str:
 
 def _dry_run(options: Options, asked: Asked) -> None:
     """Print the plan as TOML, and the rest as comments in it, so that all can be kept as one."""
-    machine = find_machine(options, asked.plan.backend)
-    with tempfile.TemporaryDirectory() as made, stage_display() as clock:
+    with (
+        open_machine(options, asked.plan.backend) as machine,
+        tempfile.TemporaryDirectory() as made,
+        stage_display() as clock,
+    ):
         kept = options.output / "scenes" if options.output else Path(made)
         scenes = kept if (kept / "demo").is_dir() else Path(made)
         prepared = prepare(asked, machine.backend, scenes, clock)
