@@ -6,6 +6,7 @@ import dataclasses
 import re
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -198,18 +199,25 @@ def test_presets_leave_out_what_is_not_there(bench, own_room, tmp_path):
         (("-o", "B", "--preset", "quick", "--plan", "x.toml"), "both"),
         (("-o", "B", "--plan", "x.toml"), "x.toml"),
         (("-o", "B", "--data", "FULL"), "--preset with --data"),
+        (("-o", "SONGS", "--scenes", "ROOM"), "another program"),
+        (("-o", "B", "--scenes", "ROOM", "--lpips"), "weights for LPIPS"),
     ],
 )
 def test_bad_words_end_in_one_line(bench, room_path, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "FULL").mkdir()
     (tmp_path / "FULL" / "thesis.txt").write_text("keep")
+    (tmp_path / "SONGS").mkdir()
+    with sqlite3.connect(tmp_path / "SONGS" / "ledger.sqlite") as db:
+        db.execute("CREATE TABLE songs (title TEXT)")
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "FULL"))
     words = [word.replace("ROOM", str(room_path)) for word in words]
     code, out, err = bench(*words)
     assert (code, out) == (2, "")
     assert re.search(said, err), err
     assert err.count("error:") == 1
-    assert {path.name for path in tmp_path.iterdir()} <= {"FULL"}
+    assert {path.name for path in tmp_path.iterdir()} == {"FULL", "SONGS"}
+    assert [path.name for path in (tmp_path / "SONGS").iterdir()] == ["ledger.sqlite"]
 
 
 def test_help_does_not_wait_for_pytorch():

@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatseed.bench.ledger import LEDGER
+from splatseed.bench.ledger import LEDGER, Ledger
 from splatseed.errors import OutputError
 from splatseed.io.staging import MANIFEST, atomic_file, check_output
 from splatseed.synthetic import make_capture, write_capture
@@ -28,7 +28,11 @@ def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
 
     Raises:
         OutputError: It is another's, or lies in a scene or around one.
+        SceneFormatError: Its ledger is none that this version knows.
     """
+    ledger = folder / LEDGER
+    if ledger.is_file() and ledger.stat().st_size:  # else another process is about to write it
+        Ledger.open(ledger, read_only=True)
     marked = (folder / MANIFEST).is_file() and not (folder / LEDGER).exists()
     if marked and _command(folder) != "bench":
         raise OutputError(
