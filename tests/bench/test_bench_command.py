@@ -16,10 +16,13 @@ import pytest
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
+from splatseed.bench import folder as folder_module
 from splatseed.bench.ledger import Ledger
 from splatseed.bench.plan import PlannedScene
 from splatseed.bench.plan_file import plan_text, read_plan
 from splatseed.cli import main
+from splatseed.io import load_scene
+from splatseed.synthetic import make_capture
 
 COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()", "bench")
 
@@ -175,6 +178,44 @@ def test_presets_leave_out_what_is_not_there(bench, own_room, tmp_path):
         PlannedScene(str(data / "garden"), "garden", "images_4"),
     )
     assert (plan.max_steps, plan.ratios, plan.test_every) == (30_000, (4, 8, 16), 8)
+
+
+def test_captures_of_replica_are_left_out_with_what_they_lack(bench, own_room, tmp_path):
+    data = tmp_path / "replica"
+    shutil.copytree(own_room, data / "room0")
+    (data / "office1").mkdir()
+    words = ("--preset", "replica", "--data", data, "--dry-run", "--repeats", 1)
+    code, out, _ = bench(*words)
+    assert code == 0
+    assert "# office1 is left out: expected sparse/0, " in out
+    assert "# 13 runs" in out  # sfm, and 6 methods at 2 ratios: the room has depth maps
+    (own_room / "depths").rename(tmp_path / "maps")
+    shutil.rmtree(data / "room0" / "depths")
+    code, out, _ = bench(*words)
+    assert "# 11 runs" in out
+    assert "# without depth maps, and so without the method depth: room0 (--depth DIR)" in out
+    (tmp_path / "captures").mkdir()
+    (tmp_path / "maps").rename(tmp_path / "captures" / "room0")
+    code, out, _ = bench(*words, "--depth", tmp_path / "captures")
+    assert "# 13 runs" in out
+
+
+def test_the_quick_preset_makes_its_own_scene(bench, tmp_path, monkeypatch):
+    made = []
+
+    def small_capture():
+        made.append(1)
+        return make_capture(0, num_views=9, width=64, height=48)
+
+    monkeypatch.setattr(folder_module, "make_capture", small_capture)
+    code, out, _ = bench("--preset", "quick", "--dry-run")
+    assert code == 0
+    assert "# 12 runs" in out
+    assert 'path = "demo:"' in out
+    path = folder_module.make_demo_scene(tmp_path / "B" / "scenes")
+    assert len(load_scene(path).images) == 9
+    assert bench("--preset", "quick", "--dry-run", "-o", tmp_path / "B")[0] == 0
+    assert len(made) == 2  # the one that is there is taken
 
 
 @pytest.mark.parametrize(

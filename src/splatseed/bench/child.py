@@ -146,7 +146,7 @@ def serve() -> None:
 
 def _end_with_parent() -> None:
     """The parent holds the other end of standard input, and says nothing more."""
-    sys.stdin.read()
+    os.read(sys.stdin.fileno(), 1)  # not through the buffer, whose lock would be held at exit
     os._exit(1)
 
 
@@ -159,14 +159,17 @@ def _reporter(replies: IO[str]) -> Progress:
         now = time.monotonic()
         if stage != last[0] or now - last[1] > REPORT_SECONDS:
             last = (stage, now)
-            _say(replies, {"stage": stage, "fraction": fraction})
+            _say(replies, {"stage": stage, "fraction": float(fraction)})
 
     return report
 
 
 def _say(replies: IO[str], message: Mapping[str, Any]) -> None:
-    replies.write(json.dumps(message) + "\n")
-    replies.flush()
+    try:
+        replies.write(json.dumps(message) + "\n")
+        replies.flush()
+    except BrokenPipeError:  # nobody listens any more: the parent is gone
+        os._exit(1)
 
 
 def _outcome(message: Mapping[str, Any]) -> Outcome:

@@ -23,6 +23,7 @@ __all__ = [
     "kept_files",
     "kept_folder",
     "read_result",
+    "result_bytes",
     "work_folder",
     "write_kept",
 ]

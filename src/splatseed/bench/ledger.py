@@ -29,6 +29,7 @@ LEDGER = "ledger.sqlite"
 APPLICATION_ID = 0x73706C62
 """What SQLite's header says the file is: "splb"."""
 SCHEMA = 1
+"""To be raised when the tables change, or the fields of a run's specification."""
 BUSY_SECONDS = 60.0
 """How long to wait while another process writes."""
 
