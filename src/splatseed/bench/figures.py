@@ -304,11 +304,11 @@ def _panels(count: int) -> tuple[Figure, list[Axes]]:
 def _legend(
     figure: Figure, variants: Sequence[Variant], style: Callable[[Variant], dict[str, Any]]
 ) -> None:
-    """Names below the panels; without ratios where lines run through them."""
+    """Names above the panels, at the left, where a narrow window shows them."""
     from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to import)
 
     handles = [Line2D([], [], label=v.label, **style(v)) for v in variants]
-    figure.legend(handles=handles, loc="outside lower center", ncols=min(4, len(handles)),
+    figure.legend(handles=handles, loc="outside upper left", ncols=min(4, len(handles)),
                   fontsize="small", frameon=False)  # fmt: skip
 
 

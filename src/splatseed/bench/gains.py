@@ -52,13 +52,17 @@ class Gains:
     on_these: Mapping[Variant, Difference]
     on_like: Mapping[Variant, Difference]
 
-    def best(self, scene: str) -> Variant | None:
-        """The variant that gains most on a scene, or None if none gains; noise included."""
+    def top(self, scene: str) -> Variant | None:
+        """The variant with the greatest gain on a scene, or the least loss; noise included."""
         means = {
             v: self.on_scene[scene, v].mean for v in self.variants if (scene, v) in self.on_scene
         }
-        best = max(means, key=lambda each: means[each], default=None)
-        return best if best is not None and means[best] > 0 else None
+        return max(means, key=lambda each: means[each], default=None)
+
+    def best(self, scene: str) -> Variant | None:
+        """The variant that gains most on a scene, or None if none gains; noise included."""
+        top = self.top(scene)
+        return top if top is not None and self.on_scene[scene, top].mean > 0 else None
 
     def means(self) -> dict[str, dict[Variant, float]]:
         """Mean gains by scene and variant."""

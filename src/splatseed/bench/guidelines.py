@@ -259,7 +259,13 @@ def winner_table(found: Gains, described: Mapping[str, Descriptors]) -> Table:
     return Table(
         f"winners_{found.strategy}",
         f"What gained most on each scene, strategy {found.strategy}",
-        ("scene", "best", "gain over sfm, dB", "", *(field.name for field in fields(Descriptors))),
+        (
+            "scene",
+            "best",
+            "gain over sfm, dB",
+            "verdict",
+            *(field.name for field in fields(Descriptors)),
+        ),
         tuple(rows),
         (WINNER_NOTE,),
     )

@@ -8,7 +8,8 @@ best that could be noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -73,7 +74,7 @@ def _psnr_table(study: Study, found: Gains, key: str, scenes: Sequence[str]) -> 
         dataset = dataset_of(scene)
         if dataset is not None:
             rows.append(_paper_row(dataset, scene, variants))
-    known = paper_dataset(key).title if key else "scenes of your own"
+    known = paper_dataset(key).title if key else "other scenes"
     return Table(
         f"{TABLE_NAMES[key]}_{found.strategy}",
         f"PSNR, {known}, strategy {found.strategy}",
@@ -127,7 +128,11 @@ def _paper_row(dataset: PaperDataset, scene: str, variants: Sequence[Variant]) -
     scores = dataset.psnr[scene]
     arms = (BASELINE, *variants)
     printed = (scores.get((arm.method, arm.ratio)) for arm in arms)
-    return (words(f"{scene} (paper)"), *(number(value) for value in printed))
+    return _soft((words(f"{scene} (paper)"), *(number(value) for value in printed)))
+
+
+def _soft(row: Iterable[Cell]) -> tuple[Cell, ...]:
+    return tuple(replace(cell, soft=True) for cell in row)
 
 
 def gain_cell(gain: Difference | None) -> Cell:
@@ -158,7 +163,7 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
     rows.append(row("mean, these scenes", lambda v: gain_cell(found.on_these[v])))
     if len(found.scenes) > 1:
         rows.append(row("mean, scenes like these", lambda v: gain_cell(found.on_like[v])))
-    rows += [row(name, cells) for name, cells in _paper_gains(found)]
+    rows += [_soft(row(name, cells)) for name, cells in _paper_gains(found)]
     return Table(
         f"gains_{strategy}",
         f"Gain over sfm in PSNR, strategy {strategy}",
@@ -206,7 +211,7 @@ def mean_gain_table(study: Study) -> Table:
     for key in DATASETS:
         theirs = mean_gains(_paper_means(paper_dataset(key)))
         if theirs is not None:
-            rows.append(_mean_row(f"paper, {DATASETS[key]}", theirs))
+            rows.append(_soft(_mean_row(f"paper, {DATASETS[key]}", theirs)))
     return Table(
         "mean_gains",
         "Three mean gains that are easily mistaken for one another",

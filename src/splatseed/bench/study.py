@@ -95,12 +95,14 @@ class Study:
         settings: What they have in common, by the names of ``RunSpec``.
         cells: By strategy, scene and variant.
         rows: The runs that the cells are made of, by scene.
-        not_finite: Labels of finished runs whose PSNR is infinite or no number.
+        variant_of_key: The variant of each of these runs.
+        not_finite: Finished runs whose PSNR is infinite or no number.
     """
 
     settings: Mapping[str, object]
     cells: Mapping[tuple[StrategyName, str, Variant], Cell]
     rows: Mapping[str, tuple[RunRow, ...]]
+    variant_of_key: Mapping[str, Variant]
     not_finite: tuple[str, ...] = ()
 
     @cached_property
@@ -163,6 +165,16 @@ class Study:
         ]
         return ", ".join(word for word in words if word)
 
+    def key(self, strategy: StrategyName, scene: str, variant: Variant, repeat: int) -> str | None:
+        """The key of a run; None where there is none."""
+        for row in self.rows.get(scene, ()):
+            spec = row.spec
+            if (spec.arm.strategy, self.variant_of_key[spec.key], spec.repeat) == (
+                strategy, variant, repeat
+            ):  # fmt: skip
+                return spec.key
+        return None
+
     @property
     def repeats(self) -> tuple[int, int]:
         """Fewest and most repeats of a cell."""
@@ -222,7 +234,8 @@ def _study(settings: Mapping[str, object], rows: Sequence[RunRow]) -> Study:
     factors = {scene: min(each) for scene, each in sorted(by_factor.items())}
     common = set(factors.values())
     told = {**settings, "data_factor": common.pop() if len(common) == 1 else factors}
-    return Study(told, dict(cells), {k: tuple(v) for k, v in scenes.items()}, tuple(odd))
+    by_scene = {k: tuple(v) for k, v in scenes.items()}
+    return Study(told, dict(cells), by_scene, variant, tuple(odd))
 
 
 def _scene_labels(rows: Sequence[RunRow]) -> dict[tuple[str, str], str]:

@@ -39,6 +39,7 @@ class Cell:
         text: The words, instead of a number or behind it.
         mark: A sign behind it, explained in the table's notes.
         bold: Whether it is the best of its row.
+        soft: Whether it is set back, as others' numbers are.
     """
 
     value: float | None = None
@@ -48,6 +49,7 @@ class Cell:
     text: str = ""
     mark: str = ""
     bold: bool = False
+    soft: bool = False
 
 
 @dataclass(frozen=True)
@@ -201,5 +203,5 @@ def write_table(table: Table, folder: Path) -> tuple[Path, ...]:
     for suffix, text in (("csv", to_csv), ("md", to_markdown), ("tex", to_tex)):
         paths.append(folder / f"{table.name}.{suffix}")
         with atomic_file(paths[-1]) as partial:
-            partial.write_text(text(table), "utf-8")
+            partial.write_text(text(table), "utf-8", errors="backslashreplace")
     return tuple(paths)
