@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.train.settings import TrainSettings
 
 __all__ = ["seeds_digest", "usable_seeds"]
@@ -20,6 +20,8 @@ def usable_seeds(
     points: PointCloud, settings: TrainSettings, note: Callable[[str], None]
 ) -> PointCloud:
     """The finite points, thinned out at random if there are more than the cap.
+
+    Originals stay as long as they fit: they lie where something was seen.
 
     Args:
         points: Those of the scene.
@@ -31,9 +33,15 @@ def usable_seeds(
         note(f"{len(points) - len(seeds):,} points without finite coordinates were left out.")
     if settings.cap is None or len(seeds) <= settings.cap:
         return seeds
-    note(f"{len(seeds):,} seeds were thinned out at random to --cap-max {settings.cap:,}.")
+    kept = min(seeds.num_original, settings.cap)
+    note(
+        f"{len(seeds):,} seeds were thinned out at random to --cap-max {settings.cap:,}, "
+        f"{kept:,} of them originals."
+    )
     rng = np.random.default_rng([settings.seed, settings.cap])
-    return seeds.select(np.sort(rng.choice(len(seeds), settings.cap, replace=False)))
+    rank = rng.permutation(len(seeds))
+    rank[seeds.source == ORIGINAL] -= len(seeds)  # ahead of all others
+    return seeds.select(np.sort(np.argsort(rank)[: settings.cap]))
 
 
 def seeds_digest(seeds: PointCloud) -> str:
