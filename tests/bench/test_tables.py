@@ -14,7 +14,7 @@ import pytest
 
 from splatseed.bench.comparisons import equal_count_table, ratio_table, strategy_table
 from splatseed.bench.convergence import convergence_table, reach
-from splatseed.bench.costs import cost_table
+from splatseed.bench.costs import cost_table, quality_table
 from splatseed.bench.gains import clear_best, gains, mean_gains
 from splatseed.bench.paper import DATASETS, dataset_of, paper_dataset
 from splatseed.bench.psnr_tables import gain_table, mean_gain_table, psnr_tables
@@ -191,6 +191,16 @@ def test_costs_are_means_over_scenes_and_the_papers_stand_beside():
         for r in rows(scenes=("fox",))
     ]
     assert "peak memory, MB" not in cost_table(one(unknown), "none").header
+
+
+def test_quality_is_told_as_far_as_it_was_measured():
+    table = quality_table(one(rows(scenes=("fox", "room0"))), "none")
+    assert table.header == ("method", "PSNR, dB", "SSIM", "scenes")
+    assert column(table, "SSIM")["mls 8x"].value == pytest.approx(0.8)
+    some = [
+        dataclasses.replace(r, result=dataclasses.replace(r.result, lpips=0.25)) for r in rows()
+    ]
+    assert column(quality_table(one(some), "none"), "LPIPS")["sfm"].value == pytest.approx(0.25)
 
 
 def test_reaching_a_target_is_interpolated():

@@ -1,4 +1,4 @@
-"""The paper's table 3 beside ours: what every variant costs in time, memory and size.
+"""What every variant gives and costs on average: quality; and the paper's table 3 beside ours.
 
 Promise: means are over runs within a scene first, then over the scenes that the variant and the baseline
 both have, so that a method is not charged for scenes that another was spared.
@@ -17,7 +17,12 @@ from splatseed.bench.study import BASELINE, Study, Variant
 from splatseed.bench.tables import Cell, Table, number, words
 from splatseed.train.settings import StrategyName
 
-__all__ = ["cost_table", "mean_cost"]
+__all__ = ["cost_table", "mean_of", "quality_table"]
+
+QUALITY_NOTE = (
+    "Means over the scenes that a method and sfm both have: compare methods of equally many scenes. PSNR"
+    " and SSIM are better when higher, LPIPS when lower. What is noise, the tables of gains say."
+)
 
 Measure = Callable[[RunResult], float]
 
@@ -40,12 +45,18 @@ COLUMNS = (
 )
 """MB are of 1,000,000 bytes."""
 
+QUALITY = (
+    _Column("PSNR, dB", lambda r: r.psnr, 2),
+    _Column("SSIM", lambda r: r.ssim, 4),
+    _Column("LPIPS", lambda r: math.nan if r.lpips is None else r.lpips, 4),
+)
+
 
 def _bytes(count: int | None) -> float:
     return math.nan if count is None else count / 1e6
 
 
-def mean_cost(
+def mean_of(
     study: Study, strategy: StrategyName, variant: Variant, measure: Measure
 ) -> float | None:
     """A measure's mean over runs within a scene, then over scenes that the baseline has as well.
@@ -68,6 +79,50 @@ def mean_cost(
     return fmean(known) if known else None
 
 
+def quality_table(study: Study, strategy: StrategyName) -> Table:
+    """PSNR, SSIM and, where it was measured, LPIPS by variant.
+
+    Args:
+        study: The study.
+        strategy: One of its strategies.
+    """
+    arms = (BASELINE, *study.variants_of(strategy))
+    shown = _known(study, strategy, arms, QUALITY)
+    rows = [
+        (
+            words(arm.label),
+            *(_cost(study, strategy, arm, column) for column in shown),
+            number(float(_num_scenes(study, strategy, arm)), 0),
+        )
+        for arm in arms
+    ]
+    return Table(
+        f"quality_{strategy}",
+        f"Mean scores, strategy {strategy}",
+        ("method", *(column.name for column in shown), "scenes"),
+        tuple(rows),
+        (QUALITY_NOTE, f"{study.description}."),
+    )
+
+
+def _known(
+    study: Study, strategy: StrategyName, arms: Iterable[Variant], columns: Iterable[_Column]
+) -> list[_Column]:
+    """The columns that any arm has a value in."""
+    return [
+        column
+        for column in columns
+        if any(mean_of(study, strategy, arm, column.measure) is not None for arm in arms)
+    ]
+
+
+def _num_scenes(study: Study, strategy: StrategyName, arm: Variant) -> int:
+    scenes = study.scenes_of(strategy)
+    return sum(
+        bool(study.cell(strategy, s, arm) and study.cell(strategy, s, BASELINE)) for s in scenes
+    )
+
+
 def cost_table(study: Study, strategy: StrategyName) -> Table:
     """Time, memory and size by variant.
 
@@ -78,11 +133,7 @@ def cost_table(study: Study, strategy: StrategyName) -> Table:
     datasets = [paper_dataset(key) for key in DATASETS]
     datasets = [each for each in datasets if set(study.scenes_of(strategy)) & set(each.psnr)]
     arms = (BASELINE, *study.variants_of(strategy))
-    shown = [
-        column
-        for column in COLUMNS
-        if any(mean_cost(study, strategy, arm, column.measure) is not None for arm in arms)
-    ]
+    shown = _known(study, strategy, arms, COLUMNS)
     rows = [
         (
             words(arm.label),
@@ -104,7 +155,7 @@ def cost_table(study: Study, strategy: StrategyName) -> Table:
 
 
 def _cost(study: Study, strategy: StrategyName, arm: Variant, column: _Column) -> Cell:
-    return number(mean_cost(study, strategy, arm, column.measure), column.digits)
+    return number(mean_of(study, strategy, arm, column.measure), column.digits)
 
 
 def _paper_costs(datasets: Iterable[PaperDataset], arm: Variant) -> list[Cell]:

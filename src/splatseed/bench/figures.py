@@ -93,11 +93,10 @@ def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
         axes.set_xlabel(by if by == "steps" else "seconds, upsampling included")
         axes.set_ylabel("PSNR, dB")
     _legend(figure, arms, _line)
-    some = "" if len(arms) == len(variants) + 1 else " Of each method, the highest ratio."
     return Plot(
         f"psnr_{by}_{strategy}",
         f"Test PSNR (dB) over {by}, strategy {strategy}: mean over repeats, and a band from the lowest"
-        f" to the highest.{some}",
+        f" to the highest.{_left_out(arms[1:], variants)}",
         _png(figure),
     )
 
@@ -156,14 +155,14 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
     found = gains(study, strategy)
     if not found.on_scene:
         return None
+    variants = shown_variants(found.variants)
     names = [*found.scenes, "mean, these scenes"]
-    figure = _figure(7.2, 1.1 + 0.16 * len(names) * (len(found.variants) + 1.5))
+    figure = _figure(7.2, 1.1 + 0.15 * len(names) * (len(variants) + 1.5))
     axes = figure.subplots()
     for row, name in enumerate(names):
-        for i, variant in enumerate(found.variants):
+        for variant, place in zip(variants, _places(row, len(variants)), strict=True):
             gain = _gain_of(found, name, variant)
             if gain is not None:
-                place = row + 0.8 * ((i + 0.5) / len(found.variants) - 0.5)
                 _dot(axes, gain, place, variant, across=True)
     axes.axvline(0.0, color=COLORS["sfm"], linewidth=1)
     axes.axhline(len(found.scenes) - 0.5, color="#bbbbbb", linewidth=0.8)
@@ -171,13 +170,22 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlabel("gain over sfm, dB")
     axes.grid(visible=True, axis="x", alpha=0.25)
-    _legend(figure, found.variants, _mark_only)
+    _legend(figure, variants, _mark_only)
     return Plot(
         f"gain_by_scene_{strategy}",
         f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and 95% interval (of each"
-        " comparison alone, not adjusted for their number).",
+        f" comparison alone, not adjusted for their number).{_left_out(variants, found.variants)}",
         _png(figure),
     )
+
+
+def _places(center: float, count: int) -> list[float]:
+    """So many places about a center, close enough to leave a gap to the next center's."""
+    return [center + 0.8 * ((i + 0.5) / count - 0.5) for i in range(count)]
+
+
+def _left_out(shown: Sequence[Variant], variants: Sequence[Variant]) -> str:
+    return "" if len(shown) == len(variants) else " Of each method, the highest ratio."
 
 
 def _gain_of(found: Gains, name: str, variant: Variant) -> Difference | None:
@@ -248,13 +256,12 @@ def strategy_figure(study: Study) -> Plot | None:
         return None
     figure = _figure(7.2, 3.6)
     axes = figure.subplots()
-    variants = study.variants
+    variants = shown_variants(study.variants)
     for column, strategy in enumerate(study.strategies):
         found = gains(study, strategy)
-        for variant in found.variants:
-            i = variants.index(variant)
-            place = column + 0.8 * ((i + 0.5) / len(variants) - 0.5)
-            _dot(axes, found.on_these[variant], place, variant)
+        for variant, place in zip(variants, _places(column, len(variants)), strict=True):
+            if variant in found.on_these:
+                _dot(axes, found.on_these[variant], place, variant)
     axes.axhline(0.0, color=COLORS["sfm"], linewidth=1)
     axes.set_xticks(range(len(study.strategies)), study.strategies)
     axes.set_ylabel("gain over sfm, dB")
@@ -262,7 +269,8 @@ def strategy_figure(study: Study) -> Plot | None:
     _legend(figure, variants, _mark_only)
     return Plot(
         "gain_by_strategy",
-        "Mean gain over sfm on these scenes by strategy, with 95% interval of training again.",
+        "Mean gain over sfm on these scenes by strategy, with 95% interval of training again."
+        f"{_left_out(variants, study.variants)}",
         _png(figure),
     )
 

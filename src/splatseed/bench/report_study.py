@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from splatseed.bench.comparisons import equal_count_table, ratio_table, strategy_table
 from splatseed.bench.convergence import convergence_table
-from splatseed.bench.costs import cost_table
+from splatseed.bench.costs import cost_table, quality_table
 from splatseed.bench.descriptors import Descriptors
 from splatseed.bench.figures import (
     Plot,
@@ -83,7 +83,7 @@ def study_report(
     """
     report = StudyReport(prefix, title)
     strategies = study.strategies
-    report.add("scores", "Scores", (t for each in strategies for t in psnr_tables(study, each)))
+    report.add("scores", "Scores", _scores(study))
     if not study.variants:
         report.add("gains", "Gains", [NO_GAINS])
     else:
@@ -92,6 +92,12 @@ def study_report(
     report.add("cost", "Cost", (cost_table(study, each) for each in strategies))
     report.add("guidelines", "Guidelines", _guidelines(study, described))
     return report
+
+
+def _scores(study: Study) -> Iterable[Table]:
+    for strategy in study.strategies:
+        yield from psnr_tables(study, strategy)
+        yield quality_table(study, strategy)
 
 
 def _add_gains(report: StudyReport, study: Study) -> None:
