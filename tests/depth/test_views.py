@@ -136,13 +136,13 @@ def test_neighbors_see_the_same_from_another_side():
         camera_at(50.0),  # sees nothing of it
     ]
     views = [view(camera, wall(camera)) for camera in cameras]
-    neighbors = choose_neighbors(views, 4)
+    neighbors = choose_neighbors(views, 4, silent)
     assert neighbors.shape == (6, 4)
     assert neighbors[0].tolist()[:2] == [2, 3]
     assert neighbors[0].tolist()[2] == 1
     assert neighbors[0].tolist()[3] == -1  # neither 4 nor 5, nor itself
     assert (neighbors[5] == -1).all()
-    assert (choose_neighbors(views[:1], 3) == -1).all()
+    assert (choose_neighbors(views[:1], 3, silent) == -1).all()
 
 
 def test_maps_are_scaled_to_agree():
@@ -155,7 +155,7 @@ def test_maps_are_scaled_to_agree():
         view(camera, np.where(np.arange(WIDTH) < 20, 0.7, 1.0) * wall(camera), factor=factor)
         for camera, factor in zip(cameras, factors, strict=True)
     ]
-    found = harmonize(views, choose_neighbors(views, 6), silent)
+    found = harmonize(views, choose_neighbors(views, 6, silent), silent)
     left = np.log(found * factors)
     assert np.abs(left - left.mean()).max() < 0.01 < np.abs(np.log(factors)).max()
     assert abs(left.mean()) < 0.02
@@ -164,7 +164,7 @@ def test_maps_are_scaled_to_agree():
 def test_maps_without_overlap_are_left_alone():
     cameras = [camera_at(100.0 * i) for i in range(3)]
     views = [view(camera, wall(camera), factor=1.1) for camera in cameras]
-    found = harmonize(views, choose_neighbors(views, 2), silent)
+    found = harmonize(views, choose_neighbors(views, 2, silent), silent)
     np.testing.assert_allclose(found, 1.0, rtol=1e-12)
 
 

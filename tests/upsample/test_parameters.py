@@ -52,7 +52,7 @@ WRONG_PARAMETERS = [
     ("depth", {"edge_tolerance": 0}, "edge_tolerance above 0"),
     ("depth", {"edge_radius": 0}, "edge_radius from 1"),
     ("depth", {"num_neighbors": 0}, "num_neighbors from 1"),
-    ("depth", {"min_agreeing": 9}, "min_agreeing from 0 to 8"),
+    ("depth", {"min_agreeing": 13}, "min_agreeing from 0 to 12"),
     ("depth", {"tolerance": 1}, "tolerance between 0 and 1"),
     ("depth", {"color_tolerance": 2}, "color_tolerance above 0"),
     ("depth", {"hold_out": 1}, "hold_out of 0 or 2"),

@@ -58,7 +58,7 @@ class Candidates:
 def gather(views: Sequence[View], settings: Settings, progress: Progress) -> Candidates:
     """Lift the views' candidates, and hold them against other views if the settings say so."""
     counts = np.array([len(view) for view in views])
-    neighbors = choose_neighbors(views, settings.num_neighbors)
+    neighbors = choose_neighbors(views, settings.num_neighbors, progress)
     factors = np.ones(len(views))
     if settings.harmonizes:
         factors = harmonize(views, neighbors, progress)

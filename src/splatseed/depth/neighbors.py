@@ -1,9 +1,10 @@
 """Which other views to ask about a view's points.
 
-Notation: V views, S sample points of each; the rays of two cameras to a point enclose an angle. Promise:
-a view's neighbours are those that have most of its samples in their frame, each sample counted by the
-angle: rays that nearly coincide confirm little, since a sensor errs alike from one place, and rays more
-than 90 degrees apart look at the other side of a surface.
+Notation: V views, S sample points of each. A view *covers* a sample of another, with a weight by the angle
+that the two cameras' rays to it enclose: little where the rays nearly coincide, since a sensor errs alike
+from one place, and none from 90 degrees on, where the other side of a surface is seen. Promise: neighbours
+are chosen one after another, each for the samples that those before it cover least, first by frames alone
+(few of all views), then by what each sees there according to its map (``num`` of these few).
 """
 
 from __future__ import annotations
@@ -11,85 +12,141 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from splatseed.depth.views import View
 from splatseed.jit import inline, kernel, parallel_range
+from splatseed.progress import Progress, in_threads
 
 __all__ = ["choose_neighbors"]
 
-SAMPLES = 32
+SAMPLES = 48
 MIN_SAMPLES = 4
 WORK = 1 << 28
 """Projections at most: the more views, the fewer samples of each."""
-
+SHORTLIST = 3
+"""Views that are looked at closer, for each that is chosen."""
 FULL = 0.03
-"""1 - cos of the angle from which on (14 degrees) it counts fully; up to 60 degrees."""
-LEAST = 0.02
-"""What rays that coincide count."""
+"""1 - cos of the angle from which on (14 degrees) a view covers fully; up to 60 degrees."""
+LEAST = 0.05
+"""How much rays that coincide cover."""
+SEEN = 0.25
+"""A view sees a sample if its own depth there differs by less than this share."""
+FAR = 1e6
+"""No grid has so many columns."""
+PIECE = 8
+"""Views that a thread takes at a time."""
 
 
-def choose_neighbors(views: Sequence[View], num: int) -> Int64[np.ndarray, "V num"]:
+def choose_neighbors(
+    views: Sequence[View], num: int, progress: Progress
+) -> Int64[np.ndarray, "V num"]:
     """The ``num`` views to ask about each view's points, best first, int64 [V, num]; -1 = no more.
 
     Args:
         views: All of them; those without a reduced copy neither ask nor answer.
         num: How many.
+        progress: Told how many have been chosen.
     """
-    usable = [i for i, view in enumerate(views) if view.reduced is not None and len(view)]
     chosen = np.full((len(views), num), -1)
+    usable = np.array([i for i, v in enumerate(views) if v.reduced is not None and len(v)], int)
     if len(usable) < 2:
         return chosen
     per_view = int(np.clip(WORK // len(usable) ** 2, MIN_SAMPLES, SAMPLES))
     samples = np.full((len(usable), per_view, 3), np.inf, np.float32)  # seen by nobody
-    for i, k in enumerate(usable):
+    for i, k in enumerate(usable.tolist()):
         own = views[k].samples(per_view)
         samples[i, : len(own)] = own
-    grids = [reduced for i in usable if (reduced := views[i].reduced) is not None]
+    grids = [copy for k in usable.tolist() if (copy := views[k].reduced) is not None]
     matrices = np.stack([grid.grid_from_world for grid in grids])
     sizes = np.array([grid.z.shape for grid in grids])
-    centers = np.stack([views[i].camera.center for i in usable])
-    found = np.full((len(usable), num), -1)
-    _rank(samples, matrices, sizes, centers, found)
-    lookup = np.array([*usable, -1])  # an index of -1 stays one
-    chosen[usable] = lookup[found]
+    centers = np.stack([views[k].camera.center for k in usable.tolist()])
+    shortlist = np.full((len(usable), SHORTLIST * num), -1)
+    _shortlist(samples, matrices, sizes, centers, shortlist)
+
+    def work(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            listed = shortlist[i][shortlist[i] >= 0]
+            covers = np.zeros((len(listed), per_view))
+            for row, j in zip(covers, listed.tolist(), strict=True):
+                _weigh(samples[i], matrices[j], sizes[j], centers[i], centers[j], row)
+                _keep_seen(samples[i], matrices[j], grids[j].z, grids[j].factor, row)
+            best = _cover(covers, num)
+            chosen[usable[i], : len(best)] = usable[listed[best]]
+
+    in_threads(work, len(usable), PIECE, "choose neighbours", progress)
     return chosen
 
 
+def _cover(covers: Float64[np.ndarray, "J S"], num: int) -> Int64[np.ndarray, " K"]:
+    """Up to ``num`` of the rows, each chosen for what those before it cover least."""
+    out = np.full(num, -1)
+    _choose(covers, out)
+    return out[out >= 0]
+
+
 @kernel
-def _rank(samples, matrices, sizes, centers, found):  # type: ignore[no-untyped-def]
-    """The best-scored views of every view, by repeated selection of the best."""
-    for i in parallel_range(len(samples)):
-        score = np.empty(len(samples))
-        for j in range(len(samples)):
-            score[j] = 0.0 if i == j else _score(i, j, samples, matrices, sizes, centers)
-        for k in range(min(found.shape[1], len(samples) - 1)):
-            best = int(np.argmax(score))
-            if score[best] <= 0.0:
-                break
-            found[i, k] = best
-            score[best] = 0.0
+def _shortlist(samples, matrices, sizes, centers, out):  # type: ignore[no-untyped-def]
+    """Views whose frames cover the samples of each view."""
+    num, per_view = samples.shape[0], samples.shape[1]
+    for i in parallel_range(num):
+        covers = np.zeros((num, per_view))
+        for j in range(num):
+            if j != i:
+                _weigh(samples[i], matrices[j], sizes[j], centers[i], centers[j], covers[j])
+        _choose(covers, out[i])
 
 
 @inline
-def _score(i, j, samples, matrices, sizes, centers):  # type: ignore[no-untyped-def]
-    """Samples of view i that are in the frame of view j, each weighted by the angle of its rays."""
-    total = 0.0
-    m = matrices[j]
-    for s in range(samples.shape[1]):
-        x, y, z = (
-            np.float64(samples[i, s, 0]),
-            np.float64(samples[i, s, 1]),
-            np.float64(samples[i, s, 2]),
-        )
-        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        if not 0.0 < depth < np.inf:
-            continue
-        column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-        row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
-        if 0.0 <= column <= sizes[j, 1] - 1 and 0.0 <= row <= sizes[j, 0] - 1:
-            total += _angle_weight(samples[i, s], centers[i], centers[j])
-    return total
+def _choose(covers, out):  # type: ignore[no-untyped-def]
+    """Rows one after another by the sum of w / (1 + covered)^2, until none adds anything."""
+    covered = np.zeros(covers.shape[1])
+    free = np.ones(len(covers), np.bool_)
+    for k in range(min(len(out), len(covers))):
+        best, most = -1, 0.0
+        for j in range(len(covers)):
+            if free[j]:
+                gain = 0.0
+                for s in range(covers.shape[1]):
+                    gain += covers[j, s] / (1.0 + covered[s]) ** 2
+                if gain > most:
+                    best, most = j, gain
+        if best < 0:
+            break
+        out[k] = best
+        free[best] = False
+        covered += covers[best]
+
+
+@inline
+def _weigh(samples, m, size, center, other, out):  # type: ignore[no-untyped-def]
+    """How much a view covers each sample, by frame and angle."""
+    for s in range(len(samples)):
+        depth, column, row = _place(samples[s], m)
+        if 0.0 < depth < np.inf and 0 <= column < size[1] and 0 <= row < size[0]:
+            out[s] = _angle_weight(samples[s], center, other)
+
+
+@inline
+def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]
+    """Take back what is hidden from the view, or unknown to it."""
+    for s in range(len(samples)):
+        if out[s] > 0.0:
+            depth, column, row = _place(samples[s], m)
+            if not abs(factor * z[row, column] / depth - 1.0) < SEEN:
+                out[s] = 0.0
+
+
+@inline
+def _place(point, m):  # type: ignore[no-untyped-def]
+    """Depth of a point in a view, and the nearest point of its grid; column -1 where there is none."""
+    x, y, z = np.float64(point[0]), np.float64(point[1]), np.float64(point[2])
+    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+    column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + 0.5
+    row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + 0.5
+    if not (0.0 <= column < FAR and 0.0 <= row < FAR):
+        return depth, -1, -1
+    return depth, int(column), int(row)
 
 
 @inline

@@ -39,7 +39,7 @@ class Settings:
     """Other views whose depth and colour must confirm a point; 0 = none (paper: 0)."""
     see_through: bool = False
     """Keep points that another view looks through (paper: yes)."""
-    num_neighbors: int = 8
+    num_neighbors: int = 12
     """Other views that are asked, at most."""
     tolerance: float = 0.02
     """Relative difference at which two depths agree."""

@@ -84,12 +84,17 @@ class View:
         """How many candidates there are."""
         return len(self.pixel)
 
-    def samples(self, num: int) -> Float32[np.ndarray, "num 3"]:
-        """The positions of up to ``num`` candidates spread evenly over the image, which has one."""
+    def samples(self, num: int, factor: float = 1.0) -> Float32[np.ndarray, "num 3"]:
+        """The positions of up to ``num`` candidates spread evenly over the image, which has one.
+
+        Args:
+            num: How many.
+            factor: Multiplies depth.
+        """
         num = min(num, len(self))
         which = ((np.arange(num) + 0.5) * (len(self) / num)).astype(np.int64)
         out = np.empty((num, 3), np.float32)
-        return lift_pixels(self.pixel[which], self.z[which], self.camera, out)
+        return lift_pixels(self.pixel[which], self.z[which], self.camera, out, factor)
 
 
 @dataclass(frozen=True, eq=False)
