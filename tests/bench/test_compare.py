@@ -35,6 +35,8 @@ def test_a_planted_change_is_found_and_nothing_else():
     assert found.settings == (("version", "0.1.0", "0.2.0"),)
     assert change(found, "fox", MLS8).mean == pytest.approx(0.3, abs=0.12)
     assert mean(found, MLS8).verdict == "better"
+    marked = [row[1].text for row in change_table(found).rows if row[-1].mark == "*"]
+    assert marked == ["mls 8x"]
     others = [c.difference.verdict for c in found.means if c.arm[1] != MLS8]
     assert set(others) == {"within noise"}
 

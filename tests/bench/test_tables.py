@@ -180,6 +180,15 @@ def test_parameters_and_profiles_are_variants_of_their_own():
     assert labels == ["linear 8x", "mls 4x", "mls 8x", "mls 8x k=12", "mls 8x (paper)", "random 8x"]
 
 
+def test_what_a_plan_always_asks_of_depth_is_no_part_of_its_name():
+    held = rows(scenes=("fox",), gains={("depth", 4): 0.1}, parameters={"hold_out": 8})
+    other = rows(scenes=("fox",), gains={("depth", 4): 0.1}, parameters={"hold_out": 4})
+    found = one([*rows(scenes=("fox",), repeats=2), *held, *other])
+    labels = [variant.label for variant in found.variants if variant.method == "depth"]
+    assert labels == ["depth 4x", "depth 4x hold_out=4"]
+    assert found.description.endswith("splatseed 0.1.0, 2 to 3 repeats")
+
+
 def test_costs_are_means_over_scenes_and_the_papers_stand_beside():
     table = cost_table(one(rows(scenes=("bonsai", "fox"))), "none")
     assert column(table, "Gaussians")["mls 4x"].value == 10_000

@@ -204,7 +204,7 @@ def change_table(found: Comparison) -> Table:
         for mean in found.means
     )
     note = (
-        "PSNR in B less that in A, dB ± standard error. Bold: more than noise (Welch's test, Holm-corrected"
+        "PSNR in B less that in A, dB ± standard error. *: more than noise (Welch's test, Holm-corrected"
         " over all changes on scenes, and over all means); ~: within noise. (1 run): nothing is known of the"
         " noise."
     )
@@ -222,7 +222,7 @@ def _cell(change: Difference | None) -> Cell:
         change.se,
         3,
         signed=True,
-        mark="~" if verdict == "within noise" else "",
+        mark={"within noise": "~", "unknown": ""}.get(verdict, "*"),
         text="(1 run)" if verdict == "unknown" else "",
         bold=verdict in {"better", "worse"},
     )

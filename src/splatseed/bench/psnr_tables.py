@@ -28,7 +28,7 @@ MARKS = (
     "PSNR in dB, mean ± standard error over repeats. Bold: the best of its row, where its gain over sfm"
     " is significant (paired by scene and repeat, Holm-corrected over all gains on scenes in this"
     " strategy, 5%), or sfm where all are significantly worse; † where it is also better than the second best. ~: within noise of sfm."
-    " (1 run): a single repeat, of whose noise nothing is known."
+    " (1 run): a single repeat, which has no standard error of its own."
 )
 PAPER_NOTE = (
     "Rows '(paper)' are the numbers printed there: 30,000 steps, a quarter (outdoors) or half (indoors) of"

@@ -162,6 +162,7 @@ class Study:
             "opacities reset" if told["opacity_reset"] else "",
             f"backend {told['backend']}",
             f"splatseed {told['version']}" if told["version"] else "",
+            self._repeats,
         ]
         return ", ".join(word for word in words if word)
 
@@ -176,10 +177,13 @@ class Study:
         return None
 
     @property
-    def repeats(self) -> tuple[int, int]:
-        """Fewest and most repeats of a cell."""
-        counts = [len(cell) for cell in self.cells.values()]
-        return min(counts), max(counts)
+    def _repeats(self) -> str:
+        """Fewest and most repeats of a cell, in words."""
+        counts = sorted({len(cell) for cell in self.cells.values()})
+        if not counts:
+            return ""
+        span = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+        return f"{span} repeat{'' if counts[-1] == 1 else 's'}"
 
 
 def _size(factor: object) -> str:
