@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.depth.alignment import reject_outliers
 from splatseed.depth.candidates import NEAR_EDGE, UNCONFIRMED, choose, gather
@@ -72,6 +73,7 @@ def lift(
         SceneFormatError: A file is damaged or does not fit, or no map can be aligned.
         PointCloudError: The maps cannot give so many points.
     """
+    scene, center = _centered(scene)
     images = _images_with_maps(scene, settings.hold_out)
     reader = _reader(scene, settings)
     factor = OVERSAMPLING if settings.compares_views or settings.spread else SURPLUS
@@ -86,7 +88,25 @@ def lift(
         candidates = gather(views, settings, progress)
     chosen = choose(candidates, _originals(scene), num, settings, rng, progress)
     notes = (*notes, *more, *_relaxed_notes(candidates.tier[chosen], settings))
-    return Lifted(candidates.xyz[chosen], candidates.rgb[chosen], notes)
+    xyz = (candidates.xyz[chosen] + center).astype(np.float32)
+    return Lifted(xyz, candidates.rgb[chosen], notes)
+
+
+def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
+    """The scene with the mean of its cameras at the origin, and where that was.
+
+    Candidates are float32, which far from the origin (UTM coordinates) would be too coarse to compare.
+    """
+    if not scene.images:
+        return scene, np.zeros(3)
+    center = np.mean([image.camera.center for image in scene.images], axis=0)
+    images = tuple(
+        replace(image, translation=image.translation + image.camera.cam_from_world[:3, :3] @ center)
+        for image in scene.images
+    )
+    xyz = (scene.points.xyz - center).astype(np.float32)
+    points = scene.points.replace(xyz=xyz)
+    return scene.replace(points=points, images=images, tracks=scene.tracks), center
 
 
 def _images_with_maps(scene: Scene, hold_out: int) -> list[Image]:
