@@ -54,12 +54,18 @@ def test_one_slow_run_does_not_spoil_the_estimate():
     assert Estimator([FACTS], rows).seconds(SPEC) == pytest.approx(530)
 
 
-def test_growth_is_learnt_by_strategy():
+def test_growth_is_learnt_by_strategy_and_ratio():
     arm = Arm("mls", "default", 8, "default")
     grown = _row(_spec(arm=arm), num_gaussians=400_000)
     estimator = Estimator([FACTS], [grown])
     assert estimator.checkpoint(_spec(arm=arm)) == pytest.approx(3 * 400_000 * 59 * 4)
     assert estimator.checkpoint(SPEC) == pytest.approx(3 * 80_000 * 59 * 4)
+    sfm = Arm(SFM, "default", 1, "default")  # as long as nothing better is known
+    assert estimator.checkpoint(_spec(arm=sfm)) == pytest.approx(3 * 50_000 * 59 * 4)
+    few = _row(_spec(arm=sfm), num_seeds=10_000, num_gaussians=200_000)
+    estimator = Estimator([FACTS], [grown, few])
+    assert estimator.checkpoint(_spec(arm=sfm)) == pytest.approx(3 * 200_000 * 59 * 4)
+    assert estimator.checkpoint(_spec(arm=arm)) == pytest.approx(3 * 400_000 * 59 * 4)
     capped = _spec(arm=arm, cap_max=100_000)
     assert estimator.checkpoint(capped) == pytest.approx(3 * 100_000 * 59 * 4)
 

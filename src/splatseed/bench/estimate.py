@@ -7,6 +7,7 @@ several times; with finished runs in the ledger their median takes the place of 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -68,7 +69,7 @@ class Estimator:
         self._threads = threads
         done = [row for row in rows if row.result and row.spec.scene_digest in self._scenes]
         self.num_measured = len(done)
-        self._growth = _by_strategy(done)
+        self._growth = _measured_growth(done)
         paces = [self._pace_of(row.spec, row.result) for row in done]
         self._pace = median(paces) if paces else 1.0
         self._around = median(map(_seconds_around, done)) if done else None
@@ -97,7 +98,9 @@ class Estimator:
         """Gaussians at the start and at the end."""
         most = spec.settings.cap or float("inf")
         seeds = min(self._scenes[spec.scene_digest].num_points * spec.arm.ratio, most)
-        return seeds, min(seeds * self._growth[spec.arm.strategy], most)
+        strategy = spec.arm.strategy
+        alike = self._growth.get((strategy, spec.arm.ratio)) or self._growth.get((strategy, None))
+        return seeds, min(seeds * (alike or GROWTH[strategy]), most)
 
     def _pixels(self, spec: RunSpec) -> float:
         return self._scenes[spec.scene_digest].pixels / spec.data_factor**2
@@ -116,14 +119,15 @@ class Estimator:
         return result.train_seconds / spec.max_steps / modelled
 
 
-def _by_strategy(done: Sequence[RunRow]) -> dict[str, float]:
-    """Growth of each strategy, as it was where it has been run."""
-    seen: dict[str, list[float]] = {strategy: [] for strategy in GROWTH}
+def _measured_growth(done: Sequence[RunRow]) -> dict[tuple[str, float | None], float]:
+    """Growth by strategy and ratio (few seeds grow more), and by strategy alone."""
+    seen: dict[tuple[str, float | None], list[float]] = defaultdict(list)
     for row in done:
         if row.result:
-            ratio = row.result.num_gaussians / row.result.num_seeds
-            seen[row.spec.arm.strategy].append(ratio)
-    return {name: median(ratios) if ratios else GROWTH[name] for name, ratios in seen.items()}
+            growth = row.result.num_gaussians / row.result.num_seeds
+            for ratio in (row.spec.arm.ratio, None):
+                seen[row.spec.arm.strategy, ratio].append(growth)
+    return {key: median(values) for key, values in seen.items()}
 
 
 def _seconds_around(row: RunRow) -> float:
