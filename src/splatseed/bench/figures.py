@@ -92,7 +92,7 @@ def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
         axes.set_title(scene)
         axes.set_xlabel(by if by == "steps" else "seconds, upsampling included")
         axes.set_ylabel("PSNR, dB")
-    _legend(figure, arms, _line)
+    _legend(figure, arms, _marked)
     return Plot(
         f"psnr_{by}_{strategy}",
         f"Test PSNR (dB) over {by}, strategy {strategy}: mean over repeats, and a band from the lowest"
@@ -117,7 +117,10 @@ def _draw_curves(
         x, psnr = curve
         mean = psnr.mean(axis=0)
         width = 2.2 if arm == BASELINE else 1.3
-        axes.plot(x, mean, **_line(arm), linewidth=width, zorder=3 if arm == BASELINE else 2)
+        every = max(len(mean) // 5, 1)
+        marked = ((len(mean) - 1) % every, every)  # the last point is one of them
+        zorder = 3 if arm == BASELINE else 2
+        axes.plot(x, mean, **_marked(arm), markevery=marked, linewidth=width, zorder=zorder)
         if len(psnr) > 1:
             axes.fill_between(x, psnr.min(axis=0), psnr.max(axis=0), color=_color(arm), alpha=0.15)
         late = min(math.ceil(LATE * len(mean)), len(mean) - 1)
@@ -287,6 +290,11 @@ def _mark(variant: Variant) -> dict[str, Any]:
 
 def _line(variant: Variant) -> dict[str, Any]:
     return {"color": _color(variant), "linestyle": "--" if variant.profile == "paper" else "-"}
+
+
+def _marked(variant: Variant) -> dict[str, Any]:
+    """A line with the ratio's mark on it; the baseline has none."""
+    return {**_mark(variant), **_line(variant), "markersize": 0.0 if variant == BASELINE else 4.5}
 
 
 def _figure(width: float, height: float) -> Figure:

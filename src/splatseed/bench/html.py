@@ -103,9 +103,7 @@ def table(content: Table) -> str:
     """A table that scrolls sideways where it is wide, with its notes folded below."""
     if not content.rows:
         return _captioned(content, paragraphs(["None.", *content.notes[:1]]))
-    texts = [
-        all(cell.value is None for cell in column) for column in zip(*content.rows, strict=True)
-    ]
+    texts = [_is_text(column) for column in zip(*content.rows, strict=True)]
     head = "".join(
         f'<th scope="col"{_WORDS if texts[i] else ""}>{escape(name)}</th>'
         for i, name in enumerate(content.header)
@@ -120,6 +118,10 @@ def _captioned(content: Table, inner: str) -> str:
     folded = f"<details><summary>How to read this</summary>{notes}</details>" if notes else ""
     title = f"<h3>{escape(content.title)}</h3>"
     return f'<div class="table" id="table-{escape(content.name)}">{title}{inner}{folded}</div>'
+
+
+def _is_text(column: Sequence[Cell]) -> bool:
+    return all(cell.value is None for cell in column) and any(cell.text for cell in column)
 
 
 def _cell(cell: Cell, place: int) -> str:

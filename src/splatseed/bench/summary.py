@@ -13,7 +13,7 @@ from statistics import fmean
 from splatseed.bench.convergence import speed
 from splatseed.bench.gains import Gains, gains
 from splatseed.bench.records import RunResult
-from splatseed.bench.statistics import Difference, Verdict
+from splatseed.bench.statistics import LEVEL, Difference, Verdict
 from splatseed.bench.study import BASELINE, Study, Variant
 from splatseed.train.settings import StrategyName
 
@@ -111,11 +111,17 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
     if sooner.log_steps is None or sooner.log_seconds is None:
         part = f"{sooner.reached} of {sooner.pairs} runs"
         return f"{text} {part} reach {BASELINE.label}'s last PSNR."
-    steps, clock = (math.exp(each.mean) for each in (sooner.log_steps, sooner.log_seconds))
+    steps, clock = (_ratio(each) for each in (sooner.log_steps, sooner.log_seconds))
     return (
-        f"{text} It is as good as {BASELINE.label} in the end after {steps:.2f} times the steps and"
-        f" {clock:.2f} times the seconds that {BASELINE.label} itself takes."
+        f"{text} It is as good as {BASELINE.label} in the end after {steps} the steps and {clock} the"
+        f" seconds that {BASELINE.label} itself takes."
     )
+
+
+def _ratio(log: Difference) -> str:
+    """How many times, and whether that could be once."""
+    sure = log.p <= LEVEL  # NaN of a single pair is not
+    return f"{math.exp(log.mean):.2f} times{'' if sure else ' (within noise)'}"
 
 
 def _pairs(
