@@ -66,7 +66,7 @@ def test_all_runs_end_up_done_once_although_a_node_is_lost(cluster, small_plan, 
         [*COMMAND, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     until = time.monotonic() + 120
-    while len(list((tmp_path / "nodes").glob("splatseed-*/work/config.json"))) < 2:
+    while len(list((tmp_path / "nodes").glob("splatseed-*/*/config.json"))) < 2:
         assert time.monotonic() < until, "no run on each of the nodes"
         assert process.poll() is None, process.communicate()
         time.sleep(0.1)
