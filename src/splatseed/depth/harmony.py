@@ -30,7 +30,7 @@ from splatseed.progress import Progress, in_threads
 
 __all__ = ["harmonize"]
 
-SAMPLES = 128
+SAMPLES = 96
 """Candidates of a view that are looked up in each neighbour."""
 LEAST_SAMPLES = 12
 FAR = 0.25

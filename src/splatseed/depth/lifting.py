@@ -28,7 +28,7 @@ from splatseed.scene import Image, Scene
 
 __all__ = ["Lifted", "lift"]
 
-OVERSAMPLING = 1.6
+OVERSAMPLING = 1.5
 """Candidates a new point, where views are compared or points spread."""
 MAX_OVERSAMPLING = 16.0
 """Candidates a new point, at most; a round of reading multiplies them by up to ``MAX_GROWTH``."""
@@ -88,7 +88,8 @@ def lift(
         candidates = gather(views, settings, progress)
     chosen = choose(candidates, _originals(scene), num, settings, rng, progress)
     notes = (*notes, *more, *_relaxed_notes(candidates.tier[chosen], settings))
-    xyz = (candidates.xyz[chosen] + center).astype(np.float32)
+    xyz = candidates.xyz[chosen]
+    np.add(xyz, center, out=xyz, casting="same_kind")  # in float64, then rounded
     return Lifted(xyz, candidates.rgb[chosen], notes)
 
 

@@ -20,11 +20,11 @@ from splatseed.progress import Progress, in_threads
 
 __all__ = ["choose_neighbors"]
 
-SAMPLES = 48
+SAMPLES = 40
 MIN_SAMPLES = 4
 WORK = 1 << 28
 """Projections at most: the more views, the fewer samples of each."""
-SHORTLIST = 3
+SHORTLIST = 2
 """Views that are looked at closer, for each that is chosen."""
 FULL = 0.03
 """1 - cos of the angle from which on (14 degrees) a view covers fully; up to 60 degrees."""
@@ -100,7 +100,7 @@ def _shortlist(samples, matrices, sizes, centers, out):  # type: ignore[no-untyp
 @inline
 def _choose(covers, out):  # type: ignore[no-untyped-def]
     """Rows one after another by the sum of w / (1 + covered)^2, until none adds anything."""
-    covered = np.zeros(covers.shape[1])
+    covered, worth = np.zeros(covers.shape[1]), np.ones(covers.shape[1])
     free = np.ones(len(covers), np.bool_)
     for k in range(min(len(out), len(covers))):
         best, most = -1, 0.0
@@ -108,7 +108,7 @@ def _choose(covers, out):  # type: ignore[no-untyped-def]
             if free[j]:
                 gain = 0.0
                 for s in range(covers.shape[1]):
-                    gain += covers[j, s] / (1.0 + covered[s]) ** 2
+                    gain += covers[j, s] * worth[s]
                 if gain > most:
                     best, most = j, gain
         if best < 0:
@@ -116,6 +116,7 @@ def _choose(covers, out):  # type: ignore[no-untyped-def]
         out[k] = best
         free[best] = False
         covered += covers[best]
+        worth = 1.0 / (1.0 + covered) ** 2
 
 
 @inline

@@ -44,7 +44,7 @@ class Reduced:
         factor: Scene units a unit of ``z``.
         grid_from_world: World to (column z, row z, z) of the grid, whose points are at whole
             numbers, float64 [3, 4].
-        rgb: The photograph's means over squares, uint8 [p, q, 3].
+        rgb: The photograph, smoothed and smaller, uint8 [p, q, 3].
         rgb_from_grid: Factor and offset from columns of the grid to those of ``rgb``, then of rows,
             float64 [2, 2].
     """
@@ -220,18 +220,20 @@ def _inside(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarr
 
 
 def _reduce(seen: _Seen, coarse: Float32[np.ndarray, "h w"], photograph: PilImage.Image) -> Reduced:
-    """Every f-th pixel of the map, for means would bridge edges, and the means of the photograph."""
+    """Every f-th pixel of the map, for means would bridge edges, and means of the photograph."""
     camera = seen.camera
     factor = -(-max(camera.width, camera.height) // GRID)
     first = factor // 2 + 0.5
     grid_from_map = np.array([[1, 0, -first], [0, 1, -first], [0, 0, factor]]) / factor
-    blocks = -(-max(photograph.size) // GRID)
-    block_from_map = np.array(photograph.size) / [camera.width, camera.height] / blocks
+    size = [-(-side // -(-max(photograph.size) // GRID)) for side in photograph.size]
+    # The mean of 2 x 2 samples of each block is smooth enough, and several times as fast as the block's.
+    samples = photograph.resize((2 * size[0], 2 * size[1]), resample=0)
+    block_from_map = np.array(size) / [camera.width, camera.height]
     return Reduced(
         coarse,
         seen.unit,
         grid_from_map @ camera.K @ camera.cam_from_world[:3],
-        np.asarray(photograph.reduce(blocks)),
+        np.asarray(samples.reduce(2)),
         block_from_map[:, None] * [[factor, first]],
     )
 
