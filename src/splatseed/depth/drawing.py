@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
-from scipy.ndimage import distance_transform_edt
 
 from splatseed.depth.settings import Settings
 from splatseed.jit import inline
@@ -23,6 +22,7 @@ CELLS = 64
 """Cells along the longer side of a map, at most."""
 
 ROUNDS = 4
+DIAGONAL = 2.0**0.5
 LEAST_DISTANCE = 0.5
 """Of a cell that has points, in cells: it is not closed to new ones."""
 
@@ -108,10 +108,11 @@ def _cell_weights(
     rows, columns = -(-shape[0] // step), -(-shape[1] // step)
     if settings.placement == "uniform" or not len(points):
         return np.ones((rows, columns))
-    empty = np.ones((rows, columns), bool)
+    distance = np.full((rows, columns), np.inf)
     column, row = (points // step).astype(np.int64).T
-    empty[row, column] = False
-    return np.asarray(np.sqrt(np.maximum(distance_transform_edt(empty), LEAST_DISTANCE)))
+    distance[row, column] = 0.0
+    _spread_distance(distance)
+    return np.asarray(np.sqrt(np.maximum(distance, LEAST_DISTANCE)))
 
 
 def _picks(num: int, placement: str, rng: np.random.Generator) -> Float64[np.ndarray, " num"]:
@@ -141,6 +142,29 @@ def _with_rest(
     chosen = np.argsort(edge, kind="stable")[: num - len(pixel)]
     edge = np.concatenate([np.zeros(len(pixel), np.bool_), edge[chosen]])
     return Drawn(np.concatenate([pixel, rest[chosen]]), edge)
+
+
+@inline
+def _spread_distance(distance):  # type: ignore[no-untyped-def]
+    """Chamfer distances from the zeros of a grid, in place, too long by 8% at most (Borgefors, 1986)."""
+    rows, columns = distance.shape
+    for sweep in range(2):
+        for a in range(rows):
+            row = a if sweep == 0 else rows - 1 - a
+            before = row - 1 if sweep == 0 else row + 1
+            for b in range(columns):
+                column = b if sweep == 0 else columns - 1 - b
+                beside = column - 1 if sweep == 0 else column + 1
+                least = distance[row, column]
+                if 0 <= beside < columns:
+                    least = min(least, distance[row, beside] + 1.0)
+                if 0 <= before < rows:
+                    least = min(least, distance[before, column] + 1.0)
+                    if column > 0:
+                        least = min(least, distance[before, column - 1] + DIAGONAL)
+                    if column < columns - 1:
+                        least = min(least, distance[before, column + 1] + DIAGONAL)
+                distance[row, column] = least
 
 
 @inline

@@ -32,6 +32,8 @@ __all__ = ["harmonize"]
 
 SAMPLES = 96
 """Candidates of a view that are looked up in each neighbour."""
+PAIRS = 6
+"""Neighbours of a view that it is compared with: more do not change the result."""
 LEAST_SAMPLES = 12
 FAR = 0.25
 """Logarithms of ratios beyond this are of other surfaces."""
@@ -72,6 +74,7 @@ def _compare_all(
     progress: Progress,
 ) -> Float64[np.ndarray, "P 4"]:
     """Rows i, j, a, sigma of every pair that overlaps, with the maps multiplied by exp(g)."""
+    neighbors = neighbors[:, :PAIRS]
     found = np.full((*neighbors.shape, 4), np.nan)
 
     def work(start: int, stop: int) -> None:

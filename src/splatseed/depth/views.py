@@ -24,6 +24,7 @@ from splatseed.depth.sightings import Sightings
 from splatseed.depthmap import ASPECT_SLACK, DepthMap, DepthMaps
 from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
+from splatseed.jit import inline
 from splatseed.scene import Image
 
 if TYPE_CHECKING:
@@ -207,10 +208,20 @@ def _colors_at(
     photograph: PilImage.Image, pixel: Int64[np.ndarray, " C"], camera: Camera
 ) -> UInt8[np.ndarray, "C 3"]:
     """The colours that a photograph of any size has at the centres of a map's pixels."""
-    row, column = np.divmod(pixel, camera.width)
-    row_of = ((np.arange(camera.height) + 0.5) * (photograph.height / camera.height)).astype(int)
-    column_of = ((np.arange(camera.width) + 0.5) * (photograph.width / camera.width)).astype(int)
-    return np.asarray(np.asarray(photograph)[row_of[row], column_of[column]])
+    out = np.empty((len(pixel), 3), np.uint8)
+    _take_colors(np.asarray(photograph), pixel, camera.width, camera.height, out)
+    return out
+
+
+@inline
+def _take_colors(photograph, pixel, width, height, out):  # type: ignore[no-untyped-def]
+    """The pixels of a photograph at the centres of those of a map."""
+    rows, columns = photograph.shape[0], photograph.shape[1]
+    for k in range(len(pixel)):
+        row = int((pixel[k] // width + 0.5) * rows / height)
+        column = int((pixel[k] % width + 0.5) * columns / width)
+        for channel in range(3):
+            out[k, channel] = photograph[row, column, channel]
 
 
 def _inside(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "K 2"]:
