@@ -153,13 +153,14 @@ class Score:
 
     def cells(self) -> list[str]:
         """As a row of a table."""
-        return [
+        cells = [
             f"{self.judged:.0%}",
             f"{1000 * self.error:.1f}",
             f"{self.off:.2%}",
             f"{1000 * self.gap:.0f}",
             f"{self.bare:.1%}",
         ]
+        return ["" if "nan" in cell else cell for cell in cells]
 
 
 def query(tree: cKDTree, xyz: np.ndarray) -> np.ndarray:
