@@ -8,7 +8,7 @@ import pytest
 from splatseed.depth import align
 from splatseed.depth.alignment import align_map
 from splatseed.depth.planar import ray_length
-from splatseed.depth.sightings import find_sightings
+from splatseed.depth.sightings import camera_points, find_sightings
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 
@@ -65,13 +65,17 @@ def test_a_point_takes_the_pixel_it_falls_into(exact):
     corner = np.stack([column, row], axis=1)
     for inside in (0.01, 0.3, 0.7, 0.99):
         xyz = image.camera.unproject(corner + inside, values[row, column])
-        found = align_map(DepthMap(values), image.camera, xyz, "robust", 20)
+        found = align_one(values, image.camera, xyz)
         assert (found.num_points, found.rejected) == (200, None)
         assert found.residual < 1e-6
         for dx, dy in ((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0), (0.0, -0.5)):
             if not (0 < inside + dx < 1 and 0 < inside + dy < 1):
                 off = image.camera.unproject(corner + inside + (dx, dy), values[row, column])
-                assert align_map(DepthMap(values), image.camera, off, "robust", 20).residual > 0.1
+                assert align_one(values, image.camera, off).residual > 0.1
+
+
+def align_one(values, camera, xyz):
+    return align_map(DepthMap(values), camera, camera_points(camera, xyz), "robust", 20)
 
 
 def test_images_are_left_out_for_a_reason(exact, make_maps):

@@ -24,7 +24,7 @@ from splatseed.depth.fits import (
     robust_line,
 )
 from splatseed.depth.planar import map_camera, ray_length
-from splatseed.depth.sightings import find_sightings
+from splatseed.depth.sightings import SeenPoints, camera_points, find_sightings
 from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress, in_threads, silent
@@ -103,8 +103,9 @@ def align(
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):
             depth = depths.read(images[i].name)
-            xyz = sightings.of(images[i])
-            found[i] = align_map(depth, map_camera(depth, images[i]), xyz, fit, min_points)
+            camera = map_camera(depth, images[i])
+            points = camera_points(camera, sightings.of(images[i]))
+            found[i] = align_map(depth, camera, points, fit, min_points)
 
     in_threads(work, len(images), 1, "align depth", progress)
     aligned = {
@@ -116,18 +117,18 @@ def align(
 
 
 def align_map(
-    depth: DepthMap, camera: Camera, xyz: Float64[np.ndarray, "M 3"], fit: Fit, min_points: int
+    depth: DepthMap, camera: Camera, points: SeenPoints, fit: Fit, min_points: int
 ) -> Alignment:
     """Align one map by the SfM points that its image sees.
 
     Args:
         depth: The map.
         camera: The image's camera in pixels of the map (``DepthMap.camera``).
-        xyz: World positions of the points, [M, 3].
+        points: Those that the image sees, in pixels of the map.
         fit: As in ``align``.
         min_points: As in ``align``.
     """
-    value, z = values_at(depth, camera, xyz)
+    value, z = values_at(depth, camera, points)
     if len(value) < max(min_points, 1):
         return Alignment(np.nan, 0.0, len(value), np.nan, _too_few(depth, len(value), min_points))
     scale, shift = _fit(depth.kind, value, z, fit)
@@ -135,15 +136,15 @@ def align_map(
     return Alignment(scale, shift, len(value), residual, _misfit(depth.kind, scale, residual))
 
 
-def trust_units(depth: DepthMap, camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Alignment:
+def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignment:
     """Take a map as it is, in scene units, and hold it against the SfM points if there are some.
 
     Args:
         depth: The map.
         camera: The image's camera in pixels of the map.
-        xyz: World positions of the points that the image sees, [M, 3].
+        points: Those that the image sees, in pixels of the map.
     """
-    value, z = values_at(depth, camera, xyz)
+    value, z = values_at(depth, camera, points)
     plain = Alignment(1.0, 0.0, len(value), np.nan)
     if not np.isfinite(depth.values).any():
         return replace(plain, rejected=_too_few(depth, 0, 0))
@@ -158,21 +159,19 @@ def trust_units(depth: DepthMap, camera: Camera, xyz: Float64[np.ndarray, "M 3"]
 
 
 def values_at(
-    depth: DepthMap, camera: Camera, xyz: Float64[np.ndarray, "M 3"]
+    depth: DepthMap, camera: Camera, points: SeenPoints
 ) -> tuple[Float64[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
     """What the map holds where points fall, and their planar depth: [K] each, K <= M see depth.
 
     A point takes the value of the pixel it falls into. Distances along the ray are turned into planar
     depth by the ray through that pixel's centre.
     """
-    uv, z = camera.project(xyz)
-    inside = (z > 0) & ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
-    column, row = uv[inside].astype(np.int64).T
+    column, row = points.uv.astype(np.int64).T
     value = depth.values[row, column].astype(np.float64)
     if depth.kind == "ray":
         value /= ray_length(camera, column, row)
     known = np.isfinite(value) & ((value > 0) | (depth.kind == "inverse"))
-    return value[known], z[inside][known]
+    return value[known], points.z[known]
 
 
 def reject_outliers(

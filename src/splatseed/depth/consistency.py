@@ -24,6 +24,9 @@ __all__ = ["Support", "find_support"]
 THROUGH = 2.0
 """Clearly farther: by this many tolerances, as both depths have errors."""
 
+ALWAYS = 8
+"""Views that are asked about every point; more are asked about those that lack confirmation."""
+
 SAYS_NOTHING, CONFIRMS, LOOKS_THROUGH = range(3)
 
 
@@ -56,7 +59,7 @@ def find_support(
     limit = np.inf if settings.color_tolerance is None else 3 * 255 * settings.color_tolerance
     rgb = np.empty((len(xyz), 3), np.uint8)
     _own_colors(xyz, own.grid_from_world, own.rgb, own.rgb_from_grid, rgb)
-    for other in others:
+    for place, other in enumerate(others):
         _ask(
             xyz,
             rgb,
@@ -68,6 +71,7 @@ def find_support(
             settings.tolerance,
             limit,
             settings.min_agreeing,
+            place >= ALWAYS,
             agreeing,
             seen_through,
         )
@@ -96,12 +100,15 @@ def _ask(  # type: ignore[no-untyped-def]
     tolerance,
     limit,
     enough,
+    only_unconfirmed,
     agreeing,
     seen_through,
 ):
     """One neighbour's word on all candidates, added to what is known of them."""
     height, width = z.shape
     for k in range(len(xyz)):
+        if only_unconfirmed and agreeing[k] >= enough:
+            continue
         column, row, depth = _project(xyz[k], grid_from_world)
         if depth > 0.0 and -0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5:
             verdict = _compare(z, column, row, depth / factor, tolerance)

@@ -28,7 +28,7 @@ from splatseed.scene import Image, Scene
 
 __all__ = ["Lifted", "lift"]
 
-OVERSAMPLING = 1.5
+OVERSAMPLING = 1.4
 """Candidates a new point, where views are compared or points spread."""
 MAX_OVERSAMPLING = 16.0
 """Candidates a new point, at most; a round of reading multiplies them by up to ``MAX_GROWTH``."""

@@ -9,6 +9,7 @@ in the image only the nearest stay, as the others are probably hidden.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -17,13 +18,29 @@ from splatseed.camera import Camera
 from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Image, Scene
 
-__all__ = ["Sightings", "find_sightings"]
+__all__ = ["SeenPoints", "Sightings", "camera_points", "find_sightings"]
 
 CELLS = 40
 """Columns and rows of an image within which points are taken to hide each other."""
 
 HIDDEN = 1.1
 """A point this many times as far as the nearest one of its cell is taken for hidden."""
+
+
+class SeenPoints(NamedTuple):
+    """Points within an image."""
+
+    uv: Float64[np.ndarray, "M 2"]
+    """Where they are, in pixels."""
+    z: Float64[np.ndarray, " M"]
+    """Their planar depth, scene units."""
+
+
+def camera_points(camera: Camera, xyz: Float64[np.ndarray, "N 3"]) -> SeenPoints:
+    """Those of N world points that lie in front of a camera and within its image."""
+    uv, z = camera.project(xyz)
+    inside = ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)  # NaN behind the camera
+    return SeenPoints(uv[inside], z[inside])
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from splatseed.depth.alignment import Alignment, align_map, trust_units
 from splatseed.depth.drawing import Drawn, draw_pixels
 from splatseed.depth.planar import PlanarDepth, lift_pixels, map_camera
 from splatseed.depth.settings import Settings
-from splatseed.depth.sightings import Sightings
+from splatseed.depth.sightings import SeenPoints, Sightings, camera_points
 from splatseed.depthmap import ASPECT_SLACK, DepthMap, DepthMaps
 from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
@@ -144,7 +144,7 @@ class Reader:
         """Everything that is asked of a map."""
         depth = self.depths.read(image.name)
         camera = map_camera(depth, image)
-        points = self.sightings.of(image)
+        points = camera_points(camera, self.sightings.of(image))
         alignment = self._align(depth, camera, points)
         if alignment.rejected is not None:
             nothing = np.empty(0, np.int64)
@@ -152,16 +152,14 @@ class Reader:
         planar = PlanarDepth.of(
             depth, camera, alignment.scale, alignment.shift, unit_ray=self.settings.unit_ray
         )
-        drawn = draw_pixels(planar.values, num, _inside(camera, points), self.settings, rng)
+        drawn = draw_pixels(planar.values, num, points.uv, self.settings, rng)
         seen = _Seen(alignment, camera, drawn, planar.at(drawn.pixel))
         if not (self.settings.compares_views or self.settings.harmonizes):
             return seen
         factor = -(-max(planar.values.shape) // GRID)
         return replace(seen, coarse=planar.every(factor // 2, factor), unit=planar.scale)
 
-    def _align(
-        self, depth: DepthMap, camera: Camera, points: Float64[np.ndarray, "M 3"]
-    ) -> Alignment:
+    def _align(self, depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignment:
         if not self.settings.align:
             return trust_units(depth, camera, points)
         return align_map(depth, camera, points, self.settings.fit, self.settings.min_points)
@@ -222,12 +220,6 @@ def _take_colors(photograph, pixel, width, height, out):  # type: ignore[no-unty
         column = int((pixel[k] % width + 0.5) * columns / width)
         for channel in range(3):
             out[k, channel] = photograph[row, column, channel]
-
-
-def _inside(camera: Camera, xyz: Float64[np.ndarray, "M 3"]) -> Float64[np.ndarray, "K 2"]:
-    """Where points fall in the image, those that do, in pixels."""
-    uv, _ = camera.project(xyz)
-    return uv[((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)]
 
 
 def _reduce(seen: _Seen, coarse: Float32[np.ndarray, "h w"], photograph: PilImage.Image) -> Reduced:
