@@ -76,4 +76,5 @@ class _CpuLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
         (gradient,) = ctx.saved_tensors
-        return gradient * upstream[0], None
+        # The loss is most often where backward begins, and multiplying by one takes a pass.
+        return gradient if float(upstream[0]) == 1.0 else gradient * upstream[0], None

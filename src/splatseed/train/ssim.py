@@ -15,17 +15,30 @@ needs four windowed means, as the two variances appear only as a sum. Its deriva
 and the gradient of the sum of S is G'*dS/dmu_x + y G'*dS/de_xy + 2 x G'*dS/de_2.
 
 Promise: sums have a fixed order, so the bytes do not depend on the number of threads. A row of
-interleaved channels is one contiguous vector whose taps lie 3 apart, which LLVM vectorises.
+interleaved channels is one contiguous vector whose taps lie 3 apart; ``simd`` takes 16 at a time.
+The derivative maps stand in a frame of zeros, so that blurring them knows no border.
 """
 
-# mypy: disable-error-code="no-untyped-def, no-untyped-call"
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, call-arg, var-annotated"
 
 from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float32
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.jit import always_inline, inline, kernel, parallel_range
+from splatseed.render.simd import (
+    LANES,
+    add,
+    divide,
+    fma,
+    load,
+    multiply,
+    select_greater,
+    splat,
+    store,
+    subtract,
+)
 
 __all__ = ["WINDOW", "l1_and_ssim", "window_weights"]
 
@@ -35,8 +48,18 @@ C1 = np.float32(0.01**2)
 C2 = np.float32(0.03**2)
 HALF = WINDOW // 2
 MARGIN = WINDOW - 1
-STRIP = 8
+CHANNELS = 3
+REACH = MARGIN * CHANNELS
+"""Values from a row's first tap to the last."""
+STRIP = 16
 """Rows that one task works on; fixed, so that sums do not depend on the threads."""
+TALL = STRIP + MARGIN
+BLOCK = 480
+"""Values of a row that are worked on at once, or up to twice as many at the end of it: what they
+need stays in the nearer caches."""
+WIDE = 2 * BLOCK + 3 * LANES
+"""Values from row to row of a block, with room for its margin and for whole vectors: an odd number
+of cache lines, so that a column of it is spread over the cache."""
 
 
 def window_weights() -> Float32[np.ndarray, " 11"]:
@@ -63,129 +86,183 @@ def l1_and_ssim(
     Returns:
         The two means, and d(l1_weight L1 + ssim_weight (1 - SSIM)) / dx.
     """
-    height, width, channels = render.shape
-    x, y = render.reshape(height, -1), truth.reshape(height, -1)
-    rows, columns = height - MARGIN, (width - MARGIN) * channels
-    partials = np.empty((3, rows, columns), np.float32)
-    ssim_sums = np.empty(-(-rows // STRIP), np.float64)
+    height, width = len(render), render.shape[1] * CHANNELS
+    x, y = render.reshape(-1), truth.reshape(-1)
+    places = (height - MARGIN) * (width - REACH)
+    partials = _framed(height, width)
+    ssim_sums = np.empty(-(-(height - MARGIN) // STRIP), np.float64)
     l1_sums = np.empty(-(-height // STRIP), np.float64)
     gradient = np.empty_like(x)
-    weights = window_weights()
-    _forward(x, y, weights, partials, ssim_sums)
-    ssim_scale = np.float32(-ssim_weight / (rows * columns))
-    l1_scale = np.float32(l1_weight / x.size)
-    _backward(x, y, weights, partials, ssim_scale, l1_scale, l1_sums, gradient)
-    l1, ssim = l1_sums.sum() / x.size, ssim_sums.sum() / (rows * columns)
+    weights = window_weights()[: HALF + 1]
+    _forward(x, y, width, weights, partials, ssim_sums)
+    scales = np.array([-ssim_weight / places, l1_weight / x.size], np.float32)
+    _backward(x, y, width, weights, partials, scales, l1_sums, gradient)
+    l1, ssim = l1_sums.sum() / x.size, ssim_sums.sum() / places
     return float(l1), float(ssim), gradient.reshape(render.shape)
 
 
-@inline
-def _blur_row(source, weights, out):
-    """out[i] = sum_k weights[k] source[i + 3 k], folded at the centre as the window is even."""
-    for i in range(len(out)):
-        total = weights[5] * source[i + 15]
-        total += weights[4] * (source[i + 12] + source[i + 18])
-        total += weights[3] * (source[i + 9] + source[i + 21])
-        total += weights[2] * (source[i + 6] + source[i + 24])
-        total += weights[1] * (source[i + 3] + source[i + 27])
-        total += weights[0] * (source[i] + source[i + 30])
-        out[i] = total
+def _framed(height: int, width: int) -> Float32[np.ndarray, "3 H+10 W*3+30"]:
+    """Room for the three derivative maps within zeros as wide as the window reaches."""
+    partials = np.empty((3, height + MARGIN + 1, width + REACH), np.float32)  # a row to read into
+    partials[:, :MARGIN] = 0.0
+    partials[:, height:] = 0.0
+    partials[:, :, :REACH] = 0.0  # what is right of the maps, _forward clears as it goes
+    return partials
+
+
+@always_inline
+def _splats(weights):
+    """The outer six weights of the window, each in all lanes; the others mirror them."""
+    return (
+        splat(weights[0]), splat(weights[1]), splat(weights[2]),
+        splat(weights[3]), splat(weights[4]), splat(weights[5]),
+    )  # fmt: skip
+
+
+@always_inline
+def _window_mean(source, i, step, w):
+    """Sixteen weighted means of eleven values ``step`` apart, folded at the centre."""
+    total = multiply(w[5], load(source, i + 5 * step))
+    total = fma(w[4], add(load(source, i + 4 * step), load(source, i + 6 * step)), total)
+    total = fma(w[3], add(load(source, i + 3 * step), load(source, i + 7 * step)), total)
+    total = fma(w[2], add(load(source, i + 2 * step), load(source, i + 8 * step)), total)
+    total = fma(w[1], add(load(source, i + step), load(source, i + 9 * step)), total)
+    return fma(w[0], add(load(source, i), load(source, i + 10 * step)), total)
 
 
 @inline
-def _add_rows(x0, y0, x1, y1, weight, sums):
-    """Add a pair of rows at the same distance from the centre to the four vertical means."""
-    for i in range(len(x0)):
-        a, b, c, d = x0[i], y0[i], x1[i], y1[i]
-        sums[0, i] += weight * (a + c)
-        sums[1, i] += weight * (b + d)
-        sums[2, i] += weight * (a * b + c * d)
-        sums[3, i] += weight * ((a * a + b * b) + (c * c + d * d))
+def _blur_columns(source, start, step, rows, columns, weights, out):
+    """Vertical means of ``rows`` rows of a block: down each column of vectors, then the next."""
+    w = _splats(weights)
+    for i in range(0, columns, LANES):
+        for row in range(rows):
+            store(out, row * WIDE + i, _window_mean(source, start + row * step + i, step, w))
 
 
 @inline
-def _similarity(means, partials, row, totals):
-    """SSIM and its three derivatives along one row of windowed means."""
-    two = np.float32(2.0)
-    for i in range(means.shape[1]):
-        mx, my, exy, e2 = means[0, i], means[1, i], means[2, i], means[3, i]
-        a1 = two * mx * my + C1
-        a2 = two * (exy - mx * my) + C2
-        squares = mx * mx + my * my
-        b1 = squares + C1
-        b2 = e2 - squares + C2
-        inverse = np.float32(1.0) / (b1 * b2)
-        ssim = a1 * a2 * inverse
-        partials[0, row, i] = two * inverse * (my * (a2 - a1) + ssim * mx * (b1 - b2))
-        partials[1, row, i] = two * inverse * a1
-        partials[2, row, i] = -ssim * inverse * b1
-        totals[i] += ssim
+def _take_block(x, y, start, width, rows, columns, planes):
+    """Copy a block of both images, and what else SSIM has windowed means of: x y and x^2 + y^2."""
+    plane_x, plane_y, plane_xy, plane_2 = planes[0], planes[1], planes[2], planes[3]
+    for row in range(rows):
+        for at in range(0, columns, LANES):
+            i = min(at, columns - LANES)  # the last vector overlaps the one before
+            a, b = load(x, start + row * width + i), load(y, start + row * width + i)
+            store(plane_x, row * WIDE + i, a)
+            store(plane_y, row * WIDE + i, b)
+            store(plane_xy, row * WIDE + i, multiply(a, b))
+            store(plane_2, row * WIDE + i, fma(a, a, multiply(b, b)))
+
+
+@inline
+def _similarity(means, at, columns, weights, partials, to, scores):
+    """Horizontal means of a row of vertical ones; SSIM and its three derivatives there."""
+    w = _splats(weights)
+    mean_x, mean_y, mean_xy, mean_2 = means[0], means[1], means[2], means[3]
+    by_mean, by_xy, by_2 = partials[0], partials[1], partials[2]
+    two, c1, c2 = splat(np.float32(2.0)), splat(C1), splat(C2)
+    for i in range(0, columns, LANES):
+        mx = _window_mean(mean_x, at + i, CHANNELS, w)
+        my = _window_mean(mean_y, at + i, CHANNELS, w)
+        exy = _window_mean(mean_xy, at + i, CHANNELS, w)
+        e2 = _window_mean(mean_2, at + i, CHANNELS, w)
+        product, squares = multiply(mx, my), fma(mx, mx, multiply(my, my))
+        a1 = fma(two, product, c1)
+        a2 = fma(two, subtract(exy, product), c2)
+        b1, b2 = add(squares, c1), add(subtract(e2, squares), c2)
+        inverse = divide(splat(np.float32(1.0)), multiply(b1, b2))
+        twice = multiply(two, inverse)
+        ssim = multiply(multiply(a1, a2), inverse)
+        by_x = multiply(multiply(ssim, mx), subtract(b1, b2))
+        store(by_mean, to + i, multiply(twice, fma(my, subtract(a2, a1), by_x)))
+        store(by_xy, to + i, multiply(twice, a1))
+        store(by_2, to + i, subtract(splat(np.float32(0.0)), multiply(ssim, multiply(inverse, b1))))
+        store(scores, i, ssim)
+
+
+@inline
+def _blocks(width):
+    """How many blocks a row of ``width`` values has; the last takes the remainder."""
+    return max(1, width // BLOCK)
+
+
+@inline
+def _block_end(block, width):
+    return width if block == _blocks(width) - 1 else (block + 1) * BLOCK
+
+
+@inline
+def _add_to(totals, values, count):
+    for i in range(count):
+        totals[i] += values[i]
+
+
+@inline
+def _sum(values):
+    total = 0.0
+    for i in range(len(values)):
+        total += values[i]
+    return total
 
 
 @kernel
-def _forward(x, y, weights, partials, ssim_sums):
-    """Fill the derivative maps [3, H-10, (W-10)*3] and the sum of SSIM of each strip."""
-    rows, columns = partials.shape[1], partials.shape[2]
+def _forward(x, y, width, weights, partials, ssim_sums):
+    """Fill the derivative maps within their frame, and the sum of SSIM of each strip."""
+    rows, columns, stride = len(x) // width - MARGIN, width - REACH, width + REACH
+    maps = partials.reshape(3, -1)
     for strip in parallel_range(len(ssim_sums)):
-        sums = np.empty((4, x.shape[1]), np.float32)
-        means = np.empty((4, columns), np.float32)
-        totals = np.zeros(columns, np.float32)
-        for row in range(strip * STRIP, min((strip + 1) * STRIP, rows)):
-            sums[:] = np.float32(0.0)
-            middle = row + HALF
-            half = np.float32(0.5) * weights[HALF]
-            _add_rows(x[middle], y[middle], x[middle], y[middle], half, sums)
-            for k in range(HALF):
-                low, high = row + k, row + MARGIN - k
-                _add_rows(x[low], y[low], x[high], y[high], weights[k], sums)
+        planes, means = np.zeros((2, 4, TALL * WIDE), np.float32)
+        scores, totals = np.empty(WIDE, np.float32), np.zeros(WIDE, np.float32)
+        first, count = strip * STRIP, min(STRIP, rows - strip * STRIP)
+        for block in range(_blocks(columns)):
+            left, size = block * BLOCK, _block_end(block, columns) - block * BLOCK
+            _take_block(x, y, first * width + left, width, count + MARGIN, size + REACH, planes)
             for m in range(4):
-                _blur_row(sums[m], weights, means[m])
-            _similarity(means, partials, row, totals)
-        total = 0.0
-        for i in range(columns):
-            total += totals[i]
-        ssim_sums[strip] = total
+                _blur_columns(planes[m], 0, WIDE, count, size + REACH, weights, means[m])
+            for row in range(count):
+                to = (first + row + MARGIN) * stride + REACH + left
+                _similarity(means, row * WIDE, size, weights, maps, to, scores)
+                _add_to(totals, scores, size)
+        partials[:, first + MARGIN : first + MARGIN + count, REACH + columns :] = np.float32(0.0)
+        ssim_sums[strip] = _sum(totals)
 
 
 @inline
-def _add_partials(partials, source, weight, margin, sums):
-    for m in range(3):
-        from_row, to_row = partials[m, source], sums[m]
-        for i in range(len(from_row)):
-            to_row[margin + i] += weight * from_row[i]
-
-
-@inline
-def _combine(x, y, blurred, ssim_scale, l1_scale, gradient, differences):
-    """The gradient along one row, from the three blurred derivative rows."""
-    two = np.float32(2.0)
-    for i in range(len(x)):
-        difference = x[i] - y[i]
-        ssim_part = blurred[0, i] + y[i] * blurred[1, i] + two * x[i] * blurred[2, i]
-        gradient[i] = ssim_scale * ssim_part + l1_scale * np.sign(difference)
-        differences[i] += abs(difference)
+def _combine(x, y, at, columns, means, row, weights, scales, gradient, differences):
+    """The gradient along one row, and |x - y|, from the vertical means of the derivatives."""
+    w = _splats(weights)
+    of_mean, of_exy, of_e2 = means[0], means[1], means[2]
+    zero, two = splat(np.float32(0.0)), splat(np.float32(2.0))
+    by_ssim, by_l1 = splat(scales[0]), splat(scales[1])
+    for start in range(0, columns, LANES):
+        i = min(start, columns - LANES)
+        a, b = load(x, at + i), load(y, at + i)
+        by_mean = _window_mean(of_mean, row + i, CHANNELS, w)
+        by_exy = _window_mean(of_exy, row + i, CHANNELS, w)
+        by_e2 = _window_mean(of_e2, row + i, CHANNELS, w)
+        ssim_part = fma(b, by_exy, fma(multiply(two, a), by_e2, by_mean))
+        away, negative = subtract(a, b), subtract(b, a)
+        slope = select_greater(away, zero, by_l1, zero)
+        slope = select_greater(zero, away, subtract(zero, by_l1), slope)
+        store(gradient, at + i, fma(by_ssim, ssim_part, slope))
+        store(differences, i, select_greater(away, negative, away, negative))
 
 
 @kernel
-def _backward(x, y, weights, partials, ssim_scale, l1_scale, l1_sums, gradient):
+def _backward(x, y, width, weights, partials, scales, l1_sums, gradient):
     """The gradient, and the sum of |x - y| of each strip of rows."""
-    height, width = x.shape
-    rows, columns = partials.shape[1], partials.shape[2]
-    margin = width - columns
+    height, stride = len(x) // width, width + REACH
+    maps = partials.reshape(3, -1)
     for strip in parallel_range(len(l1_sums)):
-        sums = np.empty((3, width + margin), np.float32)
-        blurred = np.empty((3, width), np.float32)
-        differences = np.zeros(width, np.float32)
-        for row in range(strip * STRIP, min((strip + 1) * STRIP, height)):
-            sums[:] = np.float32(0.0)
-            for k in range(WINDOW):
-                source = row + k - MARGIN
-                if 0 <= source < rows:
-                    _add_partials(partials, source, weights[k], margin, sums)
+        means = np.zeros((3, TALL * WIDE), np.float32)
+        differences, totals = np.empty(WIDE, np.float32), np.zeros(WIDE, np.float32)
+        first, count = strip * STRIP, min(STRIP, height - strip * STRIP)
+        for block in range(_blocks(width)):
+            left, size = block * BLOCK, _block_end(block, width) - block * BLOCK
             for m in range(3):
-                _blur_row(sums[m], weights, blurred[m])
-            _combine(x[row], y[row], blurred, ssim_scale, l1_scale, gradient[row], differences)
-        total = 0.0
-        for i in range(width):
-            total += differences[i]
-        l1_sums[strip] = total
+                start = first * stride + left
+                _blur_columns(maps[m], start, stride, count, size + REACH, weights, means[m])
+            for row in range(count):
+                at = (first + row) * width + left
+                _combine(x, y, at, size, means, row * WIDE, weights, scales, gradient, differences)
+                _add_to(totals, differences, size)
+        l1_sums[strip] = _sum(totals)
