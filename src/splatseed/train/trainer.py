@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from splatseed.train.allocator import keep_freed_memory
 from splatseed.train.curve import Record
 from splatseed.train.interruption import interruption
 from splatseed.train.losses import photometric_loss, psnr
@@ -56,6 +57,7 @@ class Trainer:
         self.train_views = train_views
         self.test_views = test_views
         self.on_record = on_record
+        keep_freed_memory()
 
     def run(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
         """Train to the last step, or until the user interrupts.
