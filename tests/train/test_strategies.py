@@ -6,10 +6,13 @@ import math
 
 import pytest
 import torch
+from gsplat.strategy import DefaultStrategy
 
 from splatseed.errors import ParameterError
+from splatseed.render import rasterization
 from splatseed.train.relocation import compute_relocation, covariances, mcmc_on_cpu
 from splatseed.train.settings import Schedule, TrainSettings
+from splatseed.train.strategies import make_strategy
 
 
 def test_a_full_run_has_3dgs_schedule():
@@ -35,6 +38,31 @@ def test_schedules_shrink_with_the_run(steps):
 def test_bad_settings_are_named(bad):
     with pytest.raises(ParameterError, match=f"--{next(iter(bad)).replace('_', '-')}"):
         TrainSettings(**bad)
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_running_sums_are_gsplats_own(cameras):
+    generator = torch.Generator().manual_seed(0)
+    means = torch.randn((500, 3), generator=generator).requires_grad_()
+    views = torch.eye(4).repeat(cameras, 1, 1)
+    views[:, 2, 3] = torch.linspace(0.5, 1.5, cameras)
+    ours = make_strategy(TrainSettings())
+    theirs, expected = DefaultStrategy(), DefaultStrategy().initialize_state(scene_scale=1.0)
+    for step in range(3):
+        image, _, info = rasterization(
+            means, torch.randn((500, 4), generator=generator), torch.full((500, 3), 0.05),
+            torch.full((500,), 0.5), torch.rand((500, 3), generator=generator), views,
+            torch.tensor([[40.0, 0, 25], [0, 40.0, 20], [0, 0, 1]]).repeat(cameras, 1, 1), 50, 40,
+            packed=False,
+        )  # fmt: skip
+        ours.before({"means": means}, {}, step, info)
+        image.square().sum().backward()
+        ours.after({"means": means}, {}, step, info, means_lr=0.0)
+        theirs.step_post_backward({"means": means}, {}, expected, step, info)
+    assert 0 < int((expected["count"] > 0).sum()) < 500
+    for name in ("grad2d", "count"):
+        assert expected[name].max() > 0
+        assert torch.equal(ours.state[name], expected[name])
 
 
 def _relocation_by_the_paper(opacity, share):

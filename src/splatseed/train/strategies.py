@@ -79,10 +79,24 @@ class _Fixed(Strategy):
 
 
 class _Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
-    """gsplat's strategy; with a cap, only the largest image gradients that it leaves room for grow."""
+    """gsplat's strategy; with a cap, only the largest image gradients that it leaves room for grow.
+
+    On the CPU its running sums are kept in another way, to the same bytes.
+    """
 
     cap: int | None = None
     grow_grad2d: float
+
+    def _update_state(
+        self, params: Parameters, state: Any, info: Any, packed: bool = False
+    ) -> None:
+        if packed or params["means"].device.type != "cpu":
+            super()._update_state(params, state, info, packed)
+            return
+        for name in ("grad2d", "count"):
+            if state[name] is None:
+                state[name] = torch.zeros(len(params["means"]))
+        _add_gradients(state, info)
 
     def _grow_gs(self, params: Parameters, optimizers: Any, state: Any, step: int) -> Any:
         wanted = self.grow_grad2d
@@ -103,6 +117,21 @@ class _Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
         if room >= len(gradients):
             return self.grow_grad2d
         return max(self.grow_grad2d, float(torch.topk(gradients, room + 1).values[-1]))
+
+
+def _add_gradients(state: Any, info: Any) -> None:
+    """Count each Gaussian that is seen, and add up the lengths of the gradients of its 2D mean.
+
+    gsplat lists the Gaussians that are seen and gathers their gradients, which takes three times as
+    long as adding zeros for the others.
+    """
+    radii, half_cameras = info["radii"], info["n_cameras"] / 2.0
+    seen = (radii[..., 0] > 0) & (radii[..., 1] > 0)
+    halves = torch.tensor([info["width"] * half_cameras, info["height"] * half_cameras])
+    lengths = (info["means2d"].grad * halves).norm(dim=-1)
+    for camera in range(info["n_cameras"]):
+        state["grad2d"] += lengths[camera]
+        state["count"] += seen[camera]
 
 
 class _Default(Strategy):
