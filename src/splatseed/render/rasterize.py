@@ -162,7 +162,7 @@ class _View(NamedTuple):
     @property
     def seen(self) -> Tensor:
         """Which are not culled, bool [N]."""
-        return (self.radii > 0).all(dim=-1)
+        return (self.radii[:, 0] > 0) & (self.radii[:, 1] > 0)  # all() takes four times as long
 
 
 def _intrinsics(K: Tensor) -> np.ndarray:
@@ -246,11 +246,15 @@ def _blend(
     images, alphas = [], []
     for camera, (view, colors) in enumerate(zip(views, shades, strict=True)):
         rows: Any = camera if ids is None else info["camera_ids"] == camera
-        each = slice(None) if ids is None else ids[rows]
+        shapes: tuple[Tensor, ...] = (view.conics, colors, view.opacities)
+        depths, radii = view.depths, view.radii
+        if ids is not None:  # a full slice would be copied by backward
+            each = ids[rows]
+            shapes, depths, radii = tuple(t[each] for t in shapes), depths[each], radii[each]
         image, alpha = Blend.apply(  # type: ignore[no-untyped-call]
-            means2d[rows], view.conics[each], colors[each], view.opacities[each],
+            means2d[rows], *shapes,
             None if backgrounds is None else backgrounds[camera],
-            view.depths[each], view.radii[each], info["width"], info["height"],
+            depths, radii, info["width"], info["height"],
             partial(_keep_absgrad, means2d, rows) if absgrad else None,
         )  # fmt: skip
         images.append(image)

@@ -88,13 +88,13 @@ def render_view(
         sh_degree=sh_degree,
         packed=False,
     )
-    return images[0], info
+    return images.squeeze(0), info  # unlike an index, backward makes no image of zeros of it
 
 
 def photograph(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
     """The view's pixels as float32 from 0 to 1."""
     # A copy: PyTorch warns on stderr of arrays that are read-only, as a view's may be.
-    return torch.tensor(view.image, device=device).to(torch.float32) / 255.0
+    return torch.tensor(view.image, device=device).to(torch.float32).div_(255.0)
 
 
 def _harmonics(
