@@ -21,6 +21,8 @@ from clouds import sample_unevenly
 from splatseed.camera import Camera
 from splatseed.jit import kernel, parallel_range
 from splatseed.render.binning import TILE, depth_order, list_tiles
+from splatseed.render.blending import RECORD
+from splatseed.render.layout import gather
 from splatseed.synthetic.raycast import render_views, visible
 from splatseed.synthetic.room import Room, build_room, orbit_cameras
 from splatseed.train.gaussians import SH_C0, Gaussians, neighbor_distances
@@ -176,8 +178,9 @@ def useful_pairs(
     """
     order = depth_order(depths, visible & (opacities >= MIN_ALPHA))
     shapes = [np.ascontiguousarray(each[order]) for each in (means2d, conics, opacities)]
-    reach = np.maximum(np.log(np.float32(255.0) * shapes[2]), np.float32(0.0))
-    lists = list_tiles(shapes[0], shapes[1], reach, width, height)
+    records = np.empty(RECORD * len(order), np.float32)
+    gather(order, means2d, conics, np.log(shapes[2]), means2d, 0, records)
+    lists = list_tiles(records, width, height)
     counts = np.zeros(len(lists.tile_start) - 1, np.int64)
     _count(*shapes, lists.tile_start, lists.listed_rank, width, height, counts)  # type: ignore[call-arg]  # star arguments
     return int(counts.sum())

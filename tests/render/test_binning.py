@@ -6,9 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from splatseed.render import binning, blending
 from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles
 
 View = tuple[np.ndarray, np.ndarray, np.ndarray, int, int]
+
+
+def lists_of(
+    means2d: np.ndarray, conics: np.ndarray, reach: np.ndarray, width: int, height: int
+) -> TileLists:
+    """The lists of Gaussians whose alpha reaches 1/255 where sigma is ``reach``."""
+    records = np.zeros((len(reach), blending.RECORD), np.float32)
+    records[:, :2], records[:, 2:5] = means2d, conics * np.float32([-1 / 16, -1 / 8, -1 / 16])
+    records[:, 5] = (reach - np.log(255.0)) / 8
+    return list_tiles(records.ravel(), width, height)
 
 
 def random_view(rng: np.random.Generator, n: int, width: int, height: int) -> View:
@@ -61,7 +72,7 @@ def assert_consistent(lists: TileLists, view: View) -> None:
 @pytest.mark.parametrize("size", [(40, 33), (8, 8), (3, 5), (1, 1), (200, 9)])
 def test_no_pair_is_missing_and_few_are_in_vain(rng, size: tuple[int, int]) -> None:
     view = random_view(rng, 300, *size)
-    lists = list_tiles(*view)
+    lists = lists_of(*view)
     assert_consistent(lists, view)
     found, needed = listed(lists, view), touched(view, -1e-4)
     assert needed.any()
@@ -77,12 +88,17 @@ def test_far_fewer_than_the_square_of_three_sigmas(rng) -> None:
     low = np.clip((view[0] - longest[:, None]) / TILE, 0, (25, 20)).astype(int)
     high = np.clip(np.ceil((view[0] + longest[:, None]) / TILE), 0, (25, 20)).astype(int)
     squares = np.prod(high - low, axis=1).sum()
-    assert len(list_tiles(*view).listed_rank) < 0.6 * squares
+    assert len(lists_of(*view).listed_rank) < 0.6 * squares
+
+
+def test_records_are_those_of_blending() -> None:
+    assert binning.RECORD == blending.RECORD
+    assert binning.LOWEST == blending.LOWEST
 
 
 def test_nothing_to_list() -> None:
     nothing = np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), np.empty(0, np.float32)
-    lists = list_tiles(*nothing, 20, 10)
+    lists = lists_of(*nothing, 20, 10)
     assert lists.slot_start.tolist() == [0]
     assert not lists.tile_start.any()
     assert len(lists.tile_start) == 3 * 2 + 1
@@ -91,7 +107,7 @@ def test_nothing_to_list() -> None:
 @pytest.mark.parametrize("conic", [(1e-12, 0.0, 1e-12), (1e-38, 0.0, 1e-38), (0.0, 0.0, 0.0),
                                    (1e-40, 0.0, 1e-40), (1.0, 1.0, 1.0), (1.0, -1.0001, 1.0)])  # fmt: skip
 def test_giants_and_broken_needles_are_listed_everywhere(conic: tuple[float, ...]) -> None:
-    lists = list_tiles(
+    lists = lists_of(
         np.array([[5.0, 7.0]], np.float32), np.array([conic], np.float32),
         np.array([3.0], np.float32), 40, 24,
     )  # fmt: skip

@@ -1,12 +1,17 @@
 """Which Gaussians touch which tile, in depth order.
 
 Notation: tiles are 8 x 8 px, numbered row by row; a *pair* is a Gaussian with a tile that its ellipse
-touches. Pairs are numbered Gaussian by Gaussian in depth order (their *slot*), and listed tile by tile
-in depth order; ``listed_slot`` and ``listed_rank`` lead from the list back to slot and Gaussian.
-A Gaussian counts as touching a tile if within the rectangle of the tile's pixel centres its alpha
-reaches 1/255: exact, and opacity-aware, where a square of three sigmas would be far larger and still
-cut some off.
+touches, a *span* a Gaussian with the tiles of one row of tiles that it touches. Pairs are numbered
+Gaussian by Gaussian in depth order (their *slot*), and listed tile by tile in depth order;
+``listed_slot`` and ``listed_rank`` lead from the list back to slot and Gaussian. A Gaussian counts as
+touching a tile if within the rectangle of the tile's pixel centres its alpha reaches 1/255: exact, and
+opacity-aware, where a square of three sigmas would be far larger and still cut some off.
 Promise: ties in depth go by index; nothing depends on the number of threads.
+
+Stages: spans are sorted by row while they are found, then each row sorts its own by column. Both are
+counting sorts, which keep the depth order; a row's tiles stay in the first cache, where those of the
+whole image would not. Indices are unsigned where it counts: Numba asks of every other one whether it is
+negative, which took a third of the time.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -21,13 +26,22 @@ from jaxtyping import Float32, Int32, Int64
 
 from splatseed.jit import always_inline, kernel, parallel_range
 
-__all__ = ["TILE", "TileLists", "depth_order", "list_tiles"]
+__all__ = ["TILE", "TileLists", "depth_order", "list_tiles", "row_order"]
 
 TILE = 8
+RECORD = 16
+"""Numbers in a record of a Gaussian, see ``blending``."""
+LOWEST = np.float32(-np.log(255.0) / 8)
+"""Where alpha is 1/255, in a record's units."""
 CHUNKS = 16
-"""Pieces of the depth order that are counted and listed in parallel, whatever the threads."""
+"""Pieces of the depth order that are worked on in parallel, whatever the threads."""
 STRIDE = 7
 """Pieces are taken in this stride: near Gaussians are large, and threads take consecutive turns."""
+GOLDEN = 0.6180339887498949
+BITS, PASSES = 8, 4
+"""Of a depth's 32 bits, how many are sorted by at a time; an even number of times."""
+SLACK = 0.01
+"""In pixels, in case rounding moved an ellipse's edge past a pixel centre."""
 
 
 class TileLists(NamedTuple):
@@ -43,141 +57,244 @@ class TileLists(NamedTuple):
     """Slot of each list entry, [P]."""
 
 
-def depth_order(depths: Float32[np.ndarray, " N"], visible: np.ndarray) -> Int64[np.ndarray, " G"]:
-    """Indices of the visible Gaussians, nearest first, ties by index."""
-    idx = np.flatnonzero(visible)
-    # Positive floats sort as their bits do; with the index below them the order is total.
-    keys = depths[idx].view(np.uint32).astype(np.uint64) << np.uint64(32) | idx.astype(np.uint64)
-    keys.sort()
-    return (keys & np.uint64(0xFFFFFFFF)).astype(np.int64)
+def row_order(rows: int) -> Int64[np.ndarray, " rows"]:
+    """Rows of tiles, such that every stretch of them has its share of all parts of the image.
+
+    Threads take stretches of equal length, and images are seldom as busy above as below.
+    """
+    return np.argsort(np.arange(rows) * GOLDEN % 1.0)
 
 
-def list_tiles(
-    means2d: Float32[np.ndarray, "G 2"],
-    conics: Float32[np.ndarray, "G 3"],
-    reach: Float32[np.ndarray, " G"],
-    width: int,
-    height: int,
-) -> TileLists:
+def depth_order(depths: Float32[np.ndarray, " N"], visible: np.ndarray) -> Int32[np.ndarray, " G"]:
+    """Indices of the visible Gaussians, nearest first, ties by index; no depth may be negative."""
+    keys = np.empty((2, len(depths)), np.uint64)
+    pieces = np.empty((2, CHUNKS), np.int64)
+    _make_keys(depths.view(np.uint32), visible, pieces, keys[0])
+    total = int((pieces[1] - pieces[0]).sum())
+    _sort(keys[0], keys[1], pieces, total, np.empty((CHUNKS, 1 << BITS), np.uint32))
+    # The lower halves are the indices.
+    return keys[0, :total].astype(np.uint32).view(np.int32)
+
+
+def list_tiles(records: Float32[np.ndarray, " 16*G"], width: int, height: int) -> TileLists:
     """List the pairs of Gaussians given in depth order.
 
     Args:
-        means2d: Centres in pixels, [G, 2].
-        conics: Inverse covariances (a, b, c), [G, 3].
-        reach: log(255 opacity), [G]: how large sigma can be for alpha to reach 1/255.
+        records: The Gaussians as ``blending`` reads them, [16 G].
         width: Image width in pixels.
         height: Image height in pixels.
     """
-    columns, rows = -(-width // TILE), -(-height // TILE)
-    first_row, row_start = np.empty(len(reach), np.int32), np.zeros(len(reach) + 1, np.int64)
-    _count_rows(means2d, conics, reach, rows, first_row, row_start[1:])
-    np.cumsum(row_start, out=row_start)
-    spans = np.empty((row_start[-1], 2), np.int32)
-    slot_start = np.zeros(len(reach) + 1, np.int64)
-    counts = np.zeros((CHUNKS, rows * columns), np.int64)
-    _count_tiles(
-        means2d, conics, reach, columns, first_row, row_start, spans, slot_start[1:], counts
-    )
+    columns, rows, num = -(-width // TILE), -(-height // TILE), len(records) // RECORD
+    row_range = np.empty((num, 2), np.int32)
+    touched = np.zeros((CHUNKS, rows + 1), np.int64)
+    _find_rows(records, rows, row_range, touched)
+    # Spans lie row by row, and within a row chunk by chunk.
+    per_row = touched[:, :-1].cumsum(axis=1).T
+    span_end = per_row.cumsum().reshape(rows, CHUNKS)
+    span_start = np.concatenate([[0], span_end[:, -1]])
+    spans = np.empty((span_start[-1], 4), np.uint32)
+    slot_start, pairs = np.zeros(num + 1, np.int64), np.zeros((CHUNKS, rows), np.int64)
+    cursor = np.ascontiguousarray((span_end - per_row).T)
+    _find_columns(records, columns, row_range, cursor, spans, slot_start[1:], pairs)
     np.cumsum(slot_start, out=slot_start)
-    tile_start = np.concatenate([[0], np.cumsum(counts.sum(axis=0))])
-    cursor = tile_start[:-1] + np.cumsum(counts, axis=0) - counts
-    listed = np.empty((2, slot_start[-1]), np.int32)
-    _fill(columns, first_row, row_start, spans, slot_start, cursor, listed[0], listed[1])
-    return TileLists(slot_start, tile_start, listed[0], listed[1])
+    tile_start = np.empty(rows * columns + 1, np.int64)
+    tile_start[-1] = slot_start[-1]
+    row_start = np.concatenate([[0], pairs.sum(axis=0).cumsum()])
+    ranks, slots = np.empty((2, slot_start[-1]), np.int32)
+    _fill(
+        row_order(rows), columns, span_start, spans, row_start, slot_start, tile_start, ranks, slots
+    )
+    return TileLists(slot_start, tile_start, ranks, slots)
 
 
-@always_inline
-def _row_range(a, b, c, reach, mx, my, row, columns):  # type: ignore[no-untyped-def]
-    """First and one-past-last tile column that an ellipse touches in one row of tiles.
+@kernel
+def _make_keys(depths, visible, pieces, keys):  # type: ignore[no-untyped-def]
+    """Depths above indices, of the visible only: each chunk's from its first place on.
 
-    The ellipse is {d : (a dx^2 + 2 b dx dy + c dy^2) / 2 <= reach}, d the pixel less the mean. Its
-    extent along x within the strip of the row's pixel centres is at its own extreme point, where
-    dy = -+b x_max / c, if that lies in the strip, else at the strip's edge.
+    Positive floats sort as their bits do.
     """
-    low, high = row * TILE + 0.5 - my, row * TILE + (TILE - 0.5) - my
-    det = a * c - b * b
-    if not det > 0.0:
-        return 0, columns
-    y_max = math.sqrt(2.0 * reach * a / det)
-    if low > y_max or high < -y_max:
-        return 0, 0
-    x_max = math.sqrt(2.0 * reach * c / det)
-    at_right = min(max(-b * x_max / c, low), high)
-    at_left = min(max(b * x_max / c, low), high)
-    right = (-b * at_right + math.sqrt(max(2.0 * reach * a - det * at_right * at_right, 0.0))) / a
-    left = (-b * at_left - math.sqrt(max(2.0 * reach * a - det * at_left * at_left, 0.0))) / a
-    # A pixel's slack, in case rounding moved the edge past a pixel centre.
-    return _clipped(mx + left - 0.5 - 0.01, mx + right - 0.5 + 0.01, columns)
+    for chunk in parallel_range(CHUNKS):
+        first, last = chunk * len(keys) // CHUNKS, (chunk + 1) * len(keys) // CHUNKS
+        place = first
+        for i in range(first, last):
+            # Written in any case, and written over by the next where this one is not visible.
+            keys[place] = np.uint64(depths[i]) << np.uint64(32) | np.uint64(i)
+            place += np.int64(visible[i])
+        pieces[0, chunk], pieces[1, chunk] = first, place
 
 
-@always_inline
-def _rows(a, b, c, reach, my, rows):  # type: ignore[no-untyped-def]
-    """First and one-past-last row of tiles that an ellipse touches.
+@kernel
+def _sort(keys, spare, pieces, total, counts):  # type: ignore[no-untyped-def]
+    """Sort by the upper halves, digit by digit from the last; equal ones stay in their order.
 
-    All of them where float32 has rounded the conic to one that is no ellipse (a needle or a sheet of
-    thousands of pixels).
+    Args:
+        keys: uint64 [N], sorted in place.
+        spare: uint64 [N], room.
+        pieces: Where each chunk of ``keys`` begins and ends at first, int64 [2, CHUNKS]; used up.
+        total: How many keys.
+        counts: uint32 [CHUNKS, 2^BITS], room to count in.
     """
-    det = a * c - b * b
-    if not det > 0.0:
-        return 0, rows
-    y_max = math.sqrt(2.0 * reach * a / det)
-    return _clipped(my - y_max - 0.5 - 0.01, my + y_max - 0.5 + 0.01, rows)
+    for turn in range(PASSES):
+        shift = np.uint64(32 + BITS * turn)
+        for chunk in parallel_range(CHUNKS):
+            counts[chunk] = 0
+            for i in range(np.uint64(pieces[0, chunk]), np.uint64(pieces[1, chunk])):
+                counts[chunk, _digit(keys[i], shift)] += np.uint32(1)
+        place = np.uint32(0)
+        for digit in range(1 << BITS):
+            for chunk in range(CHUNKS):
+                place, counts[chunk, digit] = place + counts[chunk, digit], place
+        for chunk in parallel_range(CHUNKS):
+            for i in range(np.uint64(pieces[0, chunk]), np.uint64(pieces[1, chunk])):
+                key, digit = keys[i], _digit(keys[i], shift)
+                place = counts[chunk, digit]
+                counts[chunk, digit] = place + np.uint32(1)
+                spare[place] = key
+            pieces[0, chunk] = chunk * total // CHUNKS
+            pieces[1, chunk] = (chunk + 1) * total // CHUNKS
+        keys, spare = spare, keys
 
 
 @always_inline
-def _clipped(low, high, tiles):  # type: ignore[no-untyped-def]
-    """First and one-past-last of the tiles between two pixels.
+def _digit(key, shift):  # type: ignore[no-untyped-def]
+    return key >> shift & np.uint64((1 << BITS) - 1)
+
+
+@always_inline
+def _ellipse(records, r):  # type: ignore[no-untyped-def]
+    """A, B, C and R of the ellipse A dx^2 + 2 B dx dy + C dy^2 <= R, d the pixel less the mean."""
+    a, b, c = np.float64(records[r + 2]), np.float64(records[r + 3]), np.float64(records[r + 4])
+    reach = max(np.float64(records[r + 5]) - np.float64(LOWEST), 0.0)
+    return -a, -0.5 * b, -c, reach
+
+
+@always_inline
+def _tiles(low, high, tiles):  # type: ignore[no-untyped-def]
+    """First and one-past-last of the tiles that have a pixel between two coordinates.
 
     Clipped while still floats: the pixels of a giant overflow integers.
     """
-    first = min(max(low / TILE, 0.0), np.float64(tiles))
-    last = min(max(high / TILE + 1.0, 0.0), np.float64(tiles))
-    return int(first), int(last)
+    last_pixel = TILE - 0.5
+    first = min(max((low - (SLACK + last_pixel)) / TILE, 0.0), np.float64(tiles))
+    last = min(max((high + (SLACK + last_pixel)) / TILE, 0.0), np.float64(tiles))
+    return math.ceil(first), int(last)
 
 
 @kernel
-def _count_rows(means2d, conics, reach, rows, first_row, count):  # type: ignore[no-untyped-def]
-    for g in parallel_range(len(reach)):
-        a, b, c = np.float64(conics[g, 0]), np.float64(conics[g, 1]), np.float64(conics[g, 2])
-        first, last = _rows(a, b, c, reach[g], means2d[g, 1], rows)
-        first_row[g], count[g] = first, max(last - first, 0)
+def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-def]
+    """First and one-past-last row of tiles that each ellipse touches.
 
+    All of them where float32 has rounded the conic to one that is no ellipse (a needle or a sheet of
+    thousands of pixels).
 
-@kernel
-def _count_tiles(  # type: ignore[no-untyped-def]
-    means2d, conics, reach, columns, first_row, row_start, spans, pairs, counts
-):
-    """The span of columns of every row of tiles, and how many pairs that makes."""
+    Args:
+        records: As in ``list_tiles``.
+        rows: Rows of tiles.
+        row_range: Written, int32 [G, 2].
+        touched: Changes from row to row of how many of a chunk touch it, int64 [CHUNKS, rows + 1].
+    """
     for k in parallel_range(CHUNKS):
-        chunk, total = STRIDE * k % CHUNKS, len(reach)
-        for g in range(chunk * total // CHUNKS, (chunk + 1) * total // CHUNKS):
-            a, b, c = np.float64(conics[g, 0]), np.float64(conics[g, 1]), np.float64(conics[g, 2])
-            pairs[g] = 0
-            for entry in range(row_start[g], row_start[g + 1]):
-                row = first_row[g] + entry - row_start[g]
-                first, last = _row_range(
-                    a, b, c, reach[g], means2d[g, 0], means2d[g, 1], row, columns
-                )
-                spans[entry, 0], spans[entry, 1] = first, last
-                pairs[g] += max(last - first, 0)
-                for column in range(first, last):
-                    counts[chunk, row * columns + column] += 1
+        chunk = STRIDE * k % CHUNKS
+        for g in range(chunk * len(row_range) // CHUNKS, (chunk + 1) * len(row_range) // CHUNKS):
+            a, b, c, reach = _ellipse(records, RECORD * g)
+            det, mean = a * c - b * b, np.float64(records[RECORD * g + 1])
+            extent = math.sqrt(reach * a / det) if det > 0.0 else np.inf
+            first, last = _tiles(mean - extent, mean + extent, rows)
+            row_range[g, 0], row_range[g, 1] = first, last
+            touched[chunk, first] += 1
+            touched[chunk, last] -= 1
+
+
+@kernel
+def _find_columns(  # type: ignore[no-untyped-def]
+    records, columns, row_range, cursor, spans, pairs, pairs_of_row
+):
+    """Write the span of every Gaussian in each of its rows to the row's part of ``spans``.
+
+    Within the strip of a row's pixel centres an ellipse extends furthest at its own extreme point if
+    that lies in the strip, else at the strip's edge.
+
+    Args:
+        records: As in ``list_tiles``.
+        columns: Tiles in a row.
+        row_range: int32 [G, 2].
+        cursor: Where each chunk writes each row's next span, int64 [CHUNKS, rows].
+        spans: Written: rank, first column, one past the last, pairs in earlier rows, uint32 [S, 4].
+        pairs: Written, pairs of each Gaussian, int64 [G].
+        pairs_of_row: Pairs of each chunk in each row are added to it, int64 [CHUNKS, rows].
+    """
+    for k in parallel_range(CHUNKS):
+        chunk = STRIDE * k % CHUNKS
+        for g in range(chunk * len(pairs) // CHUNKS, (chunk + 1) * len(pairs) // CHUNKS):
+            x, y = np.float64(records[RECORD * g]), np.float64(records[RECORD * g + 1])
+            lean, extreme, width, falloff = _profile(*_ellipse(records, RECORD * g))
+            num = 0
+            for row in range(row_range[g, 0], row_range[g, 1]):
+                low = row * TILE + 0.5 - y
+                high = low + (TILE - 1)
+                right, left = min(max(extreme, low), high), min(max(-extreme, low), high)
+                x_right = x + lean * right + math.sqrt(max(width - falloff * right * right, 0.0))
+                x_left = x + lean * left - math.sqrt(max(width - falloff * left * left, 0.0))
+                first, last = _tiles(x_left, x_right, columns)
+                place = cursor[chunk, row]
+                cursor[chunk, row] = place + 1
+                spans[place, 0], spans[place, 1] = g, first
+                spans[place, 2], spans[place, 3] = last, num
+                pairs_of_row[chunk, row] += last - first
+                num += last - first
+            pairs[g] = num
+
+
+@always_inline
+def _profile(a, b, c, reach):  # type: ignore[no-untyped-def]
+    """An ellipse's edges by height: dx = lean dy +- sqrt(width - falloff dy^2).
+
+    Also ``extreme``, the dy of the right extreme point; the left one's is its negative. What is no
+    ellipse is endless.
+    """
+    det = a * c - b * b
+    if not det > 0.0:
+        return 0.0, 0.0, np.inf, 0.0
+    inverse = 1.0 / a
+    extreme = -b * math.sqrt(reach / (c * det))
+    return -b * inverse, extreme, reach * inverse, det * inverse * inverse
 
 
 @kernel
 def _fill(  # type: ignore[no-untyped-def]
-    columns, first_row, row_start, spans, slot_start, cursor, listed_rank, listed_slot
+    row_order, columns, span_start, spans, row_start, slot_start, tile_start, ranks, slots
 ):
-    """A stable counting sort: chunks write to places that were set aside for them."""
-    for k in parallel_range(CHUNKS):
-        chunk, total = STRIDE * k % CHUNKS, len(first_row)
-        for g in range(chunk * total // CHUNKS, (chunk + 1) * total // CHUNKS):
-            slot = slot_start[g]
-            for entry in range(row_start[g], row_start[g + 1]):
-                row = first_row[g] + entry - row_start[g]
-                for column in range(spans[entry, 0], spans[entry, 1]):
-                    tile = row * columns + column
-                    place = cursor[chunk, tile]
-                    listed_rank[place], listed_slot[place] = g, slot
-                    cursor[chunk, tile] = place + 1
-                    slot += 1
+    """List each row's spans by tile.
+
+    Args:
+        row_order: The rows of tiles in the order in which they are taken, int64 [rows].
+        columns: Tiles in a row.
+        span_start: First span of each row, int64 [rows + 1].
+        spans: As in ``_find_columns``.
+        row_start: First list entry of each row, int64 [rows + 1].
+        slot_start: As in ``TileLists``.
+        tile_start: Written but for its end, as in ``TileLists``.
+        ranks: ``listed_rank``, written.
+        slots: ``listed_slot``, written.
+    """
+    one = np.uint64(1)
+    for turn in parallel_range(len(row_order)):
+        row = row_order[turn]
+        begin, end = np.uint64(span_start[row]), np.uint64(span_start[row + 1])
+        cursor = np.zeros(columns + 1, np.uint64)
+        for s in range(begin, end):
+            cursor[spans[s, 1]] += one
+            cursor[spans[s, 2]] -= one
+        entries, place = np.uint64(0), np.uint64(row_start[row])
+        for column in range(columns):
+            entries += cursor[column]
+            tile_start[row * columns + column] = cursor[column] = place
+            place += entries
+        for s in range(begin, end):
+            rank = spans[s, 0]
+            slot = np.uint64(slot_start[rank]) + np.uint64(spans[s, 3])
+            for column in range(spans[s, 1], spans[s, 2]):
+                place = cursor[column]
+                ranks[place], slots[place] = rank, slot
+                cursor[column] = place + one
+                slot += one

@@ -18,14 +18,12 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatseed.render import blending, harmonics as sh, layout, projection
-from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles
+from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles, row_order
 
 __all__ = ["Blend", "Harmonics", "Lens", "Project"]
 
-LOG_255 = np.float32(np.log(255.0))
 GREATEST = np.float32(1e6)
 """Opacities above it count as this much: beyond 1 they only make a Gaussian wider."""
-GOLDEN = 0.6180339887498949
 ALIGNMENT = 64
 
 
@@ -145,6 +143,8 @@ class _Prepared(NamedTuple):
 
     order: np.ndarray
     log_opacities: np.ndarray
+    records: np.ndarray
+    """Of the first pass of channels."""
     lists: TileLists
     width: int
     height: int
@@ -156,11 +156,8 @@ class _Prepared(NamedTuple):
 
     @property
     def row_order(self) -> np.ndarray:
-        """Rows of tiles, such that every stretch of them has its share of all parts of the image.
-
-        Threads take stretches of equal length, and images are seldom as busy above as below.
-        """
-        return np.argsort(np.arange(-(-self.height // TILE)) * GOLDEN % 1.0)
+        """Rows of tiles as threads take them."""
+        return row_order(-(-self.height // TILE))
 
     @property
     def lanes(self) -> int:
@@ -194,7 +191,7 @@ class Blend(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         """Run the kernel and keep what backward needs."""
         prepared = _prepare(means2d, conics, colors, opacities, depths, radii, width, height)
-        channels, records = colors.shape[1], None
+        channels = colors.shape[1]
         behind = np.zeros(channels, np.float32) if background is None else _array(background)
         image = np.empty((height, width, channels), np.float32)
         passing = np.empty((height, width), np.float32)
@@ -203,7 +200,6 @@ class Blend(torch.autograd.Function):
             blocks = _forward(prepared, records)
             layout.from_blocks(*blocks, prepared.columns, behind, first, image, passing)  # type: ignore[call-arg]  # star arguments
         ctx.prepared, ctx.on_absgrad, ctx.passing, ctx.image = prepared, on_absgrad, passing, image
-        ctx.records = records if channels <= blending.CHANNELS else None
         ctx.save_for_backward(means2d, conics, colors, opacities, background)
         return torch.from_numpy(image), torch.from_numpy(1.0 - passing)
 
@@ -218,20 +214,15 @@ class Blend(torch.autograd.Function):
         gradient, passing = _array(d_image), ctx.passing
         shapes = [tuple(each.shape) for each in (means2d, conics, opacities, colors, means2d)]
         results = [np.zeros(shape, np.float32) for shape in shapes]
-        # Every pass of channels takes its own part of what lies behind the first Gaussian; the first
-        # pass takes the gradient of alpha too.
-        d_passing = -_array(d_alphas) * passing
         for first in range(0, colors.shape[1], blending.CHANNELS):
-            records = ctx.records
-            if records is None:  # more passes than would be kept
-                records = _records(prepared, means2d, conics, colors, first)
+            records = _records(prepared, means2d, conics, colors, first)
             totals = _backward(
-                prepared, records, gradient, ctx.image, d_passing, first, ctx.on_absgrad is not None
-            )
+                prepared, records, gradient, ctx.image, _array(d_alphas), passing, first,
+                ctx.on_absgrad is not None,
+            )  # fmt: skip
             layout.scatter(  # type: ignore[call-arg]  # star arguments
                 prepared.order, totals, first, _array(conics), _array(opacities), *results
             )
-            d_passing = np.zeros_like(passing)
         if ctx.on_absgrad is not None:
             ctx.on_absgrad(torch.from_numpy(results[4]))
         d_background = None
@@ -257,10 +248,9 @@ def _prepare(
     layout.mark_visible(_array(radii), alphas, _array(colors), projection.MIN_ALPHA, seen)
     order = depth_order(_array(depths), seen)
     log_opacities = np.log(np.minimum(alphas.take(order), GREATEST), dtype=np.float32)
-    reach = np.maximum(log_opacities + LOG_255, np.float32(0.0))
-    places, shapes = (_array(each).take(order, axis=0) for each in (means2d, conics))
-    lists = list_tiles(places, shapes, reach, width, height)
-    return _Prepared(order, log_opacities, lists, width, height)
+    records = _gather(order, log_opacities, means2d, conics, colors, 0)
+    lists = list_tiles(records, width, height)
+    return _Prepared(order, log_opacities, records, lists, width, height)
 
 
 def _aligned(size: int, *, zero: bool = False) -> np.ndarray:
@@ -272,18 +262,26 @@ def _aligned(size: int, *, zero: bool = False) -> np.ndarray:
 
 
 def _records(
-    prepared: _Prepared,
+    prepared: _Prepared, means2d: Tensor, conics: Tensor, colors: Tensor, first: int
+) -> np.ndarray:
+    """Those of this pass of channels."""
+    if first == 0:
+        return prepared.records
+    return _gather(prepared.order, prepared.log_opacities, means2d, conics, colors, first)
+
+
+def _gather(
+    order: np.ndarray,
+    log_opacities: np.ndarray,
     means2d: Tensor,
     conics: Tensor,
     colors: Tensor,
     first: int,
 ) -> np.ndarray:
     """The Gaussians in depth order as ``blending`` reads them, flat."""
-    records = _aligned(len(prepared.order) * blending.RECORD)
-    layout.gather(
-        prepared.order, _array(means2d), _array(conics), prepared.log_opacities, _array(colors),
-        first, records,
-    )  # fmt: skip
+    records = _aligned(len(order) * blending.RECORD)
+    arrays = (_array(each) for each in (means2d, conics))
+    layout.gather(order, *arrays, log_opacities, _array(colors), first, records)  # type: ignore[call-arg]  # star arguments
     return records
 
 
@@ -302,14 +300,15 @@ def _backward(
     records: np.ndarray,
     d_image: np.ndarray,
     image: np.ndarray,
-    d_passing: np.ndarray,
+    d_alphas: np.ndarray,
+    passing: np.ndarray,
     first: int,
     absolute: bool,
 ) -> np.ndarray:
     """Gradient sums of every visible Gaussian, by depth rank, [G, 16]."""
     lists, lanes = prepared.lists, prepared.lanes
-    gradient, behind = _aligned(lanes * blending.CHANNELS, zero=True), _aligned(lanes, zero=True)
-    layout.to_blocks(d_image, image, d_passing, prepared.columns, first, gradient, behind)
+    gradient, behind = _aligned(lanes * blending.CHANNELS), _aligned(lanes)
+    layout.to_blocks(d_image, image, d_alphas, passing, prepared.columns, first, gradient, behind)
     sums = _aligned(len(lists.listed_rank) * blending.SUMS, zero=True)
     blending.backward(
         records, lists.tile_start, lists.listed_rank, lists.listed_slot, prepared.row_order,

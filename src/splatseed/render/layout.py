@@ -14,11 +14,13 @@ from __future__ import annotations
 import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
-from splatseed.render.binning import TILE
 from splatseed.render.blending import BLOCKS, CHANNELS, RECORD
 from splatseed.render.simd import LANES
 
 __all__ = ["from_blocks", "gather", "mark_visible", "scatter", "to_blocks"]
+
+RGB = 3
+"""Channels that have code of their own."""
 
 
 @kernel
@@ -35,10 +37,12 @@ def mark_visible(radii, opacities, colors, least, visible):
         visible: Written, bool [N].
     """
     for i in parallel_range(len(radii)):
-        drawn = radii[i, 0] > 0 and radii[i, 1] > 0 and opacities[i] >= least
+        # No branch: the processor would guess it wrong as often as not.
+        seen = (radii[i, 0] > 0) & (radii[i, 1] > 0) & (opacities[i] >= least)
+        zero = np.float32(0.0)
         for channel in range(colors.shape[1]):
-            drawn = drawn and np.isfinite(colors[i, channel])
-        visible[i] = drawn
+            zero += np.float32(0.0) * colors[i, channel]
+        visible[i] = seen & (zero == np.float32(0.0))
 
 
 @kernel
@@ -46,7 +50,7 @@ def gather(order, means2d, conics, log_opacities, colors, first, records):
     """Gaussians by index to records by depth rank.
 
     Args:
-        order: int64 [G].
+        order: int32 [G].
         means2d: float32 [N, 2].
         conics: float32 [N, 3].
         log_opacities: By depth rank, float32 [G].
@@ -56,15 +60,16 @@ def gather(order, means2d, conics, log_opacities, colors, first, records):
     """
     wide = min(CHANNELS, colors.shape[1] - first)
     for g in parallel_range(len(order)):
-        i, r = order[g], RECORD * g
-        records[r : r + RECORD] = np.float32(0.0)
-        records[r], records[r + 1] = means2d[i, 0], means2d[i, 1]
-        a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
-        records[r + 2], records[r + 4] = np.float32(-1 / 16) * a, np.float32(-1 / 16) * c
-        records[r + 3] = np.float32(-1 / 8) * b
-        records[r + 5] = np.float32(1 / 8) * log_opacities[g]
+        i, record = order[g], records[RECORD * g : RECORD * (g + 1)]
+        record[0], record[1] = means2d[i, 0], means2d[i, 1]
+        record[2] = np.float32(-1 / 16) * conics[i, 0]
+        record[3] = np.float32(-1 / 8) * conics[i, 1]
+        record[4] = np.float32(-1 / 16) * conics[i, 2]
+        record[5] = np.float32(1 / 8) * log_opacities[g]
+        for k in range(6, RECORD):
+            record[k] = np.float32(0.0)
         for channel in range(wide):
-            records[r + 7 + channel] = colors[i, first + channel]
+            record[7 + channel] = colors[i, first + channel]
 
 
 @kernel
@@ -74,7 +79,7 @@ def scatter(
     """Sums by depth rank to gradients by index; those of what is not visible stay.
 
     Args:
-        order: int64 [G].
+        order: int32 [G].
         totals: ``blending``'s sums over each Gaussian's pairs, float32 [G, 16].
         first: First channel.
         conics: float32 [N, 3].
@@ -102,10 +107,10 @@ def scatter(
 
 
 @always_inline
-def _lane(x, y, columns):
-    """Block and lane of a pixel."""
-    tile = (y // TILE) * columns + x // TILE
-    return BLOCKS * tile + 2 * (y % TILE // 4) + x % TILE // 4, 4 * (y % 4) + x % 4
+def _place(strip, across, columns):
+    """Block, left and top pixel of the blocks' ``strip``-th row and ``across``-th column."""
+    tile = strip // 2 * columns + across // 2
+    return BLOCKS * tile + 2 * (strip % 2) + across % 2, 4 * across, 4 * strip
 
 
 @kernel
@@ -121,37 +126,88 @@ def from_blocks(blocks, transmittance, columns, background, first, image, passin
         image: Written, float32 [H, W, D].
         passing: Written, the transmittance, float32 [H, W].
     """
+    height, width = passing.shape
     wide = min(CHANNELS, image.shape[2] - first)
-    for y in parallel_range(image.shape[0]):
-        for x in range(image.shape[1]):
-            block, lane = _lane(x, y, columns)
-            rest = transmittance[LANES * block + lane]
-            passing[y, x] = rest
-            for channel in range(wide):
-                color = blocks[LANES * (CHANNELS * block + channel) + lane]
-                image[y, x, first + channel] = color + rest * background[first + channel]
+    for strip in parallel_range((height + 3) // 4):
+        for across in range((width + 3) // 4):
+            block, x, y = _place(strip, across, columns)
+            for row in range(min(4, height - y)):
+                if x + 4 <= width and wide == RGB:  # compiled for its own constants
+                    _row_from_block(
+                        blocks, transmittance, block, row, background, first, image, passing,
+                        x, y + row, 4, RGB,
+                    )  # fmt: skip
+                else:
+                    _row_from_block(
+                        blocks, transmittance, block, row, background, first, image, passing,
+                        x, y + row, min(4, width - x), wide,
+                    )  # fmt: skip
+
+
+@always_inline
+def _row_from_block(
+    blocks, transmittance, block, row, background, first, image, passing, x, y, pixels, wide
+):
+    lane = LANES * block + 4 * row
+    for k in range(pixels):
+        passing[y, x + k] = transmittance[lane + k]
+    for channel in range(wide):
+        color, behind = LANES * (CHANNELS * block + channel) + 4 * row, background[first + channel]
+        for k in range(pixels):
+            light = blocks[color + k] + transmittance[lane + k] * behind
+            image[y, x + k, first + channel] = light
 
 
 @kernel
-def to_blocks(d_image, image, d_passing, columns, first, gradient, behind):
+def to_blocks(d_image, image, d_alphas, passing, columns, first, gradient, behind):
     """This pass's channels of the gradient to a block image, and what lies behind the first Gaussian.
+
+    Every pass takes its own channels' part of what lies behind; the first takes that of alpha too.
 
     Args:
         d_image: d loss / d image, float32 [H, W, D].
         image: float32 [H, W, D].
-        d_passing: What this pass has to count of (d loss / d transmittance) T, float32 [H, W].
+        d_alphas: d loss / d alpha, float32 [H, W].
+        passing: The transmittance, float32 [H, W].
         columns: Tiles in a row.
         first: First channel.
-        gradient: Written, block image, float32 [t * 4 * CHANNELS * 16]; must hold 0.
-        behind: Written, gradient . colour + ``d_passing``, float32 [t * 4 * 16]; must hold 0.
+        gradient: Written, block image, float32 [t * 4 * CHANNELS * 16]; 0 outside of the image.
+        behind: Written, gradient . colour - (d loss / d alpha) T, float32 [t * 4 * 16]; likewise.
     """
+    height, width = passing.shape
     wide = min(CHANNELS, image.shape[2] - first)
-    for y in parallel_range(image.shape[0]):
-        for x in range(image.shape[1]):
-            block, lane = _lane(x, y, columns)
-            total = d_passing[y, x]
-            for channel in range(wide):
-                slope = d_image[y, x, first + channel]
-                gradient[LANES * (CHANNELS * block + channel) + lane] = slope
-                total += slope * image[y, x, first + channel]
-            behind[LANES * block + lane] = total
+    alpha = np.float32(-1.0) if first == 0 else np.float32(0.0)
+    for strip in parallel_range(len(behind) // (2 * LANES * columns)):
+        for across in range(2 * columns):
+            block, x, y = _place(strip, across, columns)
+            for row in range(y, y + 4):
+                if x + 4 <= width and row < height and wide == RGB:
+                    _row_to_block(
+                        d_image, image, d_alphas, passing, alpha, first, gradient, behind,
+                        block, x, row, 4, RGB,
+                    )  # fmt: skip
+                else:
+                    pixels = min(4, max(width - x, 0)) if row < height else 0
+                    _row_to_block(
+                        d_image, image, d_alphas, passing, alpha, first, gradient, behind,
+                        block, x, row, pixels, wide,
+                    )  # fmt: skip
+
+
+@always_inline
+def _row_to_block(
+    d_image, image, d_alphas, passing, alpha, first, gradient, behind, block, x, y, pixels, wide
+):
+    lane, slopes = LANES * block + 4 * (y % 4), LANES * CHANNELS * block + 4 * (y % 4)
+    for k in range(pixels):
+        total = alpha * d_alphas[y, x + k] * passing[y, x + k]
+        for channel in range(wide):
+            slope = d_image[y, x + k, first + channel]
+            gradient[slopes + LANES * channel + k] = slope
+            total += slope * image[y, x + k, first + channel]
+        behind[lane + k] = total
+    for k in range(pixels, 4):
+        behind[lane + k] = np.float32(0.0)
+    for channel in range(CHANNELS):
+        for k in range(pixels if channel < wide else 0, 4):
+            gradient[slopes + LANES * channel + k] = np.float32(0.0)
