@@ -2,7 +2,9 @@
 
 A step asks for some hundred MiB and gives them back. glibc returns large blocks to the system at
 once, and every step then waits for the system to clear the pages anew.
-Promise: only speed changes; other C libraries are left as they are.
+Promise: results stay the same; other C libraries are left as they are. While Gaussians are added,
+blocks of the sizes of before lie idle: a run that grew from 30,000 to 250,000 took 8 % more memory
+at its peak.
 """
 
 from __future__ import annotations
