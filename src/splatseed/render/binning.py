@@ -22,7 +22,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32, Int32, Int64, UInt32
 
 from splatseed.jit import always_inline, kernel, parallel_range
 
@@ -65,7 +65,7 @@ def row_order(rows: int) -> Int64[np.ndarray, " rows"]:
     return np.argsort(np.arange(rows) * GOLDEN % 1.0)
 
 
-def depth_order(depths: Float32[np.ndarray, " N"], visible: np.ndarray) -> Int32[np.ndarray, " G"]:
+def depth_order(depths: Float32[np.ndarray, " N"], visible: np.ndarray) -> UInt32[np.ndarray, " G"]:
     """Indices of the visible Gaussians, nearest first, ties by index; no depth may be negative."""
     keys = np.empty((2, len(depths)), np.uint64)
     pieces = np.empty((2, CHUNKS), np.int64)
@@ -73,7 +73,7 @@ def depth_order(depths: Float32[np.ndarray, " N"], visible: np.ndarray) -> Int32
     total = int((pieces[1] - pieces[0]).sum())
     _sort(keys[0], keys[1], pieces, total, np.empty((CHUNKS, 1 << BITS), np.uint32))
     # The lower halves are the indices.
-    return keys[0, :total].astype(np.uint32).view(np.int32)
+    return keys[0, :total].astype(np.uint32)
 
 
 def list_tiles(records: Float32[np.ndarray, " 16*G"], width: int, height: int) -> TileLists:

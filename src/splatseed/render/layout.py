@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
+from splatseed.render.binning import TILE
 from splatseed.render.blending import BLOCKS, CHANNELS, RECORD
 from splatseed.render.simd import LANES
 
@@ -50,7 +51,7 @@ def gather(order, means2d, conics, log_opacities, colors, first, records):
     """Gaussians by index to records by depth rank.
 
     Args:
-        order: int32 [G].
+        order: uint32 [G].
         means2d: float32 [N, 2].
         conics: float32 [N, 3].
         log_opacities: By depth rank, float32 [G].
@@ -79,7 +80,7 @@ def scatter(
     """Sums by depth rank to gradients by index; those of what is not visible stay.
 
     Args:
-        order: int32 [G].
+        order: uint32 [G].
         totals: ``blending``'s sums over each Gaussian's pairs, float32 [G, 16].
         first: First channel.
         conics: float32 [N, 3].
@@ -107,10 +108,10 @@ def scatter(
 
 
 @always_inline
-def _place(strip, across, columns):
-    """Block, left and top pixel of the blocks' ``strip``-th row and ``across``-th column."""
-    tile = strip // 2 * columns + across // 2
-    return BLOCKS * tile + 2 * (strip % 2) + across % 2, 4 * across, 4 * strip
+def _first_lane(x, y, columns):
+    """Of all lanes, that of a pixel, a block's first in its row."""
+    tile, quarter = y // TILE * columns + x // TILE, y % TILE // 4 * 2 + x % TILE // 4
+    return LANES * (BLOCKS * tile + quarter) + y % 4 * 4
 
 
 @kernel
@@ -126,36 +127,34 @@ def from_blocks(blocks, transmittance, columns, background, first, image, passin
         image: Written, float32 [H, W, D].
         passing: Written, the transmittance, float32 [H, W].
     """
-    height, width = passing.shape
-    wide = min(CHANNELS, image.shape[2] - first)
-    for strip in parallel_range((height + 3) // 4):
-        for across in range((width + 3) // 4):
-            block, x, y = _place(strip, across, columns)
-            for row in range(min(4, height - y)):
-                if x + 4 <= width and wide == RGB:  # compiled for its own constants
-                    _row_from_block(
-                        blocks, transmittance, block, row, background, first, image, passing,
-                        x, y + row, 4, RGB,
-                    )  # fmt: skip
-                else:
-                    _row_from_block(
-                        blocks, transmittance, block, row, background, first, image, passing,
-                        x, y + row, min(4, width - x), wide,
-                    )  # fmt: skip
+    height, width, depth = image.shape
+    pixels, passes = image.reshape(-1), passing.reshape(-1)
+    for y in parallel_range(height):
+        for x in range(0, width, 4):
+            lane, at = _first_lane(x, y, columns), y * width + x
+            lights, rest = blocks[_color(lane) :], transmittance[lane : lane + 4]
+            row, passes_row = pixels[depth * at :], passes[at:]
+            if depth == RGB and x + 4 <= width:  # compiled for its own constants
+                _from_lanes(lights, rest, background, 0, 4, RGB, row, passes_row)
+            else:
+                count = min(4, width - x)
+                _from_lanes(lights, rest, background, first, count, depth, row, passes_row)
 
 
 @always_inline
-def _row_from_block(
-    blocks, transmittance, block, row, background, first, image, passing, x, y, pixels, wide
-):
-    lane = LANES * block + 4 * row
-    for k in range(pixels):
-        passing[y, x + k] = transmittance[lane + k]
-    for channel in range(wide):
-        color, behind = LANES * (CHANNELS * block + channel) + 4 * row, background[first + channel]
-        for k in range(pixels):
-            light = blocks[color + k] + transmittance[lane + k] * behind
-            image[y, x + k, first + channel] = light
+def _color(lane):
+    """Where a block image has the first channel of a lane."""
+    return lane // LANES * (CHANNELS * LANES) + lane % LANES
+
+
+@always_inline
+def _from_lanes(lights, rest, background, first, count, depth, pixels, passes):
+    """Up to four neighbours in a row."""
+    for k in range(count):
+        passes[k] = rest[k]
+        for channel in range(min(CHANNELS, depth - first)):
+            light = lights[LANES * channel + k] + rest[k] * background[first + channel]
+            pixels[depth * k + first + channel] = light
 
 
 @kernel
@@ -174,40 +173,39 @@ def to_blocks(d_image, image, d_alphas, passing, columns, first, gradient, behin
         gradient: Written, block image, float32 [t * 4 * CHANNELS * 16]; 0 outside of the image.
         behind: Written, gradient . colour - (d loss / d alpha) T, float32 [t * 4 * 16]; likewise.
     """
-    height, width = passing.shape
-    wide = min(CHANNELS, image.shape[2] - first)
-    alpha = np.float32(-1.0) if first == 0 else np.float32(0.0)
-    for strip in parallel_range(len(behind) // (2 * LANES * columns)):
-        for across in range(2 * columns):
-            block, x, y = _place(strip, across, columns)
-            for row in range(y, y + 4):
-                if x + 4 <= width and row < height and wide == RGB:
-                    _row_to_block(
-                        d_image, image, d_alphas, passing, alpha, first, gradient, behind,
-                        block, x, row, 4, RGB,
-                    )  # fmt: skip
-                else:
-                    pixels = min(4, max(width - x, 0)) if row < height else 0
-                    _row_to_block(
-                        d_image, image, d_alphas, passing, alpha, first, gradient, behind,
-                        block, x, row, pixels, wide,
-                    )  # fmt: skip
+    height, width, depth = image.shape
+    d_pixels, pixels = d_image.reshape(-1), image.reshape(-1)
+    d_solid, passes = d_alphas.reshape(-1), passing.reshape(-1)
+    for y in parallel_range(len(behind) // (TILE * columns)):
+        for x in range(0, TILE * columns, 4):
+            lane, at = _first_lane(x, y, columns), y * width + x
+            slopes, after = gradient[_color(lane) :], behind[lane : lane + 4]
+            if depth == RGB and x + 4 <= width and y < height:
+                _to_lanes(
+                    d_pixels[depth * at :], pixels[depth * at :], d_solid[at:], passes[at:],
+                    0, 4, RGB, slopes, after,
+                )  # fmt: skip
+            else:
+                count = min(4, max(width - x, 0)) if y < height else 0
+                _to_lanes(
+                    d_pixels[depth * at :], pixels[depth * at :], d_solid[at:], passes[at:],
+                    first, count, depth, slopes, after,
+                )  # fmt: skip
 
 
 @always_inline
-def _row_to_block(
-    d_image, image, d_alphas, passing, alpha, first, gradient, behind, block, x, y, pixels, wide
-):
-    lane, slopes = LANES * block + 4 * (y % 4), LANES * CHANNELS * block + 4 * (y % 4)
-    for k in range(pixels):
-        total = alpha * d_alphas[y, x + k] * passing[y, x + k]
+def _to_lanes(d_pixels, pixels, d_solid, passes, first, count, depth, slopes, after):
+    """Up to four neighbours in a row, and 0 in what is left of four and of the channels."""
+    wide = min(CHANNELS, depth - first)
+    for k in range(count):
+        total = -d_solid[k] * passes[k] if first == 0 else np.float32(0.0)
         for channel in range(wide):
-            slope = d_image[y, x + k, first + channel]
-            gradient[slopes + LANES * channel + k] = slope
-            total += slope * image[y, x + k, first + channel]
-        behind[lane + k] = total
-    for k in range(pixels, 4):
-        behind[lane + k] = np.float32(0.0)
+            slope = d_pixels[depth * k + first + channel]
+            slopes[LANES * channel + k] = slope
+            total += slope * pixels[depth * k + first + channel]
+        after[k] = total
+    for k in range(count, 4):
+        after[k] = np.float32(0.0)
     for channel in range(CHANNELS):
-        for k in range(pixels if channel < wide else 0, 4):
-            gradient[slopes + LANES * channel + k] = np.float32(0.0)
+        for k in range(count if channel < wide else 0, 4):
+            slopes[LANES * channel + k] = np.float32(0.0)
