@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from clocks import Clock, start_clock
-from splatseed.render import blending, functions
+from splatseed.render import blending, blending_vjp, functions
 from splatseed.render.functions import Blend, Harmonics, Project
 
 __all__ = ["RENDER_STAGES", "Stopwatch", "timed"]
@@ -32,7 +32,7 @@ RENDER_STAGES: Mapping[str, Sequence[Place]] = {
     "project backward": ((Project, "backward"),),
     "harmonics backward": ((Harmonics, "backward"),),
     "blend layout backward": ((Blend, "backward"),),
-    "blend kernel backward": ((blending, "backward"), (blending, "sum_pairs")),
+    "blend kernel backward": ((blending_vjp, "backward"), (blending_vjp, "sum_spans")),
 }
 """The rasteriser's. ``layout`` is what stands around the kernels of blending: it moves arrays."""
 

@@ -58,13 +58,22 @@ def listed(lists: TileLists, view: View) -> np.ndarray:
     return found.reshape(-1, rows, columns).astype(bool)
 
 
+def assert_one_row_a_span(lists: TileLists, columns: int) -> None:
+    """No span has pairs in two rows of tiles, and a Gaussian's spans are in the order of rows."""
+    tiles = np.repeat(np.arange(len(lists.tile_start) - 1), np.diff(lists.tile_start))
+    places = np.unique(np.stack([lists.listed_span, tiles // columns]), axis=1)
+    assert len(np.unique(places[0])) == places.shape[1]
+    together = np.diff(lists.listed_rank[np.argsort(lists.listed_span, kind="stable")]) == 0
+    rows = (tiles // columns)[np.argsort(lists.listed_span, kind="stable")]
+    assert (np.diff(rows)[together] >= 0).all()
+
+
 def assert_consistent(lists: TileLists, view: View) -> None:
-    """Starts, slots and ranks fit together, and every list is in depth order."""
-    pairs = len(lists.listed_rank)
-    assert lists.slot_start[-1] == lists.tile_start[-1] == pairs
-    assert np.array_equal(np.sort(lists.listed_slot), np.arange(pairs))
-    owner = np.repeat(np.arange(len(view[2])), np.diff(lists.slot_start))
-    assert np.array_equal(owner[lists.listed_slot], lists.listed_rank)
+    """Starts, spans and ranks fit together, and every list is in depth order."""
+    assert lists.tile_start[-1] == len(lists.listed_rank) == len(lists.listed_span)
+    owner = np.repeat(np.arange(len(view[2])), np.diff(lists.span_start))
+    assert np.array_equal(owner[lists.listed_span], lists.listed_rank)
+    assert_one_row_a_span(lists, -(-view[3] // TILE))
     for first, last in zip(lists.tile_start[:-1], lists.tile_start[1:], strict=True):
         assert (np.diff(lists.listed_rank[first:last]) > 0).all()
 
@@ -99,7 +108,7 @@ def test_records_are_those_of_blending() -> None:
 def test_nothing_to_list() -> None:
     nothing = np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), np.empty(0, np.float32)
     lists = lists_of(*nothing, 20, 10)
-    assert lists.slot_start.tolist() == [0]
+    assert lists.span_start.tolist() == [0]
     assert not lists.tile_start.any()
     assert len(lists.tile_start) == 3 * 2 + 1
 
@@ -111,7 +120,8 @@ def test_giants_and_broken_needles_are_listed_everywhere(conic: tuple[float, ...
         np.array([[5.0, 7.0]], np.float32), np.array([conic], np.float32),
         np.array([3.0], np.float32), 40, 24,
     )  # fmt: skip
-    assert lists.slot_start.tolist() == [0, 15]
+    assert lists.span_start.tolist() == [0, 3]
+    assert np.diff(lists.tile_start).tolist() == [1] * 15
 
 
 @settings(max_examples=60, deadline=None)

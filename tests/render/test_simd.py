@@ -60,6 +60,11 @@ def _fma(a, b, c, out):
 
 
 @njit
+def _fnma(a, b, c, out):
+    simd.store(out, 0, simd.fnma(simd.load(a, 0), simd.load(b, 0), simd.load(c, 0)))
+
+
+@njit
 def _select(a, b, out):
     a, b = simd.load(a, 0), simd.load(b, 0)
     yes, no = simd.splat(np.float32(1.0)), simd.splat(np.float32(2.0))
@@ -77,14 +82,25 @@ def _lane_sum(a):
 
 
 @njit
-def _lane_sums(a, out):
+def _load_transposed(a, start, out):
+    for j, vector in enumerate(simd.load_transposed(a, start)):
+        simd.store(out, LANES * j, vector)
+
+
+@njit
+def _store_transposed(a, out, start):
     rows = (
         simd.load(a, 0), simd.load(a, 16), simd.load(a, 32), simd.load(a, 48),
         simd.load(a, 64), simd.load(a, 80), simd.load(a, 96), simd.load(a, 112),
         simd.load(a, 128), simd.load(a, 144), simd.load(a, 160), simd.load(a, 176),
         simd.load(a, 192), simd.load(a, 208), simd.load(a, 224), simd.load(a, 240),
     )  # fmt: skip
-    simd.store(out, 0, simd.lane_sums(rows))
+    simd.store_transposed(out, start, rows)
+
+
+@njit
+def _aligned(size):
+    return simd.aligned(size)
 
 
 @njit
@@ -126,6 +142,7 @@ def test_fma_rounds_once(lanes) -> None:
     exact = a.astype(np.float64) * b + c
     assert exact.any()
     np.testing.assert_array_equal(applied(_fma, a, b, c), exact.astype(np.float32))
+    np.testing.assert_array_equal(applied(_fnma, a, b, -c), -exact.astype(np.float32))
 
 
 def test_fma_of_special_numbers(lanes) -> None:
@@ -165,12 +182,23 @@ def test_lane_sum_adds_in_its_tree(rng) -> None:
         assert _lane_sum(values) == folded(values)
 
 
-def test_lane_sums_are_sixteen_lane_sums(rng) -> None:
-    values = (rng.normal(size=(LANES, LANES)) * 10.0 ** rng.integers(-3, 4, (LANES, 1))).astype(
-        np.float32
-    )
-    found = applied(_lane_sums, values.reshape(-1))
-    np.testing.assert_array_equal(found, [folded(row) for row in values])
+def test_transposition(rng) -> None:
+    square = rng.normal(size=(LANES, LANES)).astype(np.float32)
+    padded = np.concatenate([np.full(5, 7.0, np.float32), square.reshape(-1)])
+    loaded = np.empty(LANES * LANES, np.float32)
+    _load_transposed(padded, 5, loaded)
+    np.testing.assert_array_equal(loaded.reshape(LANES, LANES), square.T)
+    stored = np.zeros(LANES * LANES + 6, np.float32)
+    _store_transposed(square.reshape(-1), stored, 3)
+    np.testing.assert_array_equal(stored[3:-3].reshape(LANES, LANES), square.T)
+    assert not stored[:3].any()
+    assert not stored[-3:].any()
+
+
+@pytest.mark.parametrize("size", [1, 16, 100])
+def test_aligned_arrays(size: int) -> None:
+    arrays = [_aligned(size) for _ in range(8)]
+    assert all(array.ctypes.data % 64 == 0 and len(array) == size for array in arrays)
 
 
 def test_exp_is_accurate_where_it_is_used() -> None:

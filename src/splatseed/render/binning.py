@@ -1,11 +1,11 @@
 """Which Gaussians touch which tile, in depth order.
 
 Notation: tiles are 8 x 8 px, numbered row by row; a *pair* is a Gaussian with a tile that its ellipse
-touches, a *span* a Gaussian with the tiles of one row of tiles that it touches. Pairs are numbered
-Gaussian by Gaussian in depth order (their *slot*), and listed tile by tile in depth order;
-``listed_slot`` and ``listed_rank`` lead from the list back to slot and Gaussian. A Gaussian counts as
-touching a tile if within the rectangle of the tile's pixel centres its alpha reaches 1/255: exact, and
-opacity-aware, where a square of three sigmas would be far larger and still cut some off.
+touches, a *span* a Gaussian with the tiles of one row of tiles that it touches. Spans are numbered
+Gaussian by Gaussian in depth order, and each Gaussian's by row; pairs are listed tile by tile in depth
+order; ``listed_span`` and ``listed_rank`` lead from the list back to span and Gaussian. A Gaussian
+counts as touching a tile if within the rectangle of the tile's pixel centres its alpha reaches 1/255:
+exact, and opacity-aware, where a square of three sigmas would be far larger and still cut some off.
 Promise: ties in depth go by index; nothing depends on the number of threads.
 
 Stages: spans are sorted by row while they are found, then each row sorts its own by column. Both are
@@ -45,16 +45,16 @@ SLACK = 0.01
 
 
 class TileLists(NamedTuple):
-    """The pairs of one view: G visible Gaussians in depth order, P pairs, t tiles."""
+    """The pairs of one view: G visible Gaussians in depth order, P pairs, S spans, t tiles."""
 
-    slot_start: Int64[np.ndarray, " G+1"]
-    """First slot of each Gaussian (by depth rank), [G + 1]."""
+    span_start: Int64[np.ndarray, " G+1"]
+    """First span of each Gaussian (by depth rank), [G + 1]."""
     tile_start: Int64[np.ndarray, " t+1"]
     """First list entry of each tile, [t + 1]."""
     listed_rank: Int32[np.ndarray, " P"]
     """Depth rank of each list entry, [P]."""
-    listed_slot: Int32[np.ndarray, " P"]
-    """Slot of each list entry, [P]."""
+    listed_span: Int32[np.ndarray, " P"]
+    """Span of each list entry, [P]."""
 
 
 def row_order(rows: int) -> Int64[np.ndarray, " rows"]:
@@ -88,23 +88,22 @@ def list_tiles(records: Float32[np.ndarray, " 16*G"], width: int, height: int) -
     row_range = np.empty((num, 2), np.int32)
     touched = np.zeros((CHUNKS, rows + 1), np.int64)
     _find_rows(records, rows, row_range, touched)
-    # Spans lie row by row, and within a row chunk by chunk.
+    # In ``spans`` they lie row by row, and within a row chunk by chunk.
     per_row = touched[:, :-1].cumsum(axis=1).T
-    span_end = per_row.cumsum().reshape(rows, CHUNKS)
-    span_start = np.concatenate([[0], span_end[:, -1]])
-    spans = np.empty((span_start[-1], 4), np.uint32)
-    slot_start, pairs = np.zeros(num + 1, np.int64), np.zeros((CHUNKS, rows), np.int64)
-    cursor = np.ascontiguousarray((span_end - per_row).T)
-    _find_columns(records, columns, row_range, cursor, spans, slot_start[1:], pairs)
-    np.cumsum(slot_start, out=slot_start)
-    tile_start = np.empty(rows * columns + 1, np.int64)
-    tile_start[-1] = slot_start[-1]
+    row_end = per_row.cumsum().reshape(rows, CHUNKS)
+    row_spans = np.concatenate([[0], row_end[:, -1]])
+    spans = np.empty((row_spans[-1], 4), np.uint32)
+    span_start = np.zeros(num + 1, np.int64)
+    np.cumsum(row_range[:, 1] - row_range[:, 0], out=span_start[1:])
+    cursor = np.ascontiguousarray((row_end - per_row).T)
+    pairs = np.zeros((CHUNKS, rows), np.int64)
+    _find_columns(records, columns, row_range, span_start, cursor, spans, pairs)
     row_start = np.concatenate([[0], pairs.sum(axis=0).cumsum()])
-    ranks, slots = np.empty((2, slot_start[-1]), np.int32)
-    _fill(
-        row_order(rows), columns, span_start, spans, row_start, slot_start, tile_start, ranks, slots
-    )
-    return TileLists(slot_start, tile_start, ranks, slots)
+    tile_start = np.empty(rows * columns + 1, np.int64)
+    tile_start[-1] = row_start[-1]
+    ranks, listed = np.empty((2, row_start[-1]), np.int32)
+    _fill(row_order(rows), columns, row_spans, spans, row_start, tile_start, ranks, listed)
+    return TileLists(span_start, tile_start, ranks, listed)
 
 
 @kernel
@@ -207,7 +206,7 @@ def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-de
 
 @kernel
 def _find_columns(  # type: ignore[no-untyped-def]
-    records, columns, row_range, cursor, spans, pairs, pairs_of_row
+    records, columns, row_range, span_start, cursor, spans, pairs
 ):
     """Write the span of every Gaussian in each of its rows to the row's part of ``spans``.
 
@@ -218,17 +217,17 @@ def _find_columns(  # type: ignore[no-untyped-def]
         records: As in ``list_tiles``.
         columns: Tiles in a row.
         row_range: int32 [G, 2].
+        span_start: As in ``TileLists``.
         cursor: Where each chunk writes each row's next span, int64 [CHUNKS, rows].
-        spans: Written: rank, first column, one past the last, pairs in earlier rows, uint32 [S, 4].
-        pairs: Written, pairs of each Gaussian, int64 [G].
-        pairs_of_row: Pairs of each chunk in each row are added to it, int64 [CHUNKS, rows].
+        spans: Written: rank, first column, one past the last, number, uint32 [S, 4].
+        pairs: Pairs of each chunk in each row are added to it, int64 [CHUNKS, rows].
     """
     for k in parallel_range(CHUNKS):
         chunk = STRIDE * k % CHUNKS
-        for g in range(chunk * len(pairs) // CHUNKS, (chunk + 1) * len(pairs) // CHUNKS):
+        for g in range(chunk * len(row_range) // CHUNKS, (chunk + 1) * len(row_range) // CHUNKS):
             x, y = np.float64(records[RECORD * g]), np.float64(records[RECORD * g + 1])
             lean, extreme, width, falloff = _profile(*_ellipse(records, RECORD * g))
-            num = 0
+            span = span_start[g]
             for row in range(row_range[g, 0], row_range[g, 1]):
                 low = row * TILE + 0.5 - y
                 high = low + (TILE - 1)
@@ -239,10 +238,9 @@ def _find_columns(  # type: ignore[no-untyped-def]
                 place = cursor[chunk, row]
                 cursor[chunk, row] = place + 1
                 spans[place, 0], spans[place, 1] = g, first
-                spans[place, 2], spans[place, 3] = last, num
-                pairs_of_row[chunk, row] += last - first
-                num += last - first
-            pairs[g] = num
+                spans[place, 2], spans[place, 3] = last, span
+                pairs[chunk, row] += last - first
+                span += 1
 
 
 @always_inline
@@ -262,25 +260,24 @@ def _profile(a, b, c, reach):  # type: ignore[no-untyped-def]
 
 @kernel
 def _fill(  # type: ignore[no-untyped-def]
-    row_order, columns, span_start, spans, row_start, slot_start, tile_start, ranks, slots
+    row_order, columns, row_spans, spans, row_start, tile_start, ranks, listed
 ):
     """List each row's spans by tile.
 
     Args:
         row_order: The rows of tiles in the order in which they are taken, int64 [rows].
         columns: Tiles in a row.
-        span_start: First span of each row, int64 [rows + 1].
+        row_spans: Where in ``spans`` each row begins, int64 [rows + 1].
         spans: As in ``_find_columns``.
         row_start: First list entry of each row, int64 [rows + 1].
-        slot_start: As in ``TileLists``.
         tile_start: Written but for its end, as in ``TileLists``.
         ranks: ``listed_rank``, written.
-        slots: ``listed_slot``, written.
+        listed: ``listed_span``, written.
     """
     one = np.uint64(1)
     for turn in parallel_range(len(row_order)):
         row = row_order[turn]
-        begin, end = np.uint64(span_start[row]), np.uint64(span_start[row + 1])
+        begin, end = np.uint64(row_spans[row]), np.uint64(row_spans[row + 1])
         cursor = np.zeros(columns + 1, np.uint64)
         for s in range(begin, end):
             cursor[spans[s, 1]] += one
@@ -291,10 +288,8 @@ def _fill(  # type: ignore[no-untyped-def]
             tile_start[row * columns + column] = cursor[column] = place
             place += entries
         for s in range(begin, end):
-            rank = spans[s, 0]
-            slot = np.uint64(slot_start[rank]) + np.uint64(spans[s, 3])
+            rank, span = spans[s, 0], spans[s, 3]
             for column in range(spans[s, 1], spans[s, 2]):
                 place = cursor[column]
-                ranks[place], slots[place] = rank, slot
+                ranks[place], listed[place] = rank, span
                 cursor[column] = place + one
-                slot += one

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from splatseed.render import blending, harmonics as sh, layout, projection
+from splatseed.render import blending, blending_vjp, harmonics as sh, layout, projection
 from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles, row_order
 
 __all__ = ["Blend", "Harmonics", "Lens", "Project"]
@@ -195,11 +195,13 @@ class Blend(torch.autograd.Function):
         behind = np.zeros(channels, np.float32) if background is None else _array(background)
         image = np.empty((height, width, channels), np.float32)
         passing = np.empty((height, width), np.float32)
+        hits = np.empty(len(prepared.lists.listed_rank), np.uint8)
         for first in range(0, channels, blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
-            blocks = _forward(prepared, records)
+            blocks = _forward(prepared, records, hits)
             layout.from_blocks(*blocks, prepared.columns, behind, first, image, passing)  # type: ignore[call-arg]  # star arguments
         ctx.prepared, ctx.on_absgrad, ctx.passing, ctx.image = prepared, on_absgrad, passing, image
+        ctx.hits = hits
         ctx.save_for_backward(means2d, conics, colors, opacities, background)
         return torch.from_numpy(image), torch.from_numpy(1.0 - passing)
 
@@ -217,7 +219,7 @@ class Blend(torch.autograd.Function):
         for first in range(0, colors.shape[1], blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
             totals = _backward(
-                prepared, records, gradient, ctx.image, _array(d_alphas), passing, first,
+                prepared, records, ctx.hits, gradient, ctx.image, _array(d_alphas), passing, first,
                 ctx.on_absgrad is not None,
             )  # fmt: skip
             layout.scatter(  # type: ignore[call-arg]  # star arguments
@@ -285,12 +287,14 @@ def _gather(
     return records
 
 
-def _forward(prepared: _Prepared, records: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The block image and its transmittance."""
+def _forward(
+    prepared: _Prepared, records: np.ndarray, hits: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The block image and its transmittance; writes ``hits``."""
     image, transmittance = _aligned(prepared.lanes * blending.CHANNELS), _aligned(prepared.lanes)
     blending.forward(
         records, prepared.lists.tile_start, prepared.lists.listed_rank, prepared.row_order,
-        blending.COLUMN, blending.ROW, image, transmittance,
+        blending.COLUMN, blending.ROW, image, transmittance, hits,
     )  # fmt: skip
     return image, transmittance
 
@@ -298,6 +302,7 @@ def _forward(prepared: _Prepared, records: np.ndarray) -> tuple[np.ndarray, np.n
 def _backward(
     prepared: _Prepared,
     records: np.ndarray,
+    hits: np.ndarray,
     d_image: np.ndarray,
     image: np.ndarray,
     d_alphas: np.ndarray,
@@ -309,11 +314,11 @@ def _backward(
     lists, lanes = prepared.lists, prepared.lanes
     gradient, behind = _aligned(lanes * blending.CHANNELS), _aligned(lanes)
     layout.to_blocks(d_image, image, d_alphas, passing, prepared.columns, first, gradient, behind)
-    sums = _aligned(len(lists.listed_rank) * blending.SUMS, zero=True)
-    blending.backward(
-        records, lists.tile_start, lists.listed_rank, lists.listed_slot, prepared.row_order,
+    sums = _aligned(int(lists.span_start[-1]) * blending_vjp.SUMS, zero=True)
+    blending_vjp.backward(
+        records, lists.tile_start, lists.listed_rank, lists.listed_span, hits, prepared.row_order,
         blending.COLUMN, blending.ROW, gradient, behind, absolute, sums,
     )  # fmt: skip
-    totals = np.empty((len(prepared.order), blending.SUMS), np.float32)
-    blending.sum_pairs(lists.slot_start, sums, totals)
+    totals = np.empty((len(prepared.order), blending_vjp.SUMS), np.float32)
+    blending_vjp.sum_spans(lists.span_start, sums, totals)
     return totals

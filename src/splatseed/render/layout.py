@@ -1,8 +1,8 @@
 """Between PyTorch's arrays and those of the blending kernels.
 
 Notation: N Gaussians of which G are visible; ``order`` [G] leads from depth rank to index; an image is
-[H, W, D]; records, totals and block images are ``blending``'s. ``first`` is the first of the up to
-four channels that one pass of blending takes.
+[H, W, D]; records and block images are ``blending``'s. ``first`` is the first of the up to
+three channels that one pass of blending takes.
 Promise: every array is read and written once, in a fixed order; NumPy's gathers and transpositions of
 the same took a tenth of a training step.
 """
@@ -10,6 +10,8 @@ the same took a tenth of a training step.
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
@@ -20,6 +22,8 @@ from splatseed.render.simd import LANES
 
 __all__ = ["from_blocks", "gather", "mark_visible", "scatter", "to_blocks"]
 
+NEEDLE = 1.0 - 2.0**-22
+"""Enough less than 1 for float32 to round to an ellipse."""
 RGB = 3
 """Channels that have code of their own."""
 
@@ -64,13 +68,25 @@ def gather(order, means2d, conics, log_opacities, colors, first, records):
         i, record = order[g], records[RECORD * g : RECORD * (g + 1)]
         record[0], record[1] = means2d[i, 0], means2d[i, 1]
         record[2] = np.float32(-1 / 16) * conics[i, 0]
-        record[3] = np.float32(-1 / 8) * conics[i, 1]
+        record[3] = np.float32(-1 / 8) * _held(conics[i, 0], conics[i, 1], conics[i, 2])
         record[4] = np.float32(-1 / 16) * conics[i, 2]
         record[5] = np.float32(1 / 8) * log_opacities[g]
         for k in range(6, RECORD):
             record[k] = np.float32(0.0)
         for channel in range(wide):
             record[7 + channel] = colors[i, first + channel]
+
+
+@always_inline
+def _held(a, b, c):
+    """b, or as much of it as leaves the conic an ellipse, where float32 has rounded a needle past one.
+
+    Blending relies on sigma >= 0.
+    """
+    product = np.float64(a) * np.float64(c)
+    if np.float64(b) * np.float64(b) <= product:
+        return b
+    return np.float32(math.copysign(NEEDLE * math.sqrt(product), b))
 
 
 @kernel
@@ -81,7 +97,7 @@ def scatter(
 
     Args:
         order: uint32 [G].
-        totals: ``blending``'s sums over each Gaussian's pairs, float32 [G, 16].
+        totals: ``blending_vjp``'s sums over each Gaussian's spans, float32 [G, 16].
         first: First channel.
         conics: float32 [N, 3].
         opacities: float32 [N].

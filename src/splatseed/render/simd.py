@@ -21,22 +21,27 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
+from splatseed.jit import inline
+
 __all__ = [
     "LANES",
     "add",
+    "aligned",
     "any_greater",
     "divide",
     "exp_of_eighth",
     "fma",
+    "fnma",
     "lane_sum",
-    "lane_sums",
     "load",
+    "load_transposed",
     "minimum",
     "multiply",
     "negative_magnitude",
     "select_greater",
     "splat",
     "store",
+    "store_transposed",
     "subtract",
 ]
 
@@ -93,6 +98,17 @@ def fma(typing_context, a, b, c):  # noqa: ARG001
 
     def generate(context, builder, signature, arguments):  # noqa: ARG001
         return _call(builder, "fma", arguments)
+
+    return f32x16(f32x16, f32x16, f32x16), generate
+
+
+@intrinsic
+def fnma(typing_context, a, b, c):  # noqa: ARG001
+    """Minus a b plus c, rounded once."""
+
+    def generate(context, builder, signature, arguments):  # noqa: ARG001
+        a, b, c = arguments
+        return _call(builder, "fma", [builder.fneg(a), b, c])
 
     return f32x16(f32x16, f32x16, f32x16), generate
 
@@ -159,6 +175,64 @@ def store(typing_context, array, index, v):  # noqa: ARG001
     return types.void(array, types.intp, f32x16), generate
 
 
+@inline
+def aligned(size):
+    """A float32 array that begins where a vector register's worth of memory does."""
+    array = np.empty(size + LANES, np.float32)
+    first = -(array.ctypes.data // 4) % LANES
+    return array[first : first + size]
+
+
+@intrinsic
+def load_transposed(typing_context, array, index):  # noqa: ARG001
+    """Sixteen vectors of 256 elements: lane i of vector j is element ``index + 16 i + j``."""
+
+    def generate(context, builder, signature, arguments):
+        pointer = _address(context, builder, signature.args[0], *arguments)
+        rows = [builder.load(_row(builder, pointer, i), align=4) for i in range(LANES)]
+        return cgutils.pack_array(builder, _transposed(builder, rows))
+
+    return types.UniTuple(f32x16, LANES)(array, types.intp), generate
+
+
+@intrinsic
+def store_transposed(typing_context, array, index, vectors):  # noqa: ARG001
+    """Write lane i of vector j, of a tuple of sixteen, to element ``index + 16 i + j``."""
+
+    def generate(context, builder, signature, arguments):
+        pointer = _address(context, builder, signature.args[0], *arguments[:2])
+        rows = cgutils.unpack_tuple(builder, arguments[2])
+        for i, row in enumerate(_transposed(builder, rows)):
+            builder.store(row, _row(builder, pointer, i), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.UniTuple(f32x16, LANES)), generate
+
+
+def _row(builder, pointer, i):
+    return builder.gep(pointer, [ir.Constant(ir.IntType(64), i)])
+
+
+def _transposed(builder, rows):
+    """Lane i of row j becomes lane j of row i: bit by bit of both numbers."""
+    for width in (1, 2, 4, 8):
+        rows = _exchange(builder, rows, width)
+    return rows
+
+
+def _exchange(builder, rows, width):
+    """Swap, in every square of 2 x 2 blocks of ``width`` rows and lanes, the two off its diagonal."""
+    out = list(rows)
+    low = [k if not k & width else k - width + LANES for k in range(LANES)]
+    high = [k + width if not k & width else k + LANES for k in range(LANES)]
+    for i in range(LANES):
+        if not i & width:
+            pair = rows[i], rows[i + width]
+            out[i] = builder.shuffle_vector(*pair, ir.Constant(INDEX, low))
+            out[i + width] = builder.shuffle_vector(*pair, ir.Constant(INDEX, high))
+    return out
+
+
 def _fold(builder, vector, combine):
     """Combine the lanes in a tree: 8 with 8, 4 with 4, 2 with 2, 1 with 1."""
     undefined = ir.Constant(VECTOR, ir.Undefined)
@@ -190,38 +264,6 @@ def any_greater(typing_context, a, b):  # noqa: ARG001
         return builder.icmp_unsigned("!=", mask, ir.Constant(mask.type, 0))
 
     return types.boolean(f32x16, f32x16), generate
-
-
-@intrinsic
-def lane_sums(typing_context, vectors):  # noqa: ARG001
-    """Sixteen vectors to one: lane j of the result is the sum of the lanes of vector j.
-
-    Four rounds of adding halves of pairs (a transposition that sums) cost half of what sixteen
-    separate sums do. ``vectors`` is a tuple of sixteen.
-    """
-
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
-        rows = cgutils.unpack_tuple(builder, arguments[0])
-        width = LANES // 2
-        while width:
-            rows = [
-                _add_halves(builder, rows[i], rows[i + len(rows) // 2], width)
-                for i in range(len(rows) // 2)
-            ]
-            width //= 2
-        return rows[0]
-
-    return f32x16(types.UniTuple(f32x16, LANES)), generate
-
-
-def _add_halves(builder, a, b, width):
-    """Fold lanes ``width`` apart; a's sums fill the lanes whose ``width`` bit is 0, b's the rest."""
-    low = [lane if not lane & width else lane + LANES - width for lane in range(LANES)]
-    high = [lane + width if not lane & width else lane + LANES for lane in range(LANES)]
-    return builder.fadd(
-        builder.shuffle_vector(a, b, ir.Constant(INDEX, low)),
-        builder.shuffle_vector(a, b, ir.Constant(INDEX, high)),
-    )
 
 
 # exp(x) on [-0.7, 0] to 8e-8 relative (minimax, degree 5).

@@ -1,0 +1,250 @@
+"""Gradients of ``blending``, whose notation and arrays this file shares.
+
+It walks front to back again: with the image known, what lies behind a Gaussian is what the image has
+less what has been blended so far, so nothing need be stored but which blocks each Gaussian hits.
+
+Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums are kept by *span*, a Gaussian in a row
+of tiles: p; p dx, p dy; p dx^2, p dx dy, p dy^2; d channels; 0; |d mean x|, |d mean y|; rest 0, each
+summed over the row's pixels. With pixels at (x, y) from a block's centre and the mean at (mx, my),
+dx = mx - x, so that all of them follow from the moments of p about the centre.
+
+Stages: per tile and block the hits are queued, then blended with all state in registers. p and the
+gained weight of sixteen hits at a time are turned, so that a vector holds one pixel of sixteen
+Gaussians: their sums over pixels are then plain additions, and pixels have the same few coordinates.
+One thread takes a row of tiles from left to right, so that a span's sums are added up in a fixed order
+without atomics, while they are still in the cache: the same bytes every time.
+"""
+
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatseed.jit import always_inline, kernel, parallel_range
+from splatseed.render.binning import TILE
+from splatseed.render.blending import BLOCKS, CHANNELS, LOWEST, MAX_ALPHA, RECORD, STOP
+from splatseed.render.simd import (
+    LANES,
+    add,
+    aligned,
+    divide,
+    exp_of_eighth,
+    fma,
+    fnma,
+    lane_sum,
+    load,
+    load_transposed,
+    minimum,
+    multiply,
+    negative_magnitude,
+    select_greater,
+    splat,
+    store,
+    store_transposed,
+    subtract,
+)
+
+__all__ = ["SUMS", "backward", "sum_spans"]
+
+SUMS = 16
+"""Numbers of a span."""
+ABSOLUTE = 10
+"""Where among them the absolute gradients are."""
+CHUNK = 512
+"""Entries of a tile's list that are queued at a time."""
+WEIGHTS, MEANS = LANES * LANES, 2 * LANES * LANES
+"""Where in a batch of sixteen hits the gained weights and the means are; p is at 0."""
+BATCH = MEANS + 2 * LANES
+ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+OUTER = np.float32(1.5)
+"""A block's columns, and its rows, are at -OUTER, -HALF, HALF and OUTER from its centre."""
+
+
+@kernel
+def backward(
+    records, tile_start, listed_rank, listed_span, hits, row_order, lane_x, lane_y, gradient, behind,
+    absolute, sums,
+):  # fmt: skip
+    """The sums of every span.
+
+    Args:
+        records: As in ``blending.forward``.
+        tile_start: As there.
+        listed_rank: As there.
+        listed_span: The span of each list entry, int32 [P].
+        hits: As ``blending.forward`` wrote them.
+        row_order: As there.
+        lane_x: ``COLUMN``.
+        lane_y: ``ROW``.
+        gradient: d loss / d image, block image, float32 [t * 4 * CHANNELS * 16].
+        behind: gradient . final colour - (d loss / d alpha) T_final, float32 [t * 4 * 16]; used up.
+        absolute: Whether the absolute gradients of the means are wanted; else they are 0.
+        sums: Written: float32 [16 S]; must hold 0.
+    """
+    columns = (len(tile_start) - 1) // len(row_order)
+    for place in parallel_range(len(row_order)):
+        row = row_order[place]
+        queue, batch = np.empty(BLOCKS * CHUNK, np.int32), aligned(BATCH)
+        passing = aligned(BLOCKS * LANES)
+        for column in range(columns):
+            tile = row * columns + column
+            for q in range(BLOCKS):
+                store(passing, LANES * q, splat(ONE))
+            for start in range(tile_start[tile], tile_start[tile + 1], CHUNK):
+                stop = min(start + CHUNK, tile_start[tile + 1])
+                counts = _queue_hits(hits, start, stop, queue)
+                for q in range(BLOCKS):
+                    x, y = TILE * column + 4 * (q % 2), TILE * row + 4 * (q // 2)
+                    _backward_block(
+                        records, listed_rank, listed_span, queue, CHUNK * q, counts[q], lane_x, lane_y,
+                        np.float32(x), np.float32(y), gradient, CHANNELS * LANES * (BLOCKS * tile + q),
+                        behind, LANES * (BLOCKS * tile + q), passing, LANES * q, absolute, batch, sums,
+                    )  # fmt: skip
+
+
+@always_inline
+def _queue_hits(hits, start, stop, queue):
+    """Queue the list entries that hit each block; returns how many."""
+    n0 = n1 = n2 = n3 = 0
+    for entry in range(start, stop):
+        bits = np.int64(hits[entry])
+        # Written in any case, and written over by the next where the block is not hit.
+        queue[n0] = queue[CHUNK + n1] = queue[2 * CHUNK + n2] = queue[3 * CHUNK + n3] = entry
+        n0 += bits & 1
+        n1 += bits >> 1 & 1
+        n2 += bits >> 2 & 1
+        n3 += bits >> 3
+    return n0, n1, n2, n3
+
+
+@always_inline
+def _backward_block(
+    records, listed_rank, listed_span, queue, first, count, lane_x, lane_y, x, y, gradient, slopes,
+    behind, beyond, passing, light, absolute, batch, sums,
+):  # fmt: skip
+    """Blend the ``count`` hits from ``queue[first]`` of the block whose corner is (x, y).
+
+    ``slopes``, ``beyond`` and ``light`` are where the block begins in the arrays before them.
+    """
+    zero, stop = splat(ZERO), splat(STOP)
+    px, py = add(load(lane_x, 0), splat(x + HALF)), add(load(lane_y, 0), splat(y + HALF))
+    t, far = load(passing, light), load(behind, beyond)
+    v0, v1 = load(gradient, slopes), load(gradient, slopes + LANES)
+    v2 = load(gradient, slopes + 2 * LANES)
+    for begin in range(first, first + count, LANES):
+        end = min(begin + LANES, first + count)
+        for k in range(end - begin):
+            r = RECORD * np.int64(listed_rank[queue[begin + k]])
+            batch[MEANS + k], batch[MEANS + LANES + k] = records[r], records[r + 1]
+            alpha = _alpha(records, r, px, py)
+            rest = fnma(t, alpha, t)
+            alpha = select_greater(rest, stop, alpha, zero)
+            gained = multiply(t, alpha)
+            shade = multiply(v0, splat(records[r + 7]))
+            shade = fma(v1, splat(records[r + 8]), shade)
+            shade = fma(v2, splat(records[r + 9]), shade)
+            far = fnma(gained, shade, far)
+            slope = fnma(t, shade, divide(far, subtract(splat(ONE), alpha)))
+            # A clamped alpha is constant.
+            p = select_greater(splat(MAX_ALPHA), alpha, multiply(slope, alpha), zero)
+            t = select_greater(rest, stop, rest, zero)
+            store(batch, LANES * k, p)
+            store(batch, WEIGHTS + LANES * k, gained)
+        if absolute:
+            _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, batch, sums)
+        _reduce(batch, x + np.float32(2.0), y + np.float32(2.0), gradient, slopes)
+        for k in range(end - begin):
+            s = SUMS * np.int64(listed_span[queue[begin + k]])
+            store(sums, s, add(load(sums, s), load(batch, LANES * k)))
+    store(passing, light, t)
+    store(behind, beyond, far)
+
+
+@always_inline
+def _alpha(records, r, px, py):
+    """Alpha where it counts (alpha >= 1/255), else 0."""
+    dx, dy = subtract(splat(records[r]), px), subtract(splat(records[r + 1]), py)
+    h = fma(multiply(splat(records[r + 4]), dy), dy, splat(records[r + 5]))
+    h = fma(add(multiply(splat(records[r + 2]), dx), multiply(splat(records[r + 3]), dy)), dx, h)
+    alpha = select_greater(h, splat(LOWEST), exp_of_eighth(h), splat(ZERO))
+    return minimum(alpha, splat(MAX_ALPHA))
+
+
+@always_inline
+def _reduce(batch, center_x, center_y, gradient, slopes):
+    """From p, weights and means of sixteen hits to their sums over the block, one row each."""
+    zero, p = splat(ZERO), load_transposed(batch, 0)
+    s0, x0, xx0 = _moments(p[0], p[1], p[2], p[3])
+    s1, x1, xx1 = _moments(p[4], p[5], p[6], p[7])
+    s2, x2, xx2 = _moments(p[8], p[9], p[10], p[11])
+    s3, x3, xx3 = _moments(p[12], p[13], p[14], p[15])
+    s, y, yy = _moments(s0, s1, s2, s3)
+    x, xy, _ = _moments(x0, x1, x2, x3)
+    xx = add(add(xx0, xx3), add(xx1, xx2))
+    mx, my = load(batch, MEANS), load(batch, MEANS + LANES)
+    mx, my = subtract(mx, splat(center_x)), subtract(my, splat(center_y))
+    px, py = subtract(multiply(mx, s), x), subtract(multiply(my, s), y)
+    pxx, pyy = fma(mx, subtract(px, x), xx), fma(my, subtract(py, y), yy)
+    pxy = fma(mx, py, fnma(my, x, xy))
+    weights = load_transposed(batch, WEIGHTS)
+    c0, c1 = _dot(weights, gradient, slopes), _dot(weights, gradient, slopes + LANES)
+    c2 = _dot(weights, gradient, slopes + 2 * LANES)
+    store_transposed(
+        batch, 0,
+        (s, px, py, pxx, pxy, pyy, c0, c1, c2, zero, zero, zero, zero, zero, zero, zero),
+    )  # fmt: skip
+
+
+@always_inline
+def _moments(a, b, c, d):
+    """Sum, first and second moment of four values at -OUTER, -HALF, HALF and OUTER."""
+    outer, inner = add(a, d), add(b, c)
+    first = fma(subtract(d, a), splat(OUTER), multiply(subtract(c, b), splat(HALF)))
+    second = fma(outer, splat(OUTER * OUTER), multiply(inner, splat(HALF * HALF)))
+    return add(outer, inner), first, second
+
+
+@always_inline
+def _dot(w, values, first):
+    """The sum of w[i] values[first + i], even and odd ones apart: half as long a chain."""
+    even, odd = multiply(w[0], splat(values[first])), multiply(w[1], splat(values[first + 1]))
+    even, odd = fma(w[2], splat(values[first + 2]), even), fma(w[3], splat(values[first + 3]), odd)
+    even, odd = fma(w[4], splat(values[first + 4]), even), fma(w[5], splat(values[first + 5]), odd)
+    even, odd = fma(w[6], splat(values[first + 6]), even), fma(w[7], splat(values[first + 7]), odd)
+    even, odd = fma(w[8], splat(values[first + 8]), even), fma(w[9], splat(values[first + 9]), odd)
+    even = fma(w[10], splat(values[first + 10]), even)
+    odd = fma(w[11], splat(values[first + 11]), odd)
+    even = fma(w[12], splat(values[first + 12]), even)
+    odd = fma(w[13], splat(values[first + 13]), odd)
+    even = fma(w[14], splat(values[first + 14]), even)
+    odd = fma(w[15], splat(values[first + 15]), odd)
+    return add(even, odd)
+
+
+@always_inline
+def _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, batch, sums):
+    """What the pixels add to |d mean x| and |d mean y|, hit by hit."""
+    for k in range(end - begin):
+        entry = queue[begin + k]
+        r, s = RECORD * np.int64(listed_rank[entry]), SUMS * np.int64(listed_span[entry])
+        p = load(batch, LANES * k)
+        along_x = multiply(p, subtract(splat(records[r]), px))
+        along_y = multiply(p, subtract(splat(records[r + 1]), py))
+        # records hold -a/16, -b/8, -c/16
+        a, b = splat(np.float32(-16.0) * records[r + 2]), splat(np.float32(-8.0) * records[r + 3])
+        c = splat(np.float32(-16.0) * records[r + 4])
+        step_x = fma(a, along_x, multiply(b, along_y))
+        step_y = fma(b, along_x, multiply(c, along_y))
+        sums[s + ABSOLUTE] -= lane_sum(negative_magnitude(step_x))
+        sums[s + ABSOLUTE + 1] -= lane_sum(negative_magnitude(step_y))
+
+
+@kernel
+def sum_spans(span_start, sums, totals):
+    """Add up each Gaussian's spans in order: [16 S] to [G, 16] by depth rank."""
+    for g in parallel_range(len(totals)):
+        total = splat(ZERO)
+        for span in range(span_start[g], span_start[g + 1]):
+            total = add(total, load(sums, SUMS * span))
+        store(totals[g], 0, total)
