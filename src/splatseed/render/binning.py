@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt32
 
-from splatseed.jit import always_inline, kernel, parallel_range
+from splatseed.jit import always_inline, inline, kernel, parallel_range
 
 __all__ = ["TILE", "TileLists", "depth_order", "list_tiles", "row_order"]
 
@@ -67,13 +67,10 @@ def row_order(rows: int) -> Int64[np.ndarray, " rows"]:
 
 def depth_order(depths: Float32[np.ndarray, " N"], visible: np.ndarray) -> UInt32[np.ndarray, " G"]:
     """Indices of the visible Gaussians, nearest first, ties by index; no depth may be negative."""
-    keys = np.empty((2, len(depths)), np.uint64)
-    pieces = np.empty((2, CHUNKS), np.int64)
-    _make_keys(depths.view(np.uint32), visible, pieces, keys[0])
-    total = int((pieces[1] - pieces[0]).sum())
-    _sort(keys[0], keys[1], pieces, total, np.empty((CHUNKS, 1 << BITS), np.uint32))
+    keys, spare = np.empty((2, len(depths)), np.uint64)
+    total = _sort(depths.view(np.uint32), visible, keys, spare)
     # The lower halves are the indices.
-    return keys[0, :total].astype(np.uint32)
+    return keys[:total].astype(np.uint32)
 
 
 def list_tiles(records: Float32[np.ndarray, " 16*G"], width: int, height: int) -> TileLists:
@@ -106,57 +103,40 @@ def list_tiles(records: Float32[np.ndarray, " 16*G"], width: int, height: int) -
     return TileLists(span_start, tile_start, ranks, listed)
 
 
-@kernel
-def _make_keys(depths, visible, pieces, keys):  # type: ignore[no-untyped-def]
-    """Depths above indices, of the visible only: each chunk's from its first place on.
+@inline
+def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]
+    """Sort the visible by depth, digit by digit from the last; equal ones stay in their order.
 
-    Positive floats sort as their bits do.
-    """
-    for chunk in parallel_range(CHUNKS):
-        first, last = chunk * len(keys) // CHUNKS, (chunk + 1) * len(keys) // CHUNKS
-        place = first
-        for i in range(first, last):
-            # Written in any case, and written over by the next where this one is not visible.
-            keys[place] = np.uint64(depths[i]) << np.uint64(32) | np.uint64(i)
-            place += np.int64(visible[i])
-        pieces[0, chunk], pieces[1, chunk] = first, place
-
-
-@kernel
-def _sort(keys, spare, pieces, total, counts):  # type: ignore[no-untyped-def]
-    """Sort by the upper halves, digit by digit from the last; equal ones stay in their order.
+    On one thread: two gain as much as they lose by waiting for each other eight times.
 
     Args:
-        keys: uint64 [N], sorted in place.
-        spare: uint64 [N], room.
-        pieces: Where each chunk of ``keys`` begins and ends at first, int64 [2, CHUNKS]; used up.
-        total: How many keys.
-        counts: uint32 [CHUNKS, 2^BITS], room to count in.
+        depths: Their bits, uint32 [N]: positive floats sort as these do.
+        visible: bool [N].
+        keys: Written: depths above indices, sorted, uint64 [N].
+        spare: Room, uint64 [N].
+
+    Returns:
+        How many are visible.
     """
+    total, one, mask = np.uint64(0), np.uint32(1), np.uint64((1 << BITS) - 1)
+    for i in range(len(depths)):
+        # Written in any case, and written over by the next where this one is not visible.
+        keys[total] = np.uint64(depths[i]) << np.uint64(32) | np.uint64(i)
+        total += np.uint64(visible[i])
     for turn in range(PASSES):
-        shift = np.uint64(32 + BITS * turn)
-        for chunk in parallel_range(CHUNKS):
-            counts[chunk] = 0
-            for i in range(np.uint64(pieces[0, chunk]), np.uint64(pieces[1, chunk])):
-                counts[chunk, _digit(keys[i], shift)] += np.uint32(1)
+        shift, cursor = np.uint64(32 + BITS * turn), np.zeros(1 << BITS, np.uint32)
+        for i in range(total):
+            cursor[keys[i] >> shift & mask] += one
         place = np.uint32(0)
         for digit in range(1 << BITS):
-            for chunk in range(CHUNKS):
-                place, counts[chunk, digit] = place + counts[chunk, digit], place
-        for chunk in parallel_range(CHUNKS):
-            for i in range(np.uint64(pieces[0, chunk]), np.uint64(pieces[1, chunk])):
-                key, digit = keys[i], _digit(keys[i], shift)
-                place = counts[chunk, digit]
-                counts[chunk, digit] = place + np.uint32(1)
-                spare[place] = key
-            pieces[0, chunk] = chunk * total // CHUNKS
-            pieces[1, chunk] = (chunk + 1) * total // CHUNKS
+            place, cursor[digit] = place + cursor[digit], place
+        for i in range(total):
+            key = keys[i]
+            digit = key >> shift & mask
+            spare[cursor[digit]] = key
+            cursor[digit] += one
         keys, spare = spare, keys
-
-
-@always_inline
-def _digit(key, shift):  # type: ignore[no-untyped-def]
-    return key >> shift & np.uint64((1 << BITS) - 1)
+    return total
 
 
 @always_inline

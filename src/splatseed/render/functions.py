@@ -214,18 +214,20 @@ class Blend(torch.autograd.Function):
         means2d, conics, colors, opacities, background = ctx.saved_tensors
         prepared: _Prepared = ctx.prepared
         gradient, passing = _array(d_image), ctx.passing
-        shapes = [tuple(each.shape) for each in (means2d, conics, opacities, colors, means2d)]
+        absolute = ctx.on_absgrad is not None
+        shapes = [tuple(each.shape) for each in (means2d, conics, opacities, colors)]
+        shapes.append(shapes[0] if absolute else (0, 2))
         results = [np.zeros(shape, np.float32) for shape in shapes]
         for first in range(0, colors.shape[1], blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
             totals = _backward(
                 prepared, records, ctx.hits, gradient, ctx.image, _array(d_alphas), passing, first,
-                ctx.on_absgrad is not None,
+                absolute,
             )  # fmt: skip
             layout.scatter(  # type: ignore[call-arg]  # star arguments
                 prepared.order, totals, first, _array(conics), _array(opacities), *results
             )
-        if ctx.on_absgrad is not None:
+        if absolute:
             ctx.on_absgrad(torch.from_numpy(results[4]))
         d_background = None
         if background is not None and ctx.needs_input_grad[4]:

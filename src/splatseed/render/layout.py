@@ -105,7 +105,7 @@ def scatter(
         d_conics: Added to, float32 [N, 3].
         d_opacities: Added to, float32 [N].
         d_colors: Written in this pass's channels, float32 [N, D].
-        d_absolute: Written, the absolute gradients of the 2D means, float32 [N, 2].
+        d_absolute: Written, the absolute gradients of the 2D means, float32 [N, 2], or empty.
     """
     wide = min(CHANNELS, d_colors.shape[1] - first)
     for g in parallel_range(len(order)):
@@ -117,8 +117,8 @@ def scatter(
         d_conics[i, 1] += totals[g, 4]
         d_conics[i, 2] += np.float32(0.5) * totals[g, 5]
         d_opacities[i] -= totals[g, 0] / opacities[i]
-        for k in range(2):
-            d_absolute[i, k] = totals[g, 10 + k]
+        if len(d_absolute):
+            d_absolute[i, 0], d_absolute[i, 1] = totals[g, 10], totals[g, 11]
         for channel in range(wide):
             d_colors[i, first + channel] = totals[g, 6 + channel]
 
