@@ -91,19 +91,35 @@ def test_radii_know_the_opacity() -> None:
 
 @pytest.mark.parametrize("degree", range(4))
 def test_harmonics(rng, degree: int) -> None:
-    directions = torch.tensor(rng.normal(size=(200, 3)), dtype=torch.float32)
-    coefficients = torch.tensor(rng.normal(size=(200, 16, 3)), dtype=torch.float32)
+    arrays = rng.normal(size=(200, 3)), rng.normal(size=3), rng.normal(size=(200, 16, 3))
     weights = torch.tensor(rng.normal(size=(200, 3)))
-    ours = [each.clone().requires_grad_() for each in (directions, coefficients)]
-    slow = [each.double().requires_grad_() for each in (directions, coefficients)]
-    found = Harmonics.apply(*ours, None, torch.ones(200, dtype=torch.bool), degree)
-    expected = _spherical_harmonics(degree, *slow)
+    ours = [torch.tensor(each, dtype=torch.float32).requires_grad_() for each in arrays]
+    slow = [each.detach().double().requires_grad_() for each in ours]
+    found = Harmonics.apply(*ours, None, torch.ones(200, 2, dtype=torch.int32), degree)
+    harmonics = _spherical_harmonics(degree, slow[0] - slow[1], slow[2])
+    expected = torch.clamp_min(harmonics + 0.5, 0.0)
+    assert bool((expected == 0).any())
     torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=1e-6)
     (found * weights.float()).sum().backward()
     (expected * weights).sum().backward()
-    by_direction = torch.zeros(200, 3) if degree == 0 else slow[0].grad  # a constant has none
-    torch.testing.assert_close(ours[0].grad.double(), by_direction.double(), rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(ours[1].grad.double(), slow[1].grad, rtol=1e-6, atol=1e-6)
+    for mine, theirs, tolerance in zip(ours, slow, (1e-5, 1e-4, 1e-6), strict=True):
+        grad = torch.zeros_like(theirs) if theirs.grad is None else theirs.grad
+        torch.testing.assert_close(mine.grad.double(), grad, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("coefficients", [4, 9, 16, 25])
+def test_coefficients_that_take_no_part_do_not_matter(rng, coefficients: int) -> None:
+    scene = random_scene(rng, coefficients=coefficients)
+    broken, few = {**scene, "colors": scene["colors"].clone()}, dict(scene)
+    broken["colors"][:, 4:] = torch.nan
+    few["colors"] = scene["colors"][:, :4]
+    found, expected = (rasterization(**each, sh_degree=1)[0] for each in (broken, few))
+    assert torch.equal(found, expected)
+    broken["colors"].requires_grad_()
+    rasterization(**broken, sh_degree=1)[0].sum().backward()
+    gradient = broken["colors"].grad
+    assert bool(gradient[:, :4].any())
+    assert not gradient[:, 4:].any()
 
 
 def test_colors_are_half_more_and_never_negative() -> None:

@@ -69,7 +69,7 @@ class Project(torch.autograd.Function):
         n = len(means)
         radii, out = (
             np.empty((n, 2), np.int32),
-            [np.zeros(shape, np.float32) for shape in ((n, 2), (n,), (n, 3), (n,))],
+            [np.empty(shape, np.float32) for shape in ((n, 2), (n,), (n, 3), (n,))],
         )
         projection.project(*arrays, *lens, radii, *out)  # type: ignore[call-arg]  # star arguments
         ctx.save_for_backward(means, quats, scales, viewmat)
@@ -84,58 +84,80 @@ class Project(torch.autograd.Function):
         """Gradients of the inputs."""
         means, quats, scales, viewmat = (_array(t) for t in ctx.saved_tensors)
         lens: Lens = ctx.lens
-        results = [np.zeros(each.shape, np.float32) for each in (means, quats, scales)]
-        by_view = np.zeros((projection.CHUNKS, 4, 4))
+        results = [np.empty(each.shape, np.float32) for each in (means, quats, scales)]
+        by_view = np.empty((projection.CHUNKS, 3, 4))
         projection.project_vjp(  # type: ignore[call-arg]  # star arguments
             means, quats, scales, viewmat, lens.K, lens.width, lens.height, lens.eps2d, ctx.radii,
             *(_array(g) for g in gradients[1:]), *results, by_view,
         )  # fmt: skip
-        d_view = torch.from_numpy(by_view.sum(axis=0).astype(np.float32))
+        d_view = torch.zeros(4, 4)
+        d_view[:3] = torch.from_numpy(by_view.sum(axis=0))
         return (*(torch.from_numpy(r) for r in results), None, d_view, None)
 
 
 class Harmonics(torch.autograd.Function):
-    """Directions [N, 3], coefficients, visible [N], degree to colours [N, 3].
+    """Harmonics to colours [N, 3]: 0.5 more, and at least 0.
 
-    Coefficients come in one tensor [N, K, 3] and None, or in two, [N, 1, 3] and [N, K - 1, 3].
+    Inputs: means [N, 3], the camera's place [3], coefficients, radii [N, 2], degree. Coefficients come
+    in one tensor [N, K, 3] and None, or in two, [N, 1, 3] and [N, K - 1, 3].
     """
 
     @staticmethod
     def forward(  # type: ignore[override]
         ctx: Any,
-        directions: Tensor,
+        means: Tensor,
+        origin: Tensor,
         base: Tensor,
         rest: Tensor | None,
-        visible: Tensor,
+        radii: Tensor,
         degree: int,
     ) -> Tensor:
         """Run the kernel and keep what backward needs."""
-        colors = np.empty((len(directions), 3), np.float32)
-        terms = (degree + 1) ** 2
-        sh.harmonics(_array(directions), *_two_arrays(base, rest), _array(visible), terms, colors)
-        ctx.save_for_backward(directions, base, rest, visible)
-        ctx.terms = terms
+        colors = np.empty((len(means), 3), np.float32)
+        sh.harmonics(  # type: ignore[call-arg]  # star arguments
+            _array(means), _array(origin), *_coefficients(base, rest), _array(radii),
+            sh.TABLES[degree], colors,
+        )  # fmt: skip
+        ctx.save_for_backward(means, origin, base, rest, radii)
+        ctx.degree, ctx.colors = degree, colors
         return torch.from_numpy(colors)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, d_colors: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         """Gradients of the inputs."""
-        directions, base, rest, visible = ctx.saved_tensors
-        d_directions, d_base = (np.zeros(each.shape, np.float32) for each in (directions, base))
-        d_rest = d_base if rest is None else np.zeros(rest.shape, np.float32)
+        means, origin, base, rest, radii = ctx.saved_tensors
+        first, rows, skipped = _coefficients(base, rest)
+        d_means, d_rows = np.empty(means.shape, np.float32), np.empty(rows.shape, np.float32)
+        d_first = d_rows.reshape(first.shape) if rest is None else np.empty(first.shape, np.float32)
         sh.harmonics_vjp(  # type: ignore[call-arg]  # star arguments
-            _array(directions), *_two_arrays(base, rest)[1:], _array(visible), ctx.terms,
-            _array(d_colors), d_directions, d_base, d_rest,
+            _array(means), _array(origin), rows, skipped, _array(radii), sh.TABLES[ctx.degree],
+            ctx.colors, _array(d_colors), d_means, d_first, d_rows,
         )  # fmt: skip
-        by_rest = None if rest is None else torch.from_numpy(d_rest)
-        return torch.from_numpy(d_directions), torch.from_numpy(d_base), by_rest, None, None
+        d_base, d_rest = torch.from_numpy(_resized(d_first, base.shape[1])), None
+        if rest is not None:
+            d_rest = torch.from_numpy(
+                _resized(d_rows.reshape(len(rest), sh.TERMS - 1, 3), rest.shape[1])
+            )
+        d_origin = None
+        if ctx.needs_input_grad[1]:
+            d_origin = torch.from_numpy(-d_means.sum(axis=0, dtype=np.float64)).to(origin.dtype)
+        return torch.from_numpy(d_means), d_origin, d_base, d_rest, None, None
 
 
-def _two_arrays(base: Tensor, rest: Tensor | None) -> tuple[np.ndarray, np.ndarray, int]:
-    """``base``, ``rest`` and ``shift`` as ``harmonics`` has them."""
-    first = _array(base)
-    return (first, first, 0) if rest is None else (first, _array(rest), 1)
+def _coefficients(base: Tensor, rest: Tensor | None) -> tuple[np.ndarray, np.ndarray, int]:
+    """``base``, ``rest`` and ``skipped`` as ``harmonics`` has them."""
+    if rest is None:
+        joined = _resized(_array(base), sh.TERMS)
+        return joined, joined.reshape(-1), 3
+    return _array(base), _resized(_array(rest), sh.TERMS - 1).reshape(-1), 0
+
+
+def _resized(array: np.ndarray, count: int) -> np.ndarray:
+    """Filled with zeros or cut along axis 1; as it is where nothing changes."""
+    kept = array[:, :count]
+    missing = count - kept.shape[1]
+    return np.ascontiguousarray(np.pad(kept, ((0, 0), (0, missing), (0, 0))) if missing else kept)
 
 
 class _Prepared(NamedTuple):

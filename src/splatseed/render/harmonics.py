@@ -2,6 +2,12 @@
 
 Basis, order and signs are those of 3D Gaussian Splatting and gsplat (P.-P. Sloan, Efficient Spherical
 Harmonic Evaluation, 2013). The direction runs from the camera to the Gaussian and is normalised here.
+
+Notation: x, y, z is the unit direction. Every basis function is a *factor* (1, x, y or z) times a *form*,
+c0 + c1 xx + c2 yy + c3 zz + c4 xy + c5 yz + c6 xz: lane k of a vector holds function k. A *row* is the
+45 numbers of a Gaussian beyond its first coefficients, three channels of 15; it is read as three
+vectors from ``FIRST`` on, which overlap.
+Directions are normalised in float64, the rest is float32.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -13,133 +19,264 @@ import math
 import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
+from splatseed.render.shuffles import lane, permutation, three_sums, triple
+from splatseed.render.simd import LANES, add, fma, load, multiply, select_greater, splat, store
 
-__all__ = ["MAX_DEGREE", "harmonics", "harmonics_vjp"]
+__all__ = ["MAX_DEGREE", "TABLES", "TERMS", "harmonics", "harmonics_vjp"]
 
 MAX_DEGREE = 3
 TERMS = 16
+CHANNELS = 3
+ROW = 45
 CHUNKS = 64
-"""Pieces that threads take, each with working arrays of its own."""
-Y0 = 0.2820947917738781
+"""Pieces that threads take."""
+FIRST = (0, 15, 29)
+"""Where in a row its three vectors begin: the last of them ends with it."""
+PART = 15
+"""How many numbers of a row count in each of its vectors."""
+Y0 = np.float32(0.2820947917738781)
 Y1 = 0.48860251190292
 Y2A, Y2B, Y2C = 1.0925484305920792, 0.9461746957575601, 0.5462742152960396
 Y2D = 0.3153915652525201
 Y3A, Y3B, Y3C = 0.5900435899266435, 2.890611442640554, 0.4570457994644658
 Y3D, Y3E = 0.3731763325901154, 1.445305721320277
+FUNCTIONS: tuple[tuple[str, dict[str, float]], ...] = (
+    ("1", {"1": float(Y0)}),
+    ("y", {"1": -Y1}),
+    ("z", {"1": Y1}),
+    ("x", {"1": -Y1}),
+    ("1", {"xy": Y2A}),
+    ("1", {"yz": -Y2A}),
+    ("1", {"zz": Y2B, "1": -Y2D}),
+    ("1", {"xz": -Y2A}),
+    ("1", {"xx": Y2C, "yy": -Y2C}),
+    ("y", {"xx": -3.0 * Y3A, "yy": Y3A}),
+    ("z", {"xy": Y3B}),
+    ("y", {"zz": -5.0 * Y3C, "1": Y3C}),
+    ("z", {"zz": 5.0 * Y3D, "1": -3.0 * Y3D}),
+    ("x", {"zz": -5.0 * Y3C, "1": Y3C}),
+    ("z", {"xx": Y3E, "yy": -Y3E}),
+    ("x", {"xx": -Y3A, "yy": 3.0 * Y3A}),
+)
+"""Factor and form of the basis functions."""
+FACTORS, FORMS = ("1", "x", "y", "z"), ("1", "xx", "yy", "zz", "xy", "yz", "xz")
+FORM, LIVE = LANES * len(FACTORS), LANES * (len(FACTORS) + len(FORMS))
+"""Where in a table the forms begin, and the marks of the numbers of a row that count."""
+
+
+def _coefficient_of(number: int) -> int:
+    """Which coefficient a number of a row belongs to."""
+    return 1 + number // CHANNELS
+
+
+def _table(degree: int) -> np.ndarray:
+    """What the kernels read, flat: factors, forms, and which lanes of a row's vectors count."""
+    terms = (degree + 1) ** 2
+    table = np.zeros((len(FACTORS) + len(FORMS) + len(FIRST), LANES), np.float32)
+    for k, (factor, form) in enumerate(FUNCTIONS[:terms]):
+        table[FACTORS.index(factor), k] = 1.0
+        for name, value in form.items():
+            table[len(FACTORS) + FORMS.index(name), k] = value
+    for part, first in enumerate(FIRST):
+        for number in range(PART * part, PART * (part + 1)):
+            table[part - len(FIRST), number - first] = _coefficient_of(number) < terms
+    return table.reshape(-1)
+
+
+TABLES = tuple(map(_table, range(MAX_DEGREE + 1)))
+"""By degree, float32 [224]."""
+
+# Lane k of the basis to the three numbers of a row that it goes with, in each of the vectors.
+spread_0, spread_1, spread_2 = (
+    permutation([_coefficient_of(first + j) for j in range(LANES)]) for first in FIRST
+)
+# A colour to the channels of a row's vectors; of the first two they are the same.
+channels_01, channels_2 = (
+    permutation([(first + j) % CHANNELS for j in range(LANES)]) for first in FIRST[1:]
+)
+later_1, later_3, later_6, later_12 = (
+    permutation([(j + step) % LANES for j in range(LANES)]) for step in (1, 3, 6, 12)
+)
+lane_0, lane_1, lane_2, lane_4, lane_8 = map(lane, (0, 1, 2, 4, 8))
 
 
 @kernel
-def harmonics(directions, base, rest, shift, visible, terms, colors):  # type: ignore[no-untyped-def]
-    """Colours of N Gaussians.
+def harmonics(means, origin, base, rest, skipped, radii, table, colors):
+    """Colours of N Gaussians: 0.5 more than their harmonics, and at least 0.
 
     Args:
-        directions: float32 [N, 3], of any length.
-        base: float32 [N, 1 or K, 3].
-        rest: float32 [N, K - shift, 3].
-        shift: 0 or 1.
-        visible: bool [N]; colours of others are 0.
-        terms: How many of the K take part: (degree + 1)^2.
+        means: float32 [N, 3].
+        origin: Where the camera stands, float32 [3].
+        base: First coefficients, float32 [N, 1 or 16, 3].
+        rest: The rows one after the other, float32 [N (skipped + 45)].
+        skipped: How many numbers stand before each row.
+        radii: int32 [N, 2]; where one is 0 the colour is 0.
+        table: The degree's of ``TABLES``.
         colors: Written, float32 [N, 3].
     """
     for chunk in parallel_range(CHUNKS):
-        basis = np.empty(TERMS)
-        for i in range(chunk * len(directions) // CHUNKS, (chunk + 1) * len(directions) // CHUNKS):
-            colors[i, 0] = colors[i, 1] = colors[i, 2] = 0.0
-            if visible[i]:
-                x, y, z, _ = _unit(directions[i])
-                _basis(x, y, z, terms, basis)
-                for channel in range(3):
-                    total = basis[0] * base[i, 0, channel]
-                    for k in range(1, terms):
-                        total += basis[k] * rest[i, k - shift, channel]
-                    colors[i, channel] = total
+        for i in range(chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS):
+            if radii[i, 0] > 0 and radii[i, 1] > 0:
+                x, y, z = _offset(means, origin, i)
+                inverse = 1.0 / _length(x, y, z)
+                x, y, z = x * inverse, y * inverse, z * inverse
+                factor, form = _basis(*_vectors(x, y, z), table)
+                basis = multiply(factor, form)
+                a, b, c = _row(rest, i * (skipped + ROW) + skipped, table)
+                total = fma(spread_1(basis), b, multiply(spread_0(basis), a))
+                total = _by_channel(add(total, later_1(multiply(spread_2(basis), c))))
+                colors[i, 0] = _shade(base[i, 0, 0], lane_0(total))
+                colors[i, 1] = _shade(base[i, 0, 1], lane_1(total))
+                colors[i, 2] = _shade(base[i, 0, 2], lane_2(total))
+            else:
+                colors[i, 0] = colors[i, 1] = colors[i, 2] = np.float32(0.0)
 
 
 @kernel
-def harmonics_vjp(  # type: ignore[no-untyped-def]
-    directions, rest, shift, visible, terms, d_colors, d_directions, d_base, d_rest
+def harmonics_vjp(
+    means, origin, rest, skipped, radii, table, colors, d_colors, d_means, d_base, d_rest
 ):
     """Gradients of ``harmonics``.
 
     Args:
-        directions: As in ``harmonics``.
-        rest: [N, K - shift, 3].
-        shift: 0 or 1.
-        visible: [N].
-        terms: (degree + 1)^2.
+        means: As in ``harmonics``, and so on to ``colors``.
+        origin: [3].
+        rest: [N (skipped + 45)].
+        skipped: Numbers before each row.
+        radii: [N, 2].
+        table: The degree's.
+        colors: What ``harmonics`` wrote, [N, 3].
         d_colors: d loss / d colors, float32 [N, 3].
-        d_directions: Written, float32 [N, 3]; must hold 0.
-        d_base: Written, float32 [N, 1 or K, 3]; must hold 0.
-        d_rest: Written, float32 like ``rest``; must hold 0.
+        d_means: Written, float32 [N, 3].
+        d_base: Written, float32 like ``base``, of which only the first coefficients.
+        d_rest: Written, float32 like ``rest``, of which only the rows.
     """
     for chunk in parallel_range(CHUNKS):
-        basis, slope, weight = np.empty(TERMS), np.zeros((3, TERMS)), np.empty(TERMS)
-        for i in range(chunk * len(directions) // CHUNKS, (chunk + 1) * len(directions) // CHUNKS):
-            if visible[i]:
-                x, y, z, length = _unit(directions[i])
-                _basis(x, y, z, terms, basis)
-                _slopes(x, y, z, terms, slope)
-                for channel in range(3):
-                    d_base[i, 0, channel] = basis[0] * d_colors[i, channel]
-                for k in range(1, terms):
-                    weight[k] = 0.0
-                    for channel in range(3):
-                        d_rest[i, k - shift, channel] = basis[k] * d_colors[i, channel]
-                        weight[k] += rest[i, k - shift, channel] * np.float64(d_colors[i, channel])
-                dx = dy = dz = 0.0
-                for k in range(1, terms):
-                    dx += weight[k] * slope[0, k]
-                    dy += weight[k] * slope[1, k]
-                    dz += weight[k] * slope[2, k]
+        for i in range(chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS):
+            red, green, blue = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            dx = dy = dz = 0.0
+            row = i * (skipped + ROW) + skipped
+            if radii[i, 0] > 0 and radii[i, 1] > 0:
+                red = _unless_held(d_colors[i, 0], colors[i, 0])
+                green = _unless_held(d_colors[i, 1], colors[i, 1])
+                blue = _unless_held(d_colors[i, 2], colors[i, 2])
+                x, y, z = _offset(means, origin, i)
+                inverse = 1.0 / _length(x, y, z)
+                x, y, z = x * inverse, y * inverse, z * inverse
+                d_color = triple(red, green, blue)
+                slopes = _row_vjp(*_vectors(x, y, z), d_color, rest, row, table, d_rest)
+                dx, dy, dz = lane_0(slopes), lane_4(slopes), lane_8(slopes)
                 along = dx * x + dy * y + dz * z
-                d_directions[i, 0] = (dx - along * x) / length
-                d_directions[i, 1] = (dy - along * y) / length
-                d_directions[i, 2] = (dz - along * z) / length
+                dx, dy = (dx - along * x) * inverse, (dy - along * y) * inverse
+                dz = (dz - along * z) * inverse
+            else:
+                zero = splat(np.float32(0.0))
+                store(d_rest, row + FIRST[0], zero)
+                store(d_rest, row + FIRST[1], zero)
+                store(d_rest, row + FIRST[2], zero)
+            d_means[i, 0], d_means[i, 1], d_means[i, 2] = dx, dy, dz
+            d_base[i, 0, 0], d_base[i, 0, 1], d_base[i, 0, 2] = Y0 * red, Y0 * green, Y0 * blue
 
 
 @always_inline
-def _unit(direction):  # type: ignore[no-untyped-def]
-    x, y, z = np.float64(direction[0]), np.float64(direction[1]), np.float64(direction[2])
-    length = max(math.sqrt(x * x + y * y + z * z), 1e-12)
-    return x / length, y / length, z / length, length
+def _offset(means, origin, i):
+    """From the camera to a Gaussian, float64."""
+    return (
+        np.float64(means[i, 0] - origin[0]), np.float64(means[i, 1] - origin[1]),
+        np.float64(means[i, 2] - origin[2]),
+    )  # fmt: skip
 
 
 @always_inline
-def _basis(x, y, z, terms, out):  # type: ignore[no-untyped-def]
-    """The basis functions at a unit direction."""
-    out[0] = Y0
-    if terms > 1:
-        out[1], out[2], out[3] = -Y1 * y, Y1 * z, -Y1 * x
-    if terms > 4:
-        out[4], out[5], out[6] = Y2A * x * y, -Y2A * y * z, Y2B * z * z - Y2D
-        out[7], out[8] = -Y2A * x * z, Y2C * (x * x - y * y)
-    if terms > 9:
-        out[9] = -Y3A * y * (3.0 * x * x - y * y)
-        out[10] = Y3B * x * y * z
-        out[11] = -Y3C * y * (5.0 * z * z - 1.0)
-        out[12] = Y3D * z * (5.0 * z * z - 3.0)
-        out[13] = -Y3C * x * (5.0 * z * z - 1.0)
-        out[14] = Y3E * z * (x * x - y * y)
-        out[15] = -Y3A * x * (x * x - 3.0 * y * y)
+def _length(x, y, z):
+    return max(math.sqrt(x * x + y * y + z * z), 1e-12)
 
 
 @always_inline
-def _slopes(x, y, z, terms, out):  # type: ignore[no-untyped-def]
-    """Derivatives of ``_basis`` along x, y and z; ``out`` holds 0."""
-    if terms > 1:
-        out[1, 1], out[2, 2], out[0, 3] = -Y1, Y1, -Y1
-    if terms > 4:
-        out[0, 4], out[1, 4] = Y2A * y, Y2A * x
-        out[1, 5], out[2, 5] = -Y2A * z, -Y2A * y
-        out[2, 6] = 2.0 * Y2B * z
-        out[0, 7], out[2, 7] = -Y2A * z, -Y2A * x
-        out[0, 8], out[1, 8] = 2.0 * Y2C * x, -2.0 * Y2C * y
-    if terms > 9:
-        out[0, 9], out[1, 9] = -6.0 * Y3A * x * y, -3.0 * Y3A * (x * x - y * y)
-        out[0, 10], out[1, 10], out[2, 10] = Y3B * y * z, Y3B * x * z, Y3B * x * y
-        out[1, 11], out[2, 11] = -Y3C * (5.0 * z * z - 1.0), -10.0 * Y3C * y * z
-        out[2, 12] = Y3D * (15.0 * z * z - 3.0)
-        out[0, 13], out[2, 13] = -Y3C * (5.0 * z * z - 1.0), -10.0 * Y3C * x * z
-        out[0, 14], out[1, 14] = 2.0 * Y3E * x * z, -2.0 * Y3E * y * z
-        out[2, 14] = Y3E * (x * x - y * y)
-        out[0, 15], out[1, 15] = -3.0 * Y3A * (x * x - y * y), 6.0 * Y3A * x * y
+def _vectors(x, y, z):
+    return splat(np.float32(x)), splat(np.float32(y)), splat(np.float32(z))
+
+
+@always_inline
+def _basis(x, y, z, table):
+    """Factors and forms of the basis functions."""
+    factor = fma(load(table, LANES), x, load(table, 0))
+    factor = fma(load(table, 3 * LANES), z, fma(load(table, 2 * LANES), y, factor))
+    form = fma(load(table, FORM + LANES), multiply(x, x), load(table, FORM))
+    form = fma(load(table, FORM + 2 * LANES), multiply(y, y), form)
+    form = fma(load(table, FORM + 3 * LANES), multiply(z, z), form)
+    form = fma(load(table, FORM + 4 * LANES), multiply(x, y), form)
+    form = fma(load(table, FORM + 5 * LANES), multiply(y, z), form)
+    return factor, fma(load(table, FORM + 6 * LANES), multiply(x, z), form)
+
+
+@always_inline
+def _row(rest, row, table):
+    """A row's three vectors; what does not count is 0, also if it is NaN, and so are repetitions."""
+    return (
+        _live(load(rest, row + FIRST[0]), load(table, LIVE)),
+        _live(load(rest, row + FIRST[1]), load(table, LIVE + LANES)),
+        _live(load(rest, row + FIRST[2]), load(table, LIVE + 2 * LANES)),
+    )
+
+
+@always_inline
+def _live(v, marks):
+    zero = splat(np.float32(0.0))
+    return select_greater(marks, zero, v, zero)
+
+
+@always_inline
+def _by_channel(v):
+    """Sums of lanes 0, 3, 6, 9, 12, of 1, 4, ... and of 2, 5, ... in lanes 0 to 2."""
+    pairs = add(v, later_6(v))
+    return add(add(pairs, later_3(pairs)), later_12(v))
+
+
+@always_inline
+def _shade(base, others):
+    """The colour; NaN stays NaN, for who blends leaves it out."""
+    shade = (Y0 * base + others) + np.float32(0.5)
+    return np.float32(0.0) if shade < np.float32(0.0) else shade  # noqa: FURB136  (NaN)
+
+
+@always_inline
+def _unless_held(d_color, color):
+    """The gradient of a colour that is not held at 0."""
+    return d_color if color > np.float32(0.0) else np.float32(0.0)
+
+
+@always_inline
+def _row_vjp(x, y, z, d_color, rest, row, table, d_rest):
+    """Write a row's gradient; return those of x, y and z in lanes 0, 4 and 8."""
+    factor, form = _basis(x, y, z, table)
+    basis = multiply(factor, form)
+    red_first, blue_first = channels_01(d_color), channels_2(d_color)
+    store(d_rest, row + FIRST[0], multiply(spread_0(basis), red_first))
+    store(d_rest, row + FIRST[1], multiply(spread_1(basis), red_first))
+    store(d_rest, row + FIRST[2], multiply(spread_2(basis), blue_first))
+    a, b, c = _row(rest, row, table)
+    a, b, c = multiply(a, red_first), multiply(b, red_first), multiply(c, blue_first)
+    xx, yy, zz = add(x, x), add(y, y), add(z, z)
+    by_x = _slope(xx, y, z, FORM + LANES, FORM + 4 * LANES, FORM + 6 * LANES, table)
+    by_y = _slope(yy, x, z, FORM + 2 * LANES, FORM + 4 * LANES, FORM + 5 * LANES, table)
+    by_z = _slope(zz, y, x, FORM + 3 * LANES, FORM + 5 * LANES, FORM + 6 * LANES, table)
+    return three_sums(
+        _weighted(fma(load(table, LANES), form, multiply(factor, by_x)), a, b, c),
+        _weighted(fma(load(table, 2 * LANES), form, multiply(factor, by_y)), a, b, c),
+        _weighted(fma(load(table, 3 * LANES), form, multiply(factor, by_z)), a, b, c),
+    )
+
+
+@always_inline
+def _slope(twice, one, other, square, with_one, with_other, table):
+    """Derivatives of the forms along an axis: of its square, and of its products with the others."""
+    slope = fma(load(table, with_one), one, multiply(load(table, with_other), other))
+    return fma(load(table, square), twice, slope)
+
+
+@always_inline
+def _weighted(slopes, a, b, c):
+    """Slopes times the numbers of a row, to be summed over lanes."""
+    total = fma(spread_1(slopes), b, multiply(spread_0(slopes), a))
+    return fma(spread_2(slopes), c, total)

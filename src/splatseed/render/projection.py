@@ -1,14 +1,15 @@
 """Projection of 3D Gaussians to the image plane (EWA splatting), and its gradient.
 
 Specification (``reference.py`` is its readable form). With W, t the camera's rotation and translation,
-m_c = W m + t = (x, y, z), M = R(q) diag(s) and J the Jacobian of the pinhole projection at m_c (its
-x / z and y / z held within 15% of the image's size beyond its edges), the 2D covariance is
-P P' + eps2d I with P = J W M; its inverse is the conic (a, b, c).
+m_c = W m + t = (x, y, z), R = R(q / |q|), s the scales and J the Jacobian of the pinhole projection at
+m_c (its x / z and y / z held within 15% of the image's size beyond its edges), the 2D covariance is
+P P' + eps2d I with P = U diag(s), U = T R and T = J W; its inverse is the conic (a, b, c).
 (M. Zwicker et al., EWA Splatting, 2002; conventions and cut-offs as gsplat 1.5.3 publishes them.)
 
 Culled, with a radius of 0: z outside of the near and far planes, opacity under 1/255, nothing of the
 bounding box in the image, and whatever is not finite.
-Arithmetic is float64 inside, float32 in and out.
+Arithmetic is float64 inside, float32 in and out. Gaussians are worked on in blocks, a quantity a row, so
+that the compiler takes several at once; every one's numbers are as if it stood alone.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -21,17 +22,25 @@ import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
 
-__all__ = ["project", "project_vjp"]
+__all__ = ["CHUNKS", "MIN_ALPHA", "project", "project_vjp"]
 
 MIN_ALPHA = 1.0 / 255.0
 MAX_SIGMAS = 3.33
 EDGE = 0.3
 CHUNKS = 16
 """Pieces whose camera gradients are summed apart, whatever the number of threads."""
+BLOCK = 32
+"""Gaussians to a block."""
+X, Q, S, GIVEN = 0, 3, 7, 10
+"""Rows of a block: the mean in the world, the quaternion, the scales, and what else is given."""
+U, V, DEPTH, A, B, C, COMPENSATION, SIGMA_X, SIGMA_Y, OPACITY = range(10)
+"""Rows of a projected block; SIGMA are standard deviations."""
+DU, DV, DDEPTH, DCOMPENSATION, DCONIC = range(GIVEN, GIVEN + 5)
+"""Rows of gradients given."""
 
 
 @kernel
-def project(  # type: ignore[no-untyped-def]
+def project(
     means, quats, scales, opacities, view, K, width, height, near, far, eps2d, radius_clip,
     antialiased, radii, means2d, depths, conics, compensations,
 ):  # fmt: skip
@@ -52,120 +61,190 @@ def project(  # type: ignore[no-untyped-def]
         radius_clip: Gaussians whose radii are no larger are culled, px.
         antialiased: Whether the opacity is to be compensated for the blur.
         radii: Written, int32 [N, 2]; 0 = culled.
-        means2d: Written, float32 [N, 2], px.
+        means2d: Written, float32 [N, 2], px; 0 where culled, and so on.
         depths: Written, float32 [N], z.
         conics: Written, float32 [N, 3].
         compensations: Written, float32 [N].
     """
     for chunk in parallel_range(CHUNKS):
         # One allocation a chunk: one a Gaussian takes as long as all of the arithmetic.
-        R, M, V, P = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3))
-        stretch = _stretch(view)
-        for i in range(chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS):
-            radii[i, 0] = radii[i, 1] = 0
-            x, y, z = _to_camera(means[i], view)
-            if not near <= z <= far:
-                continue
-            J = _jacobian(x, y, z, K, width, height)
-            u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-            if _far_outside(u, v, J, stretch, scales[i], eps2d, width, height):
-                continue
-            _rotation(quats[i], R)
-            _factors(R, scales[i], view, J, M, V, P)
-            xx, xy, yy = _covariance(P)
-            det = (xx + eps2d) * (yy + eps2d) - xy * xy
-            compensation = math.sqrt(max((xx * yy - xy * xy) / det, 0.0))
-            xx, yy = xx + eps2d, yy + eps2d
-            opacity = opacities[i] * compensation if antialiased else np.float64(opacities[i])
-            if det > 0.0 and det < np.inf and MIN_ALPHA <= opacity < np.inf:
-                sigmas = min(MAX_SIGMAS, math.sqrt(2.0 * math.log(opacity / MIN_ALPHA)))
-                rx, ry = np.ceil(sigmas * math.sqrt(xx)), np.ceil(sigmas * math.sqrt(yy))
-                inside = u + rx > 0 and u - rx < width and v + ry > 0 and v - ry < height
-                if inside and (rx > radius_clip or ry > radius_clip):
-                    radii[i, 0], radii[i, 1] = min(rx, 1e9), min(ry, 1e9)
-                    means2d[i, 0], means2d[i, 1], depths[i] = u, v, z
-                    conics[i, 0], conics[i, 1], conics[i, 2] = yy / det, -xy / det, xx / det
-                    compensations[i] = compensation
+        block, projected = np.ones((GIVEN + 1, BLOCK), np.float32), np.empty((10, BLOCK))
+        lanes = np.empty(BLOCK, np.intp)
+        pose, lens = _pose(view), _lens(K, width, height)
+        end = (chunk + 1) * len(means) // CHUNKS
+        for first in range(chunk * len(means) // CHUNKS, end, BLOCK):
+            last = min(first + BLOCK, end)
+            for i in range(first, last):
+                _gather(means, quats, scales, i, block, i - first)
+                block[GIVEN, i - first] = opacities[i]
+            _project_block(block, pose, lens, eps2d, projected)
+            _cull(block, near, far, width, height, antialiased, projected)
+            radii[first:last] = 0
+            means2d[first:last], depths[first:last] = np.float32(0.0), np.float32(0.0)
+            conics[first:last], compensations[first:last] = np.float32(0.0), np.float32(0.0)
+            count = 0
+            for lane in range(last - first):  # no branch, which could not be foretold
+                lanes[count] = lane
+                count += projected[OPACITY, lane] > 0.0
+            for lane in lanes[:count]:
+                i = first + lane
+                rx, ry = _radii(projected, lane, width, height, radius_clip)
+                if rx > 0:
+                    radii[i, 0], radii[i, 1] = rx, ry
+                    means2d[i, 0], means2d[i, 1] = projected[U, lane], projected[V, lane]
+                    depths[i] = projected[DEPTH, lane]
+                    compensations[i] = projected[COMPENSATION, lane]
+                    for k in range(3):
+                        conics[i, k] = projected[A + k, lane]
 
 
 @always_inline
-def _to_camera(mean, view):  # type: ignore[no-untyped-def]
-    m0, m1, m2 = np.float64(mean[0]), np.float64(mean[1]), np.float64(mean[2])
+def _pose(view):
+    """The rows of the camera's rotation and its translation, float64."""
+    rows = view.T
+    return _column(rows, 0, 0), _column(rows, 0, 1), _column(rows, 0, 2), _column(view, 0, 3)
+
+
+@always_inline
+def _lens(K, width, height):
+    """fx, fy, cx, cy, and between what x / z and y / z are held."""
+    fx, fy = np.float64(K[0, 0]), np.float64(K[1, 1])
+    cx, cy = np.float64(K[0, 2]), np.float64(K[1, 2])
+    beyond_x, beyond_y = EDGE * 0.5 * width / fx, EDGE * 0.5 * height / fy
     return (
-        view[0, 0] * m0 + view[0, 1] * m1 + view[0, 2] * m2 + view[0, 3],
-        view[1, 0] * m0 + view[1, 1] * m1 + view[1, 2] * m2 + view[1, 3],
-        view[2, 0] * m0 + view[2, 1] * m1 + view[2, 2] * m2 + view[2, 3],
+        fx, fy, cx, cy, -(cx / fx + beyond_x), (width - cx) / fx + beyond_x,
+        -(cy / fy + beyond_y), (height - cy) / fy + beyond_y,
+    )  # fmt: skip
+
+
+@always_inline
+def _gather(means, quats, scales, i, block, lane):
+    """Copy a Gaussian into a block."""
+    for k in range(3):
+        block[X + k, lane], block[S + k, lane] = means[i, k], scales[i, k]
+    for k in range(4):
+        block[Q + k, lane] = quats[i, k]
+
+
+@always_inline
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@always_inline
+def _times(a, b):
+    """Number by number."""
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@always_inline
+def _mix(wa, a, wb, b):
+    """The vectors a and b with weights."""
+    return wa * a[0] + wb * b[0], wa * a[1] + wb * b[1], wa * a[2] + wb * b[2]
+
+
+@always_inline
+def _of_rows(weights, rows):
+    """A row vector times a matrix."""
+    a, b = _mix(weights[0], rows[0], weights[1], rows[1]), rows[2]
+    return a[0] + weights[2] * b[0], a[1] + weights[2] * b[1], a[2] + weights[2] * b[2]
+
+
+@always_inline
+def _project_block(block, pose, lens, eps2d, projected):
+    """Project all of a block, and whatever its lanes hold."""
+    for lane in range(BLOCK):
+        x, y, z = _in_camera(block, lane, pose)
+        J = _jacobian(x, y, z, lens)
+        T0, T1 = _mix(J[0], pose[0], J[1], pose[2]), _mix(J[2], pose[1], J[3], pose[2])
+        quat, _ = _quaternion(block, lane)
+        R, s = _rotation(quat), _column(block, S, lane)
+        P0, P1 = _times(_of_rows(T0, R), s), _times(_of_rows(T1, R), s)
+        xx, xy, yy = _dot(P0, P0), _dot(P0, P1), _dot(P1, P1)
+        raw = xx * yy - xy * xy
+        xx, yy = xx + eps2d, yy + eps2d
+        over = 1.0 / (xx * yy - xy * xy)
+        projected[U, lane] = lens[0] * (x * (1.0 / z)) + lens[2]
+        projected[V, lane] = lens[1] * (y * (1.0 / z)) + lens[3]
+        projected[DEPTH, lane], projected[A, lane] = z, yy * over
+        projected[B, lane], projected[C, lane] = -xy * over, xx * over
+        projected[COMPENSATION, lane] = math.sqrt(max(raw * over, 0.0))
+        projected[SIGMA_X, lane], projected[SIGMA_Y, lane] = math.sqrt(xx), math.sqrt(yy)
+        projected[OPACITY, lane] = over
+
+
+@always_inline
+def _column(array, row, column):
+    """Three numbers one below the other, float64."""
+    a, b, c = array[row, column], array[row + 1, column], array[row + 2, column]
+    return np.float64(a), np.float64(b), np.float64(c)
+
+
+@always_inline
+def _in_camera(block, lane, pose):
+    mean, t = _column(block, X, lane), pose[3]
+    return _dot(pose[0], mean) + t[0], _dot(pose[1], mean) + t[1], _dot(pose[2], mean) + t[2]
+
+
+@always_inline
+def _jacobian(x, y, z, lens):
+    """J00, J02, J11 and J12."""
+    fx, fy, _, _, low_x, high_x, low_y, high_y = lens
+    over = 1.0 / z
+    x_z, y_z = min(max(x * over, low_x), high_x), min(max(y * over, low_y), high_y)
+    return fx * over, -fx * over * x_z, fy * over, -fy * over * y_z
+
+
+@always_inline
+def _quaternion(block, lane):
+    """The normalised quaternion, and one over its length."""
+    w, (x, y, z) = np.float64(block[Q, lane]), _column(block, Q + 1, lane)
+    over = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return (w * over, x * over, y * over, z * over), over
+
+
+@always_inline
+def _rotation(quat):
+    """The rows of R."""
+    w, x, y, z = quat
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
     )
 
 
 @always_inline
-def _stretch(view):  # type: ignore[no-untyped-def]
-    """At least the spectral norm of the camera's rotation, which need not be quite one."""
-    total = 0.0
-    for r in range(3):
-        for c in range(3):
-            total += np.float64(view[r, c]) * view[r, c]
-    return math.sqrt(total)
+def _cull(block, near, far, width, height, antialiased, projected):
+    """Fill the row of opacities, which holds 1 / determinant so far, with 0 for what is culled."""
+    for lane in range(BLOCK):
+        u, v, z = projected[U, lane], projected[V, lane], projected[DEPTH, lane]
+        over = projected[OPACITY, lane]
+        rx = MAX_SIGMAS * projected[SIGMA_X, lane] + 1.0
+        ry = MAX_SIGMAS * projected[SIGMA_Y, lane] + 1.0
+        opacity = np.float64(block[GIVEN, lane])
+        if antialiased:
+            opacity *= projected[COMPENSATION, lane]
+        seen = (near <= z) & (z <= far) & (opacity >= MIN_ALPHA) & (opacity < np.inf)
+        seen &= (over > 0.0) & (over < np.inf)
+        seen &= (u + rx > 0) & (u - rx < width) & (v + ry > 0) & (v - ry < height)
+        projected[OPACITY, lane] = opacity if seen else 0.0
 
 
 @always_inline
-def _far_outside(u, v, J, stretch, scale, eps2d, width, height):  # type: ignore[no-untyped-def]
-    """Whether not even a ball of the greatest scale would reach the image.
-
-    It spares most of those beside the image the rest. Any NaN is false, and left to what follows.
-    """
-    size = stretch * max(scale[0], scale[1], scale[2])
-    across = MAX_SIGMAS * math.sqrt((J[0] * J[0] + J[1] * J[1]) * size * size + eps2d) + 1.0
-    along = MAX_SIGMAS * math.sqrt((J[2] * J[2] + J[3] * J[3]) * size * size + eps2d) + 1.0
-    return u + across < 0 or u - across > width or v + along < 0 or v - along > height
-
-
-@always_inline
-def _rotation(quat, R):  # type: ignore[no-untyped-def]
-    """Fill R(q / |q|); return |q|."""
-    w, x, y, z = np.float64(quat[0]), np.float64(quat[1]), np.float64(quat[2]), np.float64(quat[3])
-    norm = math.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = w / norm, x / norm, y / norm, z / norm
-    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    return norm
-
-
-@always_inline
-def _jacobian(x, y, z, K, width, height):  # type: ignore[no-untyped-def]
-    """(J00, J02, J11, J12), and whether x / z and y / z were held back."""
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-    beyond_x, beyond_y = EDGE * 0.5 * width / fx, EDGE * 0.5 * height / fy
-    u = min(max(x / z, -(cx / fx + beyond_x)), (width - cx) / fx + beyond_x)
-    v = min(max(y / z, -(cy / fy + beyond_y)), (height - cy) / fy + beyond_y)
-    return fx / z, -fx * u / z, fy / z, -fy * v / z, u != x / z, v != y / z
-
-
-@always_inline
-def _factors(R, scale, view, J, M, V, P):  # type: ignore[no-untyped-def]
-    """M = R diag(s), V = W M and P = J V."""
-    for r in range(3):
-        for c in range(3):
-            M[r, c] = R[r, c] * scale[c]
-    for r in range(3):
-        for c in range(3):
-            V[r, c] = view[r, 0] * M[0, c] + view[r, 1] * M[1, c] + view[r, 2] * M[2, c]
-    for c in range(3):
-        P[0, c] = J[0] * V[0, c] + J[1] * V[2, c]
-        P[1, c] = J[2] * V[1, c] + J[3] * V[2, c]
-
-
-@always_inline
-def _covariance(P):  # type: ignore[no-untyped-def]
-    xx = P[0, 0] * P[0, 0] + P[0, 1] * P[0, 1] + P[0, 2] * P[0, 2]
-    xy = P[0, 0] * P[1, 0] + P[0, 1] * P[1, 1] + P[0, 2] * P[1, 2]
-    yy = P[1, 0] * P[1, 0] + P[1, 1] * P[1, 1] + P[1, 2] * P[1, 2]
-    return xx, xy, yy
+def _radii(projected, lane, width, height, radius_clip):
+    """Half of the bounding box, of where alpha is 1/255 or more; 0 where it is to be culled."""
+    u, v = projected[U, lane], projected[V, lane]
+    sigmas = min(MAX_SIGMAS, math.sqrt(2.0 * math.log(projected[OPACITY, lane] / MIN_ALPHA)))
+    rx, ry = np.ceil(sigmas * projected[SIGMA_X, lane]), np.ceil(sigmas * projected[SIGMA_Y, lane])
+    inside = u + rx > 0 and u - rx < width and v + ry > 0 and v - ry < height
+    if inside and (rx > radius_clip or ry > radius_clip):
+        return min(rx, 1e9), min(ry, 1e9)
+    return 0.0, 0.0
 
 
 @kernel
-def project_vjp(  # type: ignore[no-untyped-def]
+def project_vjp(
     means, quats, scales, view, K, width, height, eps2d, radii,
     d_means2d, d_depths, d_conics, d_compensations, d_means, d_quats, d_scales, d_view,
 ):  # fmt: skip
@@ -180,106 +259,138 @@ def project_vjp(  # type: ignore[no-untyped-def]
         width: Pixels.
         height: Pixels.
         eps2d: px^2.
-        radii: [N, 2]; culled Gaussians get no gradient.
+        radii: [N, 2].
         d_means2d: d loss / d means2d, [N, 2], and so on.
         d_depths: [N].
         d_conics: [N, 3].
         d_compensations: [N].
-        d_means: Written, float32 [N, 3]; must hold 0.
-        d_quats: Written, float32 [N, 4]; must hold 0.
-        d_scales: Written, float32 [N, 3]; must hold 0.
-        d_view: Written, float64 [CHUNKS, 4, 4]; must hold 0.
+        d_means: Written, float32 [N, 3]; 0 where culled, and so on.
+        d_quats: Written, float32 [N, 4].
+        d_scales: Written, float32 [N, 3].
+        d_view: Written, float64 [CHUNKS, 3, 4].
     """
     for chunk in parallel_range(CHUNKS):
-        R, M, V, P = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3))
-        dP, dV, dM, dt = np.empty((2, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-        for i in range(chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS):
-            if radii[i, 0] > 0:
-                x, y, z = _to_camera(means[i], view)
-                norm = _rotation(quats[i], R)
-                J = _jacobian(x, y, z, K, width, height)
-                _factors(R, scales[i], view, J, M, V, P)
-                _covariance_vjp(P, eps2d, d_conics[i], np.float64(d_compensations[i]), dP)
-                _camera_vjp(x, y, z, K, J, V, dP, d_means2d[i], d_depths[i], dV, dt)
-                _world_vjp(means[i], view, M, dV, dt, dM, d_means[i], d_view[chunk])
-                _shape_vjp(quats[i], norm, R, scales[i], dM, d_quats[i], d_scales[i])
+        block, slopes = np.ones((GIVEN + 7, BLOCK), np.float32), np.empty((10, BLOCK))
+        sums, indices = np.zeros((3, 4, BLOCK)), np.empty(BLOCK, np.intp)
+        pose, lens = _pose(view), _lens(K, width, height)
+        begin, end = chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS
+        d_means[begin:end], d_quats[begin:end] = np.float32(0.0), np.float32(0.0)
+        d_scales[begin:end] = np.float32(0.0)
+        count = 0
+        for i in range(begin, end):
+            indices[count] = i
+            count += radii[i, 0] > 0
+            if count == BLOCK or (count > 0 and i == end - 1):
+                for lane in range(BLOCK):
+                    # An incomplete block repeats its last Gaussian, with gradients of 0.
+                    each, weight = indices[min(lane, count - 1)], np.float32(lane < count)
+                    _gather(means, quats, scales, each, block, lane)
+                    block[DU, lane] = weight * d_means2d[each, 0]
+                    block[DV, lane] = weight * d_means2d[each, 1]
+                    block[DDEPTH, lane] = weight * d_depths[each]
+                    block[DCOMPENSATION, lane] = weight * d_compensations[each]
+                    for k in range(3):
+                        block[DCONIC + k, lane] = weight * d_conics[each, k]
+                _block_vjp(block, pose, lens, eps2d, slopes, sums)
+                for lane in range(count):
+                    each = indices[lane]
+                    for k in range(3):
+                        d_means[each, k] = slopes[X + k, lane]
+                        d_scales[each, k] = slopes[S + k, lane]
+                    for k in range(4):
+                        d_quats[each, k] = slopes[Q + k, lane]
+                count = 0
+        for k in range(12):
+            d_view[chunk, k // 4, k % 4] = sums[k // 4, k % 4].sum()
 
 
 @always_inline
-def _covariance_vjp(P, eps2d, d_conic, d_compensation, dP):  # type: ignore[no-untyped-def]
-    """From the conic and the compensation to P."""
-    raw_xx, xy, raw_yy = _covariance(P)
+def _block_vjp(block, pose, lens, eps2d, slopes, sums):
+    """The gradients of a block's means, quaternions and scales; those of the pose are added up."""
+    for lane in range(BLOCK):
+        x, y, z = _in_camera(block, lane, pose)
+        J = _jacobian(x, y, z, lens)
+        T0, T1 = _mix(J[0], pose[0], J[1], pose[2]), _mix(J[2], pose[1], J[3], pose[2])
+        quat, over = _quaternion(block, lane)
+        R, s = _rotation(quat), _column(block, S, lane)
+        U0, U1 = _of_rows(T0, R), _of_rows(T1, R)
+        P0, P1 = _times(U0, s), _times(U1, s)
+        d_xx, d_xy, d_yy = _covariance_vjp(block, lane, P0, P1, eps2d)
+        dP0, dP1 = _mix(2.0 * d_xx, P0, d_xy, P1), _mix(2.0 * d_yy, P1, d_xy, P0)
+        for k in range(3):
+            slopes[S + k, lane] = dP0[k] * U0[k] + dP1[k] * U1[k]
+        dU0, dU1 = _times(dP0, s), _times(dP1, s)
+        dR = (
+            _mix(T0[0], dU0, T1[0], dU1), _mix(T0[1], dU0, T1[1], dU1), _mix(T0[2], dU0, T1[2], dU1)
+        )  # fmt: skip
+        d_quat = _rotation_vjp(quat, dR)
+        along = (
+            d_quat[0] * quat[0] + d_quat[1] * quat[1] + d_quat[2] * quat[2] + d_quat[3] * quat[3]
+        )
+        for k in range(4):  # the length of q changes nothing
+            slopes[Q + k, lane] = (d_quat[k] - along * quat[k]) * over
+        dT0 = _dot(R[0], dU0), _dot(R[1], dU0), _dot(R[2], dU0)
+        dT1 = _dot(R[0], dU1), _dot(R[1], dU1), _dot(R[2], dU1)
+        dJ = _dot(dT0, pose[0]), _dot(dT0, pose[2]), _dot(dT1, pose[1]), _dot(dT1, pose[2])
+        dt = _place_vjp(block, lane, x, y, z, lens, J, dJ)
+        d_mean, mean = _of_rows(dt, pose), _column(block, X, lane)
+        dW0, dW1 = _mix(J[0], dT0, dt[0], mean), _mix(J[2], dT1, dt[1], mean)
+        dW2 = _mix(J[1], dT0, J[3], dT1)
+        for k in range(3):
+            slopes[X + k, lane] = d_mean[k]
+            sums[0, k, lane] += dW0[k]
+            sums[1, k, lane] += dW1[k]
+            sums[2, k, lane] += dW2[k] + dt[2] * mean[k]
+            sums[k, 3, lane] += dt[k]
+
+
+@always_inline
+def _covariance_vjp(block, lane, P0, P1, eps2d):
+    """From the conic and the compensation to the covariance."""
+    raw_xx, xy, raw_yy = _dot(P0, P0), _dot(P0, P1), _dot(P1, P1)
     xx, yy = raw_xx + eps2d, raw_yy + eps2d
-    det = xx * yy - xy * xy
-    a, b, c = yy / det, -xy / det, xx / det
-    da, half_db, dc = np.float64(d_conic[0]), 0.5 * d_conic[1], np.float64(d_conic[2])
+    over = 1.0 / (xx * yy - xy * xy)
+    a, b, c = yy * over, -xy * over, xx * over
+    da, db, dc = _column(block, DCONIC, lane)
     # d covariance = -X G X for the inverse X and the symmetric gradient G
-    ga, gb = da * a + half_db * b, da * b + half_db * c
-    ha, hb = half_db * a + dc * b, half_db * b + dc * c
-    d_xx, d_xy, d_yy = -(a * ga + b * ha), -2.0 * (a * gb + b * hb), -(b * gb + c * hb)
-    raw_det = raw_xx * raw_yy - xy * xy
-    if d_compensation != 0.0 and raw_det > 0.0:
-        compensation = math.sqrt(raw_det / det)
-        by_raw = 0.5 * d_compensation * compensation / raw_det
-        by_det = -0.5 * d_compensation * compensation / det
-        d_xx += by_raw * raw_yy + by_det * yy
-        d_yy += by_raw * raw_xx + by_det * xx
-        d_xy -= 2.0 * (by_raw + by_det) * xy
-    for c_ in range(3):
-        dP[0, c_] = 2.0 * d_xx * P[0, c_] + d_xy * P[1, c_]
-        dP[1, c_] = 2.0 * d_yy * P[1, c_] + d_xy * P[0, c_]
+    ga, gb = da * a + 0.5 * db * b, da * b + 0.5 * db * c
+    ha, hb = 0.5 * db * a + dc * b, 0.5 * db * b + dc * c
+    raw = raw_xx * raw_yy - xy * xy
+    scaled = 0.5 * block[DCOMPENSATION, lane] * math.sqrt(max(raw * over, 0.0))
+    by_raw = scaled / raw if raw > 0.0 else 0.0
+    by_det = -scaled * over if raw > 0.0 else 0.0
+    return (
+        by_raw * raw_yy + by_det * yy - (a * ga + b * ha),
+        -2.0 * ((by_raw + by_det) * xy + a * gb + b * hb),
+        by_raw * raw_xx + by_det * xx - (b * gb + c * hb),
+    )
 
 
 @always_inline
-def _camera_vjp(x, y, z, K, J, V, dP, d_mean2d, d_depth, dV, dt):  # type: ignore[no-untyped-def]
-    """From P, the 2D mean and the depth to V and the mean in camera axes."""
-    fx, fy = np.float64(K[0, 0]), np.float64(K[1, 1])
-    d00 = d02 = d11 = d12 = 0.0
-    for c in range(3):
-        dV[0, c], dV[1, c] = J[0] * dP[0, c], J[2] * dP[1, c]
-        dV[2, c] = J[1] * dP[0, c] + J[3] * dP[1, c]
-        d00 += dP[0, c] * V[0, c]
-        d02 += dP[0, c] * V[2, c]
-        d11 += dP[1, c] * V[1, c]
-        d12 += dP[1, c] * V[2, c]
-    du, dv = np.float64(d_mean2d[0]), np.float64(d_mean2d[1])
-    dt[0], dt[1] = du * fx / z, dv * fy / z
-    dt[2] = d_depth - (du * fx * x + dv * fy * y) / (z * z)
-    dt[2] -= (d00 * J[0] + d11 * J[2] + d02 * J[1] + d12 * J[3]) / z
-    if not J[4]:  # within the image's surroundings J02 also follows x / z
-        dt[0] -= d02 * fx / (z * z)
-        dt[2] += d02 * fx * x / (z * z * z)
-    if not J[5]:
-        dt[1] -= d12 * fy / (z * z)
-        dt[2] += d12 * fy * y / (z * z * z)
+def _rotation_vjp(quat, dR):
+    """From R to the normalised quaternion, as if it were any."""
+    w, x, y, z = quat
+    (d00, d01, d02), (d10, d11, d12), (d20, d21, d22) = dR
+    skew_x, skew_y, skew_z = d21 - d12, d02 - d20, d10 - d01
+    xy, xz, yz = d01 + d10, d02 + d20, d12 + d21
+    return (
+        2.0 * (x * skew_x + y * skew_y + z * skew_z),
+        2.0 * (w * skew_x + y * xy + z * xz - 2.0 * x * (d11 + d22)),
+        2.0 * (w * skew_y + x * xy + z * yz - 2.0 * y * (d00 + d22)),
+        2.0 * (w * skew_z + x * xz + y * yz - 2.0 * z * (d00 + d11)),
+    )
 
 
 @always_inline
-def _world_vjp(mean, view, M, dV, dt, dM, d_mean, d_view):  # type: ignore[no-untyped-def]
-    """From camera axes to the world, and to the camera's pose."""
-    for r in range(3):
-        d_mean[r] = view[0, r] * dt[0] + view[1, r] * dt[1] + view[2, r] * dt[2]
-        for c in range(3):
-            dM[r, c] = view[0, r] * dV[0, c] + view[1, r] * dV[1, c] + view[2, r] * dV[2, c]
-            d_view[r, c] += dt[r] * mean[c]
-            d_view[r, c] += dV[r, 0] * M[c, 0] + dV[r, 1] * M[c, 1] + dV[r, 2] * M[c, 2]
-        d_view[r, 3] += dt[r]
-
-
-@always_inline
-def _shape_vjp(quat, norm, R, scale, dM, d_quat, d_scale):  # type: ignore[no-untyped-def]
-    """From M = R(q / |q|) diag(s) to the scales and the unnormalised quaternion."""
-    for c in range(3):
-        d_scale[c] = dM[0, c] * R[0, c] + dM[1, c] * R[1, c] + dM[2, c] * R[2, c]
-        for r in range(3):
-            dM[r, c] *= scale[c]
-    w, x, y, z = quat[0] / norm, quat[1] / norm, quat[2] / norm, quat[3] / norm
-    skew_x, skew_y, skew_z = dM[2, 1] - dM[1, 2], dM[0, 2] - dM[2, 0], dM[1, 0] - dM[0, 1]
-    xy, xz, yz = dM[0, 1] + dM[1, 0], dM[0, 2] + dM[2, 0], dM[1, 2] + dM[2, 1]
-    dw = 2.0 * (x * skew_x + y * skew_y + z * skew_z)
-    dx = 2.0 * (w * skew_x + y * xy + z * xz - 2.0 * x * (dM[1, 1] + dM[2, 2]))
-    dy = 2.0 * (w * skew_y + x * xy + z * yz - 2.0 * y * (dM[0, 0] + dM[2, 2]))
-    dz = 2.0 * (w * skew_z + x * xz + y * yz - 2.0 * z * (dM[0, 0] + dM[1, 1]))
-    along = dw * w + dx * x + dy * y + dz * z  # the length of q changes nothing
-    d_quat[0], d_quat[1] = (dw - along * w) / norm, (dx - along * x) / norm
-    d_quat[2], d_quat[3] = (dy - along * y) / norm, (dz - along * z) / norm
+def _place_vjp(block, lane, x, y, z, lens, J, dJ):
+    """From J, the 2D mean and the depth to the mean in camera axes."""
+    _, _, _, _, low_x, high_x, low_y, high_y = lens
+    over = 1.0 / z
+    x_z, y_z = x * over, y * over
+    # Where x / z is not held back, J02 also follows it.
+    by_x = dJ[1] * J[0] * over if low_x <= x_z <= high_x else 0.0
+    by_y = dJ[3] * J[2] * over if low_y <= y_z <= high_y else 0.0
+    du, dv = block[DU, lane] * J[0], block[DV, lane] * J[2]
+    by_depth = dJ[0] * J[0] + dJ[1] * J[1] + dJ[2] * J[2] + dJ[3] * J[3]
+    dz = block[DDEPTH, lane] - (du * x_z + dv * y_z) - by_depth * over + by_x * x_z + by_y * y_z
+    return du - by_x, dv - by_y, dz

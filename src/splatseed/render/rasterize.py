@@ -195,9 +195,9 @@ def _colors(
     if sh_degree is None:
         return base
     # The general inverse, as gsplat takes it: the rigid one has another gradient off the rotations.
-    directions = means - torch.linalg.inv_ex(viewmats[camera]).inverse[:3, 3]
-    shades: Tensor = Harmonics.apply(directions, base, rest, view.seen, sh_degree)  # type: ignore[no-untyped-call]
-    return torch.clamp_min(shades + 0.5, 0.0)
+    origin = torch.linalg.inv_ex(viewmats[camera]).inverse[:3, 3]
+    shades: Tensor = Harmonics.apply(means, origin, base, rest, view.radii, sh_degree)  # type: ignore[no-untyped-call]
+    return shades
 
 
 def _with_depth(colors: Tensor, view: _View, render_mode: RenderMode) -> Tensor:
