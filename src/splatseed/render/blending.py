@@ -41,6 +41,7 @@ from splatseed.render.simd import (
     minimum,
     multiply,
     negative_magnitude,
+    prefetch,
     select_greater,
     splat,
     store,
@@ -61,6 +62,8 @@ ZERO, ONE, HALF, FOUR = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.fl
 STATE = (1 + CHANNELS) * LANES
 """Transmittance and channels of a block."""
 CHUNK = 32
+AHEAD = 32
+"""How many list entries ahead records are asked for: those of a tile lie all over memory."""
 ALL = 15
 """Every block."""
 
@@ -108,6 +111,8 @@ def _forward_tile(
         n0 = n1 = n2 = n3 = 0
         stop = min(start + chunk, last)
         for entry in range(start, stop):
+            ahead = min(entry + AHEAD, len(listed_rank) - 1)  # it may be the next tile's
+            prefetch(records, RECORD * np.int64(listed_rank[ahead]))
             r = RECORD * np.int64(listed_rank[entry])
             h0, h1, h2, h3 = _exponents(records, r, px, right, py, below)
             # Written in any case, and written over by the next where the block is not hit.

@@ -38,6 +38,7 @@ __all__ = [
     "minimum",
     "multiply",
     "negative_magnitude",
+    "prefetch",
     "select_greater",
     "splat",
     "store",
@@ -231,6 +232,22 @@ def _exchange(builder, rows, width):
             out[i] = builder.shuffle_vector(*pair, ir.Constant(INDEX, low))
             out[i + width] = builder.shuffle_vector(*pair, ir.Constant(INDEX, high))
     return out
+
+
+@intrinsic
+def prefetch(typing_context, array, index):  # noqa: ARG001
+    """Ask for the cache line of element ``index`` of a contiguous array, without waiting for it."""
+
+    def generate(context, builder, signature, arguments):
+        pointer = _address(context, builder, signature.args[0], *arguments)
+        pointer = builder.bitcast(pointer, ir.IntType(8).as_pointer())
+        number = ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [pointer.type, number, number, number])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0")
+        builder.call(function, [pointer, number(0), number(3), number(1)])  # read, keep, data
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
 
 
 def _fold(builder, vector, combine):
