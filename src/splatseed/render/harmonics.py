@@ -19,7 +19,7 @@ import math
 import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
-from splatseed.render.shuffles import lane, permutation, three_sums, triple
+from splatseed.render.shuffles import lane, permutation, prefetch, three_sums, triple
 from splatseed.render.simd import LANES, add, fma, load, multiply, select_greater, splat, store
 
 __all__ = ["MAX_DEGREE", "TABLES", "TERMS", "harmonics", "harmonics_vjp"]
@@ -30,6 +30,9 @@ CHANNELS = 3
 ROW = 45
 CHUNKS = 64
 """Pieces that threads take."""
+AHEAD = 10
+"""How many rows ahead memory is asked for: those of Gaussians out of sight are not read, and what is
+read in leaps does not come by itself."""
 FIRST = (0, 15, 29)
 """Where in a row its three vectors begin: the last of them ends with it."""
 PART = 15
@@ -122,6 +125,7 @@ def harmonics(means, origin, base, rest, skipped, radii, table, colors):
                 x, y, z = x * inverse, y * inverse, z * inverse
                 factor, form = _basis(*_vectors(x, y, z), table)
                 basis = multiply(factor, form)
+                _prefetch(rest, (i + AHEAD) * (skipped + ROW))
                 a, b, c = _row(rest, i * (skipped + ROW) + skipped, table)
                 total = fma(spread_1(basis), b, multiply(spread_0(basis), a))
                 total = _by_channel(add(total, later_1(multiply(spread_2(basis), c))))
@@ -163,6 +167,8 @@ def harmonics_vjp(
                 x, y, z = _offset(means, origin, i)
                 inverse = 1.0 / _length(x, y, z)
                 x, y, z = x * inverse, y * inverse, z * inverse
+                _prefetch(rest, row + AHEAD * (skipped + ROW))
+                _prefetch(d_rest, row + AHEAD * (skipped + ROW))
                 d_color = triple(red, green, blue)
                 slopes = _row_vjp(*_vectors(x, y, z), d_color, rest, row, table, d_rest)
                 dx, dy, dz = lane_0(slopes), lane_4(slopes), lane_8(slopes)
@@ -208,6 +214,12 @@ def _basis(x, y, z, table):
     form = fma(load(table, FORM + 4 * LANES), multiply(x, y), form)
     form = fma(load(table, FORM + 5 * LANES), multiply(y, z), form)
     return factor, fma(load(table, FORM + 6 * LANES), multiply(x, z), form)
+
+
+@always_inline
+def _prefetch(rows, row):
+    for line in range(0, ROW, LANES):
+        prefetch(rows, row + line)
 
 
 @always_inline
