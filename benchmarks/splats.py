@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 from clouds import sample_unevenly
 from splatseed.camera import Camera
 from splatseed.jit import kernel, parallel_range
-from splatseed.render.binning import TILE, depth_order, list_tiles
-from splatseed.render.blending import RECORD
+from splatseed.render.binning import RECORD, TILE, depth_order, list_tiles
 from splatseed.render.layout import gather
 from splatseed.synthetic.raycast import render_views, visible
 from splatseed.synthetic.room import Room, build_room, orbit_cameras

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.render import binning, blending
+from splatseed.render import binning
 from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles
 
 View = tuple[np.ndarray, np.ndarray, np.ndarray, int, int]
@@ -16,7 +16,7 @@ def lists_of(
     means2d: np.ndarray, conics: np.ndarray, reach: np.ndarray, width: int, height: int
 ) -> TileLists:
     """The lists of Gaussians whose alpha reaches 1/255 where sigma is ``reach``."""
-    records = np.zeros((len(reach), blending.RECORD), np.float32)
+    records = np.zeros((len(reach), binning.RECORD), np.float32)
     records[:, :2], records[:, 2:5] = means2d, conics * np.float32([-1 / 16, -1 / 8, -1 / 16])
     records[:, 5] = (reach - np.log(255.0)) / 8
     return list_tiles(records.ravel(), width, height)
@@ -98,11 +98,6 @@ def test_far_fewer_than_the_square_of_three_sigmas(rng) -> None:
     high = np.clip(np.ceil((view[0] + longest[:, None]) / TILE), 0, (25, 20)).astype(int)
     squares = np.prod(high - low, axis=1).sum()
     assert len(lists_of(*view).listed_rank) < 0.6 * squares
-
-
-def test_records_are_those_of_blending() -> None:
-    assert binning.RECORD == blending.RECORD
-    assert binning.LOWEST == blending.LOWEST
 
 
 def test_nothing_to_list() -> None:

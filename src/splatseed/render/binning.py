@@ -26,7 +26,7 @@ from jaxtyping import Float32, Int32, Int64, UInt32
 
 from splatseed.jit import always_inline, inline, kernel, parallel_range
 
-__all__ = ["TILE", "TileLists", "depth_order", "list_tiles", "row_order"]
+__all__ = ["LOWEST", "RECORD", "TILE", "TileLists", "depth_order", "list_tiles", "row_order"]
 
 TILE = 8
 RECORD = 16

@@ -28,7 +28,7 @@ from __future__ import annotations
 import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
-from splatseed.render.binning import TILE
+from splatseed.render.binning import LOWEST, RECORD, TILE
 from splatseed.render.simd import (
     LANES,
     add,
@@ -48,14 +48,12 @@ from splatseed.render.simd import (
     subtract,
 )
 
-__all__ = ["BLOCKS", "CHANNELS", "LOWEST", "MAX_ALPHA", "RECORD", "STOP", "forward"]
+__all__ = ["BLOCKS", "CHANNELS", "MAX_ALPHA", "STOP", "forward"]
 
 CHANNELS = 3
-RECORD = 16
 BLOCKS = 4
 STOP = np.float32(1e-4)
 MAX_ALPHA = np.float32(0.999)
-LOWEST = np.float32(-np.log(255.0) / 8)
 COLUMN = np.tile(np.arange(4, dtype=np.float32), 4)
 ROW = np.repeat(np.arange(4, dtype=np.float32), 4)
 ZERO, ONE, HALF, FOUR = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(4.0)

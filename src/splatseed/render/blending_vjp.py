@@ -22,8 +22,8 @@ from __future__ import annotations
 import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
-from splatseed.render.binning import TILE
-from splatseed.render.blending import BLOCKS, CHANNELS, LOWEST, MAX_ALPHA, RECORD, STOP
+from splatseed.render.binning import LOWEST, RECORD, TILE
+from splatseed.render.blending import BLOCKS, CHANNELS, MAX_ALPHA, STOP
 from splatseed.render.simd import (
     LANES,
     add,

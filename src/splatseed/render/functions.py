@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatseed.render import blending, blending_vjp, harmonics as sh, layout, projection
-from splatseed.render.binning import TILE, TileLists, depth_order, list_tiles, row_order
+from splatseed.render.binning import RECORD, TILE, TileLists, depth_order, list_tiles, row_order
 
 __all__ = ["Blend", "Harmonics", "Lens", "Project"]
 
@@ -305,7 +305,7 @@ def _gather(
     first: int,
 ) -> np.ndarray:
     """The Gaussians in depth order as ``blending`` reads them, flat."""
-    records = _aligned(len(order) * blending.RECORD)
+    records = _aligned(len(order) * RECORD)
     arrays = (_array(each) for each in (means2d, conics))
     layout.gather(order, *arrays, log_opacities, _array(colors), first, records)  # type: ignore[call-arg]  # star arguments
     return records

@@ -19,8 +19,18 @@ import math
 import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
-from splatseed.render.shuffles import lane, permutation, prefetch, three_sums, triple
-from splatseed.render.simd import LANES, add, fma, load, multiply, select_greater, splat, store
+from splatseed.render.shuffles import lane, permutation, three_sums, triple
+from splatseed.render.simd import (
+    LANES,
+    add,
+    fma,
+    load,
+    multiply,
+    prefetch,
+    select_greater,
+    splat,
+    store,
+)
 
 __all__ = ["MAX_DEGREE", "TABLES", "TERMS", "harmonics", "harmonics_vjp"]
 

@@ -1,4 +1,4 @@
-"""Lanes of ``simd``'s vectors by their number, moved in fixed patterns and taken out; and memory ahead.
+"""Lanes of ``simd``'s vectors by their number, moved in fixed patterns and taken out.
 
 Promise: as in ``simd``; nothing is rounded but by ``three_sums``, whose tree is fixed.
 """
@@ -11,15 +11,14 @@ from collections.abc import Sequence
 
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 from splatseed.render.simd import INDEX, LANES, VECTOR, f32x16
 
-__all__ = ["lane", "permutation", "prefetch", "three_sums", "triple"]
+__all__ = ["lane", "permutation", "three_sums", "triple"]
 
 UNDEFINED = ir.Constant(VECTOR, ir.Undefined)
-I32, BYTE_POINTER = ir.IntType(32), ir.IntType(8).as_pointer()
+I32 = ir.IntType(32)
 
 
 def permutation(pattern: Sequence[int]):
@@ -93,19 +92,3 @@ def triple(typing_context, a, b, c):  # noqa: ARG001
         return vector
 
     return f32x16(types.float32, types.float32, types.float32), generate
-
-
-@intrinsic
-def prefetch(typing_context, array, index):  # noqa: ARG001
-    """Ask for the cache line of an element of a contiguous array; any index will do, there or not."""
-
-    def generate(context, builder, signature, arguments):
-        array_type = signature.args[0]
-        data = context.make_array(array_type)(context, builder, arguments[0]).data
-        kind = ir.FunctionType(ir.VoidType(), [BYTE_POINTER, I32, I32, I32])
-        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        place = builder.bitcast(builder.gep(data, [arguments[1]]), BYTE_POINTER)
-        builder.call(function, [place, I32(0), I32(3), I32(1)])  # to read, near, data
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), generate
