@@ -55,9 +55,10 @@ def call(
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def thread_settings(threads: int) -> dict[str, str]:
-    """Variables for so many threads, idle ones asleep."""
-    return {name: str(threads) for name in THREADS} | {"OMP_WAIT_POLICY": "passive"}
+def thread_settings(threads: int, *, awake: bool = False) -> dict[str, str]:
+    """Variables for so many threads, idle ones asleep unless told otherwise."""
+    policy = "active" if awake else "passive"
+    return {name: str(threads) for name in THREADS} | {"OMP_WAIT_POLICY": policy}
 
 
 def seconds_of(

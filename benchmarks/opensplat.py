@@ -105,7 +105,9 @@ def _command(program: Path, scene: Path, gaussians: Path, steps: int) -> list[st
 def _seconds(command: Sequence[str], threads: int, clock: Clock) -> float:
     """How long a run takes."""
     try:
-        return seconds_of(command, clock, threads=threads, environment=thread_settings(threads))
+        return seconds_of(
+            command, clock, threads=threads, environment=thread_settings(threads, awake=True)
+        )
     except (OSError, subprocess.CalledProcessError) as error:
         said = getattr(error, "stderr", None) or getattr(error, "stdout", None) or str(error)
         raise MissingDependencyError(

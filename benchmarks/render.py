@@ -19,7 +19,7 @@ import torch
 import tyro
 from torch import Tensor
 
-from children import avx2_environment, call
+from children import avx2_environment, call, thread_settings
 from clocks import Clock
 from machine import describe, warn_if_busy
 from markdown import table
@@ -230,6 +230,7 @@ def print_peer(settings: Settings) -> None:
         found = call(
             "render:measure_peer",
             threads=THREADS[-1],
+            environment=thread_settings(THREADS[-1], awake=True),  # PyTorch's many small loops
             path=str(Path(folder) / "scene.npz"),
             clock=settings.clock,
         )

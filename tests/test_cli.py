@@ -103,7 +103,8 @@ main()
 """
 
 
-def test_ctrl_c_while_writing_leaves_nothing(ply, tmp_path):
+@pytest.mark.parametrize(("stop", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopping_while_writing_leaves_nothing(ply, tmp_path, stop, code):
     words = [sys.executable, "-c", SLOW_WRITER, "upsample", str(ply), "-o", str(tmp_path / "a/out")]
     with subprocess.Popen(
         words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -111,9 +112,9 @@ def test_ctrl_c_while_writing_leaves_nothing(ply, tmp_path):
         for line in process.stdout:
             if line == "writing\n":
                 break
-        process.send_signal(signal.SIGINT)
+        process.send_signal(stop)
         _, err = process.communicate(timeout=60)
-    assert process.returncode == 130
+    assert process.returncode == code
     assert "interrupted" in err
     assert "Traceback" not in err
     assert [path.name for path in tmp_path.iterdir()] == [ply.name]

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
+from types import FrameType
 from typing import NoReturn
 
 from rich.console import Console
@@ -27,15 +32,17 @@ VERBS = {
     "sfm": "Make a scene from photographs (pycolmap).",
     "demo": "Make a small scene, upsample it by every method, measure, train.",
 }
-INTERRUPTED = 130
+INTERRUPTED, TERMINATED = 130, 143
+"""As shells have it: 128 and the number of the signal."""
+
+
+class _Termination(KeyboardInterrupt):
+    """SIGTERM, as schedulers send it: cleaned up after like Ctrl-C."""
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
     words = sys.argv[1:] if arguments is None else arguments
-    # PyTorch and Numba each keep a pool of threads. Waiting by spinning, as is the default, the one
-    # takes the cores from the other, and on a busy machine a training step took 5-20 times as long.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     _print_any_name()
     _let_threads_sleep()
     if not words or words[0] in {"-h", "--help"}:
@@ -55,7 +62,8 @@ def main(arguments: list[str] | None = None) -> None:
 def _run(verb: str, words: list[str]) -> None:
     try:
         # One verb's imports are enough: --help must not wait for Numba.
-        import_module(f"splatseed.commands.{verb}").run(words)
+        with _termination_raised():
+            import_module(f"splatseed.commands.{verb}").run(words)
     except SplatseedError as error:
         _fail(str(error))
     except MemoryError as error:
@@ -63,9 +71,26 @@ def _run(verb: str, words: list[str]) -> None:
             f"expected enough memory; found {error or 'none left'}. "
             "Ask for fewer points, or close other programs."
         )
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         Console(stderr=True).print("\ninterrupted; nothing was left half-written")
-        sys.exit(INTERRUPTED)
+        sys.exit(TERMINATED if isinstance(stop, _Termination) else INTERRUPTED)
+
+
+@contextmanager
+def _termination_raised() -> Iterator[None]:
+    """Have SIGTERM raise, so that what is half-written is removed; the handler of before comes back."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  (signal's)
+    raise _Termination
 
 
 def _print_any_name() -> None:
@@ -77,8 +102,8 @@ def _print_any_name() -> None:
 def _let_threads_sleep() -> None:
     """Have idle threads sleep rather than spin; OpenMP reads this as PyTorch and Numba load it.
 
-    The two have a pool of threads each: spinning, one slows the other, and on a machine that is
-    also at other work a training step was seen to take several times as long.
+    The two have a pool of threads each: spinning, one takes the cores from the other, and on a busy
+    machine a training step took 5 to 20 times as long.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
