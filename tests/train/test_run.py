@@ -226,6 +226,28 @@ def test_what_does_not_fit_the_memory_is_refused_with_what_would(begin, monkeypa
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+def test_memory_holds_growth_and_the_run_says_so(begin, monkeypatch, strategy):
+    settings = {"strategy": strategy, "max_steps": 100}
+    free = begin("free", **settings)
+    assert free.train()
+    begun, grown = free.state.records[0].num_gaussians, len(free.state.params["means"])
+    assert grown > begun + 10
+    room = device.BYTES_EACH * (grown - begun) // 2
+
+    held = begin("held", **settings)
+
+    def free_bytes(_):
+        return room - device.BYTES_EACH * (len(held.state.params["means"]) - begun)
+
+    monkeypatch.setattr(device, "free_bytes", free_bytes)
+    assert held.train()
+    most = begun + (grown - begun) // 2
+    assert begun < max(r.num_gaussians for r in held.state.records) <= most
+    assert held.finish(_score)["held_by_memory_at"] == most
+    assert free.finish(_score)["held_by_memory_at"] is None
+
+
 def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(begin, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ParameterError, match="--backend cpu"):

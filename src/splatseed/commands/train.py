@@ -206,5 +206,10 @@ def _summarise(options: Options, metrics: Mapping[str, Any]) -> None:
             ("pictures", f"{options.output / 'renders'}, {options.output / 'curve.png'}"),
         ],
     )
+    if held := metrics["held_by_memory_at"]:
+        print_note(
+            f"memory held the run at {held:,} Gaussians; on another machine it may end otherwise. "
+            f"Pass --cap-max {held} to have the same everywhere."
+        )
     output = shlex.quote(str(options.output))
     print_commands("next", [("score again, with LPIPS", f"splatseed evaluate {output}")])

@@ -1,6 +1,8 @@
 """Where to train, and how many Gaussians fit the memory there.
 
-Promise: a GPU that is asked for is used or an error, never replaced in silence; a cloud that cannot be trained is refused before the first step, with the number that can.
+Promise: a GPU that is asked for is used or an error, never replaced in silence; a cloud
+that cannot be trained is refused before the first step, with the number that can, and one that grows
+is held at what fits.
 """
 
 from __future__ import annotations
@@ -13,7 +15,9 @@ import torch
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.train.settings import Backend
 
-__all__ = ["check_fits", "device_name", "free_bytes", "peak_gpu_bytes", "pick_device"]
+__all__ = [
+    "Capacity", "check_fits", "device_name", "free_bytes", "peak_gpu_bytes", "pick_device",
+]  # fmt: skip
 
 BYTES_EACH = 2000
 """A Gaussian's 59 numbers, their gradients and two moments (944 bytes), and as much again for the
@@ -60,10 +64,39 @@ def check_fits(count: int, device: torch.device) -> None:
         )
 
 
+class Capacity:
+    """How many Gaussians a run may grow to: the cap's number, or what fits the memory if less.
+
+    Args:
+        cap: The most that are wanted; None for any number.
+        device: Where they are.
+
+    Attributes:
+        held_at: To how many memory first held a run that would have gone on, else None. Such a run
+            depends on the machine.
+    """
+
+    def __init__(self, cap: int | None, device: torch.device) -> None:
+        self.cap = cap
+        self.held_at: int | None = None
+        self._device = device
+
+    def limit(self, count: int, wanted: int) -> int:
+        """The most that ``count`` Gaussians may become when strategy and gradients ask for ``wanted``."""
+        most = wanted if self.cap is None else min(self.cap, wanted)
+        free = free_bytes(self._device)
+        if free is None or most - count <= free // BYTES_EACH:
+            return most
+        fits = count + free // BYTES_EACH
+        self.held_at = self.held_at or fits
+        return fits
+
+
 def free_bytes(device: torch.device) -> int | None:
     """Free memory of the device in bytes; None where the system does not tell."""
     if device.type == "cuda":
-        return torch.cuda.mem_get_info(device)[0]
+        kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+        return torch.cuda.mem_get_info(device)[0] + kept
     known = [free for free in (_free_of_machine(), _free_of_container()) if free is not None]
     return min(known, default=None)
 

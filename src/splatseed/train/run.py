@@ -210,6 +210,7 @@ class TrainingRun:
             "train_seconds": round(state.watch.seconds, 3),
             "num_seeds": self.folder.read_config()["seeds"]["count"],
             "num_gaussians": len(state.params["means"]),
+            "held_by_memory_at": state.strategy.capacity and state.strategy.capacity.held_at,
             "tests": [
                 {
                     "step": record.step,
@@ -264,7 +265,7 @@ def _state(
     device: torch.device,
 ) -> TrainState:
     """The state of a run that has begun, if it left a checkpoint, else the first state."""
-    strategy = make_strategy(settings)
+    strategy = make_strategy(settings, device)
     if begun and begun.checkpoint.is_file():
         return load_checkpoint(begun.checkpoint, strategy, device)
     gaussians = initial_gaussians(

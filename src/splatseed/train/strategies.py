@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from contextlib import nullcontext
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -19,6 +20,7 @@ from gsplat.strategy.ops import reset_opa
 from jaxtyping import Float
 from torch import Tensor
 
+from splatseed.train.device import Capacity
 from splatseed.train.frame import SCENE_SCALE
 from splatseed.train.parameters import Optimizers, Parameters
 from splatseed.train.relocation import mcmc_on_cpu
@@ -26,12 +28,16 @@ from splatseed.train.settings import MCMC_CAP, TrainSettings
 
 __all__ = ["Strategy", "make_strategy"]
 
+GROWTH = 1.05
+"""By what MCMC multiplies the number of Gaussians at a time, until the cap."""
+
 
 class Strategy(ABC):
     """What changes the number of Gaussians, and how they begin.
 
     Attributes:
         state: What it remembers from step to step.
+        capacity: How many Gaussians it may make; None if it makes none.
     """
 
     opacity: ClassVar[float] = 0.1
@@ -39,8 +45,9 @@ class Strategy(ABC):
     scale_factor: ClassVar[float] = 1.0
     """Size of the first Gaussians, as a multiple of the gaps between them."""
 
-    def __init__(self) -> None:
+    def __init__(self, capacity: Capacity | None = None) -> None:
         self.state: dict[str, Any] = {}
+        self.capacity = capacity
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""] | None:  # noqa: ARG002
         """What is added to the loss; nothing by default."""
@@ -57,12 +64,18 @@ class Strategy(ABC):
         """To be called behind the optimisers; may replace parameters and their moments."""
 
 
-def make_strategy(settings: TrainSettings) -> Strategy:
-    """The strategy that the settings name, on their schedule."""
+def make_strategy(settings: TrainSettings, device: torch.device | None = None) -> Strategy:
+    """The strategy that the settings name, on their schedule.
+
+    Args:
+        settings: How to train.
+        device: Whose memory bounds the number of Gaussians; the CPU's by default.
+    """
+    device = device or torch.device("cpu")
     if settings.strategy == "default":
-        return _Default(settings)
+        return _Default(settings, Capacity(settings.cap, device))
     if settings.strategy == "mcmc":
-        return _Mcmc(settings)
+        return _Mcmc(settings, Capacity(settings.cap or MCMC_CAP, device))
     return _Fixed()
 
 
@@ -79,12 +92,12 @@ class _Fixed(Strategy):
 
 
 class _Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
-    """gsplat's strategy; with a cap, only the largest image gradients that it leaves room for grow.
+    """gsplat's strategy, but that only the largest image gradients that there is room for grow.
 
     On the CPU its running sums are kept in another way, to the same bytes.
     """
 
-    cap: int | None = None
+    capacity: Capacity
     grow_grad2d: float
 
     def _update_state(
@@ -108,13 +121,12 @@ class _Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
 
     def _threshold(self, params: Parameters, state: Any) -> float:
         """A gradient that at most as many exceed as there is room: each one adds one Gaussian."""
-        if self.cap is None:
-            return self.grow_grad2d
-        room = self.cap - len(params["means"])
+        count, gradients = len(params["means"]), state["grad2d"] / state["count"].clamp_min(1)
+        wanted = int((gradients > self.grow_grad2d).sum())
+        room = self.capacity.limit(count, count + wanted) - count
         if room <= 0:
             return math.inf
-        gradients = state["grad2d"] / state["count"].clamp_min(1)
-        if room >= len(gradients):
+        if room >= wanted:
             return self.grow_grad2d
         return max(self.grow_grad2d, float(torch.topk(gradients, room + 1).values[-1]))
 
@@ -137,8 +149,8 @@ def _add_gradients(state: Any, info: Any) -> None:
 class _Default(Strategy):
     """3DGS's densification: clone and split where the image gradient is large, prune the faint."""
 
-    def __init__(self, settings: TrainSettings) -> None:
-        super().__init__()
+    def __init__(self, settings: TrainSettings, capacity: Capacity) -> None:
+        super().__init__(capacity)
         schedule = settings.schedule
         self.inner = _Capped(
             refine_start_iter=schedule.refine_start,
@@ -146,7 +158,7 @@ class _Default(Strategy):
             refine_every=schedule.refine_every,
             reset_every=schedule.reset_every,
         )
-        self.inner.cap = settings.cap
+        self.inner.capacity = capacity
         self.resets = settings.opacity_reset
         self.state = self.inner.initialize_state(scene_scale=SCENE_SCALE)
 
@@ -170,6 +182,19 @@ class _Default(Strategy):
         return while_refining and step % self.inner.reset_every == 0
 
 
+@dataclass
+class _Bounded(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
+    """gsplat's strategy, but that its cap is never more than fits the memory."""
+
+    capacity: Capacity | None = None
+
+    def _add_new_gs(self, params: Parameters, optimizers: Any, binoms: Any) -> int:
+        assert self.capacity is not None  # noqa: S101  (given in ``_Mcmc``)
+        count = len(params["means"])
+        self.cap_max = self.capacity.limit(count, int(GROWTH * count))
+        return int(super()._add_new_gs(params, optimizers, binoms))
+
+
 class _Mcmc(Strategy):
     """3DGS as MCMC: move the faint to where there is more to show, add up to a cap, add noise."""
 
@@ -178,11 +203,11 @@ class _Mcmc(Strategy):
     OPACITY_WEIGHT = 0.01
     SCALE_WEIGHT = 0.01
 
-    def __init__(self, settings: TrainSettings) -> None:
-        super().__init__()
+    def __init__(self, settings: TrainSettings, capacity: Capacity) -> None:
+        super().__init__(capacity)
         schedule = settings.schedule
-        self.inner = MCMCStrategy(
-            cap_max=settings.cap or MCMC_CAP,
+        self.inner = _Bounded(
+            capacity=capacity,
             refine_start_iter=schedule.refine_start,
             refine_stop_iter=schedule.refine_stop("mcmc"),
             refine_every=schedule.refine_every,
