@@ -153,10 +153,10 @@ def test_info_lists_what_is_visible(rng) -> None:
     assert (packed["n_cameras"], packed["width"], packed["height"]) == (3, 29, 21)
 
 
-@pytest.mark.parametrize("packed", [True, False])
-def test_gradient_of_2d_means(rng, packed: bool) -> None:
+@pytest.mark.parametrize(("packed", "channels"), [(True, 3), (False, 3), (False, 4)])
+def test_gradient_of_2d_means(rng, packed: bool, channels: int) -> None:
     """What densification reads: d loss / d means2d, and the sum of its absolute values over pixels."""
-    scene = random_scene(rng, cameras=2)
+    scene = random_scene(rng, cameras=2, channels=channels)
     ours, ours_abs, seen = _gradients_of_2d_means(scene, packed=packed)
     for camera in range(2):
         expected, expected_abs = _slow_gradients_of_2d_means(scene, camera)

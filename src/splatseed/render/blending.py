@@ -50,7 +50,8 @@ from splatseed.render.simd import (
 
 __all__ = ["BLOCKS", "CHANNELS", "MAX_ALPHA", "STOP", "forward"]
 
-CHANNELS = 3
+CHANNELS = 4
+"""The most of a pass; the last takes time only where it is used."""
 BLOCKS = 4
 STOP = np.float32(1e-4)
 MAX_ALPHA = np.float32(0.999)
@@ -68,7 +69,7 @@ ALL = 15
 
 @kernel
 def forward(
-    records, tile_start, listed_rank, row_order, lane_x, lane_y, image, transmittance, hits
+    records, tile_start, listed_rank, row_order, lane_x, lane_y, fourth, image, transmittance, hits
 ):
     """Blend every tile.
 
@@ -79,6 +80,7 @@ def forward(
         row_order: The rows of tiles in the order in which they are taken, int64 [rows].
         lane_x: ``COLUMN``.
         lane_y: ``ROW``.
+        fourth: Whether the last channel is used.
         image: Written: float32 [t * 4 * CHANNELS * 16].
         transmittance: Written: what of the light behind passes, float32 [t * 4 * 16].
         hits: Written, uint8 [P]; blocks that no light reached at the start of a chunk have none.
@@ -91,13 +93,13 @@ def forward(
         py = add(load(lane_y, 0), splat(np.float32(TILE * row + HALF)))
         _forward_tile(
             records, listed_rank, tile_start[tile], tile_start[tile + 1], tile, px, py,
-            image, transmittance, hits,
+            fourth, image, transmittance, hits,
         )  # fmt: skip
 
 
 @always_inline
 def _forward_tile(
-    records, listed_rank, first, last, tile, px, py, image, transmittance, hits
+    records, listed_rank, first, last, tile, px, py, fourth, image, transmittance, hits
 ):  # fmt: skip
     chunk, lowest = CHUNK, splat(LOWEST)
     right, below = add(px, splat(FOUR)), add(py, splat(FOUR))
@@ -124,10 +126,10 @@ def _forward_tile(
             n0, n1, n2, n3 = n0 + hit0, n1 + hit1, n2 + hit2, n3 + hit3
             hits[entry] = lit & (hit0 | hit1 << 1 | hit2 << 2 | hit3 << 3)
         lit = (
-            _blend_block(records, hit, h, 0, n0, state)
-            | _blend_block(records, hit, h, 1, n1, state) << 1
-            | _blend_block(records, hit, h, 2, n2, state) << 2
-            | _blend_block(records, hit, h, 3, n3, state) << 3
+            _blend_block(records, hit, h, 0, n0, fourth, state)
+            | _blend_block(records, hit, h, 1, n1, fourth, state) << 1
+            | _blend_block(records, hit, h, 2, n2, fourth, state) << 2
+            | _blend_block(records, hit, h, 3, n3, fourth, state) << 3
         )
         start = stop
     hits[start:last] = 0
@@ -173,13 +175,13 @@ def _exponents(records, r, left, right, above, below):
 
 
 @always_inline
-def _blend_block(records, hit, h, q, count, state):
+def _blend_block(records, hit, h, q, count, fourth, state):
     """Blend what hits block q; returns 1 if light still passes somewhere, else 0."""
     zero, stop = splat(ZERO), splat(STOP)
     base, first = STATE * q, CHUNK * q
     passing = load(state, base)
     c0, c1 = load(state, base + LANES), load(state, base + 2 * LANES)
-    c2 = load(state, base + 3 * LANES)
+    c2, c3 = load(state, base + 3 * LANES), load(state, base + 4 * LANES)
     for entry in range(first, first + count):
         r, exponent = hit[entry], load(h, LANES * entry)
         alpha = select_greater(exponent, splat(LOWEST), exp_of_eighth(exponent), zero)
@@ -190,8 +192,11 @@ def _blend_block(records, hit, h, q, count, state):
         c0 = fma(gained, splat(records[r + 7]), c0)
         c1 = fma(gained, splat(records[r + 8]), c1)
         c2 = fma(gained, splat(records[r + 9]), c2)
+        if fourth:
+            c3 = fma(gained, splat(records[r + 10]), c3)
     store(state, base, passing)
     store(state, base + LANES, c0)
     store(state, base + 2 * LANES, c1)
     store(state, base + 3 * LANES, c2)
+    store(state, base + 4 * LANES, c3)
     return np.int64(any_greater(passing, zero))

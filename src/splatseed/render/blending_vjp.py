@@ -4,7 +4,7 @@ It walks front to back again: with the image known, what lies behind a Gaussian 
 less what has been blended so far, so nothing need be stored but which blocks each Gaussian hits.
 
 Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums are kept by *span*, a Gaussian in a row
-of tiles: p; p dx, p dy; p dx^2, p dx dy, p dy^2; d channels; 0; |d mean x|, |d mean y|; rest 0, each
+of tiles: p; p dx, p dy; p dx^2, p dx dy, p dy^2; d channels; |d mean x|, |d mean y|; rest 0, each
 summed over the row's pixels. With pixels at (x, y) from a block's centre and the mean at (mx, my),
 dx = mx - x, so that all of them follow from the moments of p about the centre.
 
@@ -66,8 +66,8 @@ OUTER = np.float32(1.5)
 
 @kernel
 def backward(
-    records, tile_start, listed_rank, listed_span, hits, row_order, lane_x, lane_y, gradient, behind,
-    absolute, sums,
+    records, tile_start, listed_rank, listed_span, hits, row_order, lane_x, lane_y, fourth, gradient,
+    behind, absolute, sums,
 ):  # fmt: skip
     """The sums of every span.
 
@@ -80,6 +80,7 @@ def backward(
         row_order: As there.
         lane_x: ``COLUMN``.
         lane_y: ``ROW``.
+        fourth: Whether the last channel is used.
         gradient: d loss / d image, block image, float32 [t * 4 * CHANNELS * 16].
         behind: gradient . final colour - (d loss / d alpha) T_final, float32 [t * 4 * 16]; used up.
         absolute: Whether the absolute gradients of the means are wanted; else they are 0.
@@ -100,12 +101,21 @@ def backward(
                     hits, start, stop, records, listed_rank, sums, listed_span, queue
                 )
                 for q in range(BLOCKS):
-                    x, y = TILE * column + 4 * (q % 2), TILE * row + 4 * (q // 2)
-                    _backward_block(
-                        records, listed_rank, listed_span, queue, CHUNK * q, counts[q], lane_x, lane_y,
-                        np.float32(x), np.float32(y), gradient, CHANNELS * LANES * (BLOCKS * tile + q),
-                        behind, LANES * (BLOCKS * tile + q), passing, LANES * q, absolute, batch, sums,
-                    )  # fmt: skip
+                    x = np.float32(TILE * column + 4 * (q % 2))
+                    y = np.float32(TILE * row + 4 * (q // 2))
+                    block = LANES * (BLOCKS * tile + q)
+                    if fourth:  # compiled for its own constant
+                        _backward_block(
+                            records, listed_rank, listed_span, queue, CHUNK * q, counts[q],
+                            lane_x, lane_y, x, y, True, gradient, CHANNELS * block, behind, block,
+                            passing, LANES * q, absolute, batch, sums,
+                        )  # fmt: skip
+                    else:
+                        _backward_block(
+                            records, listed_rank, listed_span, queue, CHUNK * q, counts[q],
+                            lane_x, lane_y, x, y, False, gradient, CHANNELS * block, behind, block,
+                            passing, LANES * q, absolute, batch, sums,
+                        )  # fmt: skip
 
 
 @always_inline
@@ -131,8 +141,8 @@ def _queue_hits(hits, start, stop, records, listed_rank, sums, listed_span, queu
 
 @always_inline
 def _backward_block(
-    records, listed_rank, listed_span, queue, first, count, lane_x, lane_y, x, y, gradient, slopes,
-    behind, beyond, passing, light, absolute, batch, sums,
+    records, listed_rank, listed_span, queue, first, count, lane_x, lane_y, x, y, fourth, gradient,
+    slopes, behind, beyond, passing, light, absolute, batch, sums,
 ):  # fmt: skip
     """Blend the ``count`` hits from ``queue[first]`` of the block whose corner is (x, y).
 
@@ -142,7 +152,7 @@ def _backward_block(
     px, py = add(load(lane_x, 0), splat(x + HALF)), add(load(lane_y, 0), splat(y + HALF))
     t, far = load(passing, light), load(behind, beyond)
     v0, v1 = load(gradient, slopes), load(gradient, slopes + LANES)
-    v2 = load(gradient, slopes + 2 * LANES)
+    v2, v3 = load(gradient, slopes + 2 * LANES), load(gradient, slopes + 3 * LANES)
     for begin in range(first, first + count, LANES):
         end = min(begin + LANES, first + count)
         for k in range(end - begin):
@@ -155,6 +165,8 @@ def _backward_block(
             shade = multiply(v0, splat(records[r + 7]))
             shade = fma(v1, splat(records[r + 8]), shade)
             shade = fma(v2, splat(records[r + 9]), shade)
+            if fourth:
+                shade = fma(v3, splat(records[r + 10]), shade)
             far = fnma(gained, shade, far)
             slope = fnma(t, shade, divide(far, subtract(splat(ONE), alpha)))
             # A clamped alpha is constant.
@@ -164,7 +176,7 @@ def _backward_block(
             store(batch, WEIGHTS + LANES * k, gained)
         if absolute:
             _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, batch, sums)
-        _reduce(batch, x + np.float32(2.0), y + np.float32(2.0), gradient, slopes)
+        _reduce(batch, x + np.float32(2.0), y + np.float32(2.0), gradient, slopes, fourth)
         for k in range(end - begin):
             s = SUMS * np.int64(listed_span[queue[begin + k]])
             store(sums, s, add(load(sums, s), load(batch, LANES * k)))
@@ -183,7 +195,7 @@ def _alpha(records, r, px, py):
 
 
 @always_inline
-def _reduce(batch, center_x, center_y, gradient, slopes):
+def _reduce(batch, center_x, center_y, gradient, slopes, fourth):
     """From p, weights and means of sixteen hits to their sums over the block, one row each."""
     zero, p = splat(ZERO), load_transposed(batch, 0)
     s0, x0, xx0 = _moments(p[0], p[1], p[2], p[3])
@@ -200,10 +212,12 @@ def _reduce(batch, center_x, center_y, gradient, slopes):
     pxy = fma(mx, py, fnma(my, x, xy))
     weights = load_transposed(batch, WEIGHTS)
     c0, c1 = _dot(weights, gradient, slopes), _dot(weights, gradient, slopes + LANES)
-    c2 = _dot(weights, gradient, slopes + 2 * LANES)
+    c2, c3 = _dot(weights, gradient, slopes + 2 * LANES), zero
+    if fourth:
+        c3 = _dot(weights, gradient, slopes + 3 * LANES)
     store_transposed(
         batch, 0,
-        (s, px, py, pxx, pxy, pyy, c0, c1, c2, zero, zero, zero, zero, zero, zero, zero),
+        (s, px, py, pxx, pxy, pyy, c0, c1, c2, c3, zero, zero, zero, zero, zero, zero),
     )  # fmt: skip
 
 

@@ -220,7 +220,7 @@ class Blend(torch.autograd.Function):
         hits = np.empty(len(prepared.lists.listed_rank), np.uint8)
         for first in range(0, channels, blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
-            blocks = _forward(prepared, records, hits)
+            blocks = _forward(prepared, records, channels - first, hits)
             layout.from_blocks(*blocks, prepared.columns, behind, first, image, passing)  # type: ignore[call-arg]  # star arguments
         ctx.prepared, ctx.on_absgrad, ctx.passing, ctx.image = prepared, on_absgrad, passing, image
         ctx.hits = hits
@@ -312,13 +312,13 @@ def _gather(
 
 
 def _forward(
-    prepared: _Prepared, records: np.ndarray, hits: np.ndarray
+    prepared: _Prepared, records: np.ndarray, channels: int, hits: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The block image and its transmittance; writes ``hits``."""
     image, transmittance = _aligned(prepared.lanes * blending.CHANNELS), _aligned(prepared.lanes)
     blending.forward(
         records, prepared.lists.tile_start, prepared.lists.listed_rank, prepared.row_order,
-        blending.COLUMN, blending.ROW, image, transmittance, hits,
+        blending.COLUMN, blending.ROW, channels >= blending.CHANNELS, image, transmittance, hits,
     )  # fmt: skip
     return image, transmittance
 
@@ -341,7 +341,8 @@ def _backward(
     sums = _aligned(int(lists.span_start[-1]) * blending_vjp.SUMS, zero=True)
     blending_vjp.backward(
         records, lists.tile_start, lists.listed_rank, lists.listed_span, hits, prepared.row_order,
-        blending.COLUMN, blending.ROW, gradient, behind, absolute, sums,
+        blending.COLUMN, blending.ROW, d_image.shape[2] - first >= blending.CHANNELS, gradient, behind,
+        absolute, sums,
     )  # fmt: skip
     totals = np.empty((len(prepared.order), blending_vjp.SUMS), np.float32)
     blending_vjp.sum_spans(lists.span_start, sums, totals)
