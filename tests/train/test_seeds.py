@@ -31,7 +31,10 @@ def test_all_originals_stay_while_they_fit(points):
     seeds, notes = thinned(points, 70)
     assert len(seeds) == 70
     assert np.array_equal(seeds.xyz[:ORIGINALS], points.xyz[:ORIGINALS])
-    assert "100 seeds were thinned out at random to --cap-max 70, 40 of them originals." in notes
+    told = "100 seeds were thinned out at random to --cap-max 70, 40 of them originals."
+    assert notes == [f"{told} They leave densification no room."]
+    usable_seeds(points, TrainSettings(cap_max=70, strategy="none"), notes.append)
+    assert notes[1:] == [told]
 
 
 def test_a_cap_below_the_originals_keeps_nothing_else(points):
