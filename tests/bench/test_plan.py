@@ -192,3 +192,15 @@ def test_what_would_fail_every_run_is_found_before(own_room):
             each.unlink()
     with pytest.raises(SceneNotFoundError, match="photographs in"):
         survey(own_room, "room")
+
+
+def test_the_plan_of_the_published_results_is_the_one_they_tell_of():
+    folder = Path(__file__).parents[2] / "docs" / "results"
+    plan = read_plan(folder / "plan.toml")
+    told = (folder / "README.md").read_text("utf-8")
+    assert [each.label for each in plan.scenes] == ["bonsai", "fox", "fern", "treehill", "demo"]
+    scenes, kinds, strategies = len(plan.scenes), len(plan.methods), len(plan.strategies)
+    runs = scenes * kinds * strategies * plan.repeats
+    assert f"{scenes} x {kinds} x {strategies} x {plan.repeats} = {runs} runs" in told
+    assert f"{plan.max_steps} steps" in told
+    assert f"{plan.cap_max:,} Gaussians" in told
