@@ -88,7 +88,7 @@ def _read_all(master):
 
 
 SLOW_WRITER = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from splatseed.cli import main
 from splatseed.io import colmap_binary
@@ -99,6 +99,8 @@ def write(path, points, tracks=None):
     time.sleep(60)
 
 colmap_binary.write_points3d = write
+# A suite that runs in the background of a shell has Ctrl-C ignored, and its children inherit it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 main()
 """
 
