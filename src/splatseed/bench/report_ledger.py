@@ -94,7 +94,7 @@ def _setup(rows: Sequence[RunRow], sessions: Sequence[Mapping[str, Any]]) -> Ite
         facts += _facts(sessions[-1])
     if facts:
         rows_of_facts = tuple((words(name), words(value)) for name, value in facts)
-        calls = f"{len(sessions)} calls of the command; the last is described." if sessions else ""
+        calls = f"Calls of the command: {len(sessions)}; the last is described." if sessions else ""
         yield table(
             Table(
                 "environment",
