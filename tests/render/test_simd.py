@@ -82,8 +82,8 @@ def _lane_sum(a):
 
 
 @njit
-def _load_transposed(a, start, out):
-    for j, vector in enumerate(simd.load_transposed(a, start)):
+def _load_columns(a, start, out):
+    for j, vector in enumerate(simd.load_columns(a, start)):
         simd.store(out, LANES * j, vector)
 
 
@@ -96,6 +96,16 @@ def _store_transposed(a, out, start):
         simd.load(a, 192), simd.load(a, 208), simd.load(a, 224), simd.load(a, 240),
     )  # fmt: skip
     simd.store_transposed(out, start, rows)
+
+
+@njit
+def _broadcast(a, index, out):
+    simd.store(out, 0, simd.broadcast(a, index))
+
+
+@njit
+def _element(a, index):
+    return simd.element(a, index)
 
 
 @njit
@@ -182,17 +192,31 @@ def test_lane_sum_adds_in_its_tree(rng) -> None:
         assert _lane_sum(values) == folded(values)
 
 
-def test_transposition(rng) -> None:
+@pytest.mark.parametrize("first", [0, 4, 12])
+def test_columns(rng, first: int) -> None:
     square = rng.normal(size=(LANES, LANES)).astype(np.float32)
     padded = np.concatenate([np.full(5, 7.0, np.float32), square.reshape(-1)])
-    loaded = np.empty(LANES * LANES, np.float32)
-    _load_transposed(padded, 5, loaded)
-    np.testing.assert_array_equal(loaded.reshape(LANES, LANES), square.T)
+    loaded = np.empty(4 * LANES, np.float32)
+    _load_columns(padded, 5 + first, loaded)
+    np.testing.assert_array_equal(loaded.reshape(4, LANES), square[:, first : first + 4].T)
+
+
+def test_transposition(rng) -> None:
+    square = rng.normal(size=(LANES, LANES)).astype(np.float32)
     stored = np.zeros(LANES * LANES + 6, np.float32)
     _store_transposed(square.reshape(-1), stored, 3)
     np.testing.assert_array_equal(stored[3:-3].reshape(LANES, LANES), square.T)
     assert not stored[:3].any()
     assert not stored[-3:].any()
+
+
+def test_single_elements() -> None:
+    numbers = np.arange(40, dtype=np.float32)
+    out = np.empty(LANES, np.float32)
+    _broadcast(numbers, 33, out)
+    np.testing.assert_array_equal(out, np.full(LANES, 33.0, np.float32))
+    assert _element(numbers, 39) == 39.0
+    assert _element(numbers.astype(np.int32), 1) == 1
 
 
 @pytest.mark.parametrize("size", [1, 16, 100])

@@ -34,6 +34,8 @@ from splatseed.render.simd import (
     add,
     aligned,
     any_greater,
+    broadcast,
+    element,
     exp_of_eighth,
     fma,
     fnma,
@@ -112,8 +114,8 @@ def _forward_tile(
         stop = min(start + chunk, last)
         for entry in range(start, stop):
             ahead = min(entry + AHEAD, len(listed_rank) - 1)  # it may be the next tile's
-            prefetch(records, RECORD * np.int64(listed_rank[ahead]))
-            r = RECORD * np.int64(listed_rank[entry])
+            prefetch(records, RECORD * np.int64(element(listed_rank, ahead)))
+            r = RECORD * np.int64(element(listed_rank, entry))
             h0, h1, h2, h3 = _exponents(records, r, px, right, py, below)
             # Written in any case, and written over by the next where the block is not hit.
             hit[n0] = hit[chunk + n1] = hit[2 * chunk + n2] = hit[3 * chunk + n3] = r
@@ -159,11 +161,11 @@ def _write(state, tile, image, transmittance):
 @always_inline
 def _exponents(records, r, left, right, above, below):
     """The h of a Gaussian at the pixels of a tile's four blocks."""
-    mean_x, mean_y = splat(records[r]), splat(records[r + 1])
-    a, b, c = splat(records[r + 2]), splat(records[r + 3]), splat(records[r + 4])
+    mean_x, mean_y = broadcast(records, r), broadcast(records, r + 1)
+    a, b, c = broadcast(records, r + 2), broadcast(records, r + 3), broadcast(records, r + 4)
     dx0, dx1 = subtract(mean_x, left), subtract(mean_x, right)
     dy0, dy1 = subtract(mean_y, above), subtract(mean_y, below)
-    top = splat(records[r + 5])
+    top = broadcast(records, r + 5)
     y0, y1 = fma(multiply(c, dy0), dy0, top), fma(multiply(c, dy1), dy1, top)
     x0, x1, cross0, cross1 = multiply(a, dx0), multiply(a, dx1), multiply(b, dy0), multiply(b, dy1)
     return (
@@ -183,17 +185,17 @@ def _blend_block(records, hit, h, q, count, fourth, state):
     c0, c1 = load(state, base + LANES), load(state, base + 2 * LANES)
     c2, c3 = load(state, base + 3 * LANES), load(state, base + 4 * LANES)
     for entry in range(first, first + count):
-        r, exponent = hit[entry], load(h, LANES * entry)
+        r, exponent = element(hit, entry), load(h, LANES * entry)
         alpha = select_greater(exponent, splat(LOWEST), exp_of_eighth(exponent), zero)
         alpha = minimum(alpha, splat(MAX_ALPHA))
         rest = fnma(passing, alpha, passing)
         gained = select_greater(rest, stop, multiply(passing, alpha), zero)
         passing = select_greater(rest, stop, rest, negative_magnitude(passing))
-        c0 = fma(gained, splat(records[r + 7]), c0)
-        c1 = fma(gained, splat(records[r + 8]), c1)
-        c2 = fma(gained, splat(records[r + 9]), c2)
+        c0 = fma(gained, broadcast(records, r + 7), c0)
+        c1 = fma(gained, broadcast(records, r + 8), c1)
+        c2 = fma(gained, broadcast(records, r + 9), c2)
         if fourth:
-            c3 = fma(gained, splat(records[r + 10]), c3)
+            c3 = fma(gained, broadcast(records, r + 10), c3)
     store(state, base, passing)
     store(state, base + LANES, c0)
     store(state, base + 2 * LANES, c1)

@@ -28,13 +28,15 @@ from splatseed.render.simd import (
     LANES,
     add,
     aligned,
+    broadcast,
     divide,
+    element,
     exp_of_eighth,
     fma,
     fnma,
     lane_sum,
     load,
-    load_transposed,
+    load_columns,
     minimum,
     multiply,
     negative_magnitude,
@@ -155,18 +157,23 @@ def _backward_block(
     v2, v3 = load(gradient, slopes + 2 * LANES), load(gradient, slopes + 3 * LANES)
     for begin in range(first, first + count, LANES):
         end = min(begin + LANES, first + count)
+        # Alphas first: they wait for nothing, and so run ahead of what does.
         for k in range(end - begin):
-            r = RECORD * np.int64(listed_rank[queue[begin + k]])
-            batch[MEANS + k], batch[MEANS + LANES + k] = records[r], records[r + 1]
-            alpha = _alpha(records, r, px, py)
+            r = RECORD * _looked_up(listed_rank, queue, begin + k)
+            batch[MEANS + k] = element(records, r)
+            batch[MEANS + LANES + k] = element(records, r + 1)
+            store(batch, LANES * k, _alpha(records, r, px, py))
+        for k in range(end - begin):
+            r = RECORD * _looked_up(listed_rank, queue, begin + k)
+            alpha = load(batch, LANES * k)
             rest = fnma(t, alpha, t)
             alpha = select_greater(rest, stop, alpha, zero)
             gained = multiply(t, alpha)
-            shade = multiply(v0, splat(records[r + 7]))
-            shade = fma(v1, splat(records[r + 8]), shade)
-            shade = fma(v2, splat(records[r + 9]), shade)
+            shade = multiply(v0, broadcast(records, r + 7))
+            shade = fma(v1, broadcast(records, r + 8), shade)
+            shade = fma(v2, broadcast(records, r + 9), shade)
             if fourth:
-                shade = fma(v3, splat(records[r + 10]), shade)
+                shade = fma(v3, broadcast(records, r + 10), shade)
             far = fnma(gained, shade, far)
             slope = fnma(t, shade, divide(far, subtract(splat(ONE), alpha)))
             # A clamped alpha is constant.
@@ -178,18 +185,25 @@ def _backward_block(
             _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, batch, sums)
         _reduce(batch, x + np.float32(2.0), y + np.float32(2.0), gradient, slopes, fourth)
         for k in range(end - begin):
-            s = SUMS * np.int64(listed_span[queue[begin + k]])
+            s = SUMS * _looked_up(listed_span, queue, begin + k)
             store(sums, s, add(load(sums, s), load(batch, LANES * k)))
     store(passing, light, t)
     store(behind, beyond, far)
 
 
 @always_inline
+def _looked_up(array, queue, place):
+    """The element of an int32 array that an entry of the queue is about, int64."""
+    return np.int64(element(array, np.int64(element(queue, place))))
+
+
+@always_inline
 def _alpha(records, r, px, py):
     """Alpha where it counts (alpha >= 1/255), else 0."""
-    dx, dy = subtract(splat(records[r]), px), subtract(splat(records[r + 1]), py)
-    h = fma(multiply(splat(records[r + 4]), dy), dy, splat(records[r + 5]))
-    h = fma(add(multiply(splat(records[r + 2]), dx), multiply(splat(records[r + 3]), dy)), dx, h)
+    dx, dy = subtract(broadcast(records, r), px), subtract(broadcast(records, r + 1), py)
+    a, b, c = broadcast(records, r + 2), broadcast(records, r + 3), broadcast(records, r + 4)
+    h = fma(multiply(c, dy), dy, broadcast(records, r + 5))
+    h = fma(add(multiply(a, dx), multiply(b, dy)), dx, h)
     alpha = select_greater(h, splat(LOWEST), exp_of_eighth(h), splat(ZERO))
     return minimum(alpha, splat(MAX_ALPHA))
 
@@ -197,24 +211,27 @@ def _alpha(records, r, px, py):
 @always_inline
 def _reduce(batch, center_x, center_y, gradient, slopes, fourth):
     """From p, weights and means of sixteen hits to their sums over the block, one row each."""
-    zero, p = splat(ZERO), load_transposed(batch, 0)
-    s0, x0, xx0 = _moments(p[0], p[1], p[2], p[3])
-    s1, x1, xx1 = _moments(p[4], p[5], p[6], p[7])
-    s2, x2, xx2 = _moments(p[8], p[9], p[10], p[11])
-    s3, x3, xx3 = _moments(p[12], p[13], p[14], p[15])
-    s, y, yy = _moments(s0, s1, s2, s3)
-    x, xy, _ = _moments(x0, x1, x2, x3)
+    zero = splat(ZERO)
+    s0, x0, xx0 = _moments(load_columns(batch, 0))
+    s1, x1, xx1 = _moments(load_columns(batch, 4))
+    s2, x2, xx2 = _moments(load_columns(batch, 8))
+    s3, x3, xx3 = _moments(load_columns(batch, 12))
+    s, y, yy = _moments((s0, s1, s2, s3))
+    x, xy, _ = _moments((x0, x1, x2, x3))
     xx = add(add(xx0, xx3), add(xx1, xx2))
     mx, my = load(batch, MEANS), load(batch, MEANS + LANES)
     mx, my = subtract(mx, splat(center_x)), subtract(my, splat(center_y))
     px, py = subtract(multiply(mx, s), x), subtract(multiply(my, s), y)
     pxx, pyy = fma(mx, subtract(px, x), xx), fma(my, subtract(py, y), yy)
     pxy = fma(mx, py, fnma(my, x, xy))
-    weights = load_transposed(batch, WEIGHTS)
-    c0, c1 = _dot(weights, gradient, slopes), _dot(weights, gradient, slopes + LANES)
-    c2, c3 = _dot(weights, gradient, slopes + 2 * LANES), zero
-    if fourth:
-        c3 = _dot(weights, gradient, slopes + 3 * LANES)
+    c0 = c1 = c2 = c3 = zero
+    for pixel in range(0, LANES, 4):
+        weights, first = load_columns(batch, WEIGHTS + pixel), slopes + pixel
+        c0 = _add_products(c0, weights, gradient, first)
+        c1 = _add_products(c1, weights, gradient, first + LANES)
+        c2 = _add_products(c2, weights, gradient, first + 2 * LANES)
+        if fourth:
+            c3 = _add_products(c3, weights, gradient, first + 3 * LANES)
     store_transposed(
         batch, 0,
         (s, px, py, pxx, pxy, pyy, c0, c1, c2, c3, zero, zero, zero, zero, zero, zero),
@@ -222,8 +239,9 @@ def _reduce(batch, center_x, center_y, gradient, slopes, fourth):
 
 
 @always_inline
-def _moments(a, b, c, d):
+def _moments(values):
     """Sum, first and second moment of four values at -OUTER, -HALF, HALF and OUTER."""
+    a, b, c, d = values
     outer, inner = add(a, d), add(b, c)
     first = fma(subtract(d, a), splat(OUTER), multiply(subtract(c, b), splat(HALF)))
     second = fma(outer, splat(OUTER * OUTER), multiply(inner, splat(HALF * HALF)))
@@ -231,20 +249,12 @@ def _moments(a, b, c, d):
 
 
 @always_inline
-def _dot(w, values, first):
-    """The sum of w[i] values[first + i], even and odd ones apart: half as long a chain."""
-    even, odd = multiply(w[0], splat(values[first])), multiply(w[1], splat(values[first + 1]))
-    even, odd = fma(w[2], splat(values[first + 2]), even), fma(w[3], splat(values[first + 3]), odd)
-    even, odd = fma(w[4], splat(values[first + 4]), even), fma(w[5], splat(values[first + 5]), odd)
-    even, odd = fma(w[6], splat(values[first + 6]), even), fma(w[7], splat(values[first + 7]), odd)
-    even, odd = fma(w[8], splat(values[first + 8]), even), fma(w[9], splat(values[first + 9]), odd)
-    even = fma(w[10], splat(values[first + 10]), even)
-    odd = fma(w[11], splat(values[first + 11]), odd)
-    even = fma(w[12], splat(values[first + 12]), even)
-    odd = fma(w[13], splat(values[first + 13]), odd)
-    even = fma(w[14], splat(values[first + 14]), even)
-    odd = fma(w[15], splat(values[first + 15]), odd)
-    return add(even, odd)
+def _add_products(total, weights, values, first):
+    """``total`` and weights[i] values[first + i] of four weights."""
+    total = fma(weights[0], broadcast(values, first), total)
+    total = fma(weights[1], broadcast(values, first + 1), total)
+    total = fma(weights[2], broadcast(values, first + 2), total)
+    return fma(weights[3], broadcast(values, first + 3), total)
 
 
 @always_inline
@@ -254,8 +264,8 @@ def _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, 
         entry = queue[begin + k]
         r, s = RECORD * np.int64(listed_rank[entry]), SUMS * np.int64(listed_span[entry])
         p = load(batch, LANES * k)
-        along_x = multiply(p, subtract(splat(records[r]), px))
-        along_y = multiply(p, subtract(splat(records[r + 1]), py))
+        along_x = multiply(p, subtract(broadcast(records, r), px))
+        along_y = multiply(p, subtract(broadcast(records, r + 1), py))
         # records hold -a/16, -b/8, -c/16
         a, b = splat(np.float32(-16.0) * records[r + 2]), splat(np.float32(-8.0) * records[r + 3])
         c = splat(np.float32(-16.0) * records[r + 4])

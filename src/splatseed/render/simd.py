@@ -28,13 +28,15 @@ __all__ = [
     "add",
     "aligned",
     "any_greater",
+    "broadcast",
     "divide",
+    "element",
     "exp_of_eighth",
     "fma",
     "fnma",
     "lane_sum",
     "load",
-    "load_transposed",
+    "load_columns",
     "minimum",
     "multiply",
     "negative_magnitude",
@@ -47,7 +49,9 @@ __all__ = [
 ]
 
 LANES = 16
+QUARTER = LANES // 4
 VECTOR = ir.VectorType(ir.FloatType(), LANES)
+PIECE = ir.VectorType(ir.FloatType(), QUARTER)
 INDEX = ir.VectorType(ir.IntType(32), LANES)
 
 
@@ -140,11 +144,44 @@ def splat(typing_context, x):  # noqa: ARG001
     """The same float32 in every lane."""
 
     def generate(context, builder, signature, arguments):  # noqa: ARG001
-        undefined = ir.Constant(VECTOR, ir.Undefined)
-        first = builder.insert_element(undefined, arguments[0], ir.Constant(ir.IntType(32), 0))
-        return builder.shuffle_vector(first, undefined, ir.Constant(INDEX, [0] * LANES))
+        return _splat(builder, arguments[0])
 
     return f32x16(types.float32), generate
+
+
+def _splat(builder, x):
+    undefined = ir.Constant(VECTOR, ir.Undefined)
+    first = builder.insert_element(undefined, x, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(INDEX, [0] * LANES))
+
+
+@intrinsic
+def broadcast(typing_context, array, index):  # noqa: ARG001
+    """Element ``index`` of a contiguous float32 array in every lane; like ``element``'s, not below 0."""
+
+    def generate(context, builder, signature, arguments):
+        return _splat(builder, _element(context, builder, signature.args[0], *arguments))
+
+    return f32x16(array, types.intp), generate
+
+
+@intrinsic
+def element(typing_context, array, index):  # noqa: ARG001
+    """Element ``index`` of a contiguous array.
+
+    It must not be below 0: counting from the end, as NumPy does there, takes several instructions
+    even where it never happens.
+    """
+
+    def generate(context, builder, signature, arguments):
+        return _element(context, builder, signature.args[0], *arguments)
+
+    return array.dtype(array, types.intp), generate
+
+
+def _element(context, builder, array_type, array, index):
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.load(builder.gep(data, [index]))
 
 
 def _address(context, builder, array_type, array, index):
@@ -185,15 +222,33 @@ def aligned(size):
 
 
 @intrinsic
-def load_transposed(typing_context, array, index):  # noqa: ARG001
-    """Sixteen vectors of 256 elements: lane i of vector j is element ``index + 16 i + j``."""
+def load_columns(typing_context, array, index):  # noqa: ARG001
+    """Four vectors of sixteen rows of sixteen: lane i of vector j is element ``index + 16 i + j``.
+
+    Four at a time fit the registers of AVX2, where all sixteen would go back to memory.
+    """
 
     def generate(context, builder, signature, arguments):
         pointer = _address(context, builder, signature.args[0], *arguments)
-        rows = [builder.load(_row(builder, pointer, i), align=4) for i in range(LANES)]
-        return cgutils.pack_array(builder, _transposed(builder, rows))
+        pointer = builder.bitcast(pointer, PIECE.as_pointer())
+        pieces = [builder.load(_row(builder, pointer, 4 * i), align=4) for i in range(LANES)]
+        rows = [_joined(builder, pieces[i::QUARTER]) for i in range(QUARTER)]
+        for width in (1, 2):
+            rows = _exchange(builder, rows, width)
+        return cgutils.pack_array(builder, rows)
 
-    return types.UniTuple(f32x16, LANES)(array, types.intp), generate
+    return types.UniTuple(f32x16, QUARTER)(array, types.intp), generate
+
+
+def _joined(builder, pieces):
+    """Vectors of one size behind each other, halves first."""
+    if len(pieces) == 1:
+        return pieces[0]
+    half = len(pieces) // 2
+    first, second = _joined(builder, pieces[:half]), _joined(builder, pieces[half:])
+    size = 2 * first.type.count
+    order = ir.Constant(ir.VectorType(ir.IntType(32), size), list(range(size)))
+    return builder.shuffle_vector(first, second, order)
 
 
 @intrinsic
@@ -226,7 +281,7 @@ def _exchange(builder, rows, width):
     out = list(rows)
     low = [k if not k & width else k - width + LANES for k in range(LANES)]
     high = [k + width if not k & width else k + LANES for k in range(LANES)]
-    for i in range(LANES):
+    for i in range(len(rows)):
         if not i & width:
             pair = rows[i], rows[i + width]
             out[i] = builder.shuffle_vector(*pair, ir.Constant(INDEX, low))
