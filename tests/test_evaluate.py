@@ -172,6 +172,20 @@ def test_lpips_is_that_of_torchmetrics(net, tmp_path, monkeypatch, truth, noisy)
     assert lpips(photo, photo) == 0.0
 
 
+@pytest.mark.parametrize(("net", "theirs"), [("alex", 0.1570625), ("vgg", 0.3332108)])
+def test_lpips_with_the_published_weights_is_that_of_its_authors(net, theirs):
+    """Numbers that the package ``lpips`` 0.1.4 gave for the same images."""
+    try:
+        metric = load_lpips(net)
+    except SceneNotFoundError as error:
+        pytest.skip(f"no weights in PyTorch's cache: {error}")
+    row, column = np.mgrid[:96, :128]
+    truth = np.stack([2 * row, 2 * column % 256, (row // 8 + column // 8) % 2 * 255], axis=-1)
+    render = np.roll(truth, 3, axis=1) // 2 + 60
+    pair = [torch.from_numpy(image / np.float32(255)).float() for image in (truth, render)]
+    assert metric(*pair) == pytest.approx(theirs, abs=1e-6)
+
+
 def test_lpips_reaches_the_result(tmp_path, truth, noisy):
     torch.save(_random_weights("alex"), tmp_path / LPIPS_NETS["alex"].file)
     lpips = load_lpips("alex", tmp_path / LPIPS_NETS["alex"].file)
