@@ -17,7 +17,8 @@ from splatseed.train.strategies import make_strategy
 
 def test_a_full_run_has_3dgs_schedule():
     full = Schedule(30_000)
-    assert (full.refine_start, full.refine_every, full.reset_every) == (500, 100, 3000)
+    assert (full.refine_start, full.reset_every) == (500, 3000)
+    assert full.refine_every("default") == full.refine_every("mcmc") == 100
     assert (full.refine_stop("default"), full.refine_stop("mcmc")) == (15_000, 25_000)
     assert [full.sh_degree(step, 3) for step in (0, 999, 1000, 2500, 29_999)] == [0, 0, 1, 2, 3]
     assert full.means_lr(0) == 1.0
@@ -28,8 +29,16 @@ def test_a_full_run_has_3dgs_schedule():
 def test_schedules_shrink_with_the_run(steps):
     short = Schedule(steps)
     assert abs(short.refine_stop("default") - steps / 2) <= 0.5
-    assert short.refine_every >= 1
     assert short.means_lr(steps) == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize(
+    ("steps", "default", "mcmc"), [(7, 10, 10), (300, 25, 10), (7000, 100, 23), (90_000, 300, 300)]
+)
+def test_default_sees_enough_photographs_between_densifications(steps, default, mcmc):
+    short = Schedule(steps)
+    assert short.refine_every("default") == default
+    assert short.refine_every("mcmc") == mcmc
 
 
 @pytest.mark.parametrize(

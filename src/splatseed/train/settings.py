@@ -1,7 +1,8 @@
 """The settings of a run, and 3DGS's hyperparameters as gsplat's trainer has them.
 
 Notation: a *step* shows one photograph. Promise: every schedule is stated for a run of 30 000 steps
-and shrinks with ``max_steps``, so a short run does in little what a long one does at large.
+and shrinks with ``max_steps``, so a short run does in little what a long one does at large; but
+strategy ``default`` looks at as many photographs before it grows as in a long one.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ MEANS_LR_DECAY = 0.01
 """The learning rate of positions at the end, as a part of that at the start; exponential between."""
 FULL_RUN = 30_000
 MCMC_CAP = 1_000_000
-MIN_REFINE_EVERY = 10
+REFINE_EVERY, MIN_REFINE_EVERY = 100, 10
+LEAST_ROUNDS = 6
 
 
 @dataclass(frozen=True)
@@ -111,10 +113,17 @@ class Schedule:
         """The first densification."""
         return self.scaled(500)
 
-    @property
-    def refine_every(self) -> int:
-        """From one densification to the next; long enough to see some photographs between."""
-        return max(self.scaled(100), MIN_REFINE_EVERY)
+    def refine_every(self, strategy: StrategyName) -> int:
+        """From one densification to the next.
+
+        ``default`` grows where gradients, averaged since the last time, are large. An average over
+        few photographs is noise, and noise grows: not less than 3DGS's own 100, but where a run
+        would then have fewer than ``LEAST_ROUNDS``. MCMC grows by a share each time.
+        """
+        scaled = max(self.scaled(REFINE_EVERY), MIN_REFINE_EVERY)
+        if strategy == "mcmc":
+            return scaled
+        return max(scaled, min(REFINE_EVERY, self.refine_stop(strategy) // LEAST_ROUNDS))
 
     @property
     def reset_every(self) -> int:

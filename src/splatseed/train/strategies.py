@@ -155,7 +155,7 @@ class _Default(Strategy):
         self.inner = _Capped(
             refine_start_iter=schedule.refine_start,
             refine_stop_iter=schedule.refine_stop("default"),
-            refine_every=schedule.refine_every,
+            refine_every=schedule.refine_every("default"),
             reset_every=schedule.reset_every,
         )
         self.inner.capacity = capacity
@@ -210,7 +210,7 @@ class _Mcmc(Strategy):
             capacity=capacity,
             refine_start_iter=schedule.refine_start,
             refine_stop_iter=schedule.refine_stop("mcmc"),
-            refine_every=schedule.refine_every,
+            refine_every=schedule.refine_every("mcmc"),
         )
         self.state = self.inner.initialize_state()
 
