@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -194,10 +195,10 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
         )
     if num_points is None:
         ratio = DEFAULT_RATIO if ratio is None else ratio
-        if not 1 <= ratio < np.inf:
+        if not isinstance(ratio, Real) or not 1 <= ratio < np.inf:
             raise ParameterError(
                 "a ratio of at least 1 (points in all, per original)",
-                found=f"{ratio:g}",
+                found=f"{ratio:g}" if isinstance(ratio, Real) else repr(ratio),
                 fix="Give --ratio 8 for eight times as many points.",
             )
         num_points = round(min(ratio * num_original, 2.0 * MAX_POINTS))
