@@ -2,7 +2,7 @@
 
 Notation: a *step* shows one photograph. Promise: every schedule is stated for a run of 30 000 steps
 and shrinks with ``max_steps``, so a short run does in little what a long one does at large; but
-strategy ``default`` looks at as many photographs before it grows as in a long one.
+strategy ``default`` looks at as many photographs before it grows as in a long one, if it can.
 """
 
 from __future__ import annotations
