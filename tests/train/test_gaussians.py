@@ -11,7 +11,7 @@ from hypothesis import given, settings, strategies as st
 from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.train.frame import training_frame
+from splatseed.train.frame import stray_views, training_frame
 from splatseed.train.gaussians import SH_C0, Gaussians, initial_gaussians, neighbor_distances
 from splatseed.train.ply import read_gaussians, write_gaussians
 from splatseed.train.views import load_split
@@ -141,3 +141,38 @@ def test_a_moved_camera_sees_moved_points_alike(room):
 def test_cameras_in_one_place_keep_the_worlds_scale(room):
     (view, *_), _ = load_split(room)
     assert training_frame([view, view]).scale == 1.0
+
+
+def _moved(view, center):
+    """The view from another place, in the same direction."""
+    cam_from_world = view.cam_from_world.copy()
+    cam_from_world[:3, 3] = -cam_from_world[:3, :3] @ center
+    return dataclasses.replace(view, cam_from_world=cam_from_world)
+
+
+@pytest.mark.parametrize("distance", [1e3, 1e6])
+@pytest.mark.parametrize("stray", [0, 4])
+def test_a_stray_camera_has_no_say_in_the_frame(room, stray, distance):
+    train, _ = load_split(room)
+    others = [view for i, view in enumerate(train) if i != stray]
+    moved = list(train)
+    moved[stray] = _moved(train[stray], np.array([0.0, distance, 0.0]))
+    assert stray_views(train) == ()
+    assert stray_views(moved) == (train[stray].name,)
+    assert training_frame(moved).scale == training_frame(others).scale
+    assert np.array_equal(training_frame(moved).origin, training_frame(others).origin)
+
+
+def test_two_cameras_are_never_strays(room):
+    train, _ = load_split(room)
+    far = _moved(train[1], np.array([0.0, 1e6, 0.0]))
+    assert stray_views([train[0], far]) == ()
+    assert stray_views([train[0], train[0], far]) == ()
+    assert stray_views([train[0]]) == ()
+
+
+def test_two_camps_of_cameras_are_not_strays(room):
+    """A close-up and a distant flight, say."""
+    train, _ = load_split(room)
+    far = [_moved(view, np.array([0.0, 1e3 + i, 0.0])) for i, view in enumerate(train[:3])]
+    assert stray_views([*train, *far]) == ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import os
 import signal
@@ -86,6 +87,22 @@ def test_bytes_depend_on_the_seed_and_not_on_the_threads(begin, strategy):
         numba.set_num_threads(numba_threads)
     assert results[0] == results[1]
     assert results[1] != results[2]
+
+
+def test_a_stray_pose_is_named_and_does_no_harm(room, tmp_path):
+    """One camera 10,000 units away once made the others' views black: the frame followed it."""
+    images = sorted(room.images, key=lambda image: image.name)
+    far = dataclasses.replace(images[2], translation=images[2].translation + [0.0, 0.0, 1e4])
+    scenes = {"as it is": images, "stray": [*images[:2], far, *images[3:]]}
+    settings, gains, notes = TrainSettings(max_steps=120, data_factor=2, strategy="none"), {}, []
+    for name, each in scenes.items():
+        scene = room.replace(images=tuple(each))
+        run = prepare_run(scene, tmp_path / name, settings, note=notes.append)
+        before = run.trainer.test_psnr()
+        run.train()
+        gains[name] = run.trainer.test_psnr() - before
+    assert gains["stray"] > gains["as it is"] - 1.0
+    assert [far.name in note for note in notes] == [True]
 
 
 def test_the_callers_random_numbers_are_left_alone(begin):

@@ -1,7 +1,8 @@
 """The frame that training works in: the cameras' centroid at 0, the farthest camera at distance 1.
 
-Notation: ``x_train = scale (x_world - origin)``. Promise: the frame depends on the training cameras
-alone, so that runs from different seeds are compared in one frame; there is no rotation, so
+Notation: ``x_train = scale (x_world - origin)``; a *stray* camera is one so far from all others that
+its pose must be wrong. Promise: the frame depends on the training cameras alone, so that runs from
+different seeds are compared in one frame; strays have no say in it; there is no rotation, so
 quaternions and spherical harmonics stay as they are; single precision suffices for far-off origins.
 """
 
@@ -12,16 +13,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64
 
 from splatseed.train.gaussians import Gaussians
 from splatseed.train.views import View
 
-__all__ = ["SCENE_SCALE", "TrainingFrame", "training_frame"]
+__all__ = ["SCENE_SCALE", "TrainingFrame", "stray_views", "training_frame"]
 
 SCENE_SCALE = 1.1
 """What the strategies and the learning rate of positions take as the size of the scene: the
 cameras' extent, and as in 3DGS a tenth more."""
+STRAY_SHARE = 0.1
+"""At most this share of the cameras, but always one, may be taken for strays."""
+STRAY_DISTANCE = 10.0
+"""A stray is more than so many times as far from the cameras' median as all that are none may be."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +66,31 @@ class TrainingFrame:
 
 
 def training_frame(views: Sequence[View]) -> TrainingFrame:
-    """The frame of these cameras; that of the world, moved, where all are in one place."""
-    centers = np.array(
-        [-view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3] for view in views]
-    )
-    origin = centers.mean(axis=0)
-    extent = float(np.linalg.norm(centers - origin, axis=1).max())
+    """The frame of these cameras but the strays; that of the world, moved, if all are in one place."""
+    centers = _centers(views)
+    near = centers[~_is_stray(centers)]
+    origin = near.mean(axis=0)
+    extent = float(np.linalg.norm(near - origin, axis=1).max())
     # Rounding leaves a little extent even where all cameras are in one place.
-    rounding = 1e-9 * float(np.abs(centers).max())
+    rounding = 1e-9 * float(np.abs(near).max())
     return TrainingFrame(origin, 1.0 / extent if extent > rounding else 1.0)
+
+
+def stray_views(views: Sequence[View]) -> tuple[str, ...]:
+    """Names of the views whose cameras are strays: see ``STRAY_DISTANCE``."""
+    strays = _is_stray(_centers(views))
+    return tuple(view.name for view, stray in zip(views, strays, strict=True) if stray)
+
+
+def _centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
+    """The cameras' positions in the world."""
+    return np.array([-view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3] for view in views])
+
+
+def _is_stray(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
+    """Which cameras are out of all proportion to the others, never more than a tenth of them, or one."""
+    distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    usual = max(1, len(centers) - max(1, round(STRAY_SHARE * len(centers))))
+    reach = np.partition(distances, usual - 1)[usual - 1]
+    rounding = 1e-9 * float(np.abs(np.median(centers, axis=0)).max())
+    return np.asarray((distances > STRAY_DISTANCE * reach) & (reach > rounding))

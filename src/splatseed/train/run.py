@@ -24,7 +24,7 @@ from splatseed.scene import Scene
 from splatseed.train.config import check_same_seeds, make_config, resumed_settings
 from splatseed.train.curve import Record, write_curve_csv, write_curve_png
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
-from splatseed.train.frame import TrainingFrame, training_frame
+from splatseed.train.frame import TrainingFrame, stray_views, training_frame
 from splatseed.train.gaussians import initial_gaussians
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
 from splatseed.train.pictures import beside_truth, picture_name, write_picture
@@ -107,6 +107,8 @@ def prepare_run(
         scene, data_factor=factor, test_every=every, cache_dir=cache, progress=progress
     )
     frame = training_frame(views[0])
+    for name in stray_views(views[0]):
+        note(f"The camera of {name} is far from all others: check its pose, or leave it out.")
     state = _state(folder if begun else None, seeds, frame, settings, device)
     if not begun:
         folder.begin(config)
