@@ -1,67 +1,118 @@
 """The trained parameters in PyTorch, their optimisers, and what they look like from a view.
 
 Notation: gsplat's parameter dict: ``means``, ``scales`` (logarithms), ``quats``, ``opacities``
-(logits), ``sh0``, ``shN``; one Adam each, as gsplat's strategies need them. Promise: one rasteriser
-call serves training and scoring on CPU and CUDA alike.
+(logits), ``sh0``, ``shN``; one Adam each, as gsplat's strategies need them. Beside them stand, in
+splatseed's conventions, ``near_depths`` [N], which are not learnt: whatever adds, moves or removes
+Gaussians hands them on with the rest. Promise: one rasteriser call serves training and scoring on
+CPU and CUDA alike.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 
 from splatseed.render import rasterization
 from splatseed.train.frame import SCENE_SCALE
 from splatseed.train.gaussians import Gaussians
-from splatseed.train.settings import LEARNING_RATES
+from splatseed.train.schedule import Schedule
 from splatseed.train.views import View
 
 __all__ = [
-    "MEANS_LR",
+    "NEAR_DEPTHS",
     "Optimizers",
     "Parameters",
+    "as_parameters",
     "gaussians_of",
     "make_optimizers",
     "make_parameters",
+    "optimize",
     "photograph",
     "render_view",
+    "yardsticks",
 ]
 
 Parameters = torch.nn.ParameterDict
 Optimizers = dict[str, torch.optim.Optimizer]
 
 ADAM_EPSILON = 1e-15
-MEANS_LR = LEARNING_RATES["means"] * SCENE_SCALE
-"""The first learning rate of positions, in the training frame."""
+NEAR_DEPTHS = "near_depths"
 
 
-def make_parameters(gaussians: Gaussians, device: torch.device) -> Parameters:
-    """Trainable copies of the Gaussians' arrays on a device."""
+def make_parameters(
+    gaussians: Gaussians,
+    device: torch.device,
+    near_depths: Float32[np.ndarray, " N"] | None = None,
+) -> Parameters:
+    """Trainable copies of the Gaussians' arrays on a device, and their yardsticks beside them.
+
+    Args:
+        gaussians: The first ones.
+        device: Where they are trained.
+        near_depths: Their near depths; left out, the cameras' extent is the yardstick of all.
+    """
+    arrays = gaussians.arrays()
+    if near_depths is not None:
+        arrays[NEAR_DEPTHS] = near_depths
+    return as_parameters({name: torch.tensor(each, device=device) for name, each in arrays.items()})
+
+
+def as_parameters(tensors: Mapping[str, Tensor]) -> Parameters:
+    """The parameter dict of these tensors: near depths are kept, all else is learnt."""
     return Parameters(
         {
-            name: torch.nn.Parameter(torch.tensor(array, device=device))
-            for name, array in gaussians.arrays().items()
+            name: torch.nn.Parameter(value, requires_grad=name != NEAR_DEPTHS)
+            for name, value in tensors.items()
         }
     )
 
 
 def gaussians_of(params: Parameters | Mapping[str, Tensor]) -> Gaussians:
     """The parameters as NumPy arrays (those of the CPU share their memory)."""
-    return Gaussians(**{name: value.detach().cpu().numpy() for name, value in params.items()})
+    names = (field.name for field in dataclasses.fields(Gaussians))
+    return Gaussians(**{name: params[name].detach().cpu().numpy() for name in names})
 
 
-def make_optimizers(params: Parameters) -> Optimizers:
-    """One Adam a parameter, with 3DGS's learning rates."""
-    rates = {**LEARNING_RATES, "means": MEANS_LR}
+def yardsticks(params: Parameters) -> float | Float[Tensor, " N"]:
+    """The length that each Gaussian's size and rate are measured by, or the one for all."""
+    return params[NEAR_DEPTHS].detach() if NEAR_DEPTHS in params else SCENE_SCALE
+
+
+def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
+    """One Adam a parameter, with the schedule's learning rates."""
     return {
-        name: torch.optim.Adam([{"params": [value]}], lr=rates[name], eps=ADAM_EPSILON, fused=True)
+        name: torch.optim.Adam(
+            [{"params": [value]}], lr=schedule.learning_rates[name], eps=ADAM_EPSILON, fused=True
+        )
         for name, value in params.items()
+        if value.requires_grad
     }
+
+
+def optimize(params: Parameters, optimizers: Optimizers, means_lr: float) -> None:
+    """Take the step that the gradients ask for, and clear them.
+
+    Args:
+        params: With their gradients.
+        optimizers: Theirs.
+        means_lr: The learning rate of positions, in yardsticks.
+    """
+    means, lengths = params["means"], yardsticks(params)
+    own = isinstance(lengths, Tensor)
+    before = means.detach().clone() if own else None
+    optimizers["means"].param_groups[0]["lr"] = means_lr if own else means_lr * lengths
+    for optimizer in optimizers.values():
+        optimizer.step()
+        optimizer.zero_grad()
+    if before is not None:  # Adam's step is in proportion to the rate, so it can be scaled behind it
+        with torch.no_grad():
+            torch.addcmul(before, means - before, lengths[:, None], out=means.data)
 
 
 def render_view(

@@ -26,6 +26,7 @@ from splatseed.train.curve import Record, write_curve_csv, write_curve_png
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
 from splatseed.train.frame import TrainingFrame, stray_views, training_frame
 from splatseed.train.gaussians import initial_gaussians
+from splatseed.train.near_depths import near_depths
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
 from splatseed.train.pictures import beside_truth, picture_name, write_picture
 from splatseed.train.ply import write_gaussians
@@ -106,10 +107,11 @@ def prepare_run(
     views = load_split(
         scene, data_factor=factor, test_every=every, cache_dir=cache, progress=progress
     )
-    frame = training_frame(views[0])
-    for name in stray_views(views[0]):
+    frame, strays = training_frame(views[0]), stray_views(views[0])
+    for name in strays:
         note(f"The camera of {name} is far from all others: check its pose, or leave it out.")
-    state = _state(folder if begun else None, seeds, frame, settings, device)
+    near = [frame.view(view) for view in views[0] if view.name not in strays]
+    state = _state(folder if begun else None, seeds, frame, near, settings, device)
     if not begun:
         folder.begin(config)
     if state.step:
@@ -263,18 +265,21 @@ def _state(
     begun: RunFolder | None,
     seeds: PointCloud,
     frame: TrainingFrame,
+    views: Sequence[View],
     settings: TrainSettings,
     device: torch.device,
 ) -> TrainState:
     """The state of a run that has begun, if it left a checkpoint, else the first state."""
-    strategy = make_strategy(settings, device)
+    strategy, schedule = make_strategy(settings, device), settings.schedule
     if begun and begun.checkpoint.is_file():
-        return load_checkpoint(begun.checkpoint, strategy, device)
+        return load_checkpoint(begun.checkpoint, strategy, schedule, device)
+    xyz = frame.points_from_world(seeds.xyz)
     gaussians = initial_gaussians(
-        seeds.replace(xyz=frame.points_from_world(seeds.xyz)),
+        seeds.replace(xyz=xyz),
         sh_degree=settings.sh_degree,
-        opacity=strategy.opacity,
-        scale_factor=strategy.scale_factor,
+        opacity=schedule.opacity,
+        scale_factor=schedule.scale_factor,
     )
-    params = make_parameters(gaussians, device)
-    return TrainState(params, make_optimizers(params), strategy)
+    lengths = near_depths(xyz, views) if schedule.near_depths else None
+    params = make_parameters(gaussians, device, lengths)
+    return TrainState(params, make_optimizers(params, schedule), strategy)

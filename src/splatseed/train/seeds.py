@@ -37,7 +37,7 @@ def usable_seeds(
     note(
         f"{len(seeds):,} seeds were thinned out at random to --cap-max {settings.cap:,}, "
         f"{kept:,} of them originals."
-        + (" They leave densification no room." if settings.strategy == "default" else "")
+        + (" They leave densification no room." if settings.densification == "default" else "")
     )
     rng = np.random.default_rng([settings.seed, settings.cap])
     rank = rng.permutation(len(seeds))

@@ -1,47 +1,24 @@
-"""The settings of a run, and 3DGS's hyperparameters as gsplat's trainer has them.
+"""The settings of a run: what a user may choose.
 
-Notation: a *step* shows one photograph. Promise: every schedule is stated for a run of 30 000 steps
-and shrinks with ``max_steps``, so a short run does in little what a long one does at large; but
-strategy ``default`` looks at as many photographs before it grows as in a long one, if it can.
+Notation: a *step* shows one photograph. A strategy's name that ends in ``-3dgs`` trains in 3DGS's
+conventions, as gsplat's trainer has them, to compare with published numbers; see ``schedule``.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import MappingProxyType
-from typing import Literal
+from typing import Literal, cast
 
 from splatseed.errors import ParameterError
+from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule
 
-__all__ = [
-    "LEARNING_RATES",
-    "MCMC_CAP",
-    "MEANS_LR_DECAY",
-    "Backend",
-    "Schedule",
-    "StrategyName",
-    "TrainSettings",
-]
+__all__ = ["AS_3DGS", "MCMC_CAP", "Backend", "StrategyName", "TrainSettings"]
 
-StrategyName = Literal["default", "mcmc", "none"]
+StrategyName = Literal["default", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"]
 Backend = Literal["auto", "cpu", "cuda"]
 
-LEARNING_RATES = MappingProxyType(
-    {
-        "means": 1.6e-4,  # times the scene's scale
-        "scales": 5e-3,
-        "quats": 1e-3,
-        "opacities": 5e-2,
-        "sh0": 2.5e-3,
-        "shN": 2.5e-3 / 20,
-    }
-)
-MEANS_LR_DECAY = 0.01
-"""The learning rate of positions at the end, as a part of that at the start; exponential between."""
-FULL_RUN = 30_000
 MCMC_CAP = 1_000_000
-REFINE_EVERY, MIN_REFINE_EVERY = 100, 10
-LEAST_ROUNDS = 6
+AS_3DGS = "-3dgs"
 
 
 @dataclass(frozen=True)
@@ -53,7 +30,8 @@ class TrainSettings:
     """
 
     strategy: StrategyName = "default"
-    """How Gaussians are added and removed: 3DGS's densification, MCMC up to a cap, or not at all."""
+    """How Gaussians are added and removed: 3DGS's densification, MCMC up to a cap, or not at all;
+    with ``-3dgs`` also in 3DGS's own conventions of rates, sizes and schedules."""
     max_steps: int = FULL_RUN
     """Training steps; all schedules shrink with them."""
     data_factor: int = 1
@@ -86,58 +64,19 @@ class TrainSettings:
             )
 
     @property
+    def densification(self) -> Densification:
+        """The strategy, whatever the conventions."""
+        return cast("Densification", self.strategy.removesuffix(AS_3DGS))
+
+    @property
     def schedule(self) -> Schedule:
-        """When things happen."""
-        return Schedule(self.max_steps)
+        """The run's numbers, and when things happen."""
+        as_3dgs = self.strategy.endswith(AS_3DGS)
+        return make_schedule(self.densification, self.max_steps, as_3dgs=as_3dgs)
 
     @property
     def cap(self) -> int | None:
         """Most Gaussians; None for no limit."""
-        if self.cap_max is None and self.strategy == "mcmc":
+        if self.cap_max is None and self.densification == "mcmc":
             return MCMC_CAP
         return self.cap_max
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """3DGS's schedule, shrunk to a run of ``max_steps``; all values in steps."""
-
-    max_steps: int
-
-    def scaled(self, steps: int) -> int:
-        """What ``steps`` of a full run are in this one, at least 1."""
-        return max(1, round(steps * self.max_steps / FULL_RUN))
-
-    @property
-    def refine_start(self) -> int:
-        """The first densification."""
-        return self.scaled(500)
-
-    def refine_every(self, strategy: StrategyName) -> int:
-        """From one densification to the next.
-
-        ``default`` grows where gradients, averaged since the last time, are large. An average over
-        few photographs is noise, and noise grows: not less than 3DGS's own 100, but where a run
-        would then have fewer than ``LEAST_ROUNDS``. MCMC grows by a share each time.
-        """
-        scaled = max(self.scaled(REFINE_EVERY), MIN_REFINE_EVERY)
-        if strategy == "mcmc":
-            return scaled
-        return max(scaled, min(REFINE_EVERY, self.refine_stop(strategy) // LEAST_ROUNDS))
-
-    @property
-    def reset_every(self) -> int:
-        """From one reset of the opacities to the next."""
-        return self.scaled(3000)
-
-    def refine_stop(self, strategy: StrategyName) -> int:
-        """The end of densification: half of the run; MCMC goes on to five sixths."""
-        return self.scaled(25_000 if strategy == "mcmc" else 15_000)
-
-    def sh_degree(self, step: int, highest: int) -> int:
-        """The degree of spherical harmonics in use: one more every 1000 steps."""
-        return min(step // self.scaled(1000), highest)
-
-    def means_lr(self, step: int) -> float:
-        """What the learning rate of positions is multiplied by."""
-        return float(MEANS_LR_DECAY ** (step / self.max_steps))

@@ -19,12 +19,13 @@ from torch import Tensor
 from splatseed.errors import SceneFormatError
 from splatseed.io.staging import atomic_file
 from splatseed.train.curve import Record
-from splatseed.train.parameters import Optimizers, Parameters, make_optimizers
+from splatseed.train.parameters import Optimizers, Parameters, as_parameters, make_optimizers
+from splatseed.train.schedule import Schedule
 from splatseed.train.strategies import Strategy
 
 __all__ = ["Stopwatch", "TrainState", "load_checkpoint", "save_checkpoint"]
 
-FORMAT = 1
+FORMAT = 2
 
 
 class Stopwatch:
@@ -88,22 +89,23 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         torch.save(content, partial)
 
 
-def load_checkpoint(path: Path, strategy: Strategy, device: torch.device) -> TrainState:
+def load_checkpoint(
+    path: Path, strategy: Strategy, schedule: Schedule, device: torch.device
+) -> TrainState:
     """The state that ``save_checkpoint`` wrote, on a device.
 
     Args:
         path: The checkpoint.
         strategy: A new one of the run's settings; its state is replaced.
+        schedule: The run's.
         device: Where to go on.
 
     Raises:
         SceneFormatError: The file is no checkpoint of this version.
     """
     content = _load(path, device)
-    params = Parameters(
-        {name: torch.nn.Parameter(value) for name, value in content["params"].items()}
-    )
-    optimizers = make_optimizers(params)
+    params = as_parameters(content["params"])
+    optimizers = make_optimizers(params, schedule)
     for name, optimizer in optimizers.items():
         optimizer.load_state_dict(content["optimizers"][name])
     strategy.state = content["strategy"]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
@@ -21,8 +21,8 @@ from torch import Tensor
 
 from splatseed.render import MCMCStrategy
 from splatseed.train.device import Capacity
-from splatseed.train.frame import SCENE_SCALE
-from splatseed.train.parameters import Optimizers, Parameters
+from splatseed.train.parameters import Optimizers, Parameters, yardsticks
+from splatseed.train.schedule import LEARNING_RATES
 from splatseed.train.settings import MCMC_CAP, TrainSettings
 
 __all__ = ["Strategy", "make_strategy"]
@@ -32,17 +32,12 @@ GROWTH = 1.05
 
 
 class Strategy(ABC):
-    """What changes the number of Gaussians, and how they begin.
+    """What changes the number of Gaussians.
 
     Attributes:
         state: What it remembers from step to step.
         capacity: How many Gaussians it may make; None if it makes none.
     """
-
-    opacity: ClassVar[float] = 0.1
-    """Of the first Gaussians."""
-    scale_factor: ClassVar[float] = 1.0
-    """Size of the first Gaussians, as a multiple of the gaps between them."""
 
     def __init__(self, capacity: Capacity | None = None) -> None:
         self.state: dict[str, Any] = {}
@@ -57,9 +52,7 @@ class Strategy(ABC):
         """To be called ahead of the backward pass."""
 
     @abstractmethod
-    def after(
-        self, params: Parameters, optimizers: Optimizers, step: int, info: Any, means_lr: float
-    ) -> None:
+    def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
         """To be called behind the optimisers; may replace parameters and their moments."""
 
 
@@ -71,9 +64,9 @@ def make_strategy(settings: TrainSettings, device: torch.device | None = None) -
         device: Whose memory bounds the number of Gaussians; the CPU's by default.
     """
     device = device or torch.device("cpu")
-    if settings.strategy == "default":
+    if settings.densification == "default":
         return _Default(settings, Capacity(settings.cap, device))
-    if settings.strategy == "mcmc":
+    if settings.densification == "mcmc":
         return _Mcmc(settings, Capacity(settings.cap or MCMC_CAP, device))
     return _Fixed()
 
@@ -84,9 +77,7 @@ class _Fixed(Strategy):
     def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
         pass
 
-    def after(
-        self, params: Parameters, optimizers: Optimizers, step: int, info: Any, means_lr: float
-    ) -> None:
+    def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
         pass
 
 
@@ -153,25 +144,19 @@ class _Default(Strategy):
         schedule = settings.schedule
         self.inner = _Capped(
             refine_start_iter=schedule.refine_start,
-            refine_stop_iter=schedule.refine_stop("default"),
-            refine_every=schedule.refine_every("default"),
+            refine_stop_iter=schedule.refine_stop,
+            refine_every=schedule.refine_every,
             reset_every=schedule.reset_every,
         )
         self.inner.capacity = capacity
         self.resets = settings.opacity_reset
-        self.state = self.inner.initialize_state(scene_scale=SCENE_SCALE)
+        self.state = self.inner.initialize_state()
 
     def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
         self.inner.step_pre_backward(params, optimizers, self.state, step, info)
 
-    def after(
-        self,
-        params: Parameters,
-        optimizers: Optimizers,
-        step: int,
-        info: Any,
-        means_lr: float,  # noqa: ARG002  (MCMC's)
-    ) -> None:
+    def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        self.state["scene_scale"] = yardsticks(params)  # gsplat hands on what it holds of each one
         self.inner.step_post_backward(params, optimizers, self.state, step, info)
         if self._resets_at(step):
             reset_opa(params, optimizers, self.state, value=2 * self.inner.prune_opa)
@@ -197,32 +182,32 @@ class _Bounded(MCMCStrategy):
 class _Mcmc(Strategy):
     """3DGS as MCMC: move the faint to where there is more to show, add up to a cap, add noise."""
 
-    opacity = 0.5
-    scale_factor = 0.1
     OPACITY_WEIGHT = 0.01
     SCALE_WEIGHT = 0.01
 
     def __init__(self, settings: TrainSettings, capacity: Capacity) -> None:
         super().__init__(capacity)
-        schedule = settings.schedule
+        self.schedule = schedule = settings.schedule
         self.inner = _Bounded(
             capacity=capacity,
             refine_start_iter=schedule.refine_start,
-            refine_stop_iter=schedule.refine_stop("mcmc"),
-            refine_every=schedule.refine_every("mcmc"),
+            refine_stop_iter=schedule.refine_stop,
+            refine_every=schedule.refine_every,
         )
         self.state = self.inner.initialize_state()
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""]:
-        opacity = torch.sigmoid(params["opacities"]).mean()
-        return (
-            self.OPACITY_WEIGHT * opacity + self.SCALE_WEIGHT * torch.exp(params["scales"]).mean()
-        )
+        opacities, sizes = torch.sigmoid(params["opacities"]), torch.exp(params["scales"])
+        if self.schedule.near_depths:
+            sizes = sizes / yardsticks(params)[:, None]
+        return self.OPACITY_WEIGHT * opacities.mean() + self.SCALE_WEIGHT * sizes.mean()
 
     def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
         pass
 
-    def after(
-        self, params: Parameters, optimizers: Optimizers, step: int, info: Any, means_lr: float
-    ) -> None:
-        self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=means_lr)
+    def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        # gsplat takes the learning rate of positions; the noise is that times a covariance.
+        rate = LEARNING_RATES["means"] * self.schedule.decay(step)
+        lengths = yardsticks(params)
+        lr = rate / lengths[:, None] if self.schedule.near_depths else rate * lengths
+        self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=lr)

@@ -20,7 +20,7 @@ from splatseed.train.allocator import keep_freed_memory
 from splatseed.train.curve import Record
 from splatseed.train.interruption import interruption
 from splatseed.train.losses import photometric_loss, psnr
-from splatseed.train.parameters import MEANS_LR, photograph, render_view
+from splatseed.train.parameters import optimize, photograph, render_view
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
 from splatseed.train.views import View
@@ -107,12 +107,8 @@ class Trainer:
         state.losses.append(loss.detach())
         penalty = strategy.regularization(params)
         (loss if penalty is None else loss + penalty).backward()
-        means_lr = MEANS_LR * schedule.means_lr(step)
-        optimizers["means"].param_groups[0]["lr"] = means_lr
-        for optimizer in optimizers.values():
-            optimizer.step()
-            optimizer.zero_grad()
-        strategy.after(params, optimizers, step, info, means_lr)
+        optimize(params, optimizers, schedule.means_lr(step))
+        strategy.after(params, optimizers, step, info)
         return render.detach(), truth
 
     def _record(self, render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> None:

@@ -1,0 +1,65 @@
+"""How near the photographs come to each point: the yardstick of its Gaussian's size and rate.
+
+Notation: N points and the training views, both in the training frame; a *near depth* is the least
+depth at which a view sees a point. A length divided by it is an angle, so a rate or a size stated in
+near depths is the same in the pictures wherever a Gaussian stands: in front of cameras that stand
+close together, on a table between them, or far behind both. 3DGS takes the cameras' extent for all.
+Promise: every near depth is positive and finite; the same bytes whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from splatseed.train.views import View
+
+__all__ = ["near_depths"]
+
+MOST_VIEWS = 64
+"""More views, which are then neighbours of others, hardly change the least depth."""
+MARGIN = 0.1
+"""A view also sees what is out of its picture by this share of its size: what is large reaches in."""
+LEAST = 0.01
+"""The rasteriser's near plane: nothing nearer is drawn."""
+
+
+def near_depths(
+    xyz: Float[np.ndarray, "N 3"], views: Sequence[View]
+) -> Float32[np.ndarray, " N"]:
+    """The least depth of each point among the views that see it; what no view sees gets the median.
+
+    Args:
+        xyz: Points.
+        views: The training views; of many, ``MOST_VIEWS`` evenly chosen ones are asked.
+    """
+    nearest = np.full(len(xyz), np.inf)
+    columns = np.ascontiguousarray(xyz.T, np.float64)
+    for i in np.unique(np.linspace(0, len(views) - 1, MOST_VIEWS).round().astype(int)):
+        depths, seen = _seen_depths(columns, views[i])
+        np.minimum(nearest, np.where(seen, depths, np.inf), out=nearest)
+    known = np.isfinite(nearest)
+    nearest[~known] = np.median(nearest[known]) if known.any() else 1.0
+    return np.maximum(nearest, LEAST).astype(np.float32)
+
+
+def _seen_depths(
+    columns: Float[np.ndarray, "3 N"], view: View
+) -> tuple[Float[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+    """Depths in a view, and whether they are in front of it and about within its picture."""
+    # Sums are written out: BLAS may add in another order when it has more threads.
+    x, y, depths = (
+        row[0] * columns[0] + row[1] * columns[1] + row[2] * columns[2] + row[3]
+        for row in view.cam_from_world[:3]
+    )
+    seen = depths > LEAST
+    for across, focal, center, size in (
+        (x, view.K[0, 0], view.K[0, 2], view.width),
+        (y, view.K[1, 1], view.K[1, 2], view.height),
+    ):
+        # Multiplied by the depth, so that nothing is divided by zero.
+        seen &= focal * across >= (-MARGIN * size - center) * depths
+        seen &= focal * across <= ((1 + MARGIN) * size - center) * depths
+    return depths, seen
