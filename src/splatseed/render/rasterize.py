@@ -1,8 +1,9 @@
 """``rasterization``: gsplat's signature, on the CPU.
 
 Meant for code written against gsplat 1.5.3: arguments, results and the ``info`` dict are gsplat's, so
-that its densification strategies run unchanged. What the CPU does not do (fisheye and orthographic
-cameras, distributed rendering, rolling shutter) is refused, never ignored.
+that its default densification runs unchanged, and MCMC by way of ``splatseed.render.MCMCStrategy``. What
+the CPU does not do (fisheye and orthographic cameras, distributed rendering, rolling shutter) is refused,
+never ignored.
 """
 
 from __future__ import annotations
