@@ -40,6 +40,8 @@ REFUSED: dict[str, dict[str, Any]] = {
     "unknown rasterize_mode": {"rasterize_mode": "antialias"},
     "width 0": {"width": 0},
     "fractional height": {"height": 3.5},
+    "tile_size 0": {"tile_size": 0},
+    "sparse gradients of what is not packed": {"sparse_grad": True, "packed": False},
     "negative near plane": {"near_plane": -1.0},
     "NaN blur": {"eps2d": float("nan")},
     "float64": {"means": torch.zeros(N, 3, dtype=torch.float64)},

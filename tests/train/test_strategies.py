@@ -1,8 +1,6 @@
-"""Schedules, and what gsplat's MCMC needs on the CPU."""
+"""Schedules, and the running sums that are kept in another way than gsplat's."""
 
 from __future__ import annotations
-
-import math
 
 import pytest
 import torch
@@ -10,7 +8,6 @@ from gsplat.strategy import DefaultStrategy
 
 from splatseed.errors import ParameterError
 from splatseed.render import rasterization
-from splatseed.train.relocation import compute_relocation, covariances, mcmc_on_cpu
 from splatseed.train.settings import Schedule, TrainSettings
 from splatseed.train.strategies import make_strategy
 
@@ -72,49 +69,3 @@ def test_running_sums_are_gsplats_own(cameras):
     for name in ("grad2d", "count"):
         assert expected[name].max() > 0
         assert torch.equal(ours.state[name], expected[name])
-
-
-def _relocation_by_the_paper(opacity, share):
-    """3DGS as MCMC, eq. 9: the double sum as printed."""
-    new = 1 - (1 - opacity) ** (1 / share)
-    total = sum(
-        math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
-        for i in range(1, share + 1)
-        for k in range(i)
-    )
-    return new, opacity / total
-
-
-def test_relocation_is_the_papers_double_sum():
-    opacities = torch.tensor([0.01, 0.3, 0.9, 0.995], dtype=torch.float64).repeat(5)
-    shares = torch.tensor([1, 2, 3, 10, 51]).repeat_interleave(4)
-    scales = torch.rand(20, 3, dtype=torch.float64)
-    new, resized = compute_relocation(opacities, scales, shares, torch.zeros(51, 51))
-    for i, (opacity, share) in enumerate(zip(opacities.tolist(), shares.tolist(), strict=True)):
-        expected, factor = _relocation_by_the_paper(opacity, share)
-        assert float(new[i]) == pytest.approx(expected, rel=1e-9)
-        assert torch.allclose(resized[i], scales[i] * factor, rtol=1e-6)
-
-
-def test_gaussians_that_share_a_place_are_as_opaque_together():
-    opacities, shares = torch.tensor([0.2, 0.7, 0.99]), torch.tensor([2, 5, 60])
-    new, _ = compute_relocation(opacities, torch.ones(3, 3), shares, torch.zeros(51, 51))
-    together = 1 - (1 - new) ** shares.clamp(max=51)
-    assert torch.allclose(together, opacities, atol=1e-5)
-
-
-def test_covariances_are_rotated_squares():
-    half_turn = torch.tensor([[math.cos(math.pi / 4), 0, 0, math.sin(math.pi / 4)]]) * 3.0
-    matrices, _ = covariances(half_turn, torch.tensor([[1.0, 2.0, 3.0]]))
-    assert torch.allclose(matrices[0], torch.diag(torch.tensor([4.0, 1.0, 9.0])), atol=1e-5)
-
-
-def test_gsplat_gets_its_own_functions_back():
-    from gsplat.strategy import ops  # noqa: PLC0415
-
-    before = ops.compute_relocation, ops.quat_scale_to_covar_preci
-    with mcmc_on_cpu():
-        assert ops.compute_relocation is compute_relocation
-    with pytest.raises(KeyboardInterrupt), mcmc_on_cpu():
-        raise KeyboardInterrupt
-    assert (ops.compute_relocation, ops.quat_scale_to_covar_preci) == before

@@ -2,8 +2,14 @@
 
 ``rasterization`` has the signature and the results of ``gsplat.rasterization`` (1.5.3). CUDA tensors
 go to gsplat itself; CPU tensors to this package's own rasteriser, so that code written for gsplat
-runs, trains and is tested without a GPU. Needs PyTorch (``pip install "splatseed[train]"``).
+runs, trains and is tested without a GPU. ``MCMCStrategy`` is gsplat's on either device, and
+``mcmc_on_cpu`` a block within which gsplat's own runs on the CPU. Needs PyTorch, the strategy gsplat as
+well (``pip install "splatseed[train]"``).
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 from splatseed.errors import MissingDependencyError
 
@@ -17,5 +23,24 @@ except ModuleNotFoundError as error:
     ) from error
 
 from splatseed.render.rasterize import rasterization
+from splatseed.render.relocation import mcmc_on_cpu
+from splatseed.requirements import require
 
-__all__ = ["rasterization"]
+if TYPE_CHECKING:
+    from splatseed.render.mcmc import MCMCStrategy
+
+__all__ = ["MCMCStrategy", "mcmc_on_cpu", "rasterization"]
+
+
+def __getattr__(name: str) -> Any:
+    """What needs gsplat.
+
+    Raises:
+        MissingDependencyError: gsplat is absent.
+    """
+    if name != "MCMCStrategy":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    require("gsplat")
+    from splatseed.render.mcmc import MCMCStrategy  # noqa: PLC0415  (imports gsplat)
+
+    return MCMCStrategy

@@ -18,7 +18,7 @@ from splatseed.errors import ParameterError
 from splatseed.render.blending import CHANNELS
 from splatseed.render.harmonics import MAX_DEGREE
 
-__all__ = ["check_absgrad", "check_numbers", "check_tensors", "check_unsupported"]
+__all__ = ["check_absgrad", "check_numbers", "check_sparse", "check_tensors", "check_unsupported"]
 
 CUDA_ONLY: Mapping[str, object] = {
     "distributed": False,
@@ -63,6 +63,7 @@ def check_unsupported(arguments: Mapping[str, object]) -> None:
 def check_numbers(
     width: int,
     height: int,
+    tile_size: int,
     near_plane: float,
     eps2d: float,
     sh_degree: int | None,
@@ -73,6 +74,7 @@ def check_numbers(
     Args:
         width: Pixels, at least 1.
         height: Pixels, at least 1.
+        tile_size: Pixels, at least 1.
         near_plane: At least 0: depths sort as their bits do only where they are not negative.
         eps2d: px^2, at least 0.
         sh_degree: None, or 0 to ``MAX_DEGREE``.
@@ -81,7 +83,7 @@ def check_numbers(
     Raises:
         ParameterError: One is out of its range.
     """
-    for name, size in (("width", width), ("height", height)):
+    for name, size in (("width", width), ("height", height), ("tile_size", tile_size)):
         _require(
             isinstance(size, Integral) and int(size) >= 1, f"{name} as an int of at least 1", size
         )
@@ -166,6 +168,15 @@ def check_absgrad(absgrad: bool, channels: int) -> None:
     """
     limit = f"no more than {CHANNELS} channels, depth included, with absgrad on the CPU"
     _require(not absgrad or channels <= CHANNELS, limit, channels)
+
+
+def check_sparse(sparse_grad: bool, packed: bool) -> None:
+    """Refuse sparse gradients of what is not packed, as gsplat does.
+
+    Raises:
+        ParameterError: ``sparse_grad`` without ``packed``.
+    """
+    _require(packed or not sparse_grad, "packed=True with sparse_grad=True", packed)
 
 
 def _require(fits: object, expected: str, found: object) -> None:

@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 from splatseed.render import blending, blending_vjp, harmonics as sh, layout, projection
 from splatseed.render.binning import RECORD, TILE, TileLists, depth_order, list_tiles, row_order
 
-__all__ = ["Blend", "Harmonics", "Lens", "Project"]
+__all__ = ["Blend", "Harmonics", "Lens", "Project", "is_seen"]
 
 GREATEST = np.float32(1e6)
 """Opacities above it count as this much: beyond 1 they only make a Gaussian wider."""
@@ -48,10 +48,11 @@ def _array(tensor: Tensor) -> np.ndarray:
 class Project(torch.autograd.Function):
     """3D Gaussians to one camera's image plane.
 
-    Inputs: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], viewmat [4, 4], lens.
+    Inputs: means [N, 3], quats [N, 4], scales [N, 3], opacities [N], viewmat [4, 4], lens, sparse.
     Outputs: radii [N, 2], means2d [N, 2], depths [N], conics [N, 3], compensations [N].
 
-    Opacities only bound the radii; they get no gradient here, as in gsplat.
+    Opacities only bound the radii; they get no gradient here, as in gsplat. With ``sparse`` the
+    gradients of means, quats and scales list only the Gaussians that this camera sees.
     """
 
     @staticmethod
@@ -63,6 +64,7 @@ class Project(torch.autograd.Function):
         opacities: Tensor,
         viewmat: Tensor,
         lens: Lens,
+        sparse: bool,
     ) -> tuple[Tensor, ...]:
         """Run the kernel and keep what backward needs."""
         arrays = [_array(t) for t in (means, quats, scales, opacities, viewmat)]
@@ -73,7 +75,7 @@ class Project(torch.autograd.Function):
         )
         projection.project(*arrays, *lens, radii, *out)  # type: ignore[call-arg]  # star arguments
         ctx.save_for_backward(means, quats, scales, viewmat)
-        ctx.lens, ctx.radii = lens, radii
+        ctx.lens, ctx.radii, ctx.sparse = lens, radii, sparse
         results = [torch.from_numpy(each) for each in (radii, *out)]
         ctx.mark_non_differentiable(results[0])
         return tuple(results)
@@ -92,7 +94,23 @@ class Project(torch.autograd.Function):
         )  # fmt: skip
         d_view = torch.zeros(4, 4)
         d_view[:3] = torch.from_numpy(by_view.sum(axis=0))
-        return (*(torch.from_numpy(r) for r in results), None, d_view, None)
+        slopes = [torch.from_numpy(each) for each in results]
+        if ctx.sparse:
+            rows = is_seen(torch.from_numpy(ctx.radii)).nonzero()[:, 0]
+            slopes = [_sparse(each, rows) for each in slopes]
+        return *slopes, None, d_view, None, None
+
+
+def is_seen(radii: Tensor) -> Tensor:
+    """Which Gaussians of radii [N, 2] are not culled, bool [N]."""
+    return (radii[:, 0] > 0) & (radii[:, 1] > 0)  # all() takes four times as long
+
+
+def _sparse(dense: Tensor, rows: Tensor) -> Tensor:
+    """Some rows, in rising order, as a COO tensor; the others count as 0."""
+    return torch.sparse_coo_tensor(
+        rows[None], dense[rows], dense.shape, is_coalesced=True, check_invariants=False
+    )
 
 
 class Harmonics(torch.autograd.Function):

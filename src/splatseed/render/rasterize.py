@@ -1,15 +1,16 @@
 """``rasterization``: gsplat's signature, on the CPU.
 
 Meant for code written against gsplat 1.5.3: arguments, results and the ``info`` dict are gsplat's, so
-that its densification strategies run unchanged. What the CPU does not do (fisheye and orthographic
-cameras, distributed rendering, rolling shutter) is refused, never ignored.
+that its default densification runs unchanged, and MCMC by way of ``splatseed.render.MCMCStrategy``. What
+the CPU does not do (fisheye and orthographic cameras, distributed rendering, rolling shutter) is refused,
+never ignored.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -18,10 +19,12 @@ from torch import Tensor
 from splatseed.render.arguments import (
     check_absgrad,
     check_numbers,
+    check_sparse,
     check_tensors,
     check_unsupported,
 )
 from splatseed.render.functions import Blend, Harmonics, Lens, Project
+from splatseed.render.info import Info, View, make_info
 from splatseed.requirements import require
 
 __all__ = ["rasterization"]
@@ -29,7 +32,7 @@ __all__ = ["rasterization"]
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
 GSPLAT_TILE = 16
-"""What ``info`` reports as the size of a tile."""
+"""The size of the tiles that ``info`` lists, px."""
 
 
 def rasterization(
@@ -77,10 +80,12 @@ def rasterization(
         eps2d: Blur added to the 2D covariance, px^2.
         sh_degree: Degree of spherical harmonics, 0 to 3; None takes colours as they are.
         packed: Whether ``info`` lists visible Gaussians only; the image is the same.
-        tile_size: Kept for gsplat's sake; the CPU has tiles of its own.
+        tile_size: Pixels a tile of ``info``'s lists is wide and high; the image has tiles of its own.
         backgrounds: Colours behind everything, [C, D].
         render_mode: Colour, depth accumulated (D) or expected (ED), or both.
-        sparse_grad: Kept for gsplat's sake; gradients are dense.
+        sparse_grad: Whether what comes through projection to the gradients of means, quats and scales
+            is sparse (COO) and lists only the Gaussians that are seen; needs ``packed``. Means that
+            also get a gradient from harmonics' directions end with a dense one, as in gsplat.
         absgrad: Whether ``info["means2d"].absgrad`` is set by backward.
         rasterize_mode: "antialiased" lowers opacities by what the blur adds.
         channel_chunk: Kept for gsplat's sake.
@@ -88,8 +93,10 @@ def rasterization(
 
     Returns:
         Colours [C, H, W, D] (with depth as last channel where asked for), alphas [C, H, W, 1], and
-        ``info`` with means2d, radii, depths, conics, opacities, width, height, n_cameras, and for
-        ``packed`` camera_ids and gaussian_ids.
+        ``info``, gsplat's dictionary: means2d, radii, depths, conics, opacities ([C, N, ...], or for
+        ``packed`` [G, ...] with batch_ids, camera_ids and gaussian_ids, otherwise None); width, height,
+        tile_size, tile_width, tile_height (in tiles), n_batches, n_cameras; and, made when first read,
+        tiles_per_gauss, isect_ids, flatten_ids, isect_offsets.
 
     Raises:
         ParameterError: An argument that the CPU rasteriser does not support, or tensors that are not
@@ -118,8 +125,9 @@ def rasterization(
             sparse_grad, absgrad, rasterize_mode, channel_chunk, **unsupported,
         )  # fmt: skip
     check_unsupported(unsupported)
+    check_sparse(sparse_grad, packed)
     check_numbers(
-        width, height, near_plane, eps2d, sh_degree,
+        width, height, tile_size, near_plane, eps2d, sh_degree,
         render_mode=(render_mode, RenderMode), rasterize_mode=(rasterize_mode, RasterizeMode),
     )  # fmt: skip
     check_tensors(
@@ -134,6 +142,7 @@ def rasterization(
             means, quats, scales, opacities, viewmats[camera],
             Lens(_intrinsics(Ks[camera]), width, height, near_plane, far_plane, eps2d, radius_clip,
                  antialiased),
+            sparse_grad,
         )
         for camera in range(len(viewmats))
     ]  # fmt: skip
@@ -142,7 +151,7 @@ def rasterization(
         for camera, view in enumerate(views)
     ]
     check_absgrad(absgrad, shades[0].shape[1])
-    info = _info(views, packed, width=width, height=height, tile_size=tile_size)
+    info = make_info(views, packed, width, height, tile_size)
     images, alphas = _blend(views, shades, info, _background(backgrounds, render_mode), absgrad)
     if render_mode in {"ED", "RGB+ED"}:
         expected = images[..., -1:] / alphas.clamp(min=1e-10)
@@ -150,34 +159,25 @@ def rasterization(
     return images, alphas, info
 
 
-class _View(NamedTuple):
-    """N Gaussians in one camera."""
-
-    radii: Tensor
-    means2d: Tensor
-    depths: Tensor
-    conics: Tensor
-    opacities: Tensor
-
-    @property
-    def seen(self) -> Tensor:
-        """Which are not culled, bool [N]."""
-        return (self.radii[:, 0] > 0) & (self.radii[:, 1] > 0)  # all() takes four times as long
-
-
 def _intrinsics(K: Tensor) -> np.ndarray:
     return np.asarray(K.detach().to(torch.float32).contiguous().numpy())
 
 
 def _project(
-    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmat: Tensor, lens: Lens
-) -> _View:
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    viewmat: Tensor,
+    lens: Lens,
+    sparse: bool,
+) -> View:
     radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]
-        means, quats, scales, opacities, viewmat, lens
+        means, quats, scales, opacities, viewmat, lens, sparse
     )
     if lens.antialiased:
         opacities = opacities * compensations
-    return _View(radii, means2d, depths, conics, opacities)
+    return View(radii, means2d, depths, conics, opacities)
 
 
 def _colors(
@@ -185,7 +185,7 @@ def _colors(
     colors: Tensor | tuple[Tensor, Tensor],
     viewmats: Tensor,
     camera: int,
-    view: _View,
+    view: View,
     sh_degree: int | None,
 ) -> Tensor:
     """Colours of N Gaussians in one camera, [N, D]."""
@@ -200,7 +200,7 @@ def _colors(
     return shades
 
 
-def _with_depth(colors: Tensor, view: _View, render_mode: RenderMode) -> Tensor:
+def _with_depth(colors: Tensor, view: View, render_mode: RenderMode) -> Tensor:
     """The channels that the mode asks for, depth last."""
     if render_mode == "RGB":
         return colors
@@ -216,26 +216,10 @@ def _background(backgrounds: Tensor | None, render_mode: RenderMode) -> Tensor |
     return depth if render_mode in {"D", "ED"} else torch.cat([backgrounds, depth], dim=-1)
 
 
-def _info(views: Sequence[_View], packed: bool, **facts: int) -> dict[str, Any]:
-    """The dictionary of gsplat: stacked over cameras, or only what is visible, camera by camera."""
-    info: dict[str, Any] = {**facts, "n_cameras": len(views), "camera_ids": None}
-    info["gaussian_ids"] = None
-    if not packed:
-        for name in _View._fields:
-            info[name] = _stacked([getattr(view, name) for view in views])
-        return info
-    ids = [torch.nonzero(view.seen)[:, 0] for view in views]
-    for name in _View._fields:
-        info[name] = torch.cat([getattr(view, name)[i] for view, i in zip(views, ids, strict=True)])
-    info["gaussian_ids"] = torch.cat(ids)
-    info["camera_ids"] = torch.cat([torch.full_like(i, c) for c, i in enumerate(ids)])
-    return info
-
-
 def _blend(
-    views: Sequence[_View],
+    views: Sequence[View],
     shades: Sequence[Tensor],
-    info: dict[str, Any],
+    info: Info,
     backgrounds: Tensor | None,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
@@ -261,11 +245,6 @@ def _blend(
         alphas.append(alpha[..., None])
     # Copies also of one: backward reads the image, and who changes it in place must not disturb that.
     return torch.stack(images), torch.stack(alphas)
-
-
-def _stacked(tensors: Sequence[Tensor]) -> Tensor:
-    """Camera by camera along a new axis; what is of one camera is not copied."""
-    return tensors[0][None] if len(tensors) == 1 else torch.stack(list(tensors))
 
 
 def _keep_absgrad(means2d: Any, rows: Any, gradient: Tensor) -> None:

@@ -10,20 +10,19 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from gsplat.strategy import DefaultStrategy, MCMCStrategy
+from gsplat.strategy import DefaultStrategy
 from gsplat.strategy.ops import reset_opa
 from jaxtyping import Float
 from torch import Tensor
 
+from splatseed.render import MCMCStrategy
 from splatseed.train.device import Capacity
 from splatseed.train.frame import SCENE_SCALE
 from splatseed.train.parameters import Optimizers, Parameters
-from splatseed.train.relocation import mcmc_on_cpu
 from splatseed.train.settings import MCMC_CAP, TrainSettings
 
 __all__ = ["Strategy", "make_strategy"]
@@ -183,7 +182,7 @@ class _Default(Strategy):
 
 
 @dataclass
-class _Bounded(MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
+class _Bounded(MCMCStrategy):
     """gsplat's strategy, but that its cap is never more than fits the memory."""
 
     capacity: Capacity | None = None
@@ -226,6 +225,4 @@ class _Mcmc(Strategy):
     def after(
         self, params: Parameters, optimizers: Optimizers, step: int, info: Any, means_lr: float
     ) -> None:
-        on_cpu = params["means"].device.type == "cpu"
-        with mcmc_on_cpu() if on_cpu else nullcontext():
-            self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=means_lr)
+        self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=means_lr)

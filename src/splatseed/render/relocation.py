@@ -1,0 +1,131 @@
+"""What gsplat's MCMC strategy has in CUDA only, for the CPU: splitting a Gaussian, and covariances.
+
+Notation: o opacity, s scales, n how many Gaussians share the place. With o' = 1 - (1 - o)^(1/n)
+(3DGS as MCMC, Kheradmand et al. 2024, eq. 9; the double sum folded by the hockey-stick identity):
+
+    s' = s o / sum_{k=0}^{n-1} (-1)^k C(n, k+1) o'^(k+1) / sqrt(k+1)
+
+Promise: float64 inside, as the sum alternates; gsplat's files are not touched, and CUDA tensors go to
+gsplat's own functions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Lock
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from splatseed.requirements import require
+
+__all__ = ["compute_relocation", "covariances", "mcmc_on_cpu"]
+
+
+def compute_relocation(
+    opacities: Float[Tensor, " N"] | Float[Tensor, "N 1"],
+    scales: Float[Tensor, "N 3"],
+    ratios: Int[Tensor, " N"],
+    binoms: Float[Tensor, "M M"],
+) -> tuple[Tensor, Float[Tensor, "N 3"]]:
+    """Opacities, shaped as they came, and scales [N, 3] of each of ``ratios`` Gaussians for one.
+
+    Args:
+        opacities: From 0 to 1, [N] or [N, 1].
+        scales: Standard deviations, [N, 3].
+        ratios: How many share the place, [N]; taken as at most M.
+        binoms: gsplat's table of binomial coefficients; only its size is used.
+    """
+    if opacities.is_cuda:
+        from gsplat.relocation import compute_relocation as on_cuda  # noqa: PLC0415  (needs CUDA)
+
+        return on_cuda(opacities, scales, ratios, binoms)  # type: ignore[no-any-return]
+    largest = len(binoms)
+    shares = ratios.clamp(1, largest).view_as(opacities)
+    old = opacities.to(torch.float64)
+    new = -torch.expm1(torch.log1p(-old) / shares)
+    table = _coefficients(largest).to(old.device)
+    total = torch.zeros_like(old)
+    for k in reversed(range(largest)):  # Horner's rule
+        total = (total + table[shares, k]) * new
+    factor = torch.where(shares == 1, 1.0, old / total)
+    return new.to(opacities.dtype), scales * factor.to(scales.dtype).view(-1, 1)
+
+
+def covariances(
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    compute_covar: bool = True,
+    compute_preci: bool = False,
+    triu: bool = False,
+) -> tuple[Float[Tensor, "N 3 3"], None]:
+    """R S S R' of each Gaussian, [N, 3, 3]; element by element, as small products are slow in BLAS.
+
+    Args:
+        quats: wxyz rotations of any length, [N, 4].
+        scales: Standard deviations, [N, 3].
+        compute_covar: gsplat's flag; on the CPU covariances are always given.
+        compute_preci: gsplat's flag; on the CPU precisions never are.
+        triu: gsplat's flag; on the CPU matrices are always whole.
+    """
+    if quats.is_cuda:
+        from gsplat import quat_scale_to_covar_preci as on_cuda  # noqa: PLC0415  (needs CUDA)
+
+        return on_cuda(quats, scales, compute_covar, compute_preci, triu)  # type: ignore[no-any-return]
+    from gsplat.utils import normalized_quat_to_rotmat  # noqa: PLC0415  (as above)
+
+    half = normalized_quat_to_rotmat(normalize(quats, dim=-1)) * scales[:, None, :]
+    return (half[:, :, None, :] * half[:, None, :, :]).sum(dim=-1), None
+
+
+def _coefficients(largest: int) -> Float[Tensor, "n k"]:
+    """(-1)^k C(n, k+1) / sqrt(k+1) for n to ``largest``, zero beyond k = n - 1."""
+    rows = [
+        [(-1) ** k * math.comb(n, k + 1) / math.sqrt(k + 1) for k in range(largest)]
+        for n in range(largest + 1)
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+class _Replaced:
+    """gsplat's own functions while any block of ``mcmc_on_cpu`` runs, in whatever thread."""
+
+    lock = Lock()
+    blocks = 0
+    own: tuple[Any, Any]
+
+
+@contextmanager
+def mcmc_on_cpu() -> Iterator[None]:
+    """While the block runs, gsplat's MCMC strategy takes CPU tensors; CUDA tensors as ever.
+
+    For code that makes gsplat's ``MCMCStrategy``, or one derived from it, and is left as it is: put
+    its training loop into the block. Blocks may lie within one another and run in several threads.
+
+    Raises:
+        MissingDependencyError: gsplat is absent.
+
+    Example:
+        >>> with mcmc_on_cpu():  # here gsplat's strategy.step_post_backward(...) works
+        ...     pass
+    """
+    require("gsplat")
+    from gsplat.strategy import ops  # noqa: PLC0415  (only MCMC on the CPU needs it)
+
+    with _Replaced.lock:
+        if _Replaced.blocks == 0:
+            _Replaced.own = ops.compute_relocation, ops.quat_scale_to_covar_preci
+            ops.compute_relocation, ops.quat_scale_to_covar_preci = compute_relocation, covariances
+        _Replaced.blocks += 1
+    try:
+        yield
+    finally:
+        with _Replaced.lock:
+            _Replaced.blocks -= 1
+            if _Replaced.blocks == 0:
+                ops.compute_relocation, ops.quat_scale_to_covar_preci = _Replaced.own
