@@ -23,10 +23,10 @@ from peer_stand_ins import Capture, Peer, fused_ssim, load_peer
 from splatseed import Scene, load_scene
 from splatseed.errors import SceneFormatError
 from splatseed.evaluate import Render, evaluate_views
+from splatseed.render import mcmc_on_cpu
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.allocator import keep_freed_memory
 from splatseed.train.device import Capacity
-from splatseed.train.relocation import mcmc_on_cpu
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.strategies import _Capped
 from splatseed.train.views import View, load_split

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 import tyro
@@ -28,36 +28,33 @@ from peer_runs import Split, read_scene
 from peer_stand_ins import check_examples
 from splatseed.errors import ParameterError, SplatseedError
 from splatseed.train import TrainSettings
-from splatseed.train.settings import MCMC_CAP
+from splatseed.train.settings import MCMC_CAP, StrategyName
 from splatseed.train.views import load_split
 
 __all__: list[str] = []
 
 STRATEGIES = ("default", "mcmc")
 PEER = {f"gsplat-{strategy}": strategy for strategy in STRATEGIES}
-CONVENTIONS = ("splatseed", "3dgs")
 
 
 def our_arms() -> list[dict[str, Any]]:
-    """Fields of ``TrainSettings``: each strategy, by each set of conventions that there is."""
+    """Fields of ``TrainSettings``: the peer's strategies, in each set of conventions that we have."""
+    known = get_args(StrategyName)
+    arms = [{"strategy": name} for name in known if name.partition("-")[0] in STRATEGIES]
     if "conventions" not in {field.name for field in dataclasses.fields(TrainSettings)}:
-        return [{"strategy": strategy} for strategy in STRATEGIES]
-    return [
-        {"strategy": strategy, "conventions": conventions}
-        for strategy in STRATEGIES
-        for conventions in CONVENTIONS
-    ]
+        return arms
+    return [{**arm, "conventions": name} for arm in arms for name in ("splatseed", "3dgs")]
 
 
 def arm_name(fields: Mapping[str, Any]) -> str:
-    """splatseed-mcmc, or splatseed-3dgs-mcmc."""
+    """splatseed-mcmc, or splatseed-mcmc-3dgs."""
     conventions = fields.get("conventions", "splatseed")
-    ours = "splatseed" if conventions == "splatseed" else f"splatseed-{conventions}"
-    return f"{ours}-{fields['strategy']}"
+    suffix = "" if conventions == "splatseed" else f"-{conventions}"
+    return f"splatseed-{fields['strategy']}{suffix}"
 
 
 OURS = {arm_name(fields): fields for fields in our_arms()}
-ARMS = tuple(sorted((*PEER, *OURS), key=lambda name: (name.rpartition("-")[2], name)))
+ARMS = tuple(sorted((*PEER, *OURS), key=lambda name: name.split("-")[1:]))
 
 
 @dataclass(frozen=True)
@@ -116,7 +113,7 @@ def run_arm(arm: str, seed: int, scene: Path, settings: Settings) -> dict[str, f
 def train_settings(arm: str, seed: int, settings: Settings) -> dict[str, Any]:
     """Fields of ``TrainSettings`` for a run of either trainer."""
     fields = OURS.get(arm) or {"strategy": PEER[arm]}
-    capped = fields["strategy"] == "mcmc" or settings.cap_default
+    capped = fields["strategy"].startswith("mcmc") or settings.cap_default
     return {
         **fields,
         "max_steps": settings.max_steps,
@@ -145,7 +142,7 @@ def _say(text: str) -> None:
 def rows(results: Mapping[str, Sequence[Mapping[str, float]]]) -> Iterable[list[str]]:
     """An arm each: means over the seeds, and their standard deviation where there are several."""
     for arm, runs in results.items():
-        trainer, _, strategy = arm.rpartition("-")
+        trainer, _, strategy = arm.partition("-")
         columns = {name: [run[name] for run in runs] for name in runs[0]}
         yield [
             trainer,

@@ -8,6 +8,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -273,22 +274,27 @@ def test_both_trainers_get_the_same_settings(bench):
     settings = peer_trainer.Settings(Path(), max_steps=50, cap_max=900, data_factor=3)
     for arm in peer_trainer.ARMS:
         found = peer_trainer.train_settings(arm, 4, settings)
-        expected = 900 if arm.endswith("mcmc") else None
+        expected = 900 if "mcmc" in arm else None
         assert (found["cap_max"], found["max_steps"], found["seed"]) == (expected, 50, 4)
         held = dataclasses.replace(settings, cap_default=True)
         assert peer_trainer.train_settings(arm, 4, held)["cap_max"] == 900
 
 
+def test_our_arms_are_what_we_have_of_the_peers_strategies(bench, monkeypatch):
+    peer_trainer = bench.peer_trainer
+    monkeypatch.setattr(peer_trainer, "StrategyName", Literal["default", "none", "default-3dgs"])
+    names = [peer_trainer.arm_name(arm) for arm in peer_trainer.our_arms()]
+    assert names == ["splatseed-default", "splatseed-default-3dgs"]
+
+
 def test_conventions_are_arms_once_there_are_any(bench, monkeypatch):
     peer_trainer = bench.peer_trainer
-    Known = dataclasses.make_dataclass("Known", ["strategy", "conventions"])
-    monkeypatch.setattr(peer_trainer, "TrainSettings", Known)
+    known = dataclasses.make_dataclass("Known", ["strategy", "conventions"])
+    monkeypatch.setattr(peer_trainer, "TrainSettings", known)
+    monkeypatch.setattr(peer_trainer, "StrategyName", Literal["default", "mcmc"])
     names = {peer_trainer.arm_name(arm) for arm in peer_trainer.our_arms()}
-    of_3dgs = {"splatseed-3dgs-default", "splatseed-3dgs-mcmc"}
+    of_3dgs = {"splatseed-default-3dgs", "splatseed-mcmc-3dgs"}
     assert names == {"splatseed-default", "splatseed-mcmc"} | of_3dgs
-    Unknown = dataclasses.make_dataclass("Unknown", ["strategy"])
-    monkeypatch.setattr(peer_trainer, "TrainSettings", Unknown)
-    assert peer_trainer.our_arms() == [{"strategy": "default"}, {"strategy": "mcmc"}]
 
 
 def test_the_table_has_means_and_their_spread(bench):
@@ -296,8 +302,8 @@ def test_the_table_has_means_and_their_spread(bench):
         {"psnr": 20.0, "ssim": 0.5, "gaussians": 1000, "seconds": 10.0},
         {"psnr": 21.0, "ssim": 0.7, "gaussians": 2001, "seconds": 11.4},
     ]
-    (several,) = bench.peer_trainer.rows({"splatseed-3dgs-mcmc": runs})
-    assert several == ["splatseed-3dgs", "mcmc", "20.50 ± 0.71", "0.6000 ± 0.1414", "1,500", "11"]
+    (several,) = bench.peer_trainer.rows({"splatseed-mcmc-3dgs": runs})
+    assert several == ["splatseed", "mcmc-3dgs", "20.50 ± 0.71", "0.6000 ± 0.1414", "1,500", "11"]
     (one,) = bench.peer_trainer.rows({"gsplat-default": runs[:1]})
     assert one == ["gsplat", "default", "20.00", "0.5000", "1,000", "10"]
 
