@@ -125,13 +125,17 @@ def train_settings(arm: str, seed: int, settings: Settings) -> dict[str, Any]:
 
 def compare(scene: Path, settings: Settings) -> dict[str, list[dict[str, float]]]:
     """All runs, arm by arm within each seed, so that a slow hour of the machine is shared."""
-    results: dict[str, list[dict[str, float]]] = {arm: [] for arm in settings.arms}
+    results: dict[str, list[dict[str, float]]] = {}
     for seed in range(settings.repeats):
         for arm in settings.arms:
             _say(f"{arm}, seed {seed}: {settings.max_steps:,} steps ...")
-            result = run_arm(arm, seed, scene, settings)
+            try:
+                result = run_arm(arm, seed, scene, settings)
+            except SplatseedError as error:  # the others may have taken hours
+                print(f"SKIPPED {arm}, seed {seed}: {error}\n")
+                continue
             _say("  " + ", ".join(f"{name} {value:g}" for name, value in result.items()))
-            results[arm].append(result)
+            results.setdefault(arm, []).append(result)
     return results
 
 

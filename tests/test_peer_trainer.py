@@ -297,6 +297,22 @@ def test_conventions_are_arms_once_there_are_any(bench, monkeypatch):
     assert names == {"splatseed-default", "splatseed-mcmc"} | of_3dgs
 
 
+def test_a_run_that_fails_does_not_cost_the_others(bench, monkeypatch, capsys):
+    def run_arm(arm, seed, *_):
+        if (arm, seed) == ("gsplat-default", 0):
+            raise bench.children.ChildError("a run", found="none", fix="Try again.")
+        return {"psnr": float(seed)}
+
+    monkeypatch.setattr(bench.peer_trainer, "run_arm", run_arm)
+    settings = bench.peer_trainer.Settings(
+        Path(), repeats=2, arms=("gsplat-default", "splatseed-default")
+    )
+    found = bench.peer_trainer.compare(Path(), settings)
+    assert found["gsplat-default"] == [{"psnr": 1.0}]
+    assert found["splatseed-default"] == [{"psnr": 0.0}, {"psnr": 1.0}]
+    assert "SKIPPED gsplat-default, seed 0: expected a run" in capsys.readouterr().out
+
+
 def test_the_table_has_means_and_their_spread(bench):
     runs = [
         {"psnr": 20.0, "ssim": 0.5, "gaussians": 1000, "seconds": 10.0},
