@@ -17,7 +17,8 @@ from typing import Any, get_args
 from splatseed.bench.records import SFM, Arm, RunSpec
 from splatseed.bench.scenes import SceneFacts
 from splatseed.errors import ParameterError
-from splatseed.train.settings import FULL_RUN, Backend, StrategyName, TrainSettings
+from splatseed.train.schedule import FULL_RUN
+from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.upsample import METHODS, Profile, Upsampler, configure
 
 __all__ = ["DEMO", "Plan", "PlannedScene", "plan_runs"]

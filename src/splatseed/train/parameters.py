@@ -79,9 +79,12 @@ def gaussians_of(params: Parameters | Mapping[str, Tensor]) -> Gaussians:
     return Gaussians(**{name: params[name].detach().cpu().numpy() for name in names})
 
 
-def yardsticks(params: Parameters) -> float | Float[Tensor, " N"]:
-    """The length that each Gaussian's size and rate are measured by, or the one for all."""
-    return params[NEAR_DEPTHS].detach() if NEAR_DEPTHS in params else SCENE_SCALE
+def yardsticks(params: Parameters) -> Float[Tensor, "#N"]:
+    """The length that each Gaussian's size and rate are measured by; one number if it is all's."""
+    if NEAR_DEPTHS in params:
+        lengths: Tensor = params[NEAR_DEPTHS]
+        return lengths.detach()
+    return params["means"].new_full((1,), SCENE_SCALE)
 
 
 def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
@@ -95,24 +98,22 @@ def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
     }
 
 
-def optimize(params: Parameters, optimizers: Optimizers, means_lr: float) -> None:
+def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, float]) -> None:
     """Take the step that the gradients ask for, and clear them.
 
     Args:
         params: With their gradients.
         optimizers: Theirs.
-        means_lr: The learning rate of positions, in yardsticks.
+        rates: Their learning rates; that of positions in yardsticks.
     """
     means, lengths = params["means"], yardsticks(params)
-    own = isinstance(lengths, Tensor)
-    before = means.detach().clone() if own else None
-    optimizers["means"].param_groups[0]["lr"] = means_lr if own else means_lr * lengths
-    for optimizer in optimizers.values():
+    before = means.detach().clone()
+    for name, optimizer in optimizers.items():
+        optimizer.param_groups[0]["lr"] = rates[name]
         optimizer.step()
         optimizer.zero_grad()
-    if before is not None:  # Adam's step is in proportion to the rate, so it can be scaled behind it
-        with torch.no_grad():
-            torch.addcmul(before, means - before, lengths[:, None], out=means.data)
+    with torch.no_grad():  # Adam's step is in proportion to the rate, so it can be scaled behind it
+        torch.addcmul(before, means - before, lengths[:, None], out=means)
 
 
 def render_view(

@@ -30,11 +30,15 @@ LEARNING_RATES: Mapping[str, float] = MappingProxyType(
     }
 )
 """3DGS's."""
-MEANS_LR_DECAY = 0.01
-"""The learning rate of positions at the end, as a part of that at the start; exponential between."""
-LEAST_ROUNDS = 6
+DECAYS: Mapping[str, float] = MappingProxyType({"means": 0.01})
+"""What learning rates fall to by the end, as a part of the first; exponential between."""
+GROWTH = 1.05
+"""By what MCMC multiplies the number of Gaussians at a time, until the cap."""
+LEAST_ROUNDS: Mapping[str, int] = MappingProxyType({"default": 6, "mcmc": 24, "none": 1})
 """A short run densifies so many times, if need be more often than every 100 steps."""
+MOST_RATE = 4.0
 MOST_HASTE = 20.0
+MOST_HASTE_OF = {"means": 20.0, "opacities": 1.0}
 """Positions move so many times faster at most: beyond it nothing was gained."""
 
 
@@ -46,12 +50,15 @@ class Schedule:
         max_steps: T.
         near_depths: Whether each Gaussian's near depth is its yardstick, else the cameras' extent.
         learning_rates: Of each parameter at the first step; positions' in yardsticks.
+        decays: What some of them fall to by the end, as a part of the first.
         sh_every: Steps from one degree of the spherical harmonics to the next.
         refine_start: Densification begins after this step.
         refine_stop: And ends before this one.
         refine_every: Steps from one densification to the next.
         reset_every: From one reset of the opacities to the next, where they are asked for; also the
             step from which on Gaussians that are too large are pruned.
+        prune_size: How large that is, in yardsticks.
+        growth: What MCMC multiplies the number of Gaussians by at a time.
         opacity: Of the first Gaussians.
         scale_factor: Size of the first Gaussians, as a multiple of the gaps between them.
     """
@@ -59,11 +66,14 @@ class Schedule:
     max_steps: int
     near_depths: bool
     learning_rates: Mapping[str, float]
+    decays: Mapping[str, float]
     sh_every: int
     refine_start: int
     refine_stop: int
     refine_every: int
     reset_every: int
+    prune_size: float = 0.1
+    growth: float = GROWTH
     opacity: float = 0.1
     scale_factor: float = 1.0
 
@@ -71,13 +81,13 @@ class Schedule:
         """The degree of spherical harmonics in use."""
         return min(step // self.sh_every, highest)
 
-    def means_lr(self, step: int) -> float:
-        """The learning rate of positions, in yardsticks."""
-        return float(self.learning_rates["means"] * self.decay(step))
+    def rates(self, step: int) -> dict[str, float]:
+        """The learning rate of each parameter; positions' in yardsticks."""
+        return {name: rate * self.decay(name, step) for name, rate in self.learning_rates.items()}
 
-    def decay(self, step: int) -> float:
-        """What the learning rate of positions has fallen to, as a part of the first."""
-        return float(MEANS_LR_DECAY ** (step / self.max_steps))
+    def decay(self, name: str, step: int) -> float:
+        """What a learning rate has fallen to, as a part of the first."""
+        return float(self.decays.get(name, 1.0) ** (step / self.max_steps))
 
 
 def make_schedule(densification: Densification, max_steps: int, *, as_3dgs: bool) -> Schedule:
@@ -98,6 +108,7 @@ def _as_3dgs(densification: Densification, max_steps: int) -> Schedule:
         max_steps=max_steps,
         near_depths=False,
         learning_rates=LEARNING_RATES,
+        decays=DECAYS,
         sh_every=_scaled(1000, max_steps),
         refine_start=_scaled(500, max_steps),
         refine_stop=_scaled(25_000 if mcmc else 15_000, max_steps),
@@ -106,3 +117,31 @@ def _as_3dgs(densification: Densification, max_steps: int) -> Schedule:
         opacity=0.5 if mcmc else 0.1,
         scale_factor=0.1 if mcmc else 1.0,
     )
+
+
+def _own(densification: Densification, max_steps: int) -> Schedule:
+    mcmc = densification == "mcmc"
+    haste = min(max(FULL_RUN / max_steps, 1.0), MOST_HASTE)
+    stop = _scaled(25_000 if mcmc else 15_000, max_steps)
+    shrunk = 100 * max_steps / FULL_RUN
+    every = max(round(shrunk), min(100, stop // (LEAST_ROUNDS[densification])), 1)
+    return Schedule(
+        max_steps=max_steps,
+        near_depths=True,
+        learning_rates={
+            name: rate * min(haste, MOST_HASTE_OF.get(name, MOST_RATE))
+            for name, rate in LEARNING_RATES.items()
+        },
+        decays=DECAYS,
+        sh_every=_scaled(1000, max_steps),
+        refine_start=_scaled(500, max_steps),
+        refine_stop=stop,
+        refine_every=every,
+        reset_every=_scaled(3000, max_steps),
+        growth=GROWTH ** (every / shrunk),
+    )
+
+
+def _scaled(steps: int, max_steps: int) -> int:
+    """What ``steps`` of a full run are in this one, at least 1."""
+    return max(1, round(steps * max_steps / FULL_RUN))

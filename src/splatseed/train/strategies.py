@@ -15,20 +15,21 @@ from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy
-from gsplat.strategy.ops import reset_opa
+from gsplat.strategy.ops import reset_opa, sample_add
 from jaxtyping import Float
 from torch import Tensor
 
 from splatseed.render import MCMCStrategy
 from splatseed.train.device import Capacity
-from splatseed.train.parameters import Optimizers, Parameters, yardsticks
+from splatseed.train.frame import SCENE_SCALE
+from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters, yardsticks
 from splatseed.train.schedule import LEARNING_RATES
 from splatseed.train.settings import MCMC_CAP, TrainSettings
 
 __all__ = ["Strategy", "make_strategy"]
 
-GROWTH = 1.05
-"""By what MCMC multiplies the number of Gaussians at a time, until the cap."""
+MCMC_NOISE = 5e5
+"""What gsplat multiplies positions' learning rate by, for the noise."""
 
 
 class Strategy(ABC):
@@ -147,6 +148,7 @@ class _Default(Strategy):
             refine_stop_iter=schedule.refine_stop,
             refine_every=schedule.refine_every,
             reset_every=schedule.reset_every,
+            prune_scale3d=schedule.prune_size,
         )
         self.inner.capacity = capacity
         self.resets = settings.opacity_reset
@@ -156,7 +158,8 @@ class _Default(Strategy):
         self.inner.step_pre_backward(params, optimizers, self.state, step, info)
 
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        self.state["scene_scale"] = yardsticks(params)  # gsplat hands on what it holds of each one
+        # gsplat takes one number, or hands on one of each Gaussian like the rest of its state.
+        self.state["scene_scale"] = yardsticks(params) if NEAR_DEPTHS in params else SCENE_SCALE
         self.inner.step_post_backward(params, optimizers, self.state, step, info)
         if self._resets_at(step):
             reset_opa(params, optimizers, self.state, value=2 * self.inner.prune_opa)
@@ -168,15 +171,29 @@ class _Default(Strategy):
 
 @dataclass
 class _Bounded(MCMCStrategy):
-    """gsplat's strategy, but that its cap is never more than fits the memory."""
+    """gsplat's strategy, but that it may grow faster, never beyond the memory, and noise has a unit.
+
+    gsplat adds noise of a covariance times a number to positions. That is an area where a length is
+    due, so in near depths it is divided by one: the noise of a Gaussian of given size in the
+    pictures is then the same in the pictures wherever it stands.
+    """
 
     capacity: Capacity | None = None
+    growth: float = 1.0
+
+    def set_noise(self, params: Parameters) -> None:
+        """To be called before each step, and where the number of Gaussians changes."""
+        if NEAR_DEPTHS in params:
+            self.noise_lr = MCMC_NOISE / yardsticks(params)[:, None]
 
     def _add_new_gs(self, params: Parameters, optimizers: Any, binoms: Any) -> int:
         assert self.capacity is not None  # noqa: S101  (given in ``_Mcmc``)
         count = len(params["means"])
-        self.cap_max = self.capacity.limit(count, int(GROWTH * count))
-        return int(super()._add_new_gs(params, optimizers, binoms))
+        added = max(0, self.capacity.limit(count, int(self.growth * count)) - count)
+        if added:
+            sample_add(params, optimizers, {}, added, binoms, self.min_opacity)
+        self.set_noise(params)
+        return added
 
 
 class _Mcmc(Strategy):
@@ -190,6 +207,8 @@ class _Mcmc(Strategy):
         self.schedule = schedule = settings.schedule
         self.inner = _Bounded(
             capacity=capacity,
+            growth=schedule.growth,
+            noise_lr=MCMC_NOISE,
             refine_start_iter=schedule.refine_start,
             refine_stop_iter=schedule.refine_stop,
             refine_every=schedule.refine_every,
@@ -198,7 +217,7 @@ class _Mcmc(Strategy):
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""]:
         opacities, sizes = torch.sigmoid(params["opacities"]), torch.exp(params["scales"])
-        if self.schedule.near_depths:
+        if NEAR_DEPTHS in params:
             sizes = sizes / yardsticks(params)[:, None]
         return self.OPACITY_WEIGHT * opacities.mean() + self.SCALE_WEIGHT * sizes.mean()
 
@@ -206,8 +225,8 @@ class _Mcmc(Strategy):
         pass
 
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        # gsplat takes the learning rate of positions; the noise is that times a covariance.
-        rate = LEARNING_RATES["means"] * self.schedule.decay(step)
-        lengths = yardsticks(params)
-        lr = rate / lengths[:, None] if self.schedule.near_depths else rate * lengths
-        self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=lr)
+        self.inner.set_noise(params)
+        # 3DGS's rate of positions, however fast they move here: noise must not move them more.
+        lr = LEARNING_RATES["means"] * self.schedule.decay("means", step)
+        unit = 1.0 if NEAR_DEPTHS in params else SCENE_SCALE
+        self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=lr * unit)

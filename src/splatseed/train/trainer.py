@@ -107,7 +107,7 @@ class Trainer:
         state.losses.append(loss.detach())
         penalty = strategy.regularization(params)
         (loss if penalty is None else loss + penalty).backward()
-        optimize(params, optimizers, schedule.means_lr(step))
+        optimize(params, optimizers, schedule.rates(step))
         strategy.after(params, optimizers, step, info)
         return render.detach(), truth
 

@@ -1,0 +1,144 @@
+"""What each choice of the training schedule gives, from SfM's points, on held-out training views.
+
+The test views (names sorted, every 8th) are taken out of a capture first; of the rest every 8th is
+held out and scored. An arm is a strategy, or one with a choice undone. Runs have a process of their
+own each; those that are in the ledger are not run again. Prints Markdown; see README.md.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import tyro
+
+from baseline_arms import ARMS, CAPS
+from children import call
+from clouds import find_scenes
+from machine import describe
+from markdown import table
+from splatseed.errors import ParameterError, SplatseedError
+
+__all__: list[str] = []
+
+WRITING = Lock()
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to run."""
+
+    scenes: tuple[str, ...] = tuple(CAPS)
+    """Captures, by their names in the folder of captures."""
+    arms: tuple[str, ...] = tuple(ARMS)
+    """Which; without these, all."""
+    max_steps: int = 1500
+    """Training steps."""
+    seeds: int = 2
+    """Runs of each arm on each capture, with seeds 0, 1, ..."""
+    data_factor: int = 2
+    """By how much photographs are made smaller."""
+    jobs: int = os.cpu_count() or 1
+    """Runs at a time, on one thread each."""
+    ledger: Path = Path("baseline.jsonl")
+    """Where results are kept, a line a run."""
+
+    def __post_init__(self) -> None:
+        for name, given, known in (("scenes", self.scenes, CAPS), ("arms", self.arms, ARMS)):
+            for each in given:
+                if each not in known:
+                    raise ParameterError(
+                        f"--{name} of {', '.join(known)}", found=each, fix="Correct the name."
+                    )
+
+
+Key = tuple[str, str, int, int, int]
+"""Capture, arm, steps, data factor, seed."""
+
+
+def run(key: Key, scenes: Path, ledger: Path) -> None:
+    """One run, and its line in the ledger."""
+    scene, arm, max_steps, data_factor, seed = key
+    _say(f"{scene}, {arm}, {max_steps:,} steps, seed {seed} ...")
+    result = call(
+        "baseline_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
+        max_steps=max_steps, data_factor=data_factor, seed=seed, cap_max=CAPS[scene],
+    )  # fmt: skip
+    with WRITING, ledger.open("a", encoding="utf-8") as lines:
+        lines.write(json.dumps([key, result]) + "\n")
+    _say(f"  {scene}, {arm}: {result['psnr']:.2f} dB in {result['seconds']:.0f} s")
+
+
+def read_ledger(path: Path) -> dict[Key, dict[str, Any]]:
+    """The results so far; of runs that were made twice, the last."""
+    if not path.is_file():
+        return {}
+    return {tuple(key): result for key, result in map(json.loads, path.open(encoding="utf-8"))}
+
+
+def wanted(settings: Settings) -> Iterable[Key]:
+    """All runs that are asked for: each arm of each capture once before any is repeated."""
+    for seed in range(settings.seeds):
+        for arm in settings.arms:
+            for scene in settings.scenes:
+                yield (scene, arm, settings.max_steps, settings.data_factor, seed)
+
+
+def rows(results: Mapping[Key, Mapping[str, Any]], settings: Settings) -> Iterable[list[str]]:
+    """An arm each: PSNR / SSIM by capture, and the mean of those that all seeds have run."""
+    for arm in settings.arms:
+        means = [_means(results, arm, scene, settings) for scene in settings.scenes]
+        known = [each for each in means if each]
+        if known:
+            whole = len(known) == len(means)
+            mean = [statistics.mean(values) for values in zip(*known, strict=True)]
+            yield [arm, *(_cell(each) for each in means), _cell(mean if whole else None)]
+
+
+def _means(
+    results: Mapping[Key, Mapping[str, Any]], arm: str, scene: str, settings: Settings
+) -> list[float] | None:
+    """PSNR, SSIM, Gaussians and seconds, averaged over the seeds."""
+    at = (scene, arm, settings.max_steps, settings.data_factor)
+    runs = [results[(*at, seed)] for seed in range(settings.seeds) if (*at, seed) in results]
+    names = ("psnr", "ssim", "gaussians", "seconds")
+    return [statistics.mean(run[name] for run in runs) for name in names] if runs else None
+
+
+def _cell(means: Sequence[float] | None) -> str:
+    if means is None:
+        return ""
+    psnr, ssim, count, seconds = means
+    return f"{psnr:.2f} / {ssim:.4f} ({count / 1000:.0f}k, {seconds:.0f} s)"
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def main(settings: Settings) -> None:
+    """Run what is not there yet, and print the table."""
+    scenes = find_scenes()
+    done = read_ledger(settings.ledger)
+    missing = [key for key in wanted(settings) if key not in done]
+    with ThreadPoolExecutor(settings.jobs) as pool:
+        list(pool.map(partial(run, scenes=scenes, ledger=settings.ledger), missing))
+    header = ["arm", *settings.scenes, "mean"]
+    print(f"{describe()}\n\n### {settings.max_steps:,} steps, seeds: {settings.seeds}\n")
+    print(table(header, rows(read_ledger(settings.ledger), settings)))
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Settings, description=__doc__))
+    except SplatseedError as error:
+        raise SystemExit(str(error)) from None
