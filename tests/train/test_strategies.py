@@ -8,34 +8,69 @@ from gsplat.strategy import DefaultStrategy
 
 from splatseed.errors import ParameterError
 from splatseed.render import rasterization
-from splatseed.train.settings import Schedule, TrainSettings
+from splatseed.train.schedule import LEARNING_RATES, make_schedule
+from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies import make_strategy
 
 
-def test_a_full_run_has_3dgs_schedule():
-    full = Schedule(30_000)
-    assert (full.refine_start, full.reset_every) == (500, 3000)
-    assert full.refine_every("default") == full.refine_every("mcmc") == 100
-    assert (full.refine_stop("default"), full.refine_stop("mcmc")) == (15_000, 25_000)
+@pytest.mark.parametrize("as_3dgs", [True, False])
+def test_a_full_run_has_3dgs_schedule(as_3dgs):
+    full, mcmc = (make_schedule(name, 30_000, as_3dgs=as_3dgs) for name in ("default", "mcmc"))
+    assert (full.refine_start, full.reset_every, full.prune_size) == (500, 3000, 0.1)
+    assert full.refine_every == mcmc.refine_every == 100
+    assert full.growth == mcmc.growth == 1.05
+    assert (full.refine_stop, mcmc.refine_stop) == (15_000, 25_000)
     assert [full.sh_degree(step, 3) for step in (0, 999, 1000, 2500, 29_999)] == [0, 0, 1, 2, 3]
-    assert full.means_lr(0) == 1.0
-    assert full.means_lr(30_000) == pytest.approx(0.01)
+    assert full.rates(0) == dict(LEARNING_RATES)
+    last = full.rates(30_000)
+    assert last.pop("means") == pytest.approx(1.6e-6)
+    assert last == {name: rate for name, rate in LEARNING_RATES.items() if name != "means"}
 
 
 @pytest.mark.parametrize("steps", [1, 7, 300, 7000])
-def test_schedules_shrink_with_the_run(steps):
-    short = Schedule(steps)
-    assert abs(short.refine_stop("default") - steps / 2) <= 0.5
-    assert short.means_lr(steps) == pytest.approx(0.01)
+@pytest.mark.parametrize("as_3dgs", [True, False])
+def test_schedules_shrink_with_the_run(steps, as_3dgs):
+    short = make_schedule("default", steps, as_3dgs=as_3dgs)
+    assert abs(short.refine_stop - steps / 2) <= 0.5
+    assert short.decay("means", steps) == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("steps", [1500, 7000])
+def test_conventions_of_3dgs_change_no_number_but_steps(steps):
+    """Those of gsplat's trainer with its steps_scaler: 23 steps at 7,000, and so on."""
+    short = make_schedule("default", steps, as_3dgs=True)
+    assert short.learning_rates == LEARNING_RATES
+    assert short.refine_every == round(steps / 300)
+    assert not short.near_depths
 
 
 @pytest.mark.parametrize(
-    ("steps", "default", "mcmc"), [(7, 10, 10), (300, 25, 10), (7000, 100, 23), (90_000, 300, 300)]
+    ("steps", "default", "mcmc"), [(7, 1, 1), (300, 25, 10), (7000, 100, 100), (90_000, 300, 300)]
 )
-def test_default_sees_enough_photographs_between_densifications(steps, default, mcmc):
-    short = Schedule(steps)
-    assert short.refine_every("default") == default
-    assert short.refine_every("mcmc") == mcmc
+def test_enough_photographs_are_seen_between_densifications(steps, default, mcmc):
+    assert make_schedule("default", steps, as_3dgs=False).refine_every == default
+    assert make_schedule("mcmc", steps, as_3dgs=False).refine_every == mcmc
+
+
+@pytest.mark.parametrize("steps", [30, 1500, 4000])
+def test_mcmc_may_grow_as_far_in_a_short_run(steps):
+    """By 1.05 each of 245 times in a full one."""
+    short = make_schedule("mcmc", steps, as_3dgs=False)
+    rounds = (short.refine_stop - short.refine_start) / short.refine_every
+    assert short.growth**rounds == pytest.approx(1.05**245, rel=2.0)
+
+
+def test_short_runs_are_in_haste_up_to_a_bound():
+    full, half, short, tiny = (
+        make_schedule("none", steps, as_3dgs=False).learning_rates
+        for steps in (30_000, 15_000, 1500, 10)
+    )
+    assert short == tiny
+    assert half["means"] == pytest.approx(2 * full["means"])
+    assert half["sh0"] == pytest.approx(2**0.5 * full["sh0"])
+    assert short["means"] == pytest.approx(20 * full["means"])
+    assert half["opacities"] == short["opacities"] == full["opacities"]
+    assert make_schedule("none", 90_000, as_3dgs=False).learning_rates == full
 
 
 @pytest.mark.parametrize(
@@ -63,7 +98,7 @@ def test_running_sums_are_gsplats_own(cameras):
         )  # fmt: skip
         ours.before({"means": means}, {}, step, info)
         image.square().sum().backward()
-        ours.after({"means": means}, {}, step, info, means_lr=0.0)
+        ours.after({"means": means}, {}, step, info)
         theirs.step_post_backward({"means": means}, {}, expected, step, info)
     assert 0 < int((expected["count"] > 0).sum()) < 500
     for name in ("grad2d", "count"):

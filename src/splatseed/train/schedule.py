@@ -34,12 +34,16 @@ DECAYS: Mapping[str, float] = MappingProxyType({"means": 0.01})
 """What learning rates fall to by the end, as a part of the first; exponential between."""
 GROWTH = 1.05
 """By what MCMC multiplies the number of Gaussians at a time, until the cap."""
-LEAST_ROUNDS: Mapping[str, int] = MappingProxyType({"default": 6, "mcmc": 24, "none": 1})
-"""A short run densifies so many times, if need be more often than every 100 steps."""
-MOST_RATE = 4.0
+LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType({"default": 6, "mcmc": 24, "none": 1})
+"""A short run densifies so many times, if need be more often than every 100 steps: gradients averaged
+over few photographs are noise."""
 MOST_HASTE = 20.0
-MOST_HASTE_OF = {"means": 20.0, "opacities": 1.0}
-"""Positions move so many times faster at most: beyond it nothing was gained."""
+"""A short run is in haste by how many times shorter it is than a full one, up to this."""
+HASTE: Mapping[str, float] = MappingProxyType(
+    {"means": 1.0, "scales": 0.5, "quats": 0.5, "opacities": 0.0, "sh0": 0.5, "shN": 0.5}
+)
+"""The power of the haste that learning rates are multiplied by. Positions have as far to go in a short
+run as in a long one; where opacities are hasty, Gaussians die that are needed later."""
 
 
 @dataclass(frozen=True)
@@ -124,14 +128,11 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
     haste = min(max(FULL_RUN / max_steps, 1.0), MOST_HASTE)
     stop = _scaled(25_000 if mcmc else 15_000, max_steps)
     shrunk = 100 * max_steps / FULL_RUN
-    every = max(round(shrunk), min(100, stop // (LEAST_ROUNDS[densification])), 1)
+    every = max(1, round(shrunk), min(100, stop // LEAST_ROUNDS[densification]))
     return Schedule(
         max_steps=max_steps,
         near_depths=True,
-        learning_rates={
-            name: rate * min(haste, MOST_HASTE_OF.get(name, MOST_RATE))
-            for name, rate in LEARNING_RATES.items()
-        },
+        learning_rates={n: rate * haste ** HASTE[n] for n, rate in LEARNING_RATES.items()},
         decays=DECAYS,
         sh_every=_scaled(1000, max_steps),
         refine_start=_scaled(500, max_steps),
@@ -139,6 +140,7 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
         refine_every=every,
         reset_every=_scaled(3000, max_steps),
         growth=GROWTH ** (every / shrunk),
+        opacity=0.5 if mcmc else 0.1,
     )
 
 
