@@ -54,6 +54,13 @@ def test_one_slow_run_does_not_spoil_the_estimate():
     assert Estimator([FACTS], rows).seconds(SPEC) == pytest.approx(530)
 
 
+@pytest.mark.parametrize("strategy", ["default", "mcmc", "none"])
+def test_conventions_do_not_change_what_is_guessed_of_growth(strategy):
+    estimator = Estimator([FACTS], [])
+    own, in_3dgs = (Arm(SFM, "default", 1, name) for name in (strategy, f"{strategy}-3dgs"))
+    assert estimator.checkpoint(_spec(arm=own)) == estimator.checkpoint(_spec(arm=in_3dgs))
+
+
 def test_growth_is_learnt_by_strategy_and_ratio():
     arm = Arm("mls", "default", 8, "default")
     grown = _row(_spec(arm=arm), num_gaussians=400_000)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import tomllib
 from pathlib import Path
+from typing import get_args
 
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -15,6 +16,7 @@ from splatseed.bench.records import SFM, Arm
 from splatseed.bench.scenes import survey
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
+from splatseed.train.settings import StrategyName
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20)
 RATIOS = st.floats(1, 1e6, exclude_min=True)
@@ -34,7 +36,7 @@ PLANS = st.builds(
     Plan,
     methods=_some(st.sampled_from(["sfm", "linear", "mls", "depth"])),
     ratios=_some(RATIOS),
-    strategies=_some(st.sampled_from(["default", "mcmc", "none"])),
+    strategies=_some(st.sampled_from(get_args(StrategyName))),
     profiles=_some(st.sampled_from(["default", "paper"])),
     repeats=st.integers(1, 9),
     cap_max=st.none() | st.integers(2, 10**9),

@@ -15,6 +15,7 @@ from types import MappingProxyType
 
 from splatseed.bench.records import RunResult, RunRow, RunSpec
 from splatseed.bench.scenes import SceneFacts
+from splatseed.train.schedule import Densification
 from splatseed.train.settings import TrainSettings
 
 __all__ = ["Estimator"]
@@ -49,7 +50,7 @@ SPEEDS: Mapping[str, _Speed] = MappingProxyType(
     }
 )
 CORES_MEASURED = 2
-GROWTH: Mapping[str, float] = MappingProxyType({"none": 1.0, "default": 3.0, "mcmc": 3.0})
+GROWTH: Mapping[Densification, float] = MappingProxyType({"none": 1.0, "default": 3.0, "mcmc": 3.0})
 """Gaussians at the end of a run, per seed; with default and mcmc, a guess."""
 
 
@@ -100,7 +101,7 @@ class Estimator:
         seeds = min(self._scenes[spec.scene_digest].num_points * spec.arm.ratio, most)
         strategy = spec.arm.strategy
         alike = self._growth.get((strategy, spec.arm.ratio)) or self._growth.get((strategy, None))
-        return seeds, min(seeds * (alike or GROWTH[strategy]), most)
+        return seeds, min(seeds * (alike or GROWTH[spec.settings.densification]), most)
 
     def _pixels(self, spec: RunSpec) -> float:
         return self._scenes[spec.scene_digest].pixels / spec.data_factor**2
