@@ -27,12 +27,16 @@ TEST_EVERY = 8
 Change = Callable[[Schedule], Schedule]
 
 
+def _as_it_is(schedule: Schedule) -> Schedule:
+    return schedule
+
+
 @dataclass(frozen=True)
 class Arm:
     """A strategy, and what is changed in its schedule."""
 
     strategy: str
-    change: Change = staticmethod(lambda schedule: schedule)
+    change: Change = _as_it_is
 
 
 def _set(**values: Any) -> Change:
@@ -82,25 +86,29 @@ def _before(prune_size: float = 0.1) -> Change:
 
 
 OTHERS = {"scales": 1.0, "quats": 1.0, "sh0": 1.0, "shN": 1.0}
+UNBOUNDED = float("inf")
 ARMS: Mapping[str, Arm] = {
     "default-3dgs": Arm("default-3dgs"),
     "default as it was": Arm("default-3dgs", _before()),
-    "default as it was, nothing pruned by size": Arm("default-3dgs", _before(float("inf"))),
+    "the same, nothing pruned by size": Arm("default-3dgs", _before(UNBOUNDED)),
     "default": Arm("default"),
-    "default, cameras' extent": Arm("default", _set(near_depths=False)),
-    "default, nothing pruned by size": Arm("default", _set(prune_size=float("inf"))),
-    "default, positions x 1": Arm("default", _times(means=1.0)),
-    "default, other rates x 1": Arm("default", _times(**OTHERS)),
-    "default, opacities x 4": Arm("default", _times(opacities=4.0)),
-    "default, rates fall to 0.3": Arm("default", _falling(0.3)),
-    "default, densified from 1/6 to 3/5": Arm("default", _parts(1 / 6, 3 / 5)),
-    "default, densified to 3/4": Arm("default", _parts(0.0, 3 / 4)),
+    "- near depths": Arm("default", _set(near_depths=False)),
+    "- pruning by size": Arm("default", _set(prune_size=UNBOUNDED)),
+    "- haste of positions": Arm("default", _times(means=1.0)),
+    "- haste of scales, rotations, colours": Arm("default", _times(**OTHERS)),
+    "+ haste of opacities": Arm("default", _times(opacities=4.0)),
+    "+ all rates fall to 0.3": Arm("default", _falling(0.3)),
+    "- bound on first sizes": Arm("default", _set(largest=UNBOUNDED)),
+    "densified from 1/6 to 3/5 of the run": Arm("default", _parts(1 / 6, 3 / 5)),
+    "densified up to 3/4 of the run": Arm("default", _parts(1 / 60, 3 / 4)),
     "mcmc-3dgs": Arm("mcmc-3dgs"),
     "mcmc": Arm("mcmc"),
-    "mcmc, begun as 3DGS's": Arm("mcmc", _set(opacity=0.5, scale_factor=0.1)),
+    "mcmc begun at a tenth of the size": Arm("mcmc", _set(scale_factor=0.1)),
+    "mcmc begun at opacity 0.1": Arm("mcmc", _set(opacity=0.1)),
     "none-3dgs": Arm("none-3dgs"),
     "none": Arm("none"),
 }
+"""By what the table calls them; - and + are ``default`` with a choice undone or added."""
 
 
 def train(

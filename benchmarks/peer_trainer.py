@@ -8,7 +8,6 @@ stderr how far it is. See README.md.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import statistics
 import sys
@@ -35,25 +34,12 @@ __all__: list[str] = []
 
 STRATEGIES = ("default", "mcmc")
 PEER = {f"gsplat-{strategy}": strategy for strategy in STRATEGIES}
-
-
-def our_arms() -> list[dict[str, Any]]:
-    """Fields of ``TrainSettings``: the peer's strategies, in each set of conventions that we have."""
-    known = get_args(StrategyName)
-    arms = [{"strategy": name} for name in known if name.partition("-")[0] in STRATEGIES]
-    if "conventions" not in {field.name for field in dataclasses.fields(TrainSettings)}:
-        return arms
-    return [{**arm, "conventions": name} for arm in arms for name in ("splatseed", "3dgs")]
-
-
-def arm_name(fields: Mapping[str, Any]) -> str:
-    """splatseed-mcmc, or splatseed-mcmc-3dgs."""
-    conventions = fields.get("conventions", "splatseed")
-    suffix = "" if conventions == "splatseed" else f"-{conventions}"
-    return f"splatseed-{fields['strategy']}{suffix}"
-
-
-OURS = {arm_name(fields): fields for fields in our_arms()}
+OURS = {
+    f"splatseed-{name}": name
+    for name in get_args(StrategyName)
+    if name.partition("-")[0] in STRATEGIES
+}
+"""The peer's strategies, in splatseed's conventions and in 3DGS's."""
 ARMS = tuple(sorted((*PEER, *OURS), key=lambda name: name.split("-")[1:]))
 
 
@@ -112,10 +98,10 @@ def run_arm(arm: str, seed: int, scene: Path, settings: Settings) -> dict[str, f
 
 def train_settings(arm: str, seed: int, settings: Settings) -> dict[str, Any]:
     """Fields of ``TrainSettings`` for a run of either trainer."""
-    fields = OURS.get(arm) or {"strategy": PEER[arm]}
-    capped = fields["strategy"].startswith("mcmc") or settings.cap_default
+    strategy = OURS.get(arm) or PEER[arm]
+    capped = strategy.startswith("mcmc") or settings.cap_default
     return {
-        **fields,
+        "strategy": strategy,
         "max_steps": settings.max_steps,
         "data_factor": settings.data_factor,
         "cap_max": settings.cap_max if capped else None,

@@ -8,7 +8,6 @@ import sys
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -280,21 +279,10 @@ def test_both_trainers_get_the_same_settings(bench):
         assert peer_trainer.train_settings(arm, 4, held)["cap_max"] == 900
 
 
-def test_our_arms_are_what_we_have_of_the_peers_strategies(bench, monkeypatch):
-    peer_trainer = bench.peer_trainer
-    monkeypatch.setattr(peer_trainer, "StrategyName", Literal["default", "none", "default-3dgs"])
-    names = [peer_trainer.arm_name(arm) for arm in peer_trainer.our_arms()]
-    assert names == ["splatseed-default", "splatseed-default-3dgs"]
-
-
-def test_conventions_are_arms_once_there_are_any(bench, monkeypatch):
-    peer_trainer = bench.peer_trainer
-    known = dataclasses.make_dataclass("Known", ["strategy", "conventions"])
-    monkeypatch.setattr(peer_trainer, "TrainSettings", known)
-    monkeypatch.setattr(peer_trainer, "StrategyName", Literal["default", "mcmc"])
-    names = {peer_trainer.arm_name(arm) for arm in peer_trainer.our_arms()}
-    of_3dgs = {"splatseed-default-3dgs", "splatseed-mcmc-3dgs"}
-    assert names == {"splatseed-default", "splatseed-mcmc"} | of_3dgs
+def test_our_arms_are_the_peers_strategies_in_both_conventions(bench):
+    assert set(bench.peer_trainer.OURS) == {
+        "splatseed-default", "splatseed-default-3dgs", "splatseed-mcmc", "splatseed-mcmc-3dgs"
+    }  # fmt: skip
 
 
 def test_a_run_that_fails_does_not_cost_the_others(bench, monkeypatch, capsys):

@@ -93,6 +93,15 @@ def test_initial_scale_is_the_distance_to_three_neighbours(rng):
     assert np.allclose(gaussians.sh0 * SH_C0 + 0.5, 0.0, atol=1e-6)
 
 
+def test_first_gaussians_are_no_larger_than_they_may_be(rng):
+    cloud = PointCloud(rng.normal(size=(200, 3)), np.zeros((200, 3), np.uint8))
+    free, largest = initial_gaussians(cloud), rng.uniform(0.01, 1.0, 200)
+    held = initial_gaussians(cloud, largest=largest)
+    expected = np.minimum(np.exp(free.scales), largest[:, None])
+    assert np.allclose(np.exp(held.scales), expected, rtol=1e-5)
+    assert 0 < (held.scales < free.scales).all(axis=1).sum() < 200
+
+
 @settings(deadline=None, max_examples=40)
 @given(
     count=st.integers(1, 40),

@@ -69,7 +69,7 @@ def test_many_views_are_sampled_evenly():
 )  # fmt: skip
 def test_they_scale_with_the_scene_and_do_not_move_with_it(shift, scale, seed):
     rng = np.random.default_rng(seed)
-    xyz, center = rng.uniform(-1, 1, (20, 3)) + [0, 0, 4.0], rng.normal(size=3)
+    xyz, center = rng.uniform([-1, -1, 3], [1, 1, 5], (20, 3)), rng.normal(size=3)
     here = near_depths(xyz, [_view([0, 0, 0]), _view(center)])
     there = near_depths(
         scale * xyz + shift, [_view([shift] * 3), _view(scale * center + shift)]
@@ -105,7 +105,7 @@ def test_steps_of_positions_are_in_near_depths(room):
     optimizers = make_optimizers(params, make_schedule("none", 100, as_3dgs=False))
     for value in params.values():
         value.grad = torch.ones_like(value) if value.requires_grad else None
-    optimize(params, optimizers, {name: 1e-2 for name in optimizers})
+    optimize(params, optimizers, dict.fromkeys(optimizers, 1e-2))
     moved = gaussians.means - params["means"].detach().numpy()
     assert np.allclose(moved, 1e-2 * lengths[:, None], rtol=1e-3, atol=1e-6)
     changed = gaussians.scales - params["scales"].detach().numpy()

@@ -92,7 +92,9 @@ def test_bytes_depend_on_the_seed_and_not_on_the_threads(begin, strategy):
 def test_a_stray_pose_is_named_and_does_no_harm(room, tmp_path):
     """One camera 10,000 units away once made the others' views black: the frame followed it."""
     images = sorted(room.images, key=lambda image: image.name)
-    far = dataclasses.replace(images[2], translation=images[2].translation + [0.0, 0.0, 1e4])
+    far = dataclasses.replace(
+        images[2], translation=images[2].translation + np.array([0.0, 0.0, 1e4])
+    )
     scenes = {"as it is": images, "stray": [*images[:2], far, *images[3:]]}
     settings, gains, notes = TrainSettings(max_steps=120, data_factor=2, strategy="none"), {}, []
     for name, each in scenes.items():

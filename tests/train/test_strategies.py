@@ -67,8 +67,9 @@ def test_short_runs_are_in_haste_up_to_a_bound():
     )
     assert short == tiny
     assert half["means"] == pytest.approx(2 * full["means"])
-    assert half["sh0"] == pytest.approx(2**0.5 * full["sh0"])
+    assert half["sh0"] == pytest.approx(2 * full["sh0"])
     assert short["means"] == pytest.approx(20 * full["means"])
+    assert short["sh0"] == pytest.approx(4 * full["sh0"])
     assert half["opacities"] == short["opacities"] == full["opacities"]
     assert make_schedule("none", 90_000, as_3dgs=False).learning_rates == full
 

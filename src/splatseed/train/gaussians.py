@@ -54,6 +54,7 @@ def initial_gaussians(
     sh_degree: int = 3,
     opacity: float = 0.1,
     scale_factor: float = 1.0,
+    largest: Float[np.ndarray, " N"] | None = None,
 ) -> Gaussians:
     """One round Gaussian a seed, as large as the gap to its 3 nearest neighbours.
 
@@ -62,13 +63,16 @@ def initial_gaussians(
         sh_degree: Degree up to which colours may come to depend on the direction.
         opacity: Of each, between 0 and 1.
         scale_factor: Multiplies the size.
+        largest: Most that each one's size may be, [N]; no bound when left out.
 
     Raises:
         PointCloudError: Fewer than two distinct finite points.
     """
     count, rest = len(seeds), (sh_degree + 1) ** 2 - 1
-    distance = neighbor_distances(seeds.xyz)
-    scales = np.repeat(np.log(distance * scale_factor)[:, None], 3, axis=1)
+    sizes = neighbor_distances(seeds.xyz) * scale_factor
+    if largest is not None:
+        sizes = np.minimum(sizes, largest)
+    scales = np.repeat(np.log(sizes)[:, None], 3, axis=1)
     sh0 = (seeds.rgb / 255.0 - 0.5) / SH_C0
     return Gaussians(
         means=np.array(seeds.xyz, np.float32),

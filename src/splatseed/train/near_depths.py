@@ -26,9 +26,7 @@ LEAST = 0.01
 """The rasteriser's near plane: nothing nearer is drawn."""
 
 
-def near_depths(
-    xyz: Float[np.ndarray, "N 3"], views: Sequence[View]
-) -> Float32[np.ndarray, " N"]:
+def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32[np.ndarray, " N"]:
     """The least depth of each point among the views that see it; what no view sees gets the median.
 
     Args:

@@ -274,12 +274,13 @@ def _state(
     if begun and begun.checkpoint.is_file():
         return load_checkpoint(begun.checkpoint, strategy, schedule, device)
     xyz = frame.points_from_world(seeds.xyz)
+    lengths = near_depths(xyz, views) if schedule.near_depths else None
     gaussians = initial_gaussians(
         seeds.replace(xyz=xyz),
         sh_degree=settings.sh_degree,
         opacity=schedule.opacity,
         scale_factor=schedule.scale_factor,
+        largest=None if lengths is None else schedule.largest * lengths,
     )
-    lengths = near_depths(xyz, views) if schedule.near_depths else None
     params = make_parameters(gaussians, device, lengths)
     return TrainState(params, make_optimizers(params, schedule), strategy)

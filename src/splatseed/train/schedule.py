@@ -9,6 +9,7 @@ was chosen on held-out training views and is listed in benchmarks/README.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -37,13 +38,15 @@ GROWTH = 1.05
 LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType({"default": 6, "mcmc": 24, "none": 1})
 """A short run densifies so many times, if need be more often than every 100 steps: gradients averaged
 over few photographs are noise."""
-MOST_HASTE = 20.0
-"""A short run is in haste by how many times shorter it is than a full one, up to this."""
 HASTE: Mapping[str, float] = MappingProxyType(
-    {"means": 1.0, "scales": 0.5, "quats": 0.5, "opacities": 0.0, "sh0": 0.5, "shN": 0.5}
+    {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 4.0}
 )
-"""The power of the haste that learning rates are multiplied by. Positions have as far to go in a short
-run as in a long one; where opacities are hasty, Gaussians die that are needed later."""
+"""Most that learning rates are multiplied by in a short run, else by how many times shorter it is than
+a full one. Positions have as far to go in a short run as in a long one; where opacities are hasty,
+Gaussians die that are needed later."""
+LARGEST = 0.05
+"""Of the first Gaussians, in near depths. Where SfM has few points the gaps between them are wide, and
+what fills one hides all that lies behind it."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,7 @@ class Schedule:
         growth: What MCMC multiplies the number of Gaussians by at a time.
         opacity: Of the first Gaussians.
         scale_factor: Size of the first Gaussians, as a multiple of the gaps between them.
+        largest: And at most so many near depths.
     """
 
     max_steps: int
@@ -80,6 +84,7 @@ class Schedule:
     growth: float = GROWTH
     opacity: float = 0.1
     scale_factor: float = 1.0
+    largest: float = math.inf
 
     def sh_degree(self, step: int, highest: int) -> int:
         """The degree of spherical harmonics in use."""
@@ -125,14 +130,14 @@ def _as_3dgs(densification: Densification, max_steps: int) -> Schedule:
 
 def _own(densification: Densification, max_steps: int) -> Schedule:
     mcmc = densification == "mcmc"
-    haste = min(max(FULL_RUN / max_steps, 1.0), MOST_HASTE)
+    haste = max(FULL_RUN / max_steps, 1.0)
     stop = _scaled(25_000 if mcmc else 15_000, max_steps)
     shrunk = 100 * max_steps / FULL_RUN
     every = max(1, round(shrunk), min(100, stop // LEAST_ROUNDS[densification]))
     return Schedule(
         max_steps=max_steps,
         near_depths=True,
-        learning_rates={n: rate * haste ** HASTE[n] for n, rate in LEARNING_RATES.items()},
+        learning_rates={n: rate * min(haste, HASTE[n]) for n, rate in LEARNING_RATES.items()},
         decays=DECAYS,
         sh_every=_scaled(1000, max_steps),
         refine_start=_scaled(500, max_steps),
@@ -141,6 +146,7 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
         reset_every=_scaled(3000, max_steps),
         growth=GROWTH ** (every / shrunk),
         opacity=0.5 if mcmc else 0.1,
+        largest=LARGEST,
     )
 
 
