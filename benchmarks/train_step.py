@@ -32,6 +32,7 @@ from splatseed.errors import SplatseedError
 from splatseed.train import losses, trainer as loop
 from splatseed.train.frame import TrainingFrame, training_frame
 from splatseed.train.gaussians import Gaussians, initial_gaussians
+from splatseed.train.near_depths import near_depths
 from splatseed.train.parameters import make_optimizers, make_parameters, render_view
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.settings import TrainSettings
@@ -120,9 +121,12 @@ def _trainer(workload: Workload) -> Trainer:
     """A run in the middle of its first third, as ``splatseed train`` would have it."""
     settings = TrainSettings(backend="cpu")
     frame = training_frame(workload.views)
-    params = make_parameters(_in_frame(workload.gaussians, frame), torch.device("cpu"))
-    state = TrainState(params, make_optimizers(params), make_strategy(settings))
-    return Trainer(state, settings, [frame.view(view) for view in workload.views], [])
+    views = [frame.view(view) for view in workload.views]
+    gaussians = _in_frame(workload.gaussians, frame)
+    lengths = near_depths(gaussians.means, views)
+    params = make_parameters(gaussians, torch.device("cpu"), lengths)
+    optimizers = make_optimizers(params, settings.schedule)
+    return Trainer(TrainState(params, optimizers, make_strategy(settings)), settings, views, [])
 
 
 def _in_frame(gaussians: Gaussians, frame: TrainingFrame) -> Gaussians:
