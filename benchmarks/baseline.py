@@ -21,7 +21,7 @@ from typing import Any
 
 import tyro
 
-from baseline_arms import ARMS, CAPS
+from baseline_arms import ARMS, CAPS, fingerprint
 from children import call
 from clouds import find_scenes
 from machine import describe
@@ -61,13 +61,13 @@ class Settings:
                     )
 
 
-Key = tuple[str, str, int, int, int]
-"""Capture, arm, steps, data factor, seed."""
+Key = tuple[str, str, int, int, int, str]
+"""Capture, arm, steps, data factor, seed, and a fingerprint of the arm's numbers."""
 
 
 def run(key: Key, scenes: Path, ledger: Path) -> None:
     """One run, and its line in the ledger."""
-    scene, arm, max_steps, data_factor, seed = key
+    scene, arm, max_steps, data_factor, seed, _ = key
     _say(f"{scene}, {arm}, {max_steps:,} steps, seed {seed} ...")
     result = call(
         "baseline_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
@@ -90,11 +90,17 @@ def wanted(settings: Settings) -> Iterable[Key]:
     for seed in range(settings.seeds):
         for arm in settings.arms:
             for scene in settings.scenes:
-                yield (scene, arm, settings.max_steps, settings.data_factor, seed)
+                yield make_key(scene, arm, seed, settings)
+
+
+def make_key(scene: str, arm: str, seed: int, settings: Settings) -> Key:
+    """What a run is known by in the ledger."""
+    steps = settings.max_steps
+    return (scene, arm, steps, settings.data_factor, seed, fingerprint(scene, arm, steps))
 
 
 def rows(results: Mapping[Key, Mapping[str, Any]], settings: Settings) -> Iterable[list[str]]:
-    """An arm each: PSNR / SSIM by capture, and the mean of those that all seeds have run."""
+    """An arm each: PSNR / SSIM by capture where all seeds have been run, and the mean of all."""
     for arm in settings.arms:
         means = [_means(results, arm, scene, settings) for scene in settings.scenes]
         known = [each for each in means if each]
@@ -107,11 +113,13 @@ def rows(results: Mapping[Key, Mapping[str, Any]], settings: Settings) -> Iterab
 def _means(
     results: Mapping[Key, Mapping[str, Any]], arm: str, scene: str, settings: Settings
 ) -> list[float] | None:
-    """PSNR, SSIM, Gaussians and seconds, averaged over the seeds."""
-    at = (scene, arm, settings.max_steps, settings.data_factor)
-    runs = [results[(*at, seed)] for seed in range(settings.seeds) if (*at, seed) in results]
+    """PSNR, SSIM, Gaussians and seconds, averaged over the seeds; None until all have been run."""
+    keys = [make_key(scene, arm, seed, settings) for seed in range(settings.seeds)]
+    runs = [results[key] for key in keys if key in results]
     names = ("psnr", "ssim", "gaussians", "seconds")
-    return [statistics.mean(run[name] for run in runs) for name in names] if runs else None
+    if len(runs) < settings.seeds:
+        return None
+    return [statistics.mean(run[name] for run in runs) for name in names]
 
 
 def _cell(means: Sequence[float] | None) -> str:

@@ -7,6 +7,7 @@ scored on are held out of the training views, after the test views were taken ou
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from splatseed.evaluate import evaluate_views
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.schedule import LEARNING_RATES, Schedule
 
-__all__ = ["ARMS", "CAPS", "Arm", "train"]
+__all__ = ["ARMS", "CAPS", "Arm", "fingerprint", "train"]
 
 CAPS: Mapping[str, int] = {"fern": 40_000, "treehill": 80_000, "fox": 38_000, "bonsai": 150_000}
 """Most Gaussians: 0.33, 1.2, 0.42 and 1.4 of the pixels of a photograph at half size."""
@@ -109,6 +110,13 @@ ARMS: Mapping[str, Arm] = {
     "none": Arm("none"),
 }
 """By what the table calls them; - and + are ``default`` with a choice undone or added."""
+
+
+def fingerprint(scene: str, arm: str, max_steps: int) -> str:
+    """Of the numbers that an arm's run is made of: what was measured with others is another run."""
+    chosen = ARMS[arm]
+    schedule = chosen.change(TrainSettings(strategy=chosen.strategy, max_steps=max_steps).schedule)
+    return hashlib.blake2b(f"{CAPS[scene]} {schedule}".encode(), digest_size=8).hexdigest()
 
 
 def train(

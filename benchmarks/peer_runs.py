@@ -27,17 +27,16 @@ from splatseed.render import mcmc_on_cpu
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.allocator import keep_freed_memory
 from splatseed.train.device import Capacity
+from splatseed.train.schedule import FULL_RUN
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.strategies import _Capped
 from splatseed.train.views import View, load_split
 
-__all__ = ["FULL_RUN", "Split", "read_scene", "train_ours", "train_peer"]
+__all__ = ["Split", "read_scene", "train_ours", "train_peer"]
 
 Split = Literal["validation", "test"]
 Result = dict[str, float]
 
-FULL_RUN = 30_000
-"""The steps that gsplat's schedules are stated for."""
 TEST_EVERY = 8
 CPU = torch.device("cpu")
 

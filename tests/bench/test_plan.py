@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
@@ -15,7 +16,7 @@ from splatseed.bench.plan_file import KINDS, plan_text, read_plan
 from splatseed.bench.records import SFM, Arm
 from splatseed.bench.scenes import survey
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io import load_scene
+from splatseed.io import load_scene, write_scene
 from splatseed.train.settings import StrategyName
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20)
@@ -151,6 +152,16 @@ def test_depth_needs_maps_and_never_sees_the_test_photographs(small_plan, room_p
     assert depth.depth_digest == facts.depth_digest
     with pytest.raises(SceneNotFoundError, match="folder of depth maps"):
         survey(room_path, "room", depth=tmp_path / "none", with_depth=True)
+
+
+def test_a_stray_camera_is_named_before_anything_is_run(room_path, tmp_path):
+    scene = load_scene(room_path)
+    first, *others = scene.images
+    far = dataclasses.replace(first, translation=first.translation + np.array([0, 0, 1e4]))
+    write_scene(scene.replace(images=(far, *others)), tmp_path / "stray")
+    (said,) = survey(tmp_path / "stray", "stray").warnings
+    assert first.name in said
+    assert survey(room_path, "room").warnings == ()
 
 
 def test_a_scene_is_known_by_its_content(room_path, own_room):

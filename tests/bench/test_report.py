@@ -108,6 +108,14 @@ def test_a_whole_ledger(tmp_path):
     assert "abacus" in said
 
 
+def test_3dgs_conventions_are_strategies_of_their_own(tmp_path):
+    bench = write_ledger(tmp_path / "b", rows(strategies=("default", "default-3dgs")))
+    write_report(bench)
+    names = {path.name for path in (bench / "tables").iterdir()}
+    assert {"gains_default.md", "gains_default-3dgs.md", "gain_by_strategy.md"} <= names
+    assert "default-3dgs" in text_of(bench)
+
+
 def test_a_partial_ledger_says_what_is_missing(tmp_path):
     found = [dataclasses.replace(r, status="pending", result=None) if i % 5 == 2 else r
              for i, r in enumerate(rows(**GONE))]  # fmt: skip

@@ -57,10 +57,13 @@ def test_what_no_view_sees_at_all_is_one_extent_away():
     assert near_depths(np.array([[0, 0, -1.0]]), [_view([0, 0, 0])]).tolist() == [1.0]
 
 
-def test_many_views_are_sampled_evenly():
+def test_many_views_are_sampled_evenly(monkeypatch):
     views = [_view([0, 0, -0.01 * i]) for i in range(1000)]
-    found = near_depths(np.array([[0, 0, 1.0]]), views)
-    assert found[0] == pytest.approx(1.0)  # the first, and so the nearest, is among them
+    one = np.array([[0, 0, 1.0]])
+    assert near_depths(one, views[::-1])[0] == pytest.approx(1.0)
+    monkeypatch.setattr("splatseed.train.near_depths.MOST_PROJECTIONS", 1)
+    assert near_depths(one, views)[0] == pytest.approx(1.0)  # the first is among those asked
+    assert near_depths(one, views[1:] + views[:1])[0] == pytest.approx(1.0)  # and the last
 
 
 @settings(deadline=None, max_examples=30)
@@ -110,6 +113,21 @@ def test_steps_of_positions_are_in_near_depths(room):
     assert np.allclose(moved, 1e-2 * lengths[:, None], rtol=1e-3, atol=1e-6)
     changed = gaussians.scales - params["scales"].detach().numpy()
     assert np.allclose(changed, 1e-2, rtol=1e-3)
+
+
+def test_small_steps_of_far_positions_are_not_lost(room):
+    """At the end of a full run a step is far below the last digit of a far position's own."""
+    rate, far = 1.6e-6, 100.0
+    gaussians = initial_gaussians(room.points)
+    away = dataclasses.replace(gaussians, means=np.full_like(gaussians.means, far))
+    params = make_parameters(away, CPU, np.full(len(away), far, np.float32))
+    optimizers = make_optimizers(params, make_schedule("none", 100, as_3dgs=False))
+    for _ in range(50):
+        for value in params.values():
+            value.grad = torch.ones_like(value) if value.requires_grad else None
+        optimize(params, optimizers, dict.fromkeys(optimizers, rate))
+    moved = far - params["means"].detach().double()
+    assert float(moved.mean()) == pytest.approx(50 * rate * far, rel=0.05)
 
 
 def test_a_views_size_matters_and_not_its_pixels(room):

@@ -17,7 +17,8 @@ from splatseed.io.depth_find import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.train.views import check_lens
+from splatseed.train.frame import stray_note, stray_views
+from splatseed.train.views import check_lens, poses_of
 
 __all__ = ["SceneFacts", "open_scene", "survey"]
 
@@ -110,7 +111,7 @@ def survey(
         images=images,
         depth_path="" if maps is None else str(maps.resolve()),
         depth_digest="" if maps is None else depth_digest(find_depths(scene, maps), progress),
-        warnings=scene.warnings,
+        warnings=(*scene.warnings, *map(stray_note, stray_views(poses_of(scene.images)))),
     )
 
 

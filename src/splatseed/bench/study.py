@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import get_args
 
 from splatseed.bench.records import SFM, RunResult, RunRow, RunSpec
 from splatseed.train.settings import StrategyName
@@ -30,7 +31,7 @@ SETTINGS = (
     "version",
 )
 """Fields of a specification that are the same for all runs of a study."""
-STRATEGIES: tuple[StrategyName, ...] = ("default", "mcmc", "none")
+STRATEGIES: tuple[StrategyName, ...] = get_args(StrategyName)
 
 Cell = Mapping[int, RunResult]
 """The results of one variant on one scene under one strategy, by repeat."""

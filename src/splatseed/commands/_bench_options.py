@@ -64,13 +64,13 @@ class Options:
     ratios: Annotated[tuple[float, ...], _hint(_listed(DEFAULT.ratios))] = ()
     """Points in all, per original."""
     strategies: Annotated[tuple[StrategyName, ...], _hint(_listed(DEFAULT.strategies))] = ()
-    """Densification strategies."""
+    """Densification strategies; -3dgs: in 3DGS's own conventions of rates and schedules."""
     profiles: Annotated[tuple[Profile, ...], _hint(_listed(DEFAULT.profiles))] = ()
     """Improved parameters of the methods, and those of the paper's text."""
     repeats: Annotated[int | None, _one(int, f"{DEFAULT.repeats}")] = None
     """How often, with another seed each time; error bars need at least 3."""
     max_steps: Annotated[int | None, _one(int, f"{DEFAULT.max_steps}")] = None
-    """Training steps; all schedules shrink with them."""
+    """Training steps; schedules and learning rates are adapted to them."""
     data_factor: Annotated[int | None, _one(int, f"{DEFAULT.data_factor}")] = None
     """By how much the photographs are made smaller."""
     test_every: Annotated[int | None, _one(int, f"{DEFAULT.test_every}")] = None

@@ -54,9 +54,10 @@ class Options:
     backend: Backend = DEFAULT.backend
     """Where to train; auto takes a GPU if PyTorch sees one."""
     strategy: StrategyName = DEFAULT.strategy
-    """Densify as 3DGS does, as MCMC up to a cap, or keep the seeds' number."""
+    """Densify as 3DGS does, as MCMC up to a cap, or keep the seeds' number; -3dgs: in 3DGS's own
+    conventions of rates and schedules, to compare with published numbers."""
     max_steps: int = DEFAULT.max_steps
-    """Steps; all schedules shrink with them."""
+    """Steps; schedules and learning rates are adapted to them."""
     data_factor: int = DEFAULT.data_factor
     """By how much the photographs are made smaller."""
     seed: int = DEFAULT.seed

@@ -30,7 +30,7 @@ from splatseed.train.gaussians import Gaussians
 from splatseed.train.parameters import render_view
 from splatseed.train.pictures import beside_truth, picture_name, write_picture
 from splatseed.train.ply import read_gaussians
-from splatseed.train.views import View, load_views
+from splatseed.train.views import View, load_views, poses_of
 
 __all__ = [
     "TrainedModel",
@@ -154,10 +154,7 @@ def frame_of_scene(scene: Scene, test_every: int = 8) -> TrainingFrame:
         test_every: As it was trained with.
     """
     train, _ = scene.split(test_every)
-    unseen = np.empty((0, 0, 3), np.uint8)
-    return training_frame(
-        [View(i.name, unseen, i.camera.K, 0, 0, i.camera.cam_from_world) for i in train]
-    )
+    return training_frame(poses_of(train))
 
 
 def write_renders(model: TrainedModel, folder: Path, progress: Progress = silent) -> None:

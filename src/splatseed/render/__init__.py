@@ -3,8 +3,8 @@
 ``rasterization`` has the signature and the results of ``gsplat.rasterization`` (1.5.3). CUDA tensors
 go to gsplat itself; CPU tensors to this package's own rasteriser, so that code written for gsplat
 runs, trains and is tested without a GPU. ``MCMCStrategy`` is gsplat's on either device, and
-``mcmc_on_cpu`` a block within which gsplat's own runs on the CPU. Needs PyTorch, the strategy gsplat as
-well (``pip install "splatseed[train]"``).
+``mcmc_on_cpu`` a block within which gsplat's own runs on the CPU. It needs PyTorch; the strategy also
+needs gsplat (``pip install "splatseed[train]"``).
 """
 
 from __future__ import annotations

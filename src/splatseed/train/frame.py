@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 from splatseed.train.gaussians import Gaussians
 from splatseed.train.views import View
 
-__all__ = ["SCENE_SCALE", "TrainingFrame", "stray_views", "training_frame"]
+__all__ = ["SCENE_SCALE", "TrainingFrame", "stray_note", "stray_views", "training_frame"]
 
 SCENE_SCALE = 1.1
 """What the strategies and the learning rate of positions take as the size of the scene: the
@@ -26,7 +26,9 @@ cameras' extent, and as in 3DGS a tenth more."""
 STRAY_SHARE = 0.1
 """At most this share of the cameras, but always one, may be taken for strays."""
 STRAY_DISTANCE = 10.0
-"""A stray is more than so many times as far from the cameras' median as all that are none may be."""
+"""How many times farther from the cameras' median a stray is than the farthest that cannot be one."""
+MIN_CAMERAS = 5
+"""Among fewer, nobody can say which are the usual ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +84,11 @@ def stray_views(views: Sequence[View]) -> tuple[str, ...]:
     return tuple(view.name for view, stray in zip(views, strays, strict=True) if stray)
 
 
+def stray_note(name: str) -> str:
+    """What the user should know of a stray."""
+    return f"The camera of {name} is far from all others: check its pose, or leave it out."
+
+
 def _centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
     """The cameras' positions in the world."""
     return np.array([-view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3] for view in views])
@@ -89,6 +96,8 @@ def _centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
 
 def _is_stray(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
     """Which cameras are out of all proportion to the others, never more than a tenth of them, or one."""
+    if len(centers) < MIN_CAMERAS:
+        return np.zeros(len(centers), bool)
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     usual = max(1, len(centers) - max(1, round(STRAY_SHARE * len(centers))))
     reach = np.partition(distances, usual - 1)[usual - 1]

@@ -18,10 +18,13 @@ from splatseed.train.views import View
 
 __all__ = ["near_depths"]
 
-MOST_VIEWS = 64
-"""More views, which are then neighbours of others, hardly change the least depth."""
+MOST_PROJECTIONS = 20_000_000
+"""Points times views: some seconds. Of a large capture with many points, some views are not asked."""
+LEAST_VIEWS = 64
+"""But these are."""
 MARGIN = 0.1
-"""A view also sees what is out of its picture by this share of its size: what is large reaches in."""
+"""A point that misses the picture by up to this share of its size counts as seen: a large Gaussian
+there reaches in."""
 LEAST = 0.01
 """The rasteriser's near plane: nothing nearer is drawn."""
 
@@ -31,16 +34,17 @@ def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32
 
     Args:
         xyz: Points.
-        views: The training views; of many, ``MOST_VIEWS`` evenly chosen ones are asked.
+        views: The training views; see ``MOST_PROJECTIONS``.
     """
     nearest = np.full(len(xyz), np.inf)
     columns = np.ascontiguousarray(xyz.T, np.float64)
-    for i in np.unique(np.linspace(0, len(views) - 1, MOST_VIEWS).round().astype(int)):
+    asked = max(LEAST_VIEWS, MOST_PROJECTIONS // max(1, len(xyz)))
+    for i in np.unique(np.linspace(0, len(views) - 1, min(asked, len(views))).round().astype(int)):
         depths, seen = _seen_depths(columns, views[i])
         np.minimum(nearest, np.where(seen, depths, np.inf), out=nearest)
     known = np.isfinite(nearest)
     nearest[~known] = np.median(nearest[known]) if known.any() else 1.0
-    return np.maximum(nearest, LEAST).astype(np.float32)
+    return np.asarray(np.maximum(nearest, LEAST), np.float32)
 
 
 def _seen_depths(

@@ -82,9 +82,10 @@ def gaussians_of(params: Parameters | Mapping[str, Tensor]) -> Gaussians:
 def yardsticks(params: Parameters) -> Float[Tensor, "#N"]:
     """The length that each Gaussian's size and rate are measured by; one number if it is all's."""
     if NEAR_DEPTHS in params:
-        lengths: Tensor = params[NEAR_DEPTHS]
-        return lengths.detach()
-    return params["means"].new_full((1,), SCENE_SCALE)
+        lengths: Tensor = params[NEAR_DEPTHS].detach()
+    else:
+        lengths = params["means"].new_full((1,), SCENE_SCALE)
+    return lengths
 
 
 def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
@@ -107,13 +108,17 @@ def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, flo
         rates: Their learning rates; that of positions in yardsticks.
     """
     means, lengths = params["means"], yardsticks(params)
-    before = means.detach().clone()
+    with torch.no_grad():  # a step from 0 loses no digits, however far off the Gaussian is
+        before = means.detach().clone()
+        means.zero_()
     for name, optimizer in optimizers.items():
         optimizer.param_groups[0]["lr"] = rates[name]
         optimizer.step()
         optimizer.zero_grad()
-    with torch.no_grad():  # Adam's step is in proportion to the rate, so it can be scaled behind it
-        torch.addcmul(before, means - before, lengths[:, None], out=means)
+    with (
+        torch.no_grad()
+    ):  # Adam's step is in proportion to the rate, so it can be scaled afterwards
+        torch.addcmul(before, means, lengths[:, None], out=means)
 
 
 def render_view(

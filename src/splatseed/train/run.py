@@ -24,7 +24,7 @@ from splatseed.scene import Scene
 from splatseed.train.config import check_same_seeds, make_config, resumed_settings
 from splatseed.train.curve import Record, write_curve_csv, write_curve_png
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
-from splatseed.train.frame import TrainingFrame, stray_views, training_frame
+from splatseed.train.frame import TrainingFrame, stray_note, stray_views, training_frame
 from splatseed.train.gaussians import initial_gaussians
 from splatseed.train.near_depths import near_depths
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
@@ -109,7 +109,7 @@ def prepare_run(
     )
     frame, strays = training_frame(views[0]), stray_views(views[0])
     for name in strays:
-        note(f"The camera of {name} is far from all others: check its pose, or leave it out.")
+        note(stray_note(name))
     near = [frame.view(view) for view in views[0] if view.name not in strays]
     state = _state(folder if begun else None, seeds, frame, near, settings, device)
     if not begun:
@@ -274,13 +274,13 @@ def _state(
     if begun and begun.checkpoint.is_file():
         return load_checkpoint(begun.checkpoint, strategy, schedule, device)
     xyz = frame.points_from_world(seeds.xyz)
-    lengths = near_depths(xyz, views) if schedule.near_depths else None
+    lengths = near_depths(xyz, views)
     gaussians = initial_gaussians(
         seeds.replace(xyz=xyz),
         sh_degree=settings.sh_degree,
         opacity=schedule.opacity,
         scale_factor=schedule.scale_factor,
-        largest=None if lengths is None else schedule.largest * lengths,
+        largest=schedule.largest * lengths,
     )
-    params = make_parameters(gaussians, device, lengths)
+    params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
     return TrainState(params, make_optimizers(params, schedule), strategy)

@@ -3,8 +3,8 @@
 Notation: a *full* run has 30,000 steps, and all numbers of 3DGS are stated for it; T are the steps of
 the run at hand. Lengths, and so the rates of positions, are in *yardsticks*: a Gaussian's near depth
 (``near_depths``) in splatseed's conventions, the cameras' extent in 3DGS's. Promise: a full run of
-splatseed's differs from 3DGS's by the yardstick alone (and MCMC's start); each departure in short runs
-was chosen on held-out training views and is listed in benchmarks/README.md.
+splatseed's differs from 3DGS's by the yardstick, the bound on first sizes and MCMC's start; these and
+each departure in short runs were chosen on held-out training views: see benchmarks/README.md.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ GROWTH = 1.05
 LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType({"default": 6, "mcmc": 24, "none": 1})
 """A short run densifies so many times, if need be more often than every 100 steps: gradients averaged
 over few photographs are noise."""
-HASTE: Mapping[str, float] = MappingProxyType(
+MOST_HASTE: Mapping[str, float] = MappingProxyType(
     {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 4.0}
 )
-"""Most that learning rates are multiplied by in a short run, else by how many times shorter it is than
-a full one. Positions have as far to go in a short run as in a long one; where opacities are hasty,
-Gaussians die that are needed later."""
+"""Learning rates of a short run are multiplied by how many times shorter it is than a full one, but by
+no more than this. Positions have as far to go in a short run as in a long one; with a higher rate of
+opacities, Gaussians die that are needed later."""
 LARGEST = 0.05
-"""Of the first Gaussians, in near depths. Where SfM has few points the gaps between them are wide, and
-what fills one hides all that lies behind it."""
+"""Largest size of a first Gaussian, in near depths. Where SfM has few points the gaps between them are
+wide, and what fills one hides all that lies behind it."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
     return Schedule(
         max_steps=max_steps,
         near_depths=True,
-        learning_rates={n: rate * min(haste, HASTE[n]) for n, rate in LEARNING_RATES.items()},
+        learning_rates={n: rate * min(haste, MOST_HASTE[n]) for n, rate in LEARNING_RATES.items()},
         decays=DECAYS,
         sh_every=_scaled(1000, max_steps),
         refine_start=_scaled(500, max_steps),

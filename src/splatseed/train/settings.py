@@ -33,7 +33,7 @@ class TrainSettings:
     """How Gaussians are added and removed: 3DGS's densification, MCMC up to a cap, or not at all;
     with ``-3dgs`` also in 3DGS's own conventions of rates, sizes and schedules."""
     max_steps: int = FULL_RUN
-    """Training steps; all schedules shrink with them."""
+    """Training steps; schedules and learning rates are adapted to them."""
     data_factor: int = 1
     """By how much the photographs are made smaller, a whole number."""
     seed: int = 0

@@ -22,7 +22,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.train.photographs import load_photograph
 
-__all__ = ["View", "check_lens", "load_split", "load_views"]
+__all__ = ["View", "check_lens", "load_split", "load_views", "poses_of"]
 
 MIN_SIDE = 11
 """The window of SSIM, in pixels: smaller views cannot be scored."""
@@ -50,6 +50,12 @@ class View:
     width: int
     height: int
     cam_from_world: Float64[np.ndarray, "4 4"]
+
+
+def poses_of(images: Sequence[Image]) -> tuple[View, ...]:
+    """The views of some images without their pixels, for whoever needs their poses alone."""
+    unseen = np.empty((0, 0, 3), np.uint8)
+    return tuple(View(i.name, unseen, i.camera.K, 0, 0, i.camera.cam_from_world) for i in images)
 
 
 def load_split(
