@@ -34,10 +34,11 @@ def _as_it_is(schedule: Schedule) -> Schedule:
 
 @dataclass(frozen=True)
 class Arm:
-    """A strategy, and what is changed in its schedule."""
+    """A strategy, and what is changed in its schedule and settings."""
 
     strategy: str
     change: Change = _as_it_is
+    opacity_reset: bool = False
 
 
 def _set(**values: Any) -> Change:
@@ -76,6 +77,11 @@ def _parts(first: float, last: float) -> Change:
     return change
 
 
+def _late_harmonics(schedule: Schedule) -> Schedule:
+    """One degree more each fifth of the run, not each thirtieth."""
+    return dataclasses.replace(schedule, sh_every=schedule.max_steps // 5)
+
+
 def _before(prune_size: float = 0.1) -> Change:
     """As splatseed's ``default`` was: in 3DGS's conventions, but for rounds of 100 steps."""
 
@@ -102,10 +108,15 @@ ARMS: Mapping[str, Arm] = {
     "- bound on first sizes": Arm("default", _set(largest=UNBOUNDED)),
     "densified from 1/6 to 3/5 of the run": Arm("default", _parts(1 / 6, 3 / 5)),
     "densified up to 3/4 of the run": Arm("default", _parts(1 / 60, 3 / 4)),
+    "harmonics each fifth of the run": Arm("default", _late_harmonics),
+    "opacities reset each tenth of the run": Arm("default", opacity_reset=True),
     "mcmc-3dgs": Arm("mcmc-3dgs"),
     "mcmc": Arm("mcmc"),
     "mcmc begun at a tenth of the size": Arm("mcmc", _set(scale_factor=0.1)),
     "mcmc begun at opacity 0.1": Arm("mcmc", _set(opacity=0.1)),
+    "mcmc without noise": Arm("mcmc", _set(noise=0.0)),
+    "mcmc with a tenth of the penalties": Arm("mcmc", _set(penalty=0.001)),
+    "mcmc that grows by 1.05": Arm("mcmc", _set(growth=1.05)),
     "none-3dgs": Arm("none-3dgs"),
     "none": Arm("none"),
 }
@@ -132,7 +143,7 @@ def train(
 
     settings = Altered(
         strategy=chosen.strategy, max_steps=max_steps, data_factor=data_factor, seed=seed,
-        cap_max=cap_max, test_every=TEST_EVERY, backend="cpu",
+        cap_max=cap_max, test_every=TEST_EVERY, backend="cpu", opacity_reset=chosen.opacity_reset,
     )  # fmt: skip
     whole = load_scene(Path(scene))
     validation = whole.replace(images=whole.split(TEST_EVERY)[0])

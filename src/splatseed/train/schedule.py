@@ -66,6 +66,8 @@ class Schedule:
             step from which on Gaussians that are too large are pruned.
         prune_size: How large that is, in yardsticks.
         growth: What MCMC multiplies the number of Gaussians by at a time.
+        noise: What it multiplies 3DGS's learning rate of positions by, for its noise.
+        penalty: What it weighs mean opacity and mean size by, each, beside the loss.
         opacity: Of the first Gaussians.
         scale_factor: Size of the first Gaussians, as a multiple of the gaps between them.
         largest: And at most so many near depths.
@@ -82,6 +84,8 @@ class Schedule:
     reset_every: int
     prune_size: float = 0.1
     growth: float = GROWTH
+    noise: float = 5e5
+    penalty: float = 0.01
     opacity: float = 0.1
     scale_factor: float = 1.0
     largest: float = math.inf

@@ -29,9 +29,6 @@ from splatseed.train.settings import MCMC_CAP, TrainSettings
 
 __all__ = ["Strategy", "make_strategy"]
 
-MCMC_NOISE = 5e5
-"""What gsplat multiplies positions' learning rate by, for the noise."""
-
 
 class Strategy(ABC):
     """What changes the number of Gaussians.
@@ -181,11 +178,12 @@ class _Bounded(MCMCStrategy):
 
     capacity: Capacity | None = None
     growth: float = 1.0
+    noise: float = 0.0
 
     def set_noise(self, params: Parameters) -> None:
         """To be called before each step, and where the number of Gaussians changes."""
         if NEAR_DEPTHS in params:
-            self.noise_lr = MCMC_NOISE / yardsticks(params)[:, None]
+            self.noise_lr = self.noise / yardsticks(params)[:, None]
 
     def _add_new_gs(self, params: Parameters, optimizers: Any, binoms: Any) -> int:
         assert self.capacity is not None  # noqa: S101  (given in ``_Mcmc``)
@@ -200,16 +198,14 @@ class _Bounded(MCMCStrategy):
 class _Mcmc(Strategy):
     """3DGS as MCMC: move the faint to where there is more to show, add up to a cap, add noise."""
 
-    OPACITY_WEIGHT = 0.01
-    SCALE_WEIGHT = 0.01
-
     def __init__(self, settings: TrainSettings, capacity: Capacity) -> None:
         super().__init__(capacity)
         self.schedule = schedule = settings.schedule
         self.inner = _Bounded(
             capacity=capacity,
             growth=schedule.growth,
-            noise_lr=MCMC_NOISE,
+            noise=schedule.noise,
+            noise_lr=schedule.noise,
             refine_start_iter=schedule.refine_start,
             refine_stop_iter=schedule.refine_stop,
             refine_every=schedule.refine_every,
@@ -220,7 +216,7 @@ class _Mcmc(Strategy):
         opacities, sizes = torch.sigmoid(params["opacities"]), torch.exp(params["scales"])
         if NEAR_DEPTHS in params:
             sizes = sizes / yardsticks(params)[:, None]
-        return self.OPACITY_WEIGHT * opacities.mean() + self.SCALE_WEIGHT * sizes.mean()
+        return self.schedule.penalty * (opacities.mean() + sizes.mean())
 
     def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
         pass
