@@ -181,12 +181,13 @@ def _finish(run: TrainingRun, lpips: Lpips | None, progress: Progress) -> Mappin
 
 
 def _result(metrics: Mapping[str, Any], run: TrainingRun, upsample_seconds: float) -> RunResult:
+    from splatseed.train.parameters import gaussians_of  # noqa: PLC0415  (PyTorch)
+
     scores = tuple(
         ImageScore(each["name"], _number(each["psnr"]), each["ssim"], each["lpips"])
         for each in metrics["per_image"]
     )
     curve = tuple(CurvePoint(**each) for each in metrics["tests"] if each["psnr"] is not None)
-    parameters = run.state.params.values()
     return RunResult(
         psnr=_number(metrics["psnr"]),
         ssim=metrics["ssim"],
@@ -195,7 +196,7 @@ def _result(metrics: Mapping[str, Any], run: TrainingRun, upsample_seconds: floa
         curve=curve,
         num_seeds=metrics["num_seeds"],
         num_gaussians=metrics["num_gaussians"],
-        model_bytes=sum(4 * each.numel() for each in parameters),
+        model_bytes=gaussians_of(run.state.params).num_bytes,
         upsample_seconds=upsample_seconds,
         train_seconds=metrics["train_seconds"],
         render_seconds=metrics["render_seconds"],

@@ -56,11 +56,6 @@ class TrainedModel:
     views: Sequence[View]
     render: Render
 
-    @property
-    def num_bytes(self) -> int:
-        """Bytes of the parameters as float32: 236 a Gaussian at degree 3."""
-        return sum(array.nbytes for array in self.gaussians.arrays().values())
-
 
 def load_model(
     path: Path,
@@ -117,7 +112,7 @@ def evaluate_model(
         model.render, model.views, lpips=lpips, lpips_reason=lpips_reason, progress=progress
     )
     return dataclasses.replace(
-        result, num_gaussians=len(model.gaussians), model_bytes=model.num_bytes
+        result, num_gaussians=len(model.gaussians), model_bytes=model.gaussians.num_bytes
     )
 
 

@@ -43,6 +43,11 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of the parameters as float32: 236 a Gaussian at degree 3."""
+        return sum(array.nbytes for array in self.arrays().values())
+
     def arrays(self) -> dict[str, Float32[np.ndarray, "N ..."]]:
         """The parameters by name, in the order above."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
