@@ -60,7 +60,7 @@ def test_mcmc_may_grow_as_far_in_a_short_run(steps):
     assert short.growth**rounds == pytest.approx(1.05**245, rel=2.0)
 
 
-def test_short_runs_are_in_haste_up_to_a_bound():
+def test_short_runs_learn_faster_up_to_a_bound():
     full, half, short, tiny = (
         make_schedule("none", steps, as_3dgs=False).learning_rates
         for steps in (30_000, 15_000, 1500, 10)

@@ -38,7 +38,7 @@ GROWTH = 1.05
 LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType({"default": 6, "mcmc": 24, "none": 1})
 """A short run densifies so many times, if need be more often than every 100 steps: gradients averaged
 over few photographs are noise."""
-MOST_HASTE: Mapping[str, float] = MappingProxyType(
+MOST_SPEEDUP: Mapping[str, float] = MappingProxyType(
     {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 4.0}
 )
 """Learning rates of a short run are multiplied by how many times shorter it is than a full one, but by
@@ -134,14 +134,14 @@ def _as_3dgs(densification: Densification, max_steps: int) -> Schedule:
 
 def _own(densification: Densification, max_steps: int) -> Schedule:
     mcmc = densification == "mcmc"
-    haste = max(FULL_RUN / max_steps, 1.0)
+    speedup = max(FULL_RUN / max_steps, 1.0)
     stop = _scaled(25_000 if mcmc else 15_000, max_steps)
     shrunk = 100 * max_steps / FULL_RUN
     every = max(1, round(shrunk), min(100, stop // LEAST_ROUNDS[densification]))
     return Schedule(
         max_steps=max_steps,
         near_depths=True,
-        learning_rates={n: rate * min(haste, MOST_HASTE[n]) for n, rate in LEARNING_RATES.items()},
+        learning_rates={n: rate * min(speedup, MOST_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()},
         decays=DECAYS,
         sh_every=_scaled(1000, max_steps),
         refine_start=_scaled(500, max_steps),
