@@ -141,7 +141,9 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
     return Schedule(
         max_steps=max_steps,
         near_depths=True,
-        learning_rates={n: rate * min(speedup, MOST_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()},
+        learning_rates={
+            n: rate * min(speedup, MOST_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()
+        },
         decays=DECAYS,
         sh_every=_scaled(1000, max_steps),
         refine_start=_scaled(500, max_steps),
