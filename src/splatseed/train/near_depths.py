@@ -19,9 +19,9 @@ from splatseed.train.views import View
 __all__ = ["near_depths"]
 
 MOST_PROJECTIONS = 20_000_000
-"""Points times views: some seconds. Of a large capture with many points, some views are not asked."""
+"""Points times views: of a large capture with many points, only evenly chosen views are asked."""
 LEAST_VIEWS = 64
-"""But these are."""
+"""But never fewer than these."""
 MARGIN = 0.1
 """A point that misses the picture by up to this share of its size counts as seen: a large Gaussian
 there reaches in."""
