@@ -14,7 +14,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.train.frame import stray_views, training_frame
 from splatseed.train.gaussians import SH_C0, Gaussians, initial_gaussians, neighbor_distances
 from splatseed.train.ply import read_gaussians, write_gaussians
-from splatseed.train.views import load_split
+from splatseed.views.view import load_split
 
 
 def _random(rng, count, degree=3):

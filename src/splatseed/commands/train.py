@@ -31,8 +31,8 @@ from splatseed.console import (
 )
 from splatseed.io import load_scene
 from splatseed.requirements import require
-from splatseed.train.photographs import user_cache_dir
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
+from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
 from splatseed.train.gaussians import Gaussians
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["SCENE_SCALE", "TrainingFrame", "stray_note", "stray_views", "training_frame"]
 

@@ -1,4 +1,4 @@
-"""Views: posed photographs in memory, at the size at which they are trained and scored.
+"""Views: posed photographs in memory, at the size at which they are looked at.
 
 Notation: a view is W x H pixels; ``K`` is in its own pixels, the centre of the top-left one at
 (0.5, 0.5); ``cam_from_world`` maps the scene's world to OpenCV camera axes. Promise: views come
@@ -20,12 +20,10 @@ from splatseed.camera import CAMERA_MODELS
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.train.photographs import load_photograph
+from splatseed.views.photographs import load_photograph
 
 __all__ = ["View", "check_lens", "load_split", "load_views", "poses_of"]
 
-MIN_SIDE = 11
-"""The window of SSIM, in pixels: smaller views cannot be scored."""
 ASPECT_SLACK = 0.02
 """By how much a file may be stretched against its camera: rounding of a resized copy."""
 READERS = 4
@@ -63,6 +61,7 @@ def load_split(
     *,
     data_factor: int = 1,
     test_every: int = 8,
+    min_side: int = 1,
     cache_dir: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
@@ -72,6 +71,7 @@ def load_split(
         scene: A scene with images, as read from files.
         data_factor: By how much photographs are made smaller.
         test_every: Which views are kept for the test.
+        min_side: Pixels that the shorter side of a view must have.
         cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
         progress: Told how far reading is.
 
@@ -87,7 +87,12 @@ def load_split(
             fix="Name a scene with photographs: a point cloud alone cannot be trained.",
         )
     views = load_views(
-        scene, (*train, *test), data_factor=data_factor, cache_dir=cache_dir, progress=progress
+        scene,
+        (*train, *test),
+        data_factor=data_factor,
+        min_side=min_side,
+        cache_dir=cache_dir,
+        progress=progress,
     )
     return views[: len(train)], views[len(train) :]
 
@@ -97,6 +102,7 @@ def load_views(
     images: Sequence[Image],
     *,
     data_factor: int = 1,
+    min_side: int = 1,
     cache_dir: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[View, ...]:
@@ -106,6 +112,7 @@ def load_views(
         scene: Where they belong, for the folder.
         images: Which.
         data_factor: By how much photographs are made smaller.
+        min_side: Pixels that the shorter side of a view must have.
         cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
         progress: Told how far reading is.
 
@@ -116,7 +123,9 @@ def load_views(
     folder = _image_folder(scene)
     for image in images:
         check_lens(image)
-    read = partial(_load_view, folder=folder, data_factor=data_factor, cache_dir=cache_dir)
+    read = partial(
+        _load_view, folder=folder, data_factor=data_factor, min_side=min_side, cache_dir=cache_dir
+    )
     views = []
     with ThreadPoolExecutor(READERS) as pool:
         for view in pool.map(read, images):
@@ -155,13 +164,15 @@ def _focal_and_center(model: str) -> int:
     return CAMERA_MODELS[model].num_focal + 2
 
 
-def _load_view(image: Image, folder: Path, data_factor: int, cache_dir: Path | None) -> View:
+def _load_view(
+    image: Image, folder: Path, data_factor: int, min_side: int, cache_dir: Path | None
+) -> View:
     path = folder / image.name
     pixels, file_size = load_photograph(path, data_factor, cache_dir)
     height, width = pixels.shape[:2]
-    if min(width, height) < MIN_SIDE:
+    if min(width, height) < min_side:
         raise SceneFormatError(
-            f"{path} to have at least {MIN_SIDE} pixels a side at --data-factor {data_factor}",
+            f"{path} to have at least {min_side} pixels a side at --data-factor {data_factor}",
             found=f"{width} x {height}",
             fix="Choose a smaller --data-factor.",
         )
