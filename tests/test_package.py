@@ -25,6 +25,7 @@ ORDER = (
     "errors",
     "requirements",
     "progress",
+    "kernel_sources",
     "jit",
     "camera",
     "pointcloud",
