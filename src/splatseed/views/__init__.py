@@ -1,0 +1,1 @@
+"""Photographs at a size with their cameras, and what each of them sees."""
