@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.camera import Camera
+from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 from splatseed.stereo.consistency import confirm
@@ -26,7 +27,7 @@ from splatseed.train.views import View, load_views
 from splatseed.views.pairs import choose_sources
 from splatseed.views.sightings import Sightings, find_sightings
 
-__all__ = ["Stereo", "find_stereo", "other_from_view", "stereo_depths"]
+__all__ = ["Stereo", "data_factor", "find_stereo", "other_from_view", "stereo_depths"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,25 +108,54 @@ def stereo_depths(
         SceneNotFoundError: There are no photographs, or less than two.
         SceneFormatError: A photograph cannot be used.
     """
-    stereo = find_stereo(scene, scene.images, settings or StereoSettings(), seed, progress)
+    settings = settings or StereoSettings()
+    if len(scene.images) < 2:
+        raise SceneNotFoundError(
+            "at least two photographs with a pose",
+            found=f"{len(scene.images)}",
+            fix="Name a scene with photographs: depth is found by comparing them.",
+        )
+    views = load_views(
+        scene,
+        scene.images,
+        data_factor=data_factor(scene.images, settings.max_size),
+        progress=progress,
+    )
+    stereo = find_stereo(views, scene.images, find_sightings(scene), settings, seed, progress)
     return tuple(stereo.map(i) for i in range(len(stereo.views)))
 
 
-def find_stereo(
-    scene: Scene, images: Sequence[Image], settings: StereoSettings, seed: int, progress: Progress
-) -> Stereo:
-    """Compare some of a scene's images with each other (see ``stereo_depths``)."""
+def data_factor(images: Sequence[Image], max_size: int) -> int:
+    """By how much photographs are made smaller, for the largest to have ``max_size`` pixels a side."""
     side = max(max(image.camera.width, image.camera.height) for image in images)
-    factor = max(1, -(-side // settings.max_size))
-    views = load_views(scene, images, data_factor=factor, progress=progress)
-    sightings = find_sightings(scene)
+    return max(1, -(-side // max_size))
+
+
+def find_stereo(
+    views: Sequence[View],
+    images: Sequence[Image],
+    sightings: Sightings,
+    settings: StereoSettings,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Stereo:
+    """Compare photographs with each other.
+
+    Args:
+        views: The photographs at the size to compare.
+        images: The images they are of, in the same order.
+        sightings: The points that each image sees, which depth is looked for around.
+        settings: How.
+        seed: The same seed gives the same bytes.
+        progress: Told how far it is.
+    """
     seen = [sightings.rows_of(image) for image in images]
     centers = np.stack([image.camera.center for image in images])
     sources = choose_sources(seen, sightings.xyz, centers, settings.num_witnesses)
     found = _match_all(views, seen, sightings, sources, settings, seed, progress)
     planes, costs = [each[0] for each in found], [each[1] for each in found]
     agreeing = _confirm_all(views, planes, costs, sources, settings, progress)
-    return Stereo(views, planes, costs, agreeing, sources, settings)
+    return Stereo(tuple(views), planes, costs, agreeing, sources, settings)
 
 
 Found = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
