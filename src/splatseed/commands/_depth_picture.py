@@ -18,7 +18,7 @@ from PIL import Image as PilImage, ImageDraw
 from splatseed.camera import Camera
 from splatseed.depth import Alignment
 from splatseed.depth.planar import PlanarDepth, map_camera
-from splatseed.depth.sightings import find_sightings
+from splatseed.views.sightings import find_sightings
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import decode_photograph, photograph_bytes

@@ -24,7 +24,7 @@ from splatseed.depth.fits import (
     robust_line,
 )
 from splatseed.depth.planar import map_camera, ray_length
-from splatseed.depth.sightings import SeenPoints, camera_points, find_sightings
+from splatseed.views.sightings import SeenPoints, camera_points, find_sightings
 from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress, in_threads, silent

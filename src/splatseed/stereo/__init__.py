@@ -1,0 +1,1 @@
+"""Depth and normals from photographs alone, on the CPU."""
