@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints, Upsampler
@@ -112,7 +112,8 @@ def upsample(
         parameters: Fields of the method, such as ``k=12``.
 
     Returns:
-        The N originals, first and unchanged, then the new points; ``source`` tells them apart.
+        The N originals, first and unchanged, then the new points; ``source`` tells them apart, and
+        their attributes are those that the method knows.
 
     Raises:
         ParameterError: An unknown method, profile or parameter, or a value or size out of range.
@@ -148,13 +149,12 @@ def upsample(
             found="a ratio, or 0",
             fix="Give --num-points.",
         )
-    new = chosen(cloud, num_new, rng, progress)
+    new = NewPoints(*chosen(cloud, num_new, rng, progress))  # a plain tuple will do
     _check_finite(new)
     for sentence in new.notes:
         note(sentence)
     name = method if isinstance(method, str) else _name_of(chosen)
-    source = np.full(num_new, source_code(name), np.uint8)
-    return PointCloud.concatenate(originals, PointCloud(new.xyz, new.rgb, source))
+    return PointCloud.concatenate(originals, _as_cloud(new, num_new, source_code(name)))
 
 
 def upsample_points(
@@ -249,6 +249,23 @@ def _check_finite(new: NewPoints) -> None:
             found=f"{new.xyz[bad].tolist()} at new point {bad}",
             fix="Report this with the scene; float32 may be too small for its coordinates.",
         )
+
+
+def _as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
+    """The new points with all that their method knows of them.
+
+    Raises:
+        PointCloudError: Arrays that do not fit, or new points that are said to be originals.
+    """
+    source = np.full(num_new, code, np.uint8) if new.source is None else np.asarray(new.source)
+    if source.dtype != np.uint8 or (source == ORIGINAL).any():
+        raise PointCloudError(
+            "a uint8 source of new points, of codes from 1 to 255",
+            found=f"{source.dtype}, {np.count_nonzero(source == ORIGINAL):,} with the originals' 0",
+            fix="Leave the method's source out, or take codes of SOURCE_CODES.",
+        )
+    known = {name: getattr(new, name) for name in ATTRIBUTES}
+    return PointCloud(new.xyz, new.rgb, source, **known)
 
 
 def _name_of(method: Upsampler) -> str:
