@@ -10,7 +10,8 @@ from splatseed.errors import SplatseedError
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.upsample import METHODS, upsample, upsample_points
+from splatseed.seeding.upsampling import upsample
+from splatseed.upsample import METHODS, upsample_points
 
 __all__ = [
     "METHODS",

@@ -20,12 +20,12 @@ from splatseed.depth.alignment import Alignment, align_map, trust_units
 from splatseed.depth.drawing import Drawn, draw_pixels
 from splatseed.depth.planar import PlanarDepth, lift_pixels, map_camera
 from splatseed.depth.settings import Settings
-from splatseed.views.sightings import SeenPoints, Sightings, camera_points
 from splatseed.depthmap import ASPECT_SLACK, DepthMap, DepthMaps
 from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.jit import inline
 from splatseed.scene import Image
+from splatseed.views.sightings import SeenPoints, Sightings, camera_points
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage

@@ -23,11 +23,11 @@ from splatseed.stereo.patchmatch import Pictures, begin, sweep
 from splatseed.stereo.quads import grey_image, make_quads
 from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import first_planes, inverse_depth_bounds
-from splatseed.views.view import View, load_views
 from splatseed.views.pairs import choose_sources
 from splatseed.views.sightings import Sightings, find_sightings
+from splatseed.views.view import View, data_factor, load_views
 
-__all__ = ["Stereo", "data_factor", "find_stereo", "other_from_view", "stereo_depths"]
+__all__ = ["Stereo", "find_stereo", "other_from_view", "stereo_depths"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,9 +66,7 @@ class Stereo:
         names = tuple(self.views[j].name for j in self.sources[i] if j >= 0)
         camera = Camera(K, width, height, view.cam_from_world)
         agreeing = np.where(kept, self.agreeing[i], 0).astype(np.uint8)
-        return StereoMap(
-            view.name, camera, depth, normal, self.confidence(i), names, agreeing
-        )
+        return StereoMap(view.name, camera, depth, normal, self.confidence(i), names, agreeing)
 
     def confidence(self, i: int) -> Float32[np.ndarray, "h w"]:
         """The correlation, and half as much doubt with each view that agrees; 0 where not kept."""
@@ -119,16 +117,11 @@ def stereo_depths(
         scene,
         scene.images,
         data_factor=data_factor(scene.images, settings.max_size),
+        undistort=True,
         progress=progress,
     )
     stereo = find_stereo(views, scene.images, find_sightings(scene), settings, seed, progress)
     return tuple(stereo.map(i) for i in range(len(stereo.views)))
-
-
-def data_factor(images: Sequence[Image], max_size: int) -> int:
-    """By how much photographs are made smaller, for the largest to have ``max_size`` pixels a side."""
-    side = max(max(image.camera.width, image.camera.height) for image in images)
-    return max(1, -(-side // max_size))
 
 
 def find_stereo(
@@ -201,8 +194,9 @@ def _match(
         return planes, costs
     rng = np.random.default_rng([seed, i])
     bounds = inverse_depth_bounds(w)
-    pictures = _pictures(view, greys[i], [views[j] for j in others], [greys[j] for j in others],
-                         grid, bounds)
+    pictures = _pictures(
+        view, greys[i], [views[j] for j in others], [greys[j] for j in others], grid, bounds
+    )
     begin(pictures, first_planes(uv, w, bounds, shape, grid, rng), planes, costs)
     for number in range(settings.sweeps):
         for color in range(2):

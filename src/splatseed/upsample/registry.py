@@ -21,6 +21,9 @@ __all__ = ["METHODS", "SOURCE_CODES", "origin_name", "source_code"]
 GROUP = "splatseed.methods"
 
 BUILT_IN = {
+    "auto": "splatseed.seeding.photographs:Auto",
+    "stereo": "splatseed.seeding.photographs:Stereo",
+    "cover": "splatseed.seeding.photographs:Cover",
     "linear": "splatseed.upsample.linear:Linear",
     "triangle": "splatseed.upsample.triangle:Triangle",
     "spline": "splatseed.upsample.spline:Spline",

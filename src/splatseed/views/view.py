@@ -22,7 +22,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.views.photographs import load_photograph
 
-__all__ = ["View", "check_lens", "load_split", "load_views", "poses_of"]
+__all__ = ["View", "check_lens", "data_factor", "load_split", "load_views", "poses_of"]
 
 ASPECT_SLACK = 0.02
 """By how much a file may be stretched against its camera: rounding of a resized copy."""
@@ -50,10 +50,33 @@ class View:
     cam_from_world: Float64[np.ndarray, "4 4"]
 
 
-def poses_of(images: Sequence[Image]) -> tuple[View, ...]:
-    """The views of some images without their pixels, for whoever needs their poses alone."""
+def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
+    """The views of some images without their pixels, for whoever needs their frames alone.
+
+    Args:
+        images: Which.
+        data_factor: By how much photographs are made smaller.
+    """
     unseen = np.empty((0, 0, 3), np.uint8)
-    return tuple(View(i.name, unseen, i.camera.K, 0, 0, i.camera.cam_from_world) for i in images)
+    shrink = np.diag([1 / data_factor, 1 / data_factor, 1.0])
+    cameras = [(image.name, image.camera) for image in images]
+    return tuple(
+        View(
+            name,
+            unseen,
+            shrink @ camera.K,
+            camera.width // data_factor,
+            camera.height // data_factor,
+            camera.cam_from_world,
+        )
+        for name, camera in cameras
+    )
+
+
+def data_factor(images: Sequence[Image], max_size: int) -> int:
+    """By how much photographs are made smaller, for the largest to have ``max_size`` pixels a side."""
+    side = max(max(image.camera.width, image.camera.height) for image in images)
+    return max(1, -(-side // max_size))
 
 
 def load_split(
