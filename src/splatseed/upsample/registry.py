@@ -21,9 +21,6 @@ __all__ = ["METHODS", "SOURCE_CODES", "origin_name", "source_code"]
 GROUP = "splatseed.methods"
 
 BUILT_IN = {
-    "auto": "splatseed.seeding.photographs:Auto",
-    "stereo": "splatseed.seeding.photographs:Stereo",
-    "cover": "splatseed.seeding.photographs:Cover",
     "linear": "splatseed.upsample.linear:Linear",
     "triangle": "splatseed.upsample.triangle:Triangle",
     "spline": "splatseed.upsample.spline:Spline",
@@ -31,6 +28,9 @@ BUILT_IN = {
     "voronoi": "splatseed.upsample.voronoi:Voronoi",
     "depth": "splatseed.upsample.depth:Depth",
     "random": "splatseed.upsample.bounding_box:BoundingBox",
+    "stereo": "splatseed.seeding.photographs:Stereo",
+    "cover": "splatseed.seeding.photographs:Cover",
+    "auto": "splatseed.seeding.photographs:Auto",
 }
 
 SOURCE_CODES = {
