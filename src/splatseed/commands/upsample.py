@@ -205,7 +205,7 @@ def _make(
     asked = None if total is None else total + int((~usable.keep).sum())
     number = {"ratio": options.ratio, "num_points": options.num_points}
     return upsample(
-        scene, method, **({"num_points": asked} if asked is not None else number),  # type: ignore[arg-type]
+        scene, method, **({"num_points": asked} if asked is not None else number),
         budget=options.budget, cover=options.cover, verify=options.verify, seed=options.seed,
         progress=clock, note=notes.append,
     )  # fmt: skip

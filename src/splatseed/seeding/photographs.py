@@ -169,7 +169,7 @@ class Auto(PhotographMethod):
     ) -> NewPoints:
         found = _stereo(scene, images, views, self.spacing, self.grid, rng, progress)
         known = PointCloud.concatenate(
-            scene.points.originals, PointCloud(found.xyz, found.rgb, found.source)
+            scene.points.originals, PointCloud(found.xyz, found.rgb)
         )
         return _join(found, cover_cloud(views, known, self.cell, rng, progress))
 
@@ -247,7 +247,7 @@ def cover_cloud(
     seeds = cover(views, cloud.xyz[cloud.finite], cell=cell, rng=rng, progress=progress)
     normals = np.full((len(seeds.xyz), 3), np.nan, np.float32)
     source = np.full(len(seeds.xyz), source_code("cover"), np.uint8)
-    return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.sizes, seeds.confidence, source)
+    return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.size, seeds.confidence, source)
 
 
 def _join(first: NewPoints, second: NewPoints) -> NewPoints:

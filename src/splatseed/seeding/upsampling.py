@@ -141,8 +141,9 @@ def _covered(
     views = read_views(scene, photographed(scene), MAX_SIZE, progress)
     rng = np.random.default_rng([seed, source_code("cover")])
     new = cover_cloud(views, cloud, cell, rng, progress)
+    source = np.full(len(new.xyz), source_code("cover"), np.uint8)
     known = {name: getattr(new, name) for name in ATTRIBUTES}
-    return PointCloud.concatenate(cloud, PointCloud(new.xyz, new.rgb, new.source, **known))
+    return PointCloud.concatenate(cloud, PointCloud(new.xyz, new.rgb, source, **known))
 
 
 def _thinned(scene: Scene, cloud: PointCloud, budget: int | str) -> PointCloud:
