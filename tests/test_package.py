@@ -28,6 +28,7 @@ ORDER = (
     "kernel_sources",
     "jit",
     "camera",
+    "lens",
     "pointcloud",
     "depthmap",
     "scene",
