@@ -32,6 +32,7 @@ ORDER = (
     "scene",
     "io",
     "depth",
+    "stereo",
     "upsample",
     "geometry",
     "viewpoint",
