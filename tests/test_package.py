@@ -35,6 +35,7 @@ ORDER = (
     "io",
     "views",
     "depth",
+    "stereo",
     "upsample",
     "geometry",
     "viewpoint",
