@@ -10,7 +10,8 @@ from splatseed.errors import SplatseedError
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.upsampling import upsample
+from splatseed.seeding.upsampling import add_cover as cover, upsample
+from splatseed.stereo import stereo_depths
 from splatseed.upsample import METHODS, upsample_points
 
 __all__ = [
@@ -19,7 +20,9 @@ __all__ = [
     "PointCloud",
     "Scene",
     "SplatseedError",
+    "cover",
     "load_scene",
+    "stereo_depths",
     "upsample",
     "upsample_points",
     "write_scene",

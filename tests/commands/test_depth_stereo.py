@@ -107,7 +107,6 @@ def test_a_missing_photograph_is_found_before_any_work(own_room, tmp_path, splat
     assert stereo.calls == []
 
 
-@pytest.mark.skipif(not hasattr(splatseed.stereo, "stereo_depths"), reason="stereo is not here yet")
 def test_stereo_has_the_options():
     assert {"max_size", "grid", "seed", "progress"} <= set(
         inspect.signature(splatseed.stereo.stereo_depths).parameters

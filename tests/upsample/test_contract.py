@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from splatseed import METHODS, PointCloud
 
-from .contract import KINDS, named
+from .contract import KINDS, PHOTOGRAPH_METHODS, named
 
 pytestmark = pytest.mark.usefixtures("third_party")
 

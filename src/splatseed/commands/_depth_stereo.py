@@ -71,12 +71,11 @@ def provenance(options: Options, packages: Sequence[str]) -> dict[str, object]:
 
 def _maps(scene: Scene, options: Options, clock: StageClock) -> tuple[StereoMap, ...]:
     """The maps, by stereo's own defaults where an option is left out."""
-    from splatseed.stereo import stereo_depths  # type: ignore[attr-defined]  # noqa: PLC0415
+    from splatseed.stereo import stereo_depths  # noqa: PLC0415  (as little loads as can be)
 
     names = ("max_size", "grid", "seed")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    maps: tuple[StereoMap, ...] = stereo_depths(scene, progress=clock, **given)
-    return maps
+    return stereo_depths(scene, progress=clock, **given)
 
 
 def _summarise(

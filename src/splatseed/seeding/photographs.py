@@ -168,9 +168,7 @@ class Auto(PhotographMethod):
         progress: Progress,
     ) -> NewPoints:
         found = _stereo(scene, images, views, self.spacing, self.grid, rng, progress)
-        known = PointCloud.concatenate(
-            scene.points.originals, PointCloud(found.xyz, found.rgb)
-        )
+        known = PointCloud.concatenate(scene.points.originals, PointCloud(found.xyz, found.rgb))
         return _join(found, cover_cloud(views, known, self.cell, rng, progress))
 
 
@@ -244,7 +242,8 @@ def cover_cloud(
     """
     from splatseed.seeding.cover import cover  # noqa: PLC0415  (kernels load with use)
 
-    seeds = cover(views, cloud.xyz[cloud.finite], cell=cell, rng=rng, progress=progress)
+    xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
+    seeds = cover(views, xyz, cell=cell, rng=rng, masks=masks, progress=progress)
     normals = np.full((len(seeds.xyz), 3), np.nan, np.float32)
     source = np.full(len(seeds.xyz), source_code("cover"), np.uint8)
     return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.size, seeds.confidence, source)

@@ -23,7 +23,7 @@ from splatseed.upsample.registry import source_code
 if TYPE_CHECKING:
     from splatseed.views.view import View
 
-__all__ = ["DEFAULT_METHOD", "FALLBACK", "method_for", "share_covered", "upsample"]
+__all__ = ["DEFAULT_METHOD", "FALLBACK", "add_cover", "method_for", "share_covered", "upsample"]
 
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """What makes the points, and what does where there are no photographs to look at."""
@@ -98,10 +98,41 @@ def upsample(
     if verify:
         cloud = _verified(whole, cloud, progress, note)
     if cover is not None:
-        cloud = _covered(whole, cloud, cover, seed, progress)
+        cloud = add_cover(whole, cloud, cell=cover, seed=seed, progress=progress)
     if budget is not None:
         cloud = _thinned(whole, cloud, budget)
     return cloud
+
+
+def add_cover(
+    scene: Scene,
+    cloud: PointCloud | None = None,
+    *,
+    cell: int = CELL,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> PointCloud:
+    """A cloud, and a seed for each part of the photographs that it leaves empty.
+
+    Args:
+        scene: Whose photographs are looked at.
+        cloud: The points; the scene's own when left out.
+        cell: Side of a part, in pixels of the photographs at the size that methods look at.
+        seed: The same seed gives the same bytes.
+        progress: Told how far it is.
+
+    Raises:
+        ParameterError: The side is below 1.
+        PointCloudError: No point lies in any photograph.
+        SceneNotFoundError: There are no photographs.
+    """
+    points = scene.points if cloud is None else cloud
+    views = read_views(scene, photographed(scene), MAX_SIZE, progress)
+    rng = np.random.default_rng([seed, source_code("cover")])
+    new = cover_cloud(views, points, cell, rng, progress)
+    source = np.full(len(new.xyz), source_code("cover"), np.uint8)
+    known = {name: getattr(new, name) for name in ATTRIBUTES}
+    return PointCloud.concatenate(points, PointCloud(new.xyz, new.rgb, source, **known))
 
 
 def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
@@ -132,18 +163,6 @@ def _frames(scene: Scene) -> tuple[View, ...]:
     from splatseed.views.view import data_factor, poses_of  # noqa: PLC0415  (loads with use)
 
     return poses_of(scene.images, data_factor(scene.images, MAX_SIZE))
-
-
-def _covered(
-    scene: Scene, cloud: PointCloud, cell: int, seed: int, progress: Progress
-) -> PointCloud:
-    """The cloud, and a seed for each part of the photographs that it leaves empty."""
-    views = read_views(scene, photographed(scene), MAX_SIZE, progress)
-    rng = np.random.default_rng([seed, source_code("cover")])
-    new = cover_cloud(views, cloud, cell, rng, progress)
-    source = np.full(len(new.xyz), source_code("cover"), np.uint8)
-    known = {name: getattr(new, name) for name in ATTRIBUTES}
-    return PointCloud.concatenate(cloud, PointCloud(new.xyz, new.rgb, source, **known))
 
 
 def _thinned(scene: Scene, cloud: PointCloud, budget: int | str) -> PointCloud:
