@@ -117,7 +117,7 @@ class Options:
     align: bool = True
     """For --method depth: --no-align takes metric depth and poses as they are (--depth.no-align)."""
     preview: bool = False
-    """Also write preview.png (before and after) and preview_methods.png (every method)."""
+    """Also write pictures: before and after, every method, seeds by origin, and cells covered."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write; auto keeps the input's."""
     copy_images: bool = False

@@ -21,7 +21,15 @@ from splatseed.upsample import Profile, Upsampler, upsample as add_points
 from splatseed.upsample.registry import source_code
 from splatseed.views.view import View, data_factor, poses_of
 
-__all__ = ["DEFAULT_METHOD", "FALLBACK", "add_cover", "method_for", "share_covered", "upsample"]
+__all__ = [
+    "CELL",
+    "DEFAULT_METHOD",
+    "FALLBACK",
+    "add_cover",
+    "method_for",
+    "share_covered",
+    "upsample",
+]
 
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """What makes the points, and what does where there are no photographs to look at."""
