@@ -40,6 +40,7 @@ from splatseed.upsample import (
     Upsampler,
     chooses_number,
     configure,
+    number_of_new,
     planned_size,
 )
 
@@ -196,9 +197,9 @@ def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
 
 def _planned(options: Options, method: Upsampler, usable: UsablePoints) -> int | None:
     """Points in all; None where the photographs say how many."""
-    if chooses_number(method):
-        return None
-    return planned_size(int(usable.keep.sum()), options.ratio, options.num_points)
+    count = int(usable.keep.sum())
+    new = number_of_new(method, options.method, count, options.ratio, options.num_points)
+    return None if new is None else count + new
 
 
 def _make(
@@ -213,10 +214,8 @@ def _make(
     """The originals and the new points."""
     # Points that writing leaves out are asked for on top, so that the output has ``total``.
     asked = None if total is None else total + int((~usable.keep).sum())
-    number = {"ratio": options.ratio, "num_points": options.num_points}
     return upsample(
-        scene, method, **({"num_points": asked} if asked is not None else number),
-        budget=options.budget, cover=options.cover_cell, verify=options.verify, seed=options.seed,
+        scene, method, num_points=asked, budget=options.budget, cover=options.cover_cell, verify=options.verify, seed=options.seed,
         progress=clock, note=notes.append,
     )  # fmt: skip
 

@@ -31,6 +31,7 @@ __all__ = [
     "chooses_number",
     "configure",
     "methods_for",
+    "number_of_new",
     "planned_size",
     "upsample",
     "upsample_points",
@@ -150,7 +151,7 @@ def upsample(
     originals = points.originals
     chosen = _choose(method, profile, parameters)
     name = method if isinstance(method, str) else _name_of(chosen)
-    num_new = _number_of_new(chosen, name, len(originals), ratio, num_points)
+    num_new = number_of_new(chosen, name, len(originals), ratio, num_points)
     rng = _generator(seed)
     if num_new == 0 and len(originals) > 0:
         return originals
@@ -172,21 +173,25 @@ def upsample(
     return PointCloud.concatenate(originals, _as_cloud(new, made, source_code(name)))
 
 
-def _number_of_new(
+def number_of_new(
     method: Upsampler,
     name: str,
     num_original: int,
     ratio: float | None,
     num_points: int | None,
 ) -> int | None:
-    """How many points are to be made; None where the photographs say it."""
+    """How many points are to be made; None where the photographs say it.
+
+    Raises:
+        ParameterError: A number is given though the photographs say it, or it is out of range.
+    """
     if not chooses_number(method):
         return planned_size(num_original, ratio, num_points) - num_original
     if ratio is not None or num_points is not None:
         raise ParameterError(
             f"no number of points for the method {name}, which the photographs decide on",
             found="a ratio" if ratio is not None else "a number of points",
-            fix="Leave it out, or set an upper bound with --budget.",
+            fix="Leave it out, bound it with --budget, or choose --method mls.",
         )
     return None
 
