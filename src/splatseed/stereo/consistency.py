@@ -10,15 +10,15 @@ in one direction only, so the order of views does not show.
 
 from __future__ import annotations
 
-import numpy as np
-
 from splatseed.jit import inline
 
 __all__ = ["confirm"]
 
 
 @inline
-def confirm(planes, costs, max_cost, grid, j_from_i, other_planes, other_costs, tolerance, bit, out):
+def confirm(
+    planes, costs, max_cost, grid, j_from_i, other_planes, other_costs, tolerance, bit, out
+):
     """Set a bit where another view's map agrees with a view's.
 
     Args:

@@ -23,9 +23,9 @@ from splatseed.stereo.patchmatch import Pictures, begin, sweep
 from splatseed.stereo.quads import grey_image, make_quads
 from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import first_planes, inverse_depth_bounds
-from splatseed.views.view import View, load_views
 from splatseed.views.pairs import choose_sources
 from splatseed.views.sightings import Sightings, find_sightings
+from splatseed.views.view import View, load_views
 
 __all__ = ["Stereo", "data_factor", "find_stereo", "other_from_view", "stereo_depths"]
 
@@ -66,9 +66,7 @@ class Stereo:
         names = tuple(self.views[j].name for j in self.sources[i] if j >= 0)
         camera = Camera(K, width, height, view.cam_from_world)
         agreeing = np.where(kept, self.agreeing[i], 0).astype(np.uint8)
-        return StereoMap(
-            view.name, camera, depth, normal, self.confidence(i), names, agreeing
-        )
+        return StereoMap(view.name, camera, depth, normal, self.confidence(i), names, agreeing)
 
     def confidence(self, i: int) -> Float32[np.ndarray, "h w"]:
         """The correlation, and half as much doubt with each view that agrees; 0 where not kept."""
@@ -195,14 +193,15 @@ def _match(
     """The planes of one view."""
     view, grid = views[i], settings.grid
     shape = (view.height // grid, view.width // grid)
-    planes, costs = np.zeros((3, *shape), np.float32), np.full(shape, np.inf, np.float32)
+    planes, costs = np.full((3, *shape), np.nan, np.float32), np.full(shape, np.inf, np.float32)
     uv, w = _points_in(view, xyz)
-    if not others or not len(w):
+    if not others or not len(w) or not costs.size:
         return planes, costs
     rng = np.random.default_rng([seed, i])
     bounds = inverse_depth_bounds(w)
-    pictures = _pictures(view, greys[i], [views[j] for j in others], [greys[j] for j in others],
-                         grid, bounds)
+    pictures = _pictures(
+        view, greys[i], [views[j] for j in others], [greys[j] for j in others], grid, bounds
+    )
     begin(pictures, first_planes(uv, w, bounds, shape, grid, rng), planes, costs)
     for number in range(settings.sweeps):
         for color in range(2):

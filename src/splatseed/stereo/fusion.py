@@ -98,9 +98,7 @@ def _choose(
 
 
 @inline
-def _take(  # noqa: PLR0917
-    order, planes, agreeing, own, others, matrices, grid, cell, taken, offsets, shapes, good
-):
+def _take(order, planes, agreeing, own, others, matrices, grid, cell, taken, offsets, shapes, good):
     """Take the cells of a view's pixels, one after another."""
     width = agreeing.shape[1]
     num = len(others)

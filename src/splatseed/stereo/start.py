@@ -50,7 +50,7 @@ def first_planes(
     """
     rows, columns = shape
     if len(w) < FITTED:
-        drawn = rng.uniform(*bounds, (RANDOM, 1, rows, columns))
+        drawn = rng.uniform(bounds[0], bounds[1], (RANDOM, 1, rows, columns))
         return np.concatenate([drawn, np.zeros((RANDOM, 2, rows, columns))], 1).astype(np.float32)
     place = (np.indices(shape)[::-1].reshape(2, -1).T + 0.5) * grid
     nearest = cKDTree(uv).query(place, FITTED)[1]

@@ -43,7 +43,7 @@ def choose_sources(
         order, offsets = _views_of_points(seen, len(xyz))
         asked = [each[:: -(-len(each) // MOST_POINTS) or 1] for each in seen]
         starts = np.cumsum([0, *map(len, asked)])
-        rows = np.concatenate(asked) if len(asked) else np.empty(0, np.int64)
+        rows = np.concatenate(asked)
         _add_up(rows, starts, xyz, centers, order, offsets, worth)
     best = np.argsort(-worth, axis=1, kind="stable")[:, :num]
     chosen = np.full((count, num), -1)
