@@ -23,7 +23,7 @@ from splatseed.io import find_depths
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Scene
-from splatseed.stereo.depths import Stereo, data_factor, find_stereo
+from splatseed.stereo.depths import Stereo, find_stereo
 from splatseed.stereo.fusion import fuse
 from splatseed.stereo.settings import StereoSettings
 from splatseed.synthetic import make_capture, write_capture
@@ -31,7 +31,7 @@ from splatseed.synthetic.raycast import render_views
 from splatseed.synthetic.room import Room
 from splatseed.synthetic.texture import Plain
 from splatseed.views.sightings import find_sightings
-from splatseed.views.view import load_views
+from splatseed.views.view import data_factor, load_views
 
 __all__ = ["TRUE_SCENES", "Score", "prepare", "score_all"]
 

@@ -16,7 +16,8 @@ from jaxtyping import Float64, Int64, UInt8
 from PIL import Image as PillowImage, ImageDraw, ImageFont
 
 from splatseed.camera import Camera
-from splatseed.errors import PointCloudError
+from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
+from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.io.staging import atomic_file
 from splatseed.jit import inline
 from splatseed.pointcloud import PointCloud
@@ -252,11 +253,12 @@ def _photo(scene: Scene, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"] | 
     image = choose_image(scene)
     if image is None or scene.source is None or scene.source.image_dir is None:
         return None
+    path = scene.source.image_dir / image.name
     try:
-        with PillowImage.open(scene.source.image_dir / image.name) as file:
-            return np.asarray(file.convert("RGB").resize(size, PillowImage.Resampling.LANCZOS))
-    except (OSError, PillowImage.DecompressionBombError):
+        picture = decode_photograph(path, photograph_bytes(path))
+    except (SceneNotFoundError, SceneFormatError):
         return None  # a scene without its pictures still has points to show
+    return np.asarray(picture.resize(size, PillowImage.Resampling.LANCZOS))
 
 
 def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

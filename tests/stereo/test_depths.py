@@ -10,7 +10,7 @@ import pytest
 
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
-from splatseed.stereo.depths import stereo_depths
+from splatseed.stereo import stereo_depths
 from splatseed.stereo.settings import StereoSettings
 
 from .conftest import SETTINGS

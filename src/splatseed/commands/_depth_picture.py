@@ -18,12 +18,12 @@ from PIL import Image as PilImage, ImageDraw
 from splatseed.camera import Camera
 from splatseed.depth import Alignment
 from splatseed.depth.planar import PlanarDepth, map_camera
-from splatseed.views.sightings import find_sightings
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.preview import Tile, color_bar, heat, write_grid
 from splatseed.scene import Image, Scene
+from splatseed.views.sightings import find_sightings
 
 __all__ = ["write_depth_picture"]
 

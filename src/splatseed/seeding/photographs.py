@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
-from jaxtyping import Float32
 
 from splatseed.errors import SceneNotFoundError
 from splatseed.pointcloud import PointCloud
@@ -25,14 +24,26 @@ if TYPE_CHECKING:
     from splatseed.upsample.neighbors import PreparedCloud
     from splatseed.views.view import View
 
-__all__ = ["Auto", "Cover", "PhotographMethod", "Stereo", "photographed"]
+__all__ = [
+    "MAX_SIZE",
+    "Auto",
+    "Cover",
+    "PhotographMethod",
+    "Stereo",
+    "cover_cloud",
+    "photographed",
+    "read_views",
+]
+
+MAX_SIZE = 800
+"""Pixels of the longer side at which photographs are looked at."""
 
 
 @dataclass(frozen=True)
 class PhotographMethod:
     """What the three have in common."""
 
-    max_size: int = 800
+    max_size: int = MAX_SIZE
     """Photographs are made smaller by a whole factor until their longer side has so many pixels."""
     hold_out: int = 0
     """Leave out every so many-th image by name, as trainers do for the test (8); 0 = use all."""
@@ -78,12 +89,8 @@ class PhotographMethod:
 
     def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
         """The new points of a scene."""
-        from splatseed.stereo.depths import data_factor  # noqa: PLC0415  (kernels load with use)
-        from splatseed.views.view import load_views  # noqa: PLC0415
-
         images = photographed(scene, self.hold_out)
-        factor = data_factor(images, self.max_size)
-        views = load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
+        views = read_views(scene, images, self.max_size, progress)
         return self._look(scene, images, views, rng, progress)
 
     def _look(
@@ -136,7 +143,7 @@ class Cover(PhotographMethod):
         rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
-        return _cover(views, _finite(scene.points.originals), self.cell, rng, progress)
+        return cover_cloud(views, scene.points.originals, self.cell, rng, progress)
 
 
 @dataclass(frozen=True)
@@ -161,8 +168,8 @@ class Auto(PhotographMethod):
         progress: Progress,
     ) -> NewPoints:
         found = _stereo(scene, images, views, self.spacing, self.grid, rng, progress)
-        known = np.concatenate([_finite(scene.points.originals), found.xyz])
-        return _join(found, _cover(views, known, self.cell, rng, progress))
+        known = PointCloud.concatenate(scene.points.originals, PointCloud(found.xyz, found.rgb))
+        return _join(found, cover_cloud(views, known, self.cell, rng, progress))
 
 
 def photographed(scene: Scene, hold_out: int = 0) -> tuple[Image, ...]:
@@ -185,8 +192,14 @@ def photographed(scene: Scene, hold_out: int = 0) -> tuple[Image, ...]:
     return tuple(used)
 
 
-def _finite(cloud: PointCloud) -> Float32[np.ndarray, "N 3"]:
-    return cloud.xyz[cloud.finite]
+def read_views(
+    scene: Scene, images: Sequence[Image], max_size: int, progress: Progress
+) -> tuple[View, ...]:
+    """The photographs of some images, undistorted, their longer side at most ``max_size`` pixels."""
+    from splatseed.views.view import data_factor, load_views  # noqa: PLC0415  (loads with use)
+
+    factor = data_factor(images, max_size)
+    return load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
 
 
 def _stereo(
@@ -208,24 +221,32 @@ def _stereo(
     found = find_stereo(views, images, find_sightings(scene), settings, seed, progress)
     seeds = fuse(found, spacing, progress)
     source = np.full(len(seeds), source_code("stereo"), np.uint8)
-    return NewPoints(
-        seeds.xyz, seeds.rgb, (), seeds.normals, seeds.sizes, seeds.confidence, source
-    )
+    return NewPoints(seeds.xyz, seeds.rgb, (), seeds.normals, seeds.sizes, seeds.confidence, source)
 
 
-def _cover(
+def cover_cloud(
     views: Sequence[View],
-    xyz: Float32[np.ndarray, "N 3"],
+    cloud: PointCloud,
     cell: int,
     rng: np.random.Generator,
     progress: Progress,
 ) -> NewPoints:
+    """A seed for every cell of every view that no point of a cloud falls in.
+
+    Args:
+        views: The photographs.
+        cloud: The points.
+        cell: Side of a cell in pixels of the views.
+        rng: The order of the views.
+        progress: Told how far it is.
+    """
     from splatseed.seeding.cover import cover  # noqa: PLC0415  (kernels load with use)
 
-    seeds = cover(views, xyz, cell=cell, rng=rng, progress=progress)
+    xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
+    seeds = cover(views, xyz, cell=cell, rng=rng, masks=masks, progress=progress)
     normals = np.full((len(seeds.xyz), 3), np.nan, np.float32)
     source = np.full(len(seeds.xyz), source_code("cover"), np.uint8)
-    return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.sizes, seeds.confidence, source)
+    return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.size, seeds.confidence, source)
 
 
 def _join(first: NewPoints, second: NewPoints) -> NewPoints:

@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int32, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.camera import Camera
-from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress, in_threads, silent
-from splatseed.scene import Image, Scene
+from splatseed.scene import Image
 from splatseed.stereo.consistency import confirm
 from splatseed.stereo.maps import StereoMap
 from splatseed.stereo.patchmatch import Pictures, begin, sweep
@@ -24,10 +23,10 @@ from splatseed.stereo.quads import grey_image, make_quads
 from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import first_planes, inverse_depth_bounds
 from splatseed.views.pairs import choose_sources
-from splatseed.views.sightings import Sightings, find_sightings
-from splatseed.views.view import View, load_views
+from splatseed.views.sightings import Sightings
+from splatseed.views.view import View
 
-__all__ = ["Stereo", "data_factor", "find_stereo", "other_from_view", "stereo_depths"]
+__all__ = ["Stereo", "find_stereo", "other_from_view"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,48 +84,6 @@ class Stereo:
         m = np.stack([gx, gy, w - gx * place[0] - gy * place[1]], axis=-1)
         normal = -m @ self.views[i].K
         return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True), np.float32)
-
-
-def stereo_depths(
-    scene: Scene,
-    settings: StereoSettings | None = None,
-    *,
-    seed: int = 0,
-    progress: Progress = silent,
-) -> tuple[StereoMap, ...]:
-    """Depth, normals and confidence of every photograph of a scene.
-
-    Args:
-        scene: With photographs.
-        settings: How; the defaults when left out.
-        seed: The same seed gives the same bytes.
-        progress: Told how far it is.
-
-    Raises:
-        SceneNotFoundError: There are no photographs, or less than two.
-        SceneFormatError: A photograph cannot be used.
-    """
-    settings = settings or StereoSettings()
-    if len(scene.images) < 2:
-        raise SceneNotFoundError(
-            "at least two photographs with a pose",
-            found=f"{len(scene.images)}",
-            fix="Name a scene with photographs: depth is found by comparing them.",
-        )
-    views = load_views(
-        scene,
-        scene.images,
-        data_factor=data_factor(scene.images, settings.max_size),
-        progress=progress,
-    )
-    stereo = find_stereo(views, scene.images, find_sightings(scene), settings, seed, progress)
-    return tuple(stereo.map(i) for i in range(len(stereo.views)))
-
-
-def data_factor(images: Sequence[Image], max_size: int) -> int:
-    """By how much photographs are made smaller, for the largest to have ``max_size`` pixels a side."""
-    side = max(max(image.camera.width, image.camera.height) for image in images)
-    return max(1, -(-side // max_size))
 
 
 def find_stereo(
@@ -206,7 +163,16 @@ def _match(
     for number in range(settings.sweeps):
         for color in range(2):
             sweep(pictures, color, number, rng.integers(1 << 63, dtype=np.uint64), planes, costs)
+    if view.mask is not None:
+        costs[~_blocks_known(view.mask, grid)] = np.inf
     return planes, costs
+
+
+def _blocks_known(mask: Bool[np.ndarray, "H W"], grid: int) -> Bool[np.ndarray, "h w"]:
+    """Which blocks of grid x grid pixels have all of them in the photograph."""
+    rows, columns = mask.shape[0] // grid, mask.shape[1] // grid
+    blocks = mask[: rows * grid, : columns * grid].reshape(rows, grid, columns, grid)
+    return np.asarray(blocks.all(axis=(1, 3)))
 
 
 def _points_in(

@@ -28,6 +28,9 @@ BUILT_IN = {
     "voronoi": "splatseed.upsample.voronoi:Voronoi",
     "depth": "splatseed.upsample.depth:Depth",
     "random": "splatseed.upsample.bounding_box:BoundingBox",
+    "stereo": "splatseed.seeding.photographs:Stereo",
+    "cover": "splatseed.seeding.photographs:Cover",
+    "auto": "splatseed.seeding.photographs:Auto",
 }
 
 SOURCE_CODES = {
