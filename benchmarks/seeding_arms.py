@@ -22,13 +22,13 @@ from splatseed.upsample import configure
 __all__ = ["ARMS", "TEST_EVERY", "train"]
 
 ARMS: Mapping[str, Mapping[str, Any]] = {
-    "sfm": {},
+    "sfm": {"method": "linear", "ratio": 1},
     "mls": {"method": "mls", "ratio": 4},
     "cover": {"method": "cover"},
     "stereo": {"method": "stereo"},
     "auto": {"method": "auto"},
 }
-"""How seeds are made, by what the table calls them."""
+"""How seeds are made, by what the table calls them; at ratio 1 nothing is added to SfM's points."""
 TEST_EVERY = 8
 SEEDS_SHARE = 0.7
 """Seeds at most, as a part of the cap: what densification adds is the rest. All, where nothing is added."""
@@ -66,8 +66,6 @@ def train(
 def _seeds(scene: Scene, arm: str, most: int) -> PointCloud:
     """The points that a run begins with, thinned where there are more than may be trained."""
     chosen = dict(ARMS[arm])
-    if not chosen:
-        return scene.points.select(scene.points.distinct)
     name = chosen.pop("method")
     looks = hasattr(ss.METHODS[name], "hold_out")
     method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)

@@ -70,4 +70,7 @@ def _key_on_sources(compiled: Any) -> None:
     if hasattr(file, "_source_stamp"):
         with suppress(OSError):
             path, module = Path(compiled.__code__.co_filename), compiled.__module__
-            file._source_stamp = source_digest(path, module)  # noqa: SLF001
+            digest = source_digest(path, module)
+            file._source_stamp = digest  # noqa: SLF001
+            # Looked at before the rest is unpickled, which may name modules that are gone.
+            file._version = f"{numba.__version__} {digest}"  # noqa: SLF001

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import json
 import shutil
@@ -108,6 +109,7 @@ def test_a_missing_photograph_is_found_before_any_work(own_room, tmp_path, splat
 
 
 def test_stereo_has_the_options():
-    assert {"max_size", "grid", "seed", "progress"} <= set(
-        inspect.signature(splatseed.stereo.stereo_depths).parameters
-    )
+    parameters = inspect.signature(splatseed.stereo.stereo_depths).parameters
+    fields = {field.name for field in dataclasses.fields(splatseed.stereo.StereoSettings)}
+    assert {"seed", "progress"} <= set(parameters)
+    assert {"max_size", "grid"} <= fields

@@ -49,6 +49,8 @@ class Options:
     """With --stereo: a pixel of the map for every block of GRID x GRID of the photograph's."""
     seed: Annotated[int | None, _number("0")] = None
     """With --stereo: the same seed gives the same bytes."""
+    preview: bool = False
+    """With --stereo: also write preview_maps.png, some photographs beside their maps."""
     batch: int = 1
     """Photographs that the network sees at once: more is faster on a GPU, and takes more memory."""
     device: DeviceName = "auto"
@@ -75,7 +77,7 @@ _OF_NETWORK = (
     *("batch", "device", "depth_kind"),
     *("input_size", "input_multiple", "mean", "std"),
 )
-_OF_STEREO = ("colmap", "grid", "seed")
+_OF_STEREO = ("colmap", "grid", "seed", "preview")
 
 
 def check_together(options: Options) -> None:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 __all__ = ["provenance", "run_stereo"]
 
 NAMES_SHOWN = 5
+PICTURE = "preview_maps.png"
 PACKAGES = ("splatseed", "numba", "numpy", "pillow", "scipy")
 MIN_PIXELS = 3
 """What COLMAP is told to want of a fused point. Its own 5 suit maps that nothing has confirmed yet;
@@ -54,6 +55,8 @@ def run_stereo(options: Options) -> None:
             provenance=provenance(options, PACKAGES),
             progress=clock,
         )
+        if options.preview:
+            _draw(options, scene, maps, clock)
     _summarise(options, maps, report, time.perf_counter() - start)
 
 
@@ -78,6 +81,14 @@ def _maps(scene: Scene, options: Options, clock: StageClock) -> tuple[StereoMap,
     return stereo_depths(scene, progress=clock, **given)
 
 
+def _draw(options: Options, scene: Scene, maps: Sequence[StereoMap], clock: StageClock) -> None:
+    from splatseed.preview import preview_maps  # noqa: PLC0415  (Pillow)
+
+    clock("preview", 0.0)
+    preview_maps(scene, maps, options.output / PICTURE)
+    clock("preview", 1.0)
+
+
 def _summarise(
     options: Options, maps: Sequence[StereoMap], report: DenseReport, seconds: float
 ) -> None:
@@ -88,6 +99,8 @@ def _summarise(
         highlight=False,
         markup=False,
     )
+    if options.preview:
+        OUT.print(f"pictures: {options.output / PICTURE}", soft_wrap=True, highlight=False)
     if report.empty:
         more = len(report.empty) - NAMES_SHOWN
         shown = ", ".join(report.empty[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -12,12 +12,19 @@ from splatseed.console import StageClock, print_commands, print_note, print_pair
 from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.io import WriteReport
 from splatseed.pointcloud import PointCloud
+from splatseed.progress import silent
 from splatseed.scene import Scene
+from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views
+from splatseed.seeding.upsampling import CELL
 from splatseed.trainers import training_commands
 from splatseed.upsample import Upsampler, chooses_number, methods_for, upsample
 from splatseed.upsample.registry import origin_name
 
 __all__ = ["summarise", "write_previews"]
+
+PICTURES = ("preview.png", "preview_methods.png", "preview_origins.png", "preview_cells.png")
+CELLS_SHOWN = 4
+"""Photographs whose cells are drawn."""
 
 
 def write_previews(
@@ -30,7 +37,7 @@ def write_previews(
     folder: Path,
     clock: StageClock,
 ) -> None:
-    """Two pictures: before and after, and every method side by side.
+    """Before and after, every method, and, with photographs, seeds by origin and the cells they cover.
 
     Args:
         scene: With the originals that were used.
@@ -42,7 +49,11 @@ def write_previews(
         folder: Where the pictures go.
         clock: Told the stages.
     """
-    from splatseed.preview import preview_methods, preview_pair  # noqa: PLC0415  (Pillow)
+    from splatseed.preview import (  # noqa: PLC0415  (Pillow)
+        preview_methods,
+        preview_origins,
+        preview_pair,
+    )
 
     clouds = {}
     for name in methods_for(scene):
@@ -56,10 +67,31 @@ def write_previews(
                 scene, methods[name], num_points=number, seed=seed, progress=clock
             )
     clock("preview", 0.0)
-    preview_pair(scene, seeds, folder / "preview.png", title=method)
+    preview_pair(scene, seeds, folder / PICTURES[0], title=method)
     clock("preview", 0.5)
-    preview_methods(scene, clouds, folder / "preview_methods.png")
+    preview_methods(scene, clouds, folder / PICTURES[1])
+    if scene.has_photographs:
+        clock("preview", 0.7)
+        preview_origins(scene, seeds, folder / PICTURES[2])
+        _draw_cells(scene, seeds, folder / PICTURES[3])
     clock("preview", 1.0)
+
+
+def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
+    """Which cells of some photographs hold a point, before and after."""
+    from splatseed.preview import CoveredView, preview_cells  # noqa: PLC0415  (Pillow)
+    from splatseed.seeding.coverage import covered_cells  # noqa: PLC0415  (kernels load with use)
+
+    images = photographed(scene)
+    chosen = [images[i] for i in np.linspace(0, len(images) - 1, CELLS_SHOWN).astype(int)]
+    views = read_views(scene, list(dict.fromkeys(chosen)), MAX_SIZE, silent)
+    clouds = [cloud.xyz[cloud.finite] for cloud in (scene.points, seeds)]
+    before, after = (covered_cells(views, xyz, CELL) for xyz in clouds)
+    shown = [
+        CoveredView(view.name, view.image, CELL, old, new)
+        for view, old, new in zip(views, before, after, strict=True)
+    ]
+    preview_cells(shown, path)
 
 
 def summarise(
@@ -96,10 +128,8 @@ def summarise(
         )
         rows.insert(2, ("left out", left_out))
     if pictures:
-        rows += [
-            ("pictures", str(output / "preview.png")),
-            ("", str(output / "preview_methods.png")),
-        ]
+        drawn = [output / name for name in PICTURES if (output / name).is_file()]
+        rows += [("" if i else "pictures", str(path)) for i, path in enumerate(drawn)]
     print_pairs("splatseed upsample", rows)
     for note in report.notes:
         print_note(note)

@@ -55,6 +55,16 @@ def _number(kind: type, default: str) -> Any:
     )
 
 
+def _cover() -> Any:
+    """The flag --cover; its field has another name, since the method cover has that one."""
+    return tyro.conf.arg(
+        name="cover",
+        constructor=int,
+        metavar="INT",
+        help_behavior_hint="(default: none; auto and cover do so anyway)",
+    )
+
+
 def _budget() -> Any:
     """How a budget shows in the help."""
     return tyro.conf.arg(
@@ -90,7 +100,7 @@ class Options:
     """Points in all, instead of a ratio."""
     budget: Annotated[str | None, _budget()] = None
     """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph."""
-    cover: Annotated[int | None, _number(int, "8 for auto and cover, else none")] = None
+    cover_cell: Annotated[int | None, _cover()] = None
     """Give each part of the photographs, of so many pixels a side, that no point falls in a seed."""
     verify: bool = False
     """Hold interpolated points against the photographs: slide them onto surfaces, drop what fits none."""
@@ -107,7 +117,7 @@ class Options:
     align: bool = True
     """For --method depth: --no-align takes metric depth and poses as they are (--depth.no-align)."""
     preview: bool = False
-    """Also write preview.png (before and after) and preview_methods.png (every method)."""
+    """Also write pictures: before and after, every method, seeds by origin, and cells covered."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write; auto keeps the input's."""
     copy_images: bool = False
@@ -206,7 +216,7 @@ def _make(
     number = {"ratio": options.ratio, "num_points": options.num_points}
     return upsample(
         scene, method, **({"num_points": asked} if asked is not None else number),
-        budget=options.budget, cover=options.cover, verify=options.verify, seed=options.seed,
+        budget=options.budget, cover=options.cover_cell, verify=options.verify, seed=options.seed,
         progress=clock, note=notes.append,
     )  # fmt: skip
 
@@ -297,7 +307,7 @@ def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
         "ratio": options.ratio,
         "num_points_asked": options.num_points,
         "budget": options.budget,
-        "cover": options.cover,
+        "cover": options.cover_cell,
         "verify": options.verify,
         "seed": options.seed,
     }

@@ -9,21 +9,27 @@ of threads; every point is finite.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from splatseed.pointcloud import ATTRIBUTES, PointCloud
+from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import MAX_SIZE, cover_cloud, photographed, read_views
 from splatseed.upsample import Profile, Upsampler, upsample as add_points
 from splatseed.upsample.registry import source_code
+from splatseed.views.view import View, data_factor, poses_of
 
-if TYPE_CHECKING:
-    from splatseed.views.view import View
-
-__all__ = ["DEFAULT_METHOD", "FALLBACK", "add_cover", "method_for", "share_covered", "upsample"]
+__all__ = [
+    "CELL",
+    "DEFAULT_METHOD",
+    "FALLBACK",
+    "add_cover",
+    "method_for",
+    "share_covered",
+    "upsample",
+]
 
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """What makes the points, and what does where there are no photographs to look at."""
@@ -160,18 +166,24 @@ def method_for(
 
 def _frames(scene: Scene) -> tuple[View, ...]:
     """The views of a scene without their pixels, at the size that methods look at."""
-    from splatseed.views.view import data_factor, poses_of  # noqa: PLC0415  (loads with use)
-
     return poses_of(scene.images, data_factor(scene.images, MAX_SIZE))
 
 
 def _thinned(scene: Scene, cloud: PointCloud, budget: int | str) -> PointCloud:
-    """At most so many of the points."""
-    from splatseed.seeding.budget import parse_budget, thin  # noqa: PLC0415  (kernels load with use)
+    """At most so many of the points, originals before others where both would do."""
+    from splatseed.seeding.budget import (  # noqa: PLC0415  (kernels load with use)
+        median_pixels,
+        parse_budget,
+        thin,
+    )
 
-    pixels = [image.camera.width * image.camera.height for image in scene.images]
-    num = parse_budget(budget, pixels)
+    photographs = poses_of(scene.images)
+    num = parse_budget(budget, median_pixels(photographs) if photographs else 0)
     if len(cloud) <= num:
         return cloud
-    kept = thin(_frames(scene), cloud, num)
-    return cloud.select(kept)
+    usable = np.flatnonzero(cloud.distinct)
+    points = cloud.select(usable)
+    first = int((points.source == ORIGINAL).sum())
+    views = _frames(scene) if photographs else ()
+    kept = thin(points.xyz, views, num, first=first, priority=points.confidence)
+    return points.select(kept)

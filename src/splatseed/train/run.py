@@ -279,14 +279,15 @@ def _state(
     strategy, schedule = make_strategy(settings, device), settings.schedule
     if begun and begun.checkpoint.is_file():
         return load_checkpoint(begun.checkpoint, strategy, schedule, device)
-    xyz = frame.points_from_world(seeds.xyz)
-    lengths = near_depths(xyz, views)
+    seeds = frame.cloud_from_world(seeds)
+    lengths = near_depths(seeds.xyz, views)
     gaussians = initial_gaussians(
-        seeds.replace(xyz=xyz),
+        seeds,
         sh_degree=settings.sh_degree,
         opacity=schedule.opacity,
         scale_factor=schedule.scale_factor,
         largest=schedule.largest * lengths,
+        flatness=schedule.flatness,
     )
     params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
     return TrainState(params, make_optimizers(params, schedule), strategy)

@@ -1,4 +1,4 @@
-"""A COLMAP dense workspace, as its ``stereo_fusion`` and meshers take it, from maps of our own.
+"""A COLMAP dense workspace, as its ``stereo_fusion`` takes it, from maps of our own.
 
 Notation: ``images/``, ``sparse/`` and ``stereo/`` as COLMAP's image_undistorter lays them out. COLMAP
 places pixel (column, row) of a map at (column, row) of its camera where everyone else, and its own
