@@ -18,19 +18,19 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import splatseed as ss
-from depth import CAPTURES, FAR, HELD_OUT, SCENES, Truth, query, triangulated
+from depth import CAPTURES, FAR, HELD_OUT, Truth, query, triangulated
 from splatseed.io import find_depths
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import silent
 from splatseed.scene import Scene
-from splatseed.stereo.depths import Stereo, find_stereo
+from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.fusion import fuse
+from splatseed.stereo.result import Stereo
 from splatseed.stereo.settings import StereoSettings
+from splatseed.stereo.without_points import known_sightings
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.raycast import render_views
 from splatseed.synthetic.room import Room
 from splatseed.synthetic.texture import Plain
-from splatseed.views.sightings import find_sightings
 from splatseed.views.view import data_factor, load_views
 
 __all__ = ["TRUE_SCENES", "Score", "prepare", "score_all"]
@@ -104,14 +104,16 @@ def _score(name: str, cache: Path, settings: StereoSettings, limit: int, without
     images = scene.split(HELD_OUT)[0]
     seen = scene
     if without:
-        seen = scene.replace(points=PointCloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)), tracks=None)
+        seen = scene.replace(
+            points=PointCloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8)), tracks=None
+        )
     if without == "depths":
         seen = seen.replace(depths=None)
     factor = data_factor(images, settings.max_size)
     views = load_views(scene, images, data_factor=factor)
-    find_stereo(views[:2], images[:2], find_sightings(scene), settings)  # compiled
+    find_stereo(views[:2], images[:2], known_sightings(scene), settings)  # compiled
     started = time.process_time()
-    stereo = find_stereo(views, images, find_sightings(seen), settings)
+    stereo = find_stereo(views, images, known_sightings(seen), settings)
     seeds = fuse(stereo, CELL)
     seconds = time.process_time() - started
     kept, one, five = _map_shares(stereo, scene)
