@@ -214,11 +214,11 @@ def _stereo(
     from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
     from splatseed.stereo.fusion import fuse  # noqa: PLC0415
     from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415
-    from splatseed.views.sightings import find_sightings  # noqa: PLC0415
+    from splatseed.stereo.without_points import known_sightings  # noqa: PLC0415
 
     seed = int(rng.integers(1 << 32))
     settings = StereoSettings(grid=grid)
-    found = find_stereo(views, images, find_sightings(scene), settings, seed, progress)
+    found = find_stereo(views, images, known_sightings(scene), settings, seed, progress)
     seeds = fuse(found, spacing, progress)
     source = np.full(len(seeds), source_code("stereo"), np.uint8)
     return NewPoints(seeds.xyz, seeds.rgb, (), seeds.normals, seeds.sizes, seeds.confidence, source)

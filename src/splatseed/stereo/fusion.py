@@ -18,9 +18,10 @@ from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 from splatseed.camera import Camera
 from splatseed.jit import inline
 from splatseed.progress import Progress, silent
-from splatseed.stereo.depths import Stereo, other_from_view
+from splatseed.stereo.matching import other_from_view
+from splatseed.stereo.result import Stereo
 
-__all__ = ["StereoSeeds", "fuse"]
+__all__ = ["StereoSeeds", "block_means", "fuse"]
 
 SAME = 0.03
 """Relative difference of depth up to which two seeds of a cell are one."""
@@ -138,7 +139,7 @@ def _seeds(stereo: Stereo, i: int, chosen: Int64[np.ndarray, " M"], cell: float)
     normals = stereo.normals(i)[row, column] @ view.cam_from_world[:3, :3]
     return StereoSeeds(
         camera.unproject(uv, z).astype(np.float32),
-        _block_means(view.image, grid)[row, column],
+        block_means(view.image, grid)[row, column],
         normals.astype(np.float32),
         (cell * z / view.K[0, 0]).astype(np.float32),
         stereo.confidence(i)[row, column],
@@ -146,8 +147,8 @@ def _seeds(stereo: Stereo, i: int, chosen: Int64[np.ndarray, " M"], cell: float)
     )
 
 
-def _block_means(image: UInt8[np.ndarray, "H W 3"], grid: int) -> UInt8[np.ndarray, "h w 3"]:
+def block_means(image: UInt8[np.ndarray, "H W C"], grid: int) -> UInt8[np.ndarray, "h w C"]:
     """The mean of each block of grid x grid pixels."""
     rows, columns = image.shape[0] // grid, image.shape[1] // grid
-    blocks = image[: rows * grid, : columns * grid].reshape(rows, grid, columns, grid, 3)
+    blocks = image[: rows * grid, : columns * grid].reshape(rows, grid, columns, grid, -1)
     return np.asarray(np.rint(blocks.mean(axis=(1, 3))), np.uint8)

@@ -7,56 +7,68 @@ bounds.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
-__all__ = ["first_planes", "inverse_depth_bounds"]
+__all__ = ["Hints", "first_planes", "hints_from"]
 
 NEAREST = 3
 """Points whose depth is tried as it is."""
 FITTED = 8
 """Points that a plane is laid through."""
-RANDOM = 8
+RANDOM = 16
 """Guesses where nothing is known."""
 MARGIN = 1.3
 """Bounds reach so many times beyond the nearest and the farthest point."""
 RIDGE = 1e-3
 
 
-def inverse_depth_bounds(w: Float64[np.ndarray, " M"]) -> Float32[np.ndarray, " 2"]:
-    """Between which inverse depths planes are looked for, given those of some points."""
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """What is known of a view's depth before it is compared.
+
+    Args:
+        uv: Pixels of points that it sees, float64 [M, 2].
+        w: Their inverse depths, float64 [M].
+        bounds: Least and largest inverse depth that is looked for, float32 [2].
+    """
+
+    uv: Float64[np.ndarray, "M 2"]
+    w: Float64[np.ndarray, " M"]
+    bounds: Float32[np.ndarray, " 2"]
+
+
+def hints_from(uv: Float64[np.ndarray, "M 2"], w: Float64[np.ndarray, " M"]) -> Hints:
+    """Hints by some points, at least one: planes are looked for a little beyond them."""
     low, high = np.percentile(w, [0.5, 99.5])
-    return np.array([low / MARGIN, high * MARGIN], np.float32)
+    return Hints(uv, w, np.array([low / MARGIN, high * MARGIN], np.float32))
 
 
 def first_planes(
-    uv: Float64[np.ndarray, "M 2"],
-    w: Float64[np.ndarray, " M"],
-    bounds: Float32[np.ndarray, " 2"],
-    shape: tuple[int, int],
-    grid: int,
-    rng: np.random.Generator,
+    hints: Hints, shape: tuple[int, int], grid: int, rng: np.random.Generator
 ) -> Float32[np.ndarray, "K 3 h w"]:
     """The planes to try first at each grid point.
 
     Args:
-        uv: Pixels of the points that the view sees.
-        w: Their inverse depths.
-        bounds: Least and largest inverse depth.
-        shape: Rows and columns of the grid.
+        hints: Of the view.
+        shape: Rows and columns of the grid, neither 0.
         grid: Pixels between grid points.
         rng: For guesses where too few points are seen.
     """
     rows, columns = shape
+    w = hints.w
     if len(w) < FITTED:
-        drawn = rng.uniform(bounds[0], bounds[1], (RANDOM, 1, rows, columns))
-        return np.concatenate([drawn, np.zeros((RANDOM, 2, rows, columns))], 1).astype(np.float32)
+        guesses = np.zeros((RANDOM, 3, rows, columns), np.float32)
+        guesses[:, 0] = rng.uniform(hints.bounds[0], hints.bounds[1], (RANDOM, rows, columns))
+        return guesses
     place = (np.indices(shape)[::-1].reshape(2, -1).T + 0.5) * grid
-    nearest = cKDTree(uv).query(place, FITTED)[1]
+    nearest = cKDTree(hints.uv).query(place, FITTED)[1]
     guesses = np.zeros((NEAREST + 1, 3, rows * columns), np.float32)
     guesses[:NEAREST, 0] = w[nearest[:, :NEAREST]].T
-    guesses[NEAREST] = _fit(uv[nearest] - place[:, None], w[nearest])
+    guesses[NEAREST] = _fit(hints.uv[nearest] - place[:, None], w[nearest])
     return np.ascontiguousarray(guesses.reshape(-1, 3, rows, columns))
 
 

@@ -15,10 +15,14 @@ from jaxtyping import Float64, Int64
 
 from splatseed.jit import inline, kernel, parallel_range
 
-__all__ = ["choose_sources"]
+__all__ = ["choose_by_pose", "choose_sources"]
 
 LEAST, FULL, WIDE, MOST = 1.0, 4.0, 15.0, 45.0
 """Degrees between which the weight rises, stays full, and falls."""
+ALIKE = 30.0
+"""Degrees between the axes of cameras that look the same way."""
+SAME_PLACE = 1e-6
+"""Share of the cameras' spread within which two stand at one place."""
 MOST_POINTS = 4000
 """Points of a view that are asked about: more do not change the order of its pairs."""
 
@@ -43,11 +47,33 @@ def choose_sources(
         order, offsets = _views_of_points(seen, len(xyz))
         asked = [each[:: -(-len(each) // MOST_POINTS) or 1] for each in seen]
         starts = np.cumsum([0, *map(len, asked)])
-        rows = np.concatenate(asked) if asked else np.empty(0, np.int64)
+        rows = np.concatenate(asked)
         _add_up(rows, starts, xyz, centers, order, offsets, worth)
     best = np.argsort(-worth, axis=1, kind="stable")[:, :num]
     chosen = np.full((count, num), -1)
     chosen[:, : best.shape[1]] = np.where(np.take_along_axis(worth, best, 1) > 0, best, -1)
+    return chosen
+
+
+def choose_by_pose(
+    cam_from_world: Float64[np.ndarray, "V 4 4"], num: int
+) -> Int64[np.ndarray, "V num"]:
+    """The same where nothing is known but poses: of the views that look the same way, near ones.
+
+    Not the very nearest, where there are more: from a place too near, everything looks the same.
+    """
+    centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
+    gap = np.linalg.norm(centers[:, None] - centers, axis=2)
+    cosine = cam_from_world[:, 2, :3] @ cam_from_world[:, 2, :3].T
+    chosen = np.full((len(centers), num), -1)
+    for i in range(len(centers)):
+        other = np.flatnonzero(gap[i] > SAME_PLACE * gap.max())
+        alike = other[cosine[i, other] > np.cos(np.radians(ALIKE))]
+        if len(alike) < num:
+            alike = other[np.argsort(-cosine[i, other], kind="stable")[:num]]
+        near = alike[np.argsort(gap[i, alike], kind="stable")]
+        near = near[min(num // 2, len(near) - min(num, len(near))) :][:num]
+        chosen[i, : len(near)] = near
     return chosen
 
 
