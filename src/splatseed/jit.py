@@ -55,11 +55,11 @@ def always_inline(function: F) -> F:
 def _compile(function: F, **options: bool) -> F:
     njit: Any = numba.njit  # whose annotations want every option by its name
     compiled = njit(cache=True, error_model="numpy", nogil=True, **options)(function)
-    _key_on_sources(compiled)
+    _key_on_sources(compiled, function)
     return cast("F", compiled)
 
 
-def _key_on_sources(compiled: Any) -> None:
+def _key_on_sources(compiled: Any, function: Callable[..., Any]) -> None:
     """Make machine code in the cache stale when any file changes that the function may be made of.
 
     Numba asks for the function's own file only, and has no setting for more, so its stamp of the source
@@ -69,5 +69,5 @@ def _key_on_sources(compiled: Any) -> None:
     file: Any = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     if hasattr(file, "_source_stamp"):
         with suppress(OSError):
-            path, module = Path(compiled.__code__.co_filename), compiled.__module__
-            file._source_stamp = source_digest(path, module)  # noqa: SLF001
+            path = Path(function.__code__.co_filename)
+            file._source_stamp = source_digest(path, function.__module__)  # noqa: SLF001
