@@ -55,11 +55,11 @@ def always_inline(function: F) -> F:
 def _compile(function: F, **options: bool) -> F:
     njit: Any = numba.njit  # whose annotations want every option by its name
     compiled = njit(cache=True, error_model="numpy", nogil=True, **options)(function)
-    _key_on_sources(compiled)
+    _key_on_sources(compiled, function)
     return cast("F", compiled)
 
 
-def _key_on_sources(compiled: Any) -> None:
+def _key_on_sources(compiled: Any, function: Callable[..., Any]) -> None:
     """Make machine code in the cache stale when any file changes that the function may be made of.
 
     Numba asks for the function's own file only, and has no setting for more, so its stamp of the source
@@ -69,8 +69,8 @@ def _key_on_sources(compiled: Any) -> None:
     file: Any = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     if hasattr(file, "_source_stamp"):
         with suppress(OSError):
-            path, module = Path(compiled.__code__.co_filename), compiled.__module__
-            digest = source_digest(path, module)
+            path = Path(function.__code__.co_filename)
+            digest = source_digest(path, function.__module__)
             file._source_stamp = digest  # noqa: SLF001
             # Looked at before the rest is unpickled, which may name modules that are gone.
             file._version = f"{numba.__version__} {digest}"  # noqa: SLF001
