@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, Self
 import numpy as np
 
 from splatseed.errors import SceneNotFoundError
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ATTRIBUTES, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
 from splatseed.upsample.method import NewPoints, check_fields, require
@@ -33,6 +33,7 @@ __all__ = [
     "cover_cloud",
     "photographed",
     "read_views",
+    "with_cover",
 ]
 
 MAX_SIZE = 800
@@ -247,6 +248,17 @@ def cover_cloud(
     normals = np.full((len(seeds.xyz), 3), np.nan, np.float32)
     source = np.full(len(seeds.xyz), source_code("cover"), np.uint8)
     return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.size, seeds.confidence, source)
+
+
+def with_cover(
+    views: Sequence[View], points: PointCloud, cell: int, seed: int, progress: Progress
+) -> PointCloud:
+    """The points, and a seed in each cell of the views that they leave empty (see ``cover_cloud``)."""
+    code = source_code("cover")
+    new = cover_cloud(views, points, cell, np.random.default_rng([seed, code]), progress)
+    source = np.full(len(new.xyz), code, np.uint8)
+    known = {name: getattr(new, name) for name in ATTRIBUTES}
+    return PointCloud.concatenate(points, PointCloud(new.xyz, new.rgb, source, **known))
 
 
 def _join(first: NewPoints, second: NewPoints) -> NewPoints:

@@ -8,19 +8,15 @@ of threads; every point is finite.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
-from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.seeding.photographs import MAX_SIZE, cover_cloud, photographed, read_views
+from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views, with_cover
+from splatseed.seeding.thinning import frames_of, points_within, thin_to
 from splatseed.upsample import Profile, Upsampler, upsample as add_points
-from splatseed.upsample.registry import source_code
-from splatseed.views.view import View, data_factor, poses_of
 
 __all__ = [
     "CELL",
@@ -36,10 +32,6 @@ DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """What makes the points, and what does where there are no photographs to look at."""
 CELL = 8
 """Side in pixels of the cells by which coverage is measured."""
-COVER = source_code("cover")
-MOST_COVER = 0.25
-"""Part of a budget that cover's guesses may take, at most; their cells grow until they fit."""
-COARSER = 1.25
 
 Note = Callable[[str], None]
 
@@ -97,22 +89,21 @@ def upsample(
         >>> len(seeds), seeds.num_original
         (800, 100)
     """
-    if method == DEFAULT_METHOD or getattr(method, "name", None) == DEFAULT_METHOD:
+    whole = scene if isinstance(scene, Scene) else Scene(scene)
+    most = None if budget is None else points_within(whole, budget)
+    if DEFAULT_METHOD in {method, getattr(method, "name", None)}:
         method = method_for(scene, method, note)
     cloud = add_points(
         scene, method, ratio=ratio, num_points=num_points, seed=seed, profile=profile,
         progress=progress, note=note, **parameters,
     )  # fmt: skip
-    if not verify and cover is None and budget is None:
-        return cloud
-    whole = scene if isinstance(scene, Scene) else Scene(scene)
     if verify:
         cloud = _verified(whole, cloud, progress, note)
     if cover is not None:
         cloud = add_cover(whole, cloud, cell=cover, seed=seed, progress=progress)
-    if budget is not None:
+    if most is not None:
         hold_out = getattr(method, "hold_out", parameters.get("hold_out", 0))
-        cloud = _thinned(whole, cloud, budget, cover or CELL, hold_out, seed, progress)
+        cloud = thin_to(whole, cloud, most, cover or CELL, hold_out, seed, progress)
     return cloud
 
 
@@ -140,7 +131,7 @@ def add_cover(
     """
     points = scene.points if cloud is None else cloud
     views = read_views(scene, photographed(scene), MAX_SIZE, progress)
-    return _with_cover(views, points, cell, seed, progress)
+    return with_cover(views, points, cell, seed, progress)
 
 
 def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
@@ -153,7 +144,7 @@ def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
     """
     from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (kernels load with use)
 
-    return covered_share(_frames(scene), cloud.xyz[cloud.finite], cell)
+    return covered_share(frames_of(scene), cloud.xyz[cloud.finite], cell)
 
 
 def method_for(
@@ -164,69 +155,3 @@ def method_for(
         return method
     note(f"There are no photographs to look at: method {FALLBACK} instead of {DEFAULT_METHOD}.")
     return FALLBACK
-
-
-def _frames(scene: Scene) -> tuple[View, ...]:
-    """The views of a scene without their pixels, at the size that methods look at."""
-    return poses_of(scene.images, data_factor(scene.images, MAX_SIZE))
-
-
-def _thinned(
-    scene: Scene,
-    cloud: PointCloud,
-    budget: int | str,
-    cell: int,
-    hold_out: int,
-    seed: int,
-    progress: Progress,
-) -> PointCloud:
-    """At most so many of the points, originals before others where both would do.
-
-    Cover is made anew for what thinning leaves: a guess fills a gap, and must not take the place of a
-    point that is known.
-    """
-    from splatseed.seeding.budget import median_pixels, parse_budget  # noqa: PLC0415  (as below)
-
-    photographs = poses_of(scene.images)
-    num = parse_budget(budget, median_pixels(photographs) if photographs else 0)
-    if len(cloud) <= num:
-        return cloud
-    points = cloud.select(cloud.distinct)
-    guessed = points.source == COVER
-    if not guessed.any() or guessed.all():
-        return _keep(scene, points, num)
-    known = points.select(~guessed)
-    views = read_views(scene, photographed(scene, hold_out), MAX_SIZE, progress)
-    room = max(num - len(known), round(MOST_COVER * num))
-    kept = _keep(scene, known, num - room)
-    while True:
-        filled = _with_cover(views, kept, cell, seed, progress)
-        extra = len(filled) - len(kept)
-        if extra <= room:
-            break
-        cell = math.ceil(COARSER * cell)
-    return PointCloud.concatenate(
-        _keep(scene, known, num - extra), filled.select(slice(len(kept), None))
-    )
-
-
-def _keep(scene: Scene, points: PointCloud, num: int) -> PointCloud:
-    """So many of the points, by the views that see them."""
-    from splatseed.seeding.budget import thin  # noqa: PLC0415  (kernels load with use)
-
-    if num <= 0 or len(points) <= num:
-        return points.select(slice(max(num, 0)))
-    first = int((points.source == ORIGINAL).sum())
-    views = _frames(scene) if scene.images else ()
-    kept = thin(points.xyz, views, num, first=first, priority=points.confidence)
-    return points.select(kept)
-
-
-def _with_cover(
-    views: Sequence[View], points: PointCloud, cell: int, seed: int, progress: Progress
-) -> PointCloud:
-    """The points, and a seed in each cell of the views that they leave empty."""
-    new = cover_cloud(views, points, cell, np.random.default_rng([seed, COVER]), progress)
-    source = np.full(len(new.xyz), COVER, np.uint8)
-    known = {name: getattr(new, name) for name in ATTRIBUTES}
-    return PointCloud.concatenate(points, PointCloud(new.xyz, new.rgb, source, **known))

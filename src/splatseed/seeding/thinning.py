@@ -1,0 +1,99 @@
+"""A scene's points within a budget: those that are known by where they are seen, guesses for what they leave.
+
+Promise: no more points than the number, and all of it where there are as many; nothing is drawn at random but the
+order of the views in which ``cover`` fills gaps.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.progress import Progress
+from splatseed.scene import Scene
+from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views, with_cover
+from splatseed.upsample.registry import source_code
+from splatseed.views.view import View, data_factor, poses_of
+
+__all__ = ["frames_of", "points_within", "thin_to"]
+
+COVER = source_code("cover")
+MOST_COVER = 0.25
+"""Part of a budget that cover's guesses may take, at most; their cells grow until they fit."""
+COARSER = 1.25
+"""By how much."""
+
+
+def points_within(scene: Scene, budget: int | str) -> int:
+    """The number of points that a budget allows a scene.
+
+    Args:
+        scene: Of whose photographs a budget in rho speaks.
+        budget: A number, or a string such as "0.25rho".
+
+    Raises:
+        ParameterError: It is neither, or below one point.
+    """
+    from splatseed.seeding.budget import median_pixels, parse_budget  # noqa: PLC0415  (loads Numba)
+
+    photographs = poses_of(scene.images)
+    return parse_budget(budget, median_pixels(photographs) if photographs else 0)
+
+
+def thin_to(
+    scene: Scene,
+    cloud: PointCloud,
+    num: int,
+    cell: int,
+    hold_out: int,
+    seed: int,
+    progress: Progress,
+) -> PointCloud:
+    """At most ``num`` of a cloud's points, originals before others where both would do.
+
+    Cover is made anew for what thinning leaves: a guess fills a gap, and must not take the place of a
+    point that is known.
+
+    Args:
+        scene: Where the points belong.
+        cloud: The points.
+        num: How many, at least 1.
+        cell: Pixels a side of cover's cells, at least.
+        hold_out: Which photographs cover must not look at, as in ``PhotographMethod``.
+        seed: Of the order of the views.
+        progress: Told how far it is.
+    """
+    if len(cloud) <= num:
+        return cloud
+    points = cloud.select(cloud.distinct)
+    guessed = points.source == COVER
+    if not guessed.any() or guessed.all():
+        return _keep(scene, points, num)
+    known = points.select(~guessed)
+    views = read_views(scene, photographed(scene, hold_out), MAX_SIZE, progress)
+    room = max(num - len(known), round(MOST_COVER * num))
+    kept = _keep(scene, known, num - room)
+    while cell <= MAX_SIZE:
+        filled = with_cover(views, kept, cell, seed, progress).select(slice(len(kept), None))
+        if len(filled) <= room:
+            return PointCloud.concatenate(_keep(scene, known, num - len(filled)), filled)
+        cell = math.ceil(COARSER * cell)
+    return _keep(scene, known, num)
+
+
+def frames_of(scene: Scene) -> tuple[View, ...]:
+    """The views of a scene without their pixels, at the size that methods look at."""
+    return poses_of(scene.images, data_factor(scene.images, MAX_SIZE)) if scene.images else ()
+
+
+def _keep(scene: Scene, points: PointCloud, num: int) -> PointCloud:
+    """So many of the points, by the views that see them."""
+    from splatseed.seeding.budget import thin  # noqa: PLC0415  (kernels load with use)
+
+    if len(points) <= num or num < 1:
+        return points.select(slice(max(num, 0)))
+    first = int(np.count_nonzero(points.source == ORIGINAL))
+    kept = thin(points.xyz, frames_of(scene), num, first=first, priority=points.confidence)
+    return points.select(kept)
