@@ -43,6 +43,7 @@ ORDER = (
     "trainers",
     "render",
     "train",
+    "seeding",
     "evaluate",
     "bench",
     "console",
