@@ -28,7 +28,7 @@ from machine import describe
 from markdown import table
 from splatseed.errors import ParameterError, SplatseedError
 
-__all__: list[str] = []
+__all__ = ["read_ledger", "say", "write_line"]
 
 WRITING = Lock()
 
@@ -68,17 +68,22 @@ Key = tuple[str, str, int, int, int, str]
 def run(key: Key, scenes: Path, ledger: Path) -> None:
     """One run, and its line in the ledger."""
     scene, arm, max_steps, data_factor, seed, _ = key
-    _say(f"{scene}, {arm}, {max_steps:,} steps, seed {seed} ...")
+    say(f"{scene}, {arm}, {max_steps:,} steps, seed {seed} ...")
     result = call(
         "baseline_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
         max_steps=max_steps, data_factor=data_factor, seed=seed, cap_max=CAPS[scene],
     )  # fmt: skip
+    write_line(ledger, key, result)
+    say(f"  {scene}, {arm}: {result['psnr']:.2f} dB in {result['seconds']:.0f} s")
+
+
+def write_line(ledger: Path, key: Sequence[Any], result: Mapping[str, Any]) -> None:
+    """Add a result to a ledger, from any thread."""
     with WRITING, ledger.open("a", encoding="utf-8") as lines:
         lines.write(json.dumps([key, result]) + "\n")
-    _say(f"  {scene}, {arm}: {result['psnr']:.2f} dB in {result['seconds']:.0f} s")
 
 
-def read_ledger(path: Path) -> dict[Key, dict[str, Any]]:
+def read_ledger(path: Path) -> dict[tuple[Any, ...], dict[str, Any]]:
     """The results so far; of runs that were made twice, the last."""
     if not path.is_file():
         return {}
@@ -129,7 +134,8 @@ def _cell(means: Sequence[float] | None) -> str:
     return f"{psnr:.2f} / {ssim:.4f} ({count / 1000:.0f}k, {seconds:.0f} s)"
 
 
-def _say(text: str) -> None:
+def say(text: str) -> None:
+    """Tell how far it is, on stderr."""
     print(text, file=sys.stderr, flush=True)
 
 

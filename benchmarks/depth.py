@@ -38,7 +38,7 @@ from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.preview import choose_camera, render_points
 from splatseed.progress import in_threads, silent
 from splatseed.scene import Scene, SceneSource, Tracks
-from splatseed.train.photographs import user_cache_dir
+from splatseed.views.photographs import user_cache_dir
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does
 

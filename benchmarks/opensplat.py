@@ -28,7 +28,7 @@ from splatseed.io import write_scene
 from splatseed.scene import Image
 from splatseed.train.gaussians import SH_C0
 from splatseed.train.ply import write_gaussians
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["seconds_per_step"]
 

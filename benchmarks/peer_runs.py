@@ -30,7 +30,7 @@ from splatseed.train.device import Capacity
 from splatseed.train.schedule import FULL_RUN
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.strategies import _Capped
-from splatseed.train.views import View, load_split
+from splatseed.views.view import View, load_split
 
 __all__ = ["Split", "read_scene", "train_ours", "train_peer"]
 

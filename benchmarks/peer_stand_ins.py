@@ -32,7 +32,7 @@ from splatseed.errors import MissingDependencyError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
 from splatseed.render import rasterization
 from splatseed.train.ssim import l1_and_ssim
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["Capture", "Peer", "check_examples", "fused_ssim", "load_peer"]
 

@@ -28,7 +28,7 @@ from peer_stand_ins import check_examples
 from splatseed.errors import ParameterError, SplatseedError
 from splatseed.train import TrainSettings
 from splatseed.train.settings import MCMC_CAP, StrategyName
-from splatseed.train.views import load_split
+from splatseed.views.view import load_split
 
 __all__: list[str] = []
 

@@ -25,7 +25,7 @@ from splatseed.render.layout import gather
 from splatseed.synthetic.raycast import render_views, visible
 from splatseed.synthetic.room import Room, build_room, orbit_cameras
 from splatseed.train.gaussians import SH_C0, Gaussians, neighbor_distances
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["Workload", "make_workload", "useful_pairs"]
 

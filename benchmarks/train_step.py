@@ -39,7 +39,7 @@ from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
 from splatseed.train.strategies import make_strategy
 from splatseed.train.trainer import Trainer
-from splatseed.train.views import load_split
+from splatseed.views.view import load_split
 from stopwatch import RENDER_STAGES, Place, Stopwatch, timed
 
 __all__: list[str] = []

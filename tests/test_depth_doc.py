@@ -1,4 +1,4 @@
-"""The commands in docs/depth.md are ones that the command line has."""
+"""The commands in docs/depth.md and docs/stereo.md are ones that the command line has."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 
 from splatseed.cli import VERBS, main
 
-TEXT = (Path(__file__).parents[1] / "docs" / "depth.md").read_text("utf-8")
+DOCS = Path(__file__).parents[1] / "docs"
+TEXT = "".join((DOCS / name).read_text("utf-8") for name in ("depth.md", "stereo.md"))
 LINES = [
     shlex.split(line, comments=True)
     for block in re.findall(r"```sh\n(.*?)```", TEXT, re.DOTALL)

@@ -29,7 +29,7 @@ from splatseed.io import load_scene  # noqa: E402
 from splatseed.synthetic import make_capture, write_capture  # noqa: E402
 from splatseed.train.gaussians import initial_gaussians  # noqa: E402
 from splatseed.train.ply import write_gaussians  # noqa: E402
-from splatseed.train.views import View  # noqa: E402
+from splatseed.views.view import View  # noqa: E402
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ import torch
 from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.losses import ssim
-from splatseed.train.views import load_split
+from splatseed.views.view import load_split
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 MODULES = ("children", "peer_trainer", "peer_runs", "peer_stand_ins")

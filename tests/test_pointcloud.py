@@ -6,9 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra import numpy as hnp
 
 from splatseed.errors import PointCloudError
-from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 
 
 @pytest.fixture
@@ -116,3 +118,79 @@ def test_distinct_points_are_finite_and_the_first_at_their_position(rng):
         assert cloud.distinct[i] == (np.isfinite(row).all() and row not in seen)
         seen.add(row)
     assert not cloud.select(slice(0, 0)).distinct.size
+
+
+@st.composite
+def clouds_with_attributes(draw):
+    """A cloud that has any of the attributes, known of any of its points."""
+    count = draw(st.integers(0, 8))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    values = {name: rng.uniform(0.1, 1.0, (count, *shape)) for name, shape in ATTRIBUTES.items()}
+    values["normals"] /= np.linalg.norm(values["normals"], axis=1, keepdims=True)
+    for array in values.values():
+        array[draw(hnp.arrays(bool, count))] = np.nan
+    known = {name: array for name, array in values.items() if draw(st.booleans())}
+    source = draw(hnp.arrays(np.uint8, count, elements=st.sampled_from([0, 8, 9])))
+    return PointCloud(rng.normal(size=(count, 3)), np.zeros((count, 3), np.uint8), source, **known)
+
+
+def told_of(cloud):
+    """What is known of each point, by its position."""
+    unknown = {name: np.full((len(cloud), *shape), np.nan) for name, shape in ATTRIBUTES.items()}
+    columns = {**unknown, **cloud.attributes, "source": cloud.source}
+    return {
+        tuple(xyz): {
+            name: np.nan_to_num(values[i], nan=-9.0).tolist() for name, values in columns.items()
+        }
+        for i, xyz in enumerate(cloud.xyz.tolist())
+    }
+
+
+@settings(deadline=None)
+@given(first=clouds_with_attributes(), second=clouds_with_attributes(), data=st.data())
+def test_what_is_known_of_a_point_goes_where_it_goes(first, second, data):
+    moved = second.replace(xyz=second.xyz + 100)
+    both = PointCloud.concatenate(first, moved)
+    expected = {**told_of(first), **told_of(moved)}
+    assert told_of(both) == expected
+    assert set(both.attributes) == set(first.attributes) | set(second.attributes)
+    which = data.draw(hnp.arrays(bool, len(both)))
+    kept = both.select(which)
+    for part in (
+        kept,
+        kept.originals,
+        both.select(both.distinct),
+        both.select(slice(None, None, -1)),
+    ):
+        assert all(expected[place] == told for place, told in told_of(part).items())
+        assert set(part.attributes) == set(both.attributes)
+
+
+def test_an_attribute_can_be_taken_out_and_put_in(cloud):
+    sized = cloud.replace(sizes=np.arange(1, 7))
+    assert sized.sizes.dtype == np.float32
+    with pytest.raises(ValueError, match="read-only"):
+        sized.sizes[0] = 1
+    assert sized.replace(xyz=cloud.xyz + 1).sizes.tolist() == [1, 2, 3, 4, 5, 6]
+    assert sized.replace(sizes=None).attributes == {}
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "says"),
+    [
+        ("normals", np.zeros(4), r"normals as numbers of shape \[4, 3\]; found float64 \[4\]"),
+        ("sizes", np.ones(3), r"sizes as numbers of shape \[4\]; found float64 \[3\]"),
+        ("confidence", np.full(4, "1"), "confidence as numbers"),
+        ("normals", np.tile([0, 0, 1.1], (4, 1)), r"of length 1.*1\.1\] at point 0 and 3 more"),
+        ("normals", np.tile([0, np.nan, 1], (4, 1)), "of length 1.*nan, 1.0"),
+        ("sizes", np.array([1, np.nan, 0, 1]), "above 0.*found 0.0 at point 2 and 0 more"),
+        ("sizes", np.array([1, 1, 1, np.inf]), "finite.*found inf at point 3"),
+        ("sizes", np.array([1, 1e-60, 1, 1]), "above 0.*point 1"),
+        ("sizes", np.array([1, 1, 1e60, 1]), "finite.*point 2"),
+        ("confidence", np.array([0, 1, 1.01, -1]), "from 0 to 1.*1.01 at point 2 and 1 more"),
+    ],
+)
+def test_attributes_that_do_not_fit(name, values, says):
+    cloud = PointCloud(np.zeros((4, 3)), np.zeros((4, 3), np.uint8))
+    with pytest.raises(PointCloudError, match=says):
+        cloud.replace(**{name: values})

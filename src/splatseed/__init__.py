@@ -10,7 +10,9 @@ from splatseed.errors import SplatseedError
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.upsample import METHODS, upsample, upsample_points
+from splatseed.seeding.upsampling import add_cover as cover, upsample
+from splatseed.stereo import stereo_depths
+from splatseed.upsample import METHODS, upsample_points
 
 __all__ = [
     "METHODS",
@@ -18,7 +20,9 @@ __all__ = [
     "PointCloud",
     "Scene",
     "SplatseedError",
+    "cover",
     "load_scene",
+    "stereo_depths",
     "upsample",
     "upsample_points",
     "write_scene",

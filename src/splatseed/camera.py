@@ -99,6 +99,12 @@ class Intrinsics:
         return self.model in {"PINHOLE", "SIMPLE_PINHOLE"}
 
     @property
+    def has_distortion(self) -> bool:
+        """Whether straight lines are bent: not where all coefficients are 0, but by any fisheye."""
+        num_focal = CAMERA_MODELS[self.model].num_focal
+        return self.model.endswith("FISHEYE") or any(self.params[num_focal + 2 :])
+
+    @property
     def K(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (the field's name)
         """The pinhole matrix in pixels, [3, 3]; distortion is left out."""
         num_focal = CAMERA_MODELS[self.model].num_focal

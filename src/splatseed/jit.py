@@ -4,17 +4,22 @@ Promise: a kernel compiled here divides by zero as NumPy does (Numba's Python se
 a SystemError inside ``prange``), releases the GIL, is cached on disk, and never reorders
 floating-point sums, so its bytes do not depend on the number of threads or on the cache.
 
-A cached kernel is keyed on its own file alone: kernels call only functions of their own file.
+A cached kernel is keyed on what its own file says and on every file that this one reaches by its imports
+(``splatseed.kernel_sources``): kernels call functions and use constants of any file.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import config
+
+from splatseed.kernel_sources import source_digest
 
 __all__ = ["always_inline", "inline", "kernel", "parallel_range"]
 
@@ -29,14 +34,12 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def kernel(function: F) -> F:
     """Compile a function whose ``parallel_range`` loops run on all threads."""
-    compiled: Any = numba.njit(cache=True, parallel=True, error_model="numpy", nogil=True)(function)
-    return cast("F", compiled)
+    return _compile(function, parallel=True)
 
 
 def inline(function: F) -> F:
-    """Compile a serial function, or a helper that kernels of the same file call."""
-    compiled: Any = numba.njit(cache=True, error_model="numpy", nogil=True)(function)
-    return cast("F", compiled)
+    """Compile a serial function, or a helper that kernels call."""
+    return _compile(function)
 
 
 def always_inline(function: F) -> F:
@@ -46,7 +49,28 @@ def always_inline(function: F) -> F:
     compiler has its way (``inline``), it declines for large helpers, and kernels of many helpers
     compile in half of the time.
     """
-    compiled: Any = numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)(
-        function
-    )
+    return _compile(function, forceinline=True)
+
+
+def _compile(function: F, **options: bool) -> F:
+    njit: Any = numba.njit  # whose annotations want every option by its name
+    compiled = njit(cache=True, error_model="numpy", nogil=True, **options)(function)
+    _key_on_sources(compiled, function)
     return cast("F", compiled)
+
+
+def _key_on_sources(compiled: Any, function: Callable[..., Any]) -> None:
+    """Make machine code in the cache stale when any file changes that the function may be made of.
+
+    Numba asks for the function's own file only, and has no setting for more, so its stamp of the source
+    is replaced. Where there is no such stamp, as without a compiler (``NUMBA_DISABLE_JIT``), or no source
+    to be read, as in an archive, Numba's own way stays.
+    """
+    file: Any = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    if hasattr(file, "_source_stamp"):
+        with suppress(OSError):
+            path = Path(function.__code__.co_filename)
+            digest = source_digest(path, function.__module__)
+            file._source_stamp = digest  # noqa: SLF001
+            # Looked at before the rest is unpickled, which may name modules that are gone.
+            file._version = f"{numba.__version__} {digest}"  # noqa: SLF001

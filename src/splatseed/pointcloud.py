@@ -1,20 +1,24 @@
-"""PointCloud: coloured points, and which of them are the originals.
+"""PointCloud: coloured points, which of them are the originals, and what is known of them.
 
 Notation: N points; ``xyz`` in scene units and the scene's world frame; ``rgb`` 8-bit sRGB as stored
 by COLMAP; ``source`` 0 for an original point, otherwise the code of the method that made the point.
-Promise: arrays have the shapes and dtypes below and are read-only; methods return new clouds.
+The *attributes* normals, sizes and confidence are there or not, and NaN where they are not known of
+a point. Promise: arrays have the shapes and dtypes below and are read-only; methods return new clouds,
+in which every point keeps all that is known of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace as dataclass_replace
+from types import MappingProxyType
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from splatseed.errors import PointCloudError
 
-__all__ = ["GENERATED", "ORIGINAL", "PointCloud"]
+__all__ = ["ATTRIBUTES", "GENERATED", "ORIGINAL", "PointCloud"]
 
 ORIGINAL = 0
 """The ``source`` code of points that were in the input."""
@@ -22,6 +26,15 @@ ORIGINAL = 0
 GENERATED = 255
 """The ``source`` code of points made by a method that has no code of its own, or that is not known."""
 
+ATTRIBUTES: Mapping[str, tuple[int, ...]] = MappingProxyType(
+    {"normals": (3,), "sizes": (), "confidence": ()}
+)
+"""What may be known of a point beyond place, colour and origin: the shape of one point's value."""
+
+UNIT_TOLERANCE = 1e-2
+"""By how much a normal's length may differ from 1: half precision keeps it within 1e-3."""
+
+_RANGES = {"normals": "of length 1", "sizes": "above 0 and finite", "confidence": "from 0 to 1"}
 _MULTIPLIERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
 
 
@@ -33,9 +46,13 @@ class PointCloud:
         xyz: Positions, float32 [N, 3], scene units, world frame.
         rgb: Colours, uint8 [N, 3].
         source: Origin of each point, uint8 [N]; 0 = original. All originals when left out.
+        normals: Unit normals of the surface there, float32 [N, 3], world axes; NaN where unknown.
+        sizes: Radius that a Gaussian there should begin with, float32 [N], scene units, above 0;
+            NaN where unknown.
+        confidence: How sure it is that a surface is there, float32 [N], 0 to 1; NaN where unknown.
 
     Raises:
-        PointCloudError: The shapes or the colour type do not fit.
+        PointCloudError: The shapes or the colour type do not fit, or an attribute is out of range.
 
     Example:
         >>> import numpy as np
@@ -47,6 +64,9 @@ class PointCloud:
     xyz: Float32[np.ndarray, "N 3"]
     rgb: UInt8[np.ndarray, "N 3"]
     source: UInt8[np.ndarray, " N"] = None  # type: ignore[assignment]  # filled in __post_init__
+    normals: Float32[np.ndarray, "N 3"] | None = None
+    sizes: Float32[np.ndarray, " N"] | None = None
+    confidence: Float32[np.ndarray, " N"] | None = None
 
     def __post_init__(self) -> None:
         xyz = np.asarray(self.xyz)
@@ -63,9 +83,19 @@ class PointCloud:
             ("source", source, np.uint8),
         ):
             object.__setattr__(self, name, _read_only(array, dtype))
+        for name, value in self.attributes.items():
+            values = np.asarray(value)
+            _check_attribute(name, values, len(xyz))
+            object.__setattr__(self, name, _read_only(values, np.float32))
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    @property
+    def attributes(self) -> dict[str, Float32[np.ndarray, "N ..."]]:
+        """Those of ``ATTRIBUTES`` that the cloud has, by name."""
+        values = {name: getattr(self, name) for name in ATTRIBUTES}
+        return {name: value for name, value in values.items() if value is not None}
 
     @property
     def num_original(self) -> int:
@@ -91,19 +121,22 @@ class PointCloud:
 
     def select(self, which: Bool[np.ndarray, " N"] | Int[np.ndarray, " M"] | slice) -> PointCloud:
         """The points at ``which`` (a mask, indices or a slice), in that order."""
-        return PointCloud(self.xyz[which], self.rgb[which], self.source[which])
+        chosen = {name: values[which] for name, values in self.attributes.items()}
+        return PointCloud(self.xyz[which], self.rgb[which], self.source[which], **chosen)
 
-    def replace(self, **changes: np.ndarray) -> PointCloud:
-        """A copy with some of its arrays replaced."""
-        return dataclass_replace(self, **changes)
+    def replace(self, **changes: np.ndarray | None) -> PointCloud:
+        """A copy with some of its arrays replaced; None takes an attribute out."""
+        return dataclass_replace(self, **changes)  # type: ignore[arg-type]  # None for attributes
 
     @staticmethod
     def concatenate(*clouds: PointCloud) -> PointCloud:
-        """The clouds one after another, each point keeping its ``source``."""
+        """The clouds one after another; what one has not of an attribute of another's is NaN."""
+        known = [name for name in ATTRIBUTES if any(name in c.attributes for c in clouds)]
         return PointCloud(
             np.concatenate([c.xyz for c in clouds]),
             np.concatenate([c.rgb for c in clouds]),
             np.concatenate([c.source for c in clouds]),
+            **{name: _joined(clouds, name) for name in known},
         )
 
 
@@ -112,6 +145,14 @@ def _read_only(array: np.ndarray, dtype: type) -> np.ndarray:
     view: np.ndarray = np.ascontiguousarray(array, dtype=dtype).view()
     view.flags.writeable = False
     return view
+
+
+def _joined(clouds: Sequence[PointCloud], name: str) -> Float32[np.ndarray, "N ..."]:
+    """An attribute of several clouds."""
+    shape = ATTRIBUTES[name]
+    return np.concatenate(
+        [c.attributes.get(name, np.full((len(c), *shape), np.nan, np.float32)) for c in clouds]
+    )
 
 
 def _first_of_equals(xyz: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
@@ -155,3 +196,33 @@ def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:
             found=f"{list(source.shape)}",
             fix="Pass one code a point, or leave it out.",
         )
+
+
+def _check_attribute(name: str, values: np.ndarray, num_points: int) -> None:
+    """Hold an attribute to its shape and its range; NaN is always in range."""
+    shape = (num_points, *ATTRIBUTES[name])
+    if values.shape != shape or values.dtype.kind not in "fiu":
+        raise PointCloudError(
+            f"{name} as numbers of shape {list(shape)}",
+            found=f"{values.dtype} {list(values.shape)}",
+            fix="Pass one value a point, NaN where it is not known, or leave them out.",
+        )
+    fits = np.isnan(values) | _in_range(name, values)
+    wrong = np.unique(np.nonzero(~fits)[0])
+    if wrong.size:
+        raise PointCloudError(
+            f"{name} {_RANGES[name]}, or NaN where not known",
+            found=f"{values[wrong[0]].tolist()} at point {wrong[0]} and {wrong.size - 1:,} more",
+            fix="Pass NaN for points of which they are not known.",
+        )
+
+
+def _in_range(name: str, values: Float[np.ndarray, "N ..."]) -> Bool[np.ndarray, "N ..."]:
+    if name == "normals":
+        squares = np.einsum("ij,ij->i", values, values, dtype=np.float64)
+        return np.asarray(np.abs(squares - 1.0) <= 2 * UNIT_TOLERANCE)[:, None]
+    if name == "sizes":
+        with np.errstate(over="ignore", under="ignore"):
+            sizes = values.astype(np.float32)  # in which they are kept
+        return np.asarray((sizes > 0) & np.isfinite(sizes))
+    return np.asarray((values >= 0) & (values <= 1))

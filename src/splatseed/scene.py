@@ -2,7 +2,8 @@
 
 Notation: an ``_id`` comes from a file and may have gaps, an ``_idx`` is contiguous. ``tracks``
 belong to the first ``len(tracks)`` points, which are the originals in file order. Promise: a Scene
-is frozen; ``replace`` returns a copy; nothing here reads or writes files.
+is frozen; ``replace`` returns a copy; nothing here reads or writes files, but
+``has_photographs`` looks whether there are any.
 """
 
 from __future__ import annotations
@@ -164,6 +165,12 @@ class Scene:
             if not np.array_equal(kept, self.points.xyz[: len(tracks)], equal_nan=True):
                 changes["tracks"] = None
         return dataclass_replace(self, **changes)
+
+    @property
+    def has_photographs(self) -> bool:
+        """Whether the file of at least one image is there."""
+        folder = self.source.image_dir if self.source else None
+        return folder is not None and any((folder / each.name).is_file() for each in self.images)
 
     def split(self, test_every: int = 8) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
         """Training and test images: names sorted, every ``test_every``-th is a test image."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +15,10 @@ from PIL import Image as PilImage
 
 from splatseed.io import load_scene
 from splatseed.io.ply import read_ply, write_ply
-from splatseed.upsample import METHODS, configure
+from splatseed.upsample import METHODS, chooses_number, configure
 
 METHOD_NAMES = list(METHODS)
+WITH_RATIO = [name for name in METHOD_NAMES if not chooses_number(name)]
 
 
 def _manifest(folder):
@@ -30,7 +33,7 @@ def _bytes(folder):
     }
 
 
-@pytest.mark.parametrize("method", METHOD_NAMES)
+@pytest.mark.parametrize("method", WITH_RATIO)
 def test_every_method_writes_a_scene_that_opens(method, room, tmp_path, splatseed):
     out = tmp_path / "out"
     maps = ["--depth", room] if method == "depth" else []
@@ -49,9 +52,38 @@ def test_every_method_writes_a_scene_that_opens(method, room, tmp_path, splatsee
     assert (written["method"], written["num_new"]) == (method, 2 * count)
 
 
+def test_the_default_looks_at_the_photographs(room, tmp_path, splatseed):
+    out = tmp_path / "out"
+    run = splatseed("upsample", room, "--budget", 2000, "-o", out)
+    assert (run.code, run.err) == (0, "")
+    assert "as many as the photographs need" in run.out
+    assert re.search(r"[\d,]+ original, [\d,]+ stereo, [\d,]+ cover", run.out)
+    assert re.search(r"covered +[\d.]+% of the pictures", run.out)
+    written = _manifest(out)
+    assert (written["method"], written["budget"]) == ("auto", "2000")
+    assert len(load_scene(out).points) <= 2000
+    assert pycolmap.Reconstruction(out / "sparse/0").num_images() == 12
+
+
+def test_without_photographs_the_default_interpolates_and_says_so(own_room, tmp_path, splatseed):
+    shutil.rmtree(own_room / "images")
+    run = splatseed("upsample", own_room, "-o", tmp_path / "out")
+    assert run.code == 0
+    assert "-> mls" in run.out
+    assert "no photographs" in run.out + run.err
+
+
+@pytest.mark.parametrize("words", [["--ratio", 4], ["--num-points", 5000]])
+def test_a_number_for_the_default_is_refused_before_any_work(words, room, tmp_path, splatseed):
+    run = splatseed("upsample", room, *words, "-o", tmp_path / "out")
+    assert (run.code, run.out) == (2, "")
+    assert "--budget" in run.err
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_closing_table_has_what_was_asked_for(room, tmp_path, splatseed):
     out = tmp_path / "out"
-    run = splatseed("upsample", room, "--ratio", 2, "-o", out)
+    run = splatseed("upsample", room, "--method", "mls", "--ratio", 2, "-o", out)
     count = len(load_scene(room).points)
     for text in (f"{count:,}", f"{2 * count:,}", "seconds", "read ", "write ", "far from any", out):
         assert str(text) in run.out
@@ -95,14 +127,18 @@ def test_only_what_reads_transforms_json_is_offered_for_it(room, tmp_path, splat
 
 def test_transforms_in_transforms_out(room, tmp_path, splatseed):
     first, second = tmp_path / "first", tmp_path / "second"
-    splatseed("upsample", room, "-o", first, "--format", "transforms", "--ratio", 1)
-    run = splatseed("upsample", first, "-o", second, "--ratio", 2)
+    splatseed(
+        "upsample", room, "-o", first, "--format", "transforms", "--method", "mls", "--ratio", 1
+    )
+    run = splatseed("upsample", first, "-o", second, "--method", "mls", "--ratio", 2)
     assert run.code == 0
     assert _manifest(second)["format"] == "transforms"
     before, after = load_scene(first), load_scene(second)
     np.testing.assert_array_equal(after.points.xyz[: len(before.points)], before.points.xyz)
     assert (second / "images").is_dir()
-    run = splatseed("upsample", first, "-o", tmp_path / "third", "--format", "colmap")
+    run = splatseed(
+        "upsample", first, "-o", tmp_path / "third", "--format", "colmap", "--method", "mls"
+    )
     assert run.code == 0
     assert pycolmap.Reconstruction(tmp_path / "third/sparse/0").num_images() == 12
 
@@ -140,14 +176,16 @@ def test_the_paper_profile_sets_defaults_and_flags_still_win(profile, room, tmp_
 
 def test_the_last_profile_counts(room, tmp_path, splatseed):
     profiles = ["--profile", "paper", "--profile", "default"]
-    splatseed("upsample", room, "-o", tmp_path / "out", *profiles)
+    splatseed("upsample", room, "--method", "mls", "-o", tmp_path / "out", *profiles)
     written = _manifest(tmp_path / "out")
     assert written["profile"] == "default"
     assert written["parameters"]["k"] == configure("mls").k
 
 
 def test_a_number_of_points_is_met(room, tmp_path, splatseed):
-    run = splatseed("upsample", room, "-o", tmp_path / "out", "--num-points", 1234)
+    run = splatseed(
+        "upsample", room, "--method", "mls", "-o", tmp_path / "out", "--num-points", 1234
+    )
     assert "1,234" in run.out
     assert len(load_scene(tmp_path / "out").points) == 1234
     written = _manifest(tmp_path / "out")
@@ -195,7 +233,10 @@ def test_images_are_linked_or_copied(room, tmp_path, splatseed):
 def test_an_earlier_output_is_replaced_when_asked(room, tmp_path, splatseed):
     out = tmp_path / "out"
     for ratio, words in ((2, []), (3, ["--overwrite"])):
-        assert splatseed("upsample", room, "-o", out, "--ratio", ratio, *words).code == 0
+        assert (
+            splatseed("upsample", room, "--method", "mls", "-o", out, "--ratio", ratio, *words).code
+            == 0
+        )
     assert len(load_scene(out).points) == 3 * len(load_scene(room).points)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 

@@ -8,9 +8,9 @@ import pytest
 from splatseed.depth import align
 from splatseed.depth.alignment import align_map
 from splatseed.depth.planar import ray_length
-from splatseed.depth.sightings import camera_points, find_sightings
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.views.sightings import camera_points, find_sightings
 
 SCALES = 1.5 ** np.linspace(-3, 3, 12)
 

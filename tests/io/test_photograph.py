@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from PIL import Image as PilImage
@@ -49,3 +52,102 @@ def test_a_file_cut_short_is_told_from_a_whole_one(suffix, kept, rng, tmp_path):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(SceneNotFoundError, match=r"gone\.jpg"):
         check_photograph(tmp_path / "gone.jpg")
+
+
+def _png16(channels, transparent=None):
+    """A PNG of 16 bits of [H, W, C], as Pillow does not write them; C = 1, 2 (grey), 3 or 4."""
+    height, width, count = channels.shape
+    color = {1: 0, 2: 4, 3: 2, 4: 6}[count]
+    header = struct.pack(">IIBBBBB", width, height, 16, color, 0, 0, 0)
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in channels)
+    extra = [] if transparent is None else [(b"tRNS", struct.pack(">H", transparent))]
+    chunks = [(b"IHDR", header), *extra, (b"IDAT", zlib.compress(rows)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks
+    )
+
+
+ALL16 = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+NEAREST = np.rint(ALL16 / 65535 * 255)
+"""Every number of 16 bits, and the nearest of 8 bits."""
+
+
+def _saved(tmp_path, array, name="a.tif"):
+    PilImage.fromarray(array).save(tmp_path / name)
+    return _decoded(tmp_path / name)
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+def test_grey_of_16_bits_becomes_the_nearest_of_8(name, tmp_path):
+    pixels = _saved(tmp_path, ALL16, name)
+    assert pixels.dtype == np.uint8
+    assert all(np.array_equal(pixels[..., channel], NEAREST) for channel in range(3))
+
+
+def test_grey_of_16_bits_that_pillow_opens_as_32_is_the_same(monkeypatch, tmp_path):
+    """As before Pillow 11: its own conversion from I;16, and the format, stand in for the older reader."""
+    (tmp_path / "a.png").write_bytes(_png16(ALL16[..., None]))
+    real = PilImage.open
+
+    def as_32_bits(file):
+        picture = real(file).convert("I")
+        picture.format = "PNG"
+        return picture
+
+    monkeypatch.setattr(PilImage, "open", as_32_bits)
+    assert np.array_equal(_decoded(tmp_path / "a.png")[..., 0], NEAREST)
+
+
+def test_transparent_grey_of_16_bits_is_black(tmp_path):
+    (tmp_path / "a.png").write_bytes(_png16(ALL16[..., None], transparent=65535))
+    pixels = _decoded(tmp_path / "a.png")
+    assert pixels[-1, -1].tolist() == [0, 0, 0]
+    assert pixels[-1, -2].tolist() == [255, 255, 255]
+
+
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_channels_of_16_bits_are_right_to_one_step(count, rng, tmp_path):
+    channels = rng.integers(0, 65536, (32, 32, count))
+    if count in {2, 4}:
+        channels[..., -1] = 65535  # opaque
+    (tmp_path / "a.png").write_bytes(_png16(channels))
+    expected = channels[..., :1] if count == 2 else channels[..., :3]
+    assert np.abs(_decoded(tmp_path / "a.png") - expected / 257).max() <= 1
+
+
+def test_floats_of_0_to_1_are_scaled(rng, tmp_path):
+    floats = rng.random((16, 16)).astype(np.float32)
+    assert np.array_equal(_saved(tmp_path, floats)[..., 1], np.rint(floats * 255))
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.full((4, 4), 1.5, np.float32),
+        np.full((4, 4), -0.5, np.float32),
+        np.full((4, 4), np.nan, np.float32),
+        np.full((4, 4), 200, np.int32),
+    ],
+    ids=["above 1", "below 0", "NaN", "32 bits"],
+)
+def test_numbers_of_unknown_range_are_refused(array, tmp_path):
+    with pytest.raises(SceneFormatError, match="8 or 16 bits a channel"):
+        _saved(tmp_path, array)
+
+
+def test_a_damaged_grey_of_16_bits_is_said(tmp_path):
+    whole = _png16(ALL16[..., None])
+    (tmp_path / "a.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(SceneFormatError, match="cut short or damaged"):
+        _decoded(tmp_path / "a.png")
+
+
+def test_grey_of_8_bits_and_palettes_are_as_they_are(rng, tmp_path):
+    grey = rng.integers(0, 256, (9, 7), np.uint8)
+    assert np.array_equal(_saved(tmp_path, grey, "a.png")[..., 2], grey)
+    palette = PilImage.fromarray(grey).convert("RGB").quantize(16)
+    palette.save(tmp_path / "p.png")
+    assert np.array_equal(_decoded(tmp_path / "p.png"), np.asarray(palette.convert("RGB")))
+    half = np.stack([grey, np.where(grey > 127, 255, 0).astype(np.uint8)], axis=-1)
+    assert np.array_equal(_saved(tmp_path, half, "la.png")[..., 0], np.where(grey > 127, grey, 0))

@@ -13,9 +13,10 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene
-from splatseed.io.depth_lens import Undistortion, distort
+from splatseed.io.depth_lens import Undistortion
 from splatseed.io.rgbd import load_rgbd
 from splatseed.io.tum import load_tum
+from splatseed.lens import image_points
 from splatseed.scene import SceneSource
 
 START = 1305031102.175304
@@ -231,14 +232,6 @@ LENS = Intrinsics(
 )
 
 
-def test_distortion_is_colmaps(rng):
-    pycolmap = pytest.importorskip("pycolmap")
-    camera = pycolmap.Camera(model=LENS.model, width=640, height=480, params=list(LENS.params))
-    xy = rng.uniform(-0.5, 0.5, (50, 2))
-    expected = camera.img_from_cam(np.concatenate([xy, np.ones((50, 1))], axis=1))
-    np.testing.assert_allclose(distort(LENS, xy), expected, atol=1e-9)
-
-
 def test_undistorted_map_has_the_value_that_the_lens_saw_along_each_ray():
     camera = Intrinsics(1, "PINHOLE", 600, 440, (520.0, 515.0, 300.0, 225.0))
     row, column = np.mgrid[:480, :640].astype(np.float32)
@@ -248,7 +241,7 @@ def test_undistorted_map_has_the_value_that_the_lens_saw_along_each_ray():
     assert found.dtype == np.float32
     for u, v in [(0, 0), (300, 225), (10, 400), (599, 439), (450, 100)]:
         ray = np.array([(u + 0.5 - 300) / 520, (v + 0.5 - 225) / 515])
-        x, y = np.floor(distort(LENS, ray))
+        x, y = np.floor(image_points(LENS, ray))
         expected = x + 1000 * y if 0 <= x < 640 and 0 <= y < 480 else np.nan
         np.testing.assert_equal(found[v, u], np.float32(expected))
     half = Undistortion(LENS, {"a.png": camera}).apply("a.png", values[::2, ::2])

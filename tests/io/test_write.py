@@ -251,7 +251,7 @@ def test_splatseed_json_tells_how_it_came_about(scene_dir, tmp_path, rng, monkey
     assert (told["method"], told["seed"], told["options"]) == ("mls", 3, {"k": 16})
     assert (told["num_points"], told["num_original"], told["num_new"]) == (35, 10, 25)
     assert set(told["versions"]) == {"python", "splatseed", "numpy", "scipy", "numba"}
-    listed = {p.relative_to(report.path).as_posix() for p in report.path.rglob("*.[bpj]*")}
+    listed = {p.relative_to(report.path).as_posix() for p in report.path.rglob("*.[bjnp]*")}
     assert {name for name in listed if not name.startswith("images")} == set(report.files) - {
         "images"
     }

@@ -8,7 +8,7 @@ import pytest
 from splatseed.render import layout
 from splatseed.render.binning import RECORD, TILE
 from splatseed.render.blending import BLOCKS, CHANNELS
-from splatseed.render.simd import LANES
+from splatseed.simd import LANES
 
 
 def _records(conics: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from splatseed.train.views import View
+from splatseed.views.view import View
 from splatseed.viewpoint import look_at
 
 NEARER, HIDING, WITNESSES = 0.1, 5, 12

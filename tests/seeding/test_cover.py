@@ -100,13 +100,13 @@ def test_of_two_surfaces_a_seed_takes_the_one_that_no_view_looks_through(rng):
         assert (reach == 1).all()
 
 
-def test_the_room_is_covered_near_its_surfaces(exact_room, room_views, rng):
-    xyz = exact_room.scene.points.xyz
+def test_the_room_is_covered_near_its_surfaces(room_capture, room_views, rng):
+    xyz = room_capture.scene.points.xyz
     seeds = cover(room_views, xyz, rng=rng)
     before = covered_share(room_views, xyz)
     assert before < 0.7
     assert covered_share(room_views, np.concatenate([xyz, seeds.xyz])) > 0.95
-    off = exact_room.surfaces.distance(seeds.xyz.astype(np.float64))
+    off = room_capture.surfaces.distance(seeds.xyz.astype(np.float64))
     assert np.median(off) < 0.12  # of a room of 4.6 m
     for k, view in enumerate(room_views):
         mine = seeds.view == k
@@ -117,8 +117,8 @@ def test_the_room_is_covered_near_its_surfaces(exact_room, room_views, rng):
         assert gap < 25
 
 
-def test_the_same_seed_gives_the_same_bytes(exact_room, room_views):
-    xyz = exact_room.scene.points.xyz
+def test_the_same_seed_gives_the_same_bytes(room_capture, room_views):
+    xyz = room_capture.scene.points.xyz
     first, again, other = (
         cover(room_views, xyz, rng=np.random.default_rng(seed)) for seed in (1, 1, 2)
     )

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.seeding.coverage import cell_depths, covered_cells, covered_share
-from splatseed.train.views import poses_of
+from splatseed.views.view import poses_of
 
 from . import references as slow
 
@@ -67,13 +67,10 @@ def test_only_finite_points_before_the_camera_count(rng):
     assert covered_share([view], np.empty((0, 3), np.float32)) == 0.0
 
 
-def test_no_photograph_is_needed(exact_room):
-    images = exact_room.scene.images[:2]
-    views = [
-        type(view)(view.name, view.image, view.K, 160, 120, view.cam_from_world)
-        for view in poses_of(images)
-    ]
-    assert 0.1 < covered_share(views, exact_room.scene.points.xyz) < 1.0
+def test_no_photograph_is_needed(room_capture):
+    images = room_capture.scene.images[:2]
+    views = poses_of(images)
+    assert 0.1 < covered_share(views, room_capture.scene.points.xyz) < 1.0
 
 
 def test_bad_input_is_refused(rng):

@@ -88,7 +88,7 @@ def test_missing_packages_are_named_with_the_command(monkeypatch):
 
 def test_import_and_help_do_not_wait_for_pytorch():
     code = (
-        "import sys, splatseed, splatseed.commands.train, splatseed.train.views\n"
+        "import sys, splatseed, splatseed.commands.train, splatseed.views.view\n"
         "assert 'torch' not in sys.modules and 'gsplat' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from splatseed.camera import rotation_from_quat
 from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.train.frame import stray_views, training_frame
 from splatseed.train.gaussians import SH_C0, Gaussians, initial_gaussians, neighbor_distances
 from splatseed.train.ply import read_gaussians, write_gaussians
-from splatseed.train.views import load_split
+from splatseed.views.view import load_split
 
 
 def _random(rng, count, degree=3):
@@ -102,6 +103,35 @@ def test_first_gaussians_are_no_larger_than_they_may_be(rng):
     assert 0 < (held.scales < free.scales).all(axis=1).sum() < 200
 
 
+def test_first_gaussians_have_the_sizes_that_are_known(rng):
+    xyz, sizes = rng.normal(size=(200, 3)), rng.uniform(1e-3, 10.0, 200)
+    sizes[::3] = np.nan
+    cloud = PointCloud(xyz, np.zeros((200, 3), np.uint8))
+    largest = np.full(200, 5.0)
+    free = initial_gaussians(cloud, scale_factor=0.5)
+    told = initial_gaussians(cloud.replace(sizes=sizes), scale_factor=0.5, largest=largest)
+    expected = np.where(np.isnan(sizes), np.exp(free.scales[:, 0]), np.minimum(0.5 * sizes, 5.0))
+    assert np.allclose(np.exp(told.scales), expected[:, None], rtol=1e-5)
+
+
+def test_first_gaussians_lie_flat_where_normals_are_known(rng):
+    normals = rng.normal(size=(200, 3))
+    normals[:6] = np.concatenate([np.eye(3), -np.eye(3)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals[6::3] = np.nan
+    cloud = PointCloud(rng.normal(size=(200, 3)), np.zeros((200, 3), np.uint8))
+    balls, discs = initial_gaussians(cloud), initial_gaussians(cloud.replace(normals=normals))
+    known = ~np.isnan(normals[:, 0])
+    for i in np.flatnonzero(known):
+        thin = rotation_from_quat(discs.quats[i])[:, 2]
+        assert abs(thin @ normals[i]) == pytest.approx(1.0, abs=1e-6)
+    assert np.allclose(np.linalg.norm(discs.quats, axis=1), 1.0, atol=1e-6)
+    shrunk = np.exp(discs.scales - balls.scales)
+    assert np.allclose(shrunk[known], [1.0, 1.0, 0.1])
+    assert np.array_equal(discs.scales[~known], balls.scales[~known])
+    assert np.array_equal(discs.quats[~known], balls.quats[~known])
+
+
 @settings(deadline=None, max_examples=40)
 @given(
     count=st.integers(1, 40),
@@ -135,6 +165,18 @@ def test_the_frame_depends_on_cameras_alone_and_undoes_itself(room, rng):
     world = frame.gaussians_to_world(gaussians)
     assert np.allclose(world.means, xyz, atol=1e-5)
     assert np.allclose(np.exp(world.scales) * frame.scale, np.exp(gaussians.scales), rtol=1e-5)
+
+
+def test_sizes_shrink_with_the_frame(room):
+    frame, count = training_frame(load_split(room)[0]), len(room.points)
+    sizes = np.full(count, 0.3)
+    sizes[1], sizes[2] = np.nan, 1e-38
+    cloud = frame.cloud_from_world(room.points.replace(sizes=sizes))
+    assert np.array_equal(cloud.xyz, frame.points_from_world(room.points.xyz))
+    assert np.allclose(cloud.sizes[3:], 0.3 * frame.scale)
+    assert np.isnan(cloud.sizes[1])
+    assert cloud.sizes[2] > 0
+    assert frame.cloud_from_world(room.points).sizes is None
 
 
 def test_a_moved_camera_sees_moved_points_alike(room):

@@ -13,7 +13,7 @@ from splatseed.train.gaussians import initial_gaussians
 from splatseed.train.near_depths import LEAST, MARGIN, near_depths
 from splatseed.train.parameters import make_optimizers, make_parameters, optimize, yardsticks
 from splatseed.train.schedule import make_schedule
-from splatseed.train.views import View, load_split
+from splatseed.views.view import View, load_split
 
 CPU = torch.device("cpu")
 

@@ -218,6 +218,28 @@ def test_a_run_goes_on_with_its_own_settings_and_seeds(begin, room, tmp_path):
         prepare_run(room, tmp_path / "run", TrainSettings(), RESUME)
 
 
+def test_a_run_goes_on_with_what_it_knew_of_its_seeds(room, tmp_path):
+    count = len(room.points)
+    known = room.points.replace(
+        sizes=np.full(count, 0.02), normals=np.tile([0.0, 0, 1], (count, 1))
+    )
+    asked = TrainSettings(max_steps=8, data_factor=2, seed_sizes=True, seed_normals=True)
+    runs = {}
+    for name in ("straight", "stopped"):
+        runs[name] = prepare_run(room.replace(points=known), tmp_path / name, asked)
+    first = gaussians_of(runs["straight"].state.params)
+    size = 0.02 * runs["straight"]._frame.scale
+    assert np.allclose(np.exp(first.scales), [size, size, 0.1 * size], rtol=1e-4)
+    assert runs["straight"].train()
+    assert not runs["stopped"].train(_stop_after(3))
+    with pytest.raises(ParameterError, match="other points"):
+        prepare_run(room, tmp_path / "stopped", asked, RESUME)
+    resumed = prepare_run(room.replace(points=known), tmp_path / "stopped", TrainSettings(), RESUME)
+    assert resumed.settings == asked
+    assert resumed.train()
+    assert _bytes(resumed) == _bytes(runs["straight"])
+
+
 def test_a_run_killed_before_its_first_checkpoint_starts_again(begin):
     begin(max_steps=30)
     assert begin(options=RESUME, max_steps=30).state.step == 0

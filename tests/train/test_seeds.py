@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch", reason="training needs PyTorch")
 
 from splatseed.pointcloud import PointCloud
-from splatseed.train.seeds import usable_seeds
+from splatseed.train.seeds import seeds_digest, usable_seeds
 from splatseed.train.settings import TrainSettings
 
 ORIGINALS, NEW = 40, 60
@@ -63,3 +63,38 @@ def test_points_that_are_not_finite_are_left_out_and_told_of(points):
     seeds, notes = thinned(points.replace(xyz=xyz), 1000)
     assert len(seeds) == ORIGINALS + NEW - 1
     assert notes == ["1 points without finite coordinates were left out."]
+
+
+@pytest.fixture
+def known(points) -> PointCloud:
+    """The points with a size that follows from the position, normals of some, and confidence."""
+    normals = np.tile([0.0, 0, 1], (len(points), 1))
+    normals[::3] = np.nan
+    sizes = np.abs(points.xyz[:, 0])
+    return points.replace(normals=normals, sizes=sizes, confidence=np.ones(len(points)))
+
+
+def test_of_what_is_known_only_what_is_asked_for_has_a_part(known, points):
+    begun = {
+        names: usable_seeds(known, TrainSettings(**dict.fromkeys(names, True)), print)
+        for names in ((), ("seed_sizes",), ("seed_normals",), ("seed_sizes", "seed_normals"))
+    }
+    assert [sorted(seeds.attributes) for seeds in begun.values()] == [
+        *([], ["sizes"], ["normals"], ["normals", "sizes"])
+    ]
+    digests = [seeds_digest(seeds) for seeds in begun.values()]
+    assert len(set(digests)) == 4
+    assert digests[0] == seeds_digest(points)
+
+
+def test_what_is_known_follows_the_points_that_stay(known):
+    settings = TrainSettings(cap_max=55, seed_sizes=True)
+    seeds = usable_seeds(known, settings, lambda _: None)
+    np.testing.assert_array_equal(seeds.sizes, np.abs(seeds.xyz[:, 0]))
+
+
+def test_asking_for_what_is_not_known_is_told(points):
+    notes: list[str] = []
+    unknown = points.replace(sizes=np.full(len(points), np.nan))
+    usable_seeds(unknown, TrainSettings(seed_sizes=True, seed_normals=True), notes.append)
+    assert [note.split()[0] for note in notes] == ["--seed-sizes", "--seed-normals"]

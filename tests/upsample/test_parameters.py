@@ -12,8 +12,9 @@ from splatseed import METHODS
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.upsample import Upsampler, configure, planned_size
 from splatseed.upsample.method import NewPoints
+from splatseed.upsample.registry import SOURCE_CODES, origin_name
 
-from .contract import METHOD_NAMES, Copies
+from .contract import METHOD_NAMES, PHOTOGRAPH_METHODS, Copies
 from .surroundings import scene_around
 
 BUILT_IN = [name for name in METHOD_NAMES if name != "copies"]
@@ -169,8 +170,9 @@ def test_the_paper_profile_has_the_papers_values(method, values):
 def test_a_third_party_adds_methods_and_takes_none_over(wavy):
     assert METHODS["copies"] is Copies
     assert METHODS["mls"] is not Copies
-    assert list(METHODS) == list(METHOD_NAMES)
-    assert len(METHODS) == len(METHOD_NAMES)
+    names = [*BUILT_IN, *PHOTOGRAPH_METHODS, "copies"]
+    assert list(METHODS) == names
+    assert len(METHODS) == len(names)
     assert set(ss.upsample(wavy, "copies").source) == {0, 255}
 
 
@@ -183,3 +185,52 @@ def test_a_third_partys_bad_points_are_refused(wavy):
 
     with pytest.raises(PointCloudError, match="at new point 17"):
         ss.upsample(wavy, Broken())
+
+
+class Knowing(Copies):
+    """A third party's method that knows more of its points."""
+
+    def __call__(self, cloud, num_new, rng, progress):
+        new = super().__call__(cloud, num_new, rng, progress)
+        source = np.where(np.arange(num_new) % 2, 8, 9).astype(np.uint8)
+        return new._replace(sizes=np.full(num_new, 0.5), source=source)
+
+
+def test_what_a_method_knows_of_its_points_is_handed_on(wavy):
+    seeds = ss.upsample(wavy, Knowing(), num_points=len(wavy) + 4)
+    assert seeds.source[len(wavy) :].tolist() == [9, 8, 9, 8]
+    assert seeds.sizes[len(wavy) :].tolist() == [0.5] * 4
+    assert np.isnan(seeds.sizes[: len(wavy)]).all()
+    assert seeds.normals is None
+    assert ss.upsample(wavy, Copies(), num_points=len(wavy) + 4).attributes == {}
+
+
+@pytest.mark.parametrize("length", [2, 3])
+def test_a_plain_tuple_will_do(wavy, length):
+    class Plain(Copies):
+        def __call__(self, cloud, num_new, rng, progress):
+            new = super().__call__(cloud, num_new, rng, progress)
+            return (new.xyz, new.rgb, ("A note.",))[:length]
+
+    notes = []
+    seeds = ss.upsample(wavy, Plain(), num_points=len(wavy) + 4, note=notes.append)
+    assert seeds.source[-4:].tolist() == [255] * 4
+    assert notes == ["A note."][: length - 2]
+
+
+@pytest.mark.parametrize("source", [np.zeros(4, np.uint8), np.full(4, 256), np.full(4, 8.0)])
+def test_new_points_are_no_originals(wavy, source):
+    class Posing(Copies):
+        def __call__(self, cloud, num_new, rng, progress):
+            return super().__call__(cloud, num_new, rng, progress)._replace(source=source)
+
+    with pytest.raises(PointCloudError, match="codes from 1 to 255"):
+        ss.upsample(wavy, Posing(), num_points=len(wavy) + 4)
+
+
+def test_every_built_in_method_has_a_code_and_every_code_a_name():
+    assert set(BUILT_IN) <= set(SOURCE_CODES)
+    assert len({0, *SOURCE_CODES.values()}) == len(SOURCE_CODES) + 1
+    assert [origin_name(code) for code in (0, 4, 8, 9, 255)] == [
+        *("original", "mls", "stereo", "cover", "other")
+    ]

@@ -24,6 +24,8 @@ TESTS = 21
 """How often the test views are rendered: on the way, and at the end."""
 RENDER_SHARE = 0.3
 """Of a step's time, what rendering takes."""
+LIKELY_RATIO = 3.0
+"""Seeds to every original, of methods that look at photographs."""
 PICTURES = 3
 BYTES_A_PIXEL = 2.0
 """Of a PNG of a photograph, its render and its error."""
@@ -98,7 +100,8 @@ class Estimator:
     def _counts(self, spec: RunSpec) -> tuple[float, float]:
         """Gaussians at the start and at the end."""
         most = spec.settings.cap or float("inf")
-        seeds = min(self._scenes[spec.scene_digest].num_points * spec.arm.ratio, most)
+        ratio = spec.arm.ratio or LIKELY_RATIO
+        seeds = min(self._scenes[spec.scene_digest].num_points * ratio, most)
         strategy = spec.arm.strategy
         alike = self._growth.get((strategy, spec.arm.ratio)) or self._growth.get((strategy, None))
         return seeds, min(seeds * (alike or GROWTH[spec.settings.densification]), most)

@@ -33,7 +33,7 @@ from splatseed.io.staging import check_output
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.train.interruption import interruption
-from splatseed.train.photographs import user_cache_dir
+from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
     from splatseed.evaluate import Lpips

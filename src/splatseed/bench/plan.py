@@ -14,12 +14,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, get_args
 
-from splatseed.bench.records import SFM, Arm, RunSpec
+from splatseed.bench.records import ANY_RATIO, SFM, Arm, RunSpec
 from splatseed.bench.scenes import SceneFacts
 from splatseed.errors import ParameterError
 from splatseed.train.schedule import FULL_RUN
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
-from splatseed.upsample import METHODS, Profile, Upsampler, configure
+from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, configure
 
 __all__ = ["DEMO", "Plan", "PlannedScene", "plan_runs"]
 
@@ -128,14 +128,16 @@ class Plan:
         )
 
     def parameters_of(self, method: str) -> Mapping[str, Any]:
-        """What differs from the profile's; depth never sees the photographs kept for the test."""
-        held = {"hold_out": self.test_every} if method == DEPTH else {}
+        """What differs from the profile's; no method sees the photographs kept for the test."""
+        looks = hasattr(METHODS[method], "hold_out")
+        held = {"hold_out": self.test_every} if looks else {}
         return MappingProxyType({**held, **self.parameters.get(method, {})})
 
     def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:
         """The arms of one strategy: the original cloud first.
 
-        A method whose profiles are one and the same has one arm, of the first of them.
+        A method whose profiles are one and the same has one arm, of the first of them; one that makes
+        as many seeds as the photographs need has no ratio.
         """
         arms = [Arm(SFM, "default", 1, strategy)] if SFM in self.methods else []
         for method in self.methods:
@@ -143,7 +145,7 @@ class Plan:
                 arms += [
                     Arm(method, profile, ratio, strategy)
                     for profile in self._profiles_of(method)
-                    for ratio in self.ratios
+                    for ratio in ((ANY_RATIO,) if chooses_number(method) else self.ratios)
                 ]
         return tuple(arms)
 

@@ -16,10 +16,23 @@ from typing import Any, Literal, Self
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.upsample import Profile
 
-__all__ = ["SFM", "Arm", "CurvePoint", "ImageScore", "RunResult", "RunRow", "RunSpec", "RunStatus"]
+__all__ = [
+    "ANY_RATIO",
+    "SFM",
+    "Arm",
+    "CurvePoint",
+    "ImageScore",
+    "RunResult",
+    "RunRow",
+    "RunSpec",
+    "RunStatus",
+]
 
 SFM = "sfm"
 """The method that leaves the cloud of Structure-from-Motion as it is; its ratio is 1."""
+
+ANY_RATIO = 0.0
+"""The ratio of methods that make as many seeds as the photographs need."""
 
 RunStatus = Literal["pending", "running", "done", "failed"]
 
@@ -34,7 +47,7 @@ class Arm:
     Args:
         method: ``SFM``, or a key of ``splatseed.METHODS``.
         profile: "default" or "paper".
-        ratio: Points in all, per original.
+        ratio: Points in all, per original; ``ANY_RATIO`` where the photographs say it.
         strategy: The densification strategy.
     """
 
@@ -52,7 +65,8 @@ class Arm:
         """In a few words, such as ``mls 8x`` or ``mls 8x (paper)``; the strategy is left out."""
         if self.method == SFM:
             return SFM
-        return f"{self.method} {self.ratio:g}x" + (" (paper)" if self.profile == "paper" else "")
+        ratio = f" {self.ratio:g}x" if self.ratio else ""
+        return f"{self.method}{ratio}" + (" (paper)" if self.profile == "paper" else "")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from splatseed.io import find_usable
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.upsample import configure, planned_size, upsample
+from splatseed.upsample import chooses_number, configure, planned_size, upsample
 
 __all__ = ["make_seeds", "scene_of"]
 
@@ -51,9 +51,11 @@ def make_seeds(
     if spec.arm.method == SFM:
         return scene.points.select(usable.keep), 0.0
     method = configure(spec.arm.method, spec.arm.profile, **spec.parameters)
-    # As the command does: what will be left out is asked for on top.
-    total = planned_size(int(usable.keep.sum()), spec.arm.ratio, None)
-    asked = total + usable.num_nonfinite + usable.num_duplicates
+    asked = None
+    if not chooses_number(spec.arm.method):
+        # As the command does: what will be left out is asked for on top.
+        total = planned_size(int(usable.keep.sum()), spec.arm.ratio, None)
+        asked = total + usable.num_nonfinite + usable.num_duplicates
     with _compilation() as compiling:
         start = time.perf_counter()
         seeds = upsample(scene, method, num_points=asked, seed=spec.repeat, progress=progress)

@@ -12,18 +12,18 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float64, UInt8
 from PIL import Image as PilImage, ImageDraw
 
 from splatseed.camera import Camera
 from splatseed.depth import Alignment
 from splatseed.depth.planar import PlanarDepth, map_camera
-from splatseed.depth.sightings import find_sightings
 from splatseed.depthmap import DepthMap
-from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.photograph import decode_photograph, photograph_bytes
-from splatseed.preview import Tile, color_bar, heat, write_grid
+from splatseed.preview.colors import color_bar, heat, map_colors, usual_range
+from splatseed.preview.page import Tile, centered, fitted, write_grid
+from splatseed.preview.photographs import photograph_or_blank
 from splatseed.scene import Image, Scene
+from splatseed.views.sightings import find_sightings
 
 __all__ = ["write_depth_picture"]
 
@@ -31,14 +31,7 @@ SIDE = 480
 """The longer side of a tile, in pixels."""
 LIMIT = 0.1
 """Relative errors from here on have the last colour."""
-RANGE = (2, 98)
-"""Percentiles of depth between which colours change."""
 RADIUS = 2.5
-UNKNOWN = (150, 150, 150)
-PAPER = (255, 255, 255)
-NO_PHOTOGRAPH = (230, 230, 230)
-
-Size = tuple[int, int]
 
 
 def write_depth_picture(scene: Scene, alignments: Mapping[str, Alignment], path: Path) -> Path:
@@ -57,10 +50,8 @@ def write_depth_picture(scene: Scene, alignments: Mapping[str, Alignment], path:
     for name, why in _chosen(alignments).items():
         image = by_name[name]
         rows += _row(scene, image, alignments[name], sightings.of(image), why)
-    height, width = np.max([tile.picture.shape[:2] for tile in rows], axis=0)
-    tiles = [Tile(tile.label, _centered(tile.picture, height, width)) for tile in rows]
     bar = color_bar("0", f"off by {LIMIT:.0%} or more")
-    return write_grid(tiles, path, columns=3, footer=bar)
+    return write_grid(centered(rows), path, columns=3, footer=bar)
 
 
 def _chosen(alignments: Mapping[str, Alignment]) -> dict[str, str]:
@@ -84,8 +75,8 @@ def _row(
     xyz: Float64[np.ndarray, "M 3"],
     why: str,
 ) -> list[Tile]:
-    size = _fit(image.intrinsics.width, image.intrinsics.height)
-    photograph = _photograph(scene, image, size)
+    size = fitted(image.intrinsics.width, image.intrinsics.height, SIDE)
+    photograph = photograph_or_blank(scene, image, size)
     if scene.depths is None:
         return []
     depth = scene.depths.read(image.name)
@@ -110,51 +101,25 @@ def _shortened(label: str, length: int = 46) -> str:
     return label if len(label) <= length else f"...{label[3 - length :]}"
 
 
-def _photograph(scene: Scene, image: Image, size: Size) -> UInt8[np.ndarray, "H W 3"]:
-    """The photograph at a size; plain grey where it cannot be had."""
-    folder = scene.source.image_dir if scene.source else None
-    try:
-        if folder is not None:
-            path = folder / image.name
-            picture = decode_photograph(path, photograph_bytes(path))
-            return np.array(picture.resize(size, PilImage.Resampling.LANCZOS))
-    except (SceneNotFoundError, SceneFormatError):
-        pass  # depth without its photographs is still worth a look
-    return np.full((size[1], size[0], 3), NO_PHOTOGRAPH, np.uint8)
-
-
 def _depth_colors(
     depth: DepthMap, camera: Camera, alignment: Alignment
 ) -> tuple[UInt8[np.ndarray, "H W 3"], str]:
     """The map in colours, and what its range is."""
-    from matplotlib import colormaps  # noqa: PLC0415  (slow to import, needed here alone)
-
     aligned = np.isfinite(alignment.scale)
     if depth.kind == "inverse" and not aligned:
         nearness, words = depth.values, "depth, not aligned"
     else:
         z = _planar(depth, camera, alignment if aligned else Alignment(1.0, 0.0, 0, np.nan))
-        low, high = _range(z)
+        low, high = usual_range(z)
         words = f"depth {low:.3g} to {high:.3g}" + ("" if aligned else ", not aligned")
         with np.errstate(divide="ignore", invalid="ignore"):
             nearness = -np.log(z)
-    low, high = _range(nearness)
-    share = (nearness - low) / max(high - low, 1e-12)
-    colors = colormaps["viridis"](np.clip(np.nan_to_num(share), 0.0, 1.0), bytes=True)[..., :3]
-    return np.where(np.isfinite(nearness)[..., None], colors, np.array(UNKNOWN, np.uint8)), words
+    return map_colors(nearness, *usual_range(nearness)), words
 
 
 def _planar(depth: DepthMap, camera: Camera, alignment: Alignment) -> Float64[np.ndarray, "H W"]:
     """Planar depth in scene units; NaN where unknown."""
     return PlanarDepth.of(depth, camera, alignment.scale, alignment.shift, unit_ray=False).whole()
-
-
-def _range(values: Float64[np.ndarray, "H W"] | Float32[np.ndarray, "H W"]) -> tuple[float, float]:
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return 0.0, 0.0
-    low, high = np.percentile(finite, RANGE)
-    return float(low), float(high)
 
 
 def _points(
@@ -189,18 +154,3 @@ def _errors(
     error = np.abs(z_map[row, column] / z - 1.0)
     known = np.isfinite(error)
     return uv[known], error[known]
-
-
-def _fit(width: int, height: int) -> Size:
-    factor = SIDE / max(width, height)
-    return max(round(width * factor), 1), max(round(height * factor), 1)
-
-
-def _centered(
-    picture: UInt8[np.ndarray, "h w 3"], height: int, width: int
-) -> UInt8[np.ndarray, "H W 3"]:
-    """On white, as tiles are of one size and images of a scene may not be."""
-    tile = np.full((height, width, 3), PAPER, np.uint8)
-    top, left = (height - len(picture)) // 2, (width - picture.shape[1]) // 2
-    tile[top : top + len(picture), left : left + picture.shape[1]] = picture
-    return tile

@@ -36,14 +36,23 @@ from splatseed.preview import choose_camera, preview_errors, preview_methods, pr
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.synthetic import Capture, make_capture, write_capture
-from splatseed.upsample import methods_for, planned_size, upsample
+from splatseed.upsample import (
+    METHODS,
+    chooses_number,
+    configure,
+    methods_for,
+    planned_size,
+    upsample,
+)
 
 if TYPE_CHECKING:  # importing PyTorch takes a while, and it may be absent
     from splatseed.commands._demo_training import TrainedArm
 
 __all__ = ["run"]
 
-SHOWN = "mls"
+SHOWN = "auto"
+TEST_EVERY = 8
+"""Photographs kept for the test of what is trained: no method looks at them."""
 SAMPLES = 20_000
 """Places on the surfaces at which coverage is taken."""
 TRAINED_PICTURE = "preview_trained.png"
@@ -57,7 +66,7 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """The folder to write."""
     ratio: float = 8.0
-    """Points in all, as a multiple of the originals."""
+    """Points in all, as a multiple of the originals, for methods that interpolate."""
     views: int = 40
     """Photographs of the made-up room."""
     seed: int = 0
@@ -113,7 +122,10 @@ def _upsample_all(options: Options, scene: Scene, clock: StageClock) -> dict[str
     clouds, methods = {}, methods_for(scene)
     for done, name in enumerate(methods):
         clock("upsample", done / len(methods))
-        clouds[name] = upsample(scene, name, ratio=options.ratio, seed=options.seed)
+        looks = hasattr(METHODS[name], "hold_out")
+        method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)
+        ratio = None if chooses_number(name) else options.ratio
+        clouds[name] = upsample(scene, method, ratio=ratio, seed=options.seed)
     clock("upsample", 1.0)
     return clouds
 
@@ -171,8 +183,8 @@ def _summarise(
     seconds: Mapping[str, float],
 ) -> None:
     print_table(
-        f"{len(scene.points):,} points, {options.ratio:g}x; distances in units of the originals' "
-        "spacing, less is better",
+        f"{len(scene.points):,} points, {options.ratio:g}x where the method has a ratio; distances in "
+        "units of the originals' spacing, less is better",
         ("method", "error", "median", "95%", "coverage", "far"),
         [
             (
@@ -212,7 +224,7 @@ def _train(options: Options) -> bool:
     folder = options.output
     arms = [
         Arm("SfM seeds", folder / "scene", folder / "run_sfm"),
-        Arm(f"{SHOWN} {options.ratio:g}x", folder / f"scene_{SHOWN}", folder / f"run_{SHOWN}"),
+        Arm(SHOWN, folder / f"scene_{SHOWN}", folder / f"run_{SHOWN}"),
     ]
     settings = TrainSettings(strategy="none", max_steps=options.train_steps, seed=options.seed)
     with stage_display() as clock:

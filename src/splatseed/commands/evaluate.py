@@ -19,9 +19,9 @@ from splatseed.errors import (
 )
 from splatseed.io.staging import MANIFEST, atomic_file, check_output, output_folder
 from splatseed.requirements import require
-from splatseed.train.photographs import user_cache_dir
 from splatseed.train.run_folder import RunFolder
 from splatseed.train.settings import Backend, TrainSettings
+from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.evaluate import EvalResult, Lpips

@@ -75,6 +75,7 @@ def run(arguments: list[str]) -> None:
         regions = empty_regions(scene, clock)
         alignments = _alignments(options, scene, clock)
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
+    rows += _method_rows(options, scene)
     print_pairs(str(options.scene), rows)
     if alignments is not None:
         print_depth(str(options.depth or "depth"), scene, alignments, list_all=options.list_all)
@@ -120,6 +121,8 @@ def _next_command(options: Options, scene: Scene) -> str:
     if options.depth is not None and len(scene.points):
         maps = shlex.quote(str(options.depth))
         return f"splatseed upsample {quoted} --method depth --depth {maps} --ratio 16 -o OUT"
+    if len(scene.points) and scene.has_photographs:
+        return f"splatseed upsample {quoted} -o OUT"
     if len(scene.points):
         return f"splatseed upsample {quoted} --method mls --ratio 8 -o OUT"
     images = scene.source.image_dir if scene.source else None
@@ -171,6 +174,17 @@ def _track_rows(tracks: TrackStatistics | None) -> list[tuple[str, str]]:
 def _spread(mean: float, percentiles: tuple[float, ...], style: str) -> str:
     spread = " ".join(f"{x:{style}}" for x in percentiles)
     return f"mean {mean:{style}}, 5/25/50/75/95% {spread}"
+
+
+def _method_rows(options: Options, scene: Scene) -> list[tuple[str, str]]:
+    """What would make the best points of this scene, and why."""
+    if not len(scene.points):
+        return []
+    if options.depth is not None:
+        return [("method", "depth: there are depth maps")]
+    if not scene.has_photographs:
+        return [("method", "mls: there are no photographs to look at")]
+    return [("method", "auto: stereo between the photographs, and a seed where no point is seen")]
 
 
 def _region_rows(regions: EmptyRegions | None) -> list[tuple[str, str]]:

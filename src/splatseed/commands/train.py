@@ -31,8 +31,8 @@ from splatseed.console import (
 )
 from splatseed.io import load_scene
 from splatseed.requirements import require
-from splatseed.train.photographs import user_cache_dir
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
+from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
@@ -75,6 +75,10 @@ class Options:
     """Of the images sorted by name, every so many-th is kept for the test."""
     opacity_reset: bool = DEFAULT.opacity_reset
     """Lower all opacities at times, as 3DGS does (strategy default; gsplat 1.5.3 does not)."""
+    seed_sizes: bool = DEFAULT.seed_sizes
+    """Begin with the sizes that the scene's seeds.npz knows, not those of the gaps between seeds."""
+    seed_normals: bool = DEFAULT.seed_normals
+    """Begin with flat discs where the scene's seeds.npz knows the normals."""
     resume: bool = False
     """Go on with the run in the output folder, with its own settings."""
     tensorboard: bool = False

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,34 +12,39 @@ import numpy as np
 import tyro
 
 from splatseed.commands._options import parse_options
+from splatseed.commands._upsample_output import summarise, write_previews
 from splatseed.console import (
     OUT,
     StageClock,
-    print_commands,
     print_note,
-    print_pairs,
     stage_display,
 )
 from splatseed.depthmap import DepthKind
-from splatseed.errors import ParameterError, PointCloudError, SceneFormatError
+from splatseed.errors import ParameterError
 from splatseed.geometry import far_share
-from splatseed.io import WriteReport, find_depths, find_usable, load_scene, write_scene
+from splatseed.io import (
+    UsablePoints,
+    WriteReport,
+    find_depths,
+    find_usable,
+    load_scene,
+    write_scene,
+)
 from splatseed.io.staging import check_output
+from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
-from splatseed.trainers import training_commands
+from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
 from splatseed.upsample import (
     METHODS,
     Profile,
     Upsampler,
+    chooses_number,
     configure,
-    methods_for,
+    number_of_new,
     planned_size,
-    upsample,
 )
 
 __all__ = ["parse", "run"]
-
-DEFAULT_METHOD = "mls"
 
 
 def _number(kind: type, default: str) -> Any:
@@ -49,6 +53,23 @@ def _number(kind: type, default: str) -> Any:
         constructor=kind,
         metavar=kind.__name__.upper(),
         help_behavior_hint=f"(default: {default})",
+    )
+
+
+def _cover() -> Any:
+    """The flag --cover; its field has another name, since the method cover has that one."""
+    return tyro.conf.arg(
+        name="cover",
+        constructor=int,
+        metavar="INT",
+        help_behavior_hint="(default: none; auto and cover do so anyway)",
+    )
+
+
+def _budget() -> Any:
+    """How a budget shows in the help."""
+    return tyro.conf.arg(
+        constructor=str, metavar="N|Xrho", help_behavior_hint="(default: as many as there are)"
     )
 
 
@@ -73,11 +94,17 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     method: str = DEFAULT_METHOD
-    """How new points are made; the flags of each method are below."""
+    """How new points are made; the flags of each method are below. auto looks at the photographs."""
     ratio: Annotated[float | None, _number(float, "4, unless --num-points is given")] = None
-    """Points in all, as a multiple of the originals."""
+    """Points in all, as a multiple of the originals, for methods that interpolate."""
     num_points: Annotated[int | None, _number(int, "by the ratio")] = None
     """Points in all, instead of a ratio."""
+    budget: Annotated[str | None, _budget()] = None
+    """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph."""
+    cover_cell: Annotated[int | None, _cover()] = None
+    """Give each part of the photographs, of so many pixels a side, that no point falls in a seed."""
+    verify: bool = False
+    """Hold interpolated points against the photographs: slide them onto surfaces, drop what fits none."""
     seed: int = 0
     """The same seed gives the same bytes."""
     profile: Profile = "default"
@@ -91,7 +118,7 @@ class Options:
     align: bool = True
     """For --method depth: --no-align takes metric depth and poses as they are (--depth.no-align)."""
     preview: bool = False
-    """Also write preview.png (before and after) and preview_methods.png (every method)."""
+    """Also write pictures: before and after, every method, seeds by origin, and cells covered."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write; auto keeps the input's."""
     copy_images: bool = False
@@ -131,37 +158,80 @@ def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
     options, methods = parse(arguments)
-    method = methods[options.method]
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     inputs = [path for path in (options.scene, options.depth_maps) if path is not None]
     check_output(options.output, overwrite=options.overwrite, protect=inputs)
+    notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
-        scene = _read(options, method)
+        scene = _read(options, methods[options.method])
+        options = _settle(options, scene, notes)
+        method = methods[options.method]
         usable = find_usable(scene.points)
-        total = planned_size(int(usable.keep.sum()), options.ratio, options.num_points)
+        total = _planned(options, method, usable)
     _announce(options, scene, method, total, _idle(options, methods))
-    notes: list[str] = []
     with stage_display(clock):
-        # Points that writing leaves out are asked for on top, so that the output has ``total``.
-        asked = total + int((~usable.keep).sum())
-        seeds = upsample(
-            scene, method, num_points=asked, seed=options.seed, progress=clock, note=notes.append
-        )
+        seeds = _make(options, scene, method, total, usable, clock, notes)
         clock("check", 0.0)
-        new = seeds.xyz[len(scene.points) :]
-        far = None
-        if usable.keep.any():
-            far = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
+        found = _check(scene, seeds, method, usable)
         clock("write", 0.0)
         report = _write(options, scene.replace(points=seeds), method)
         if options.preview:
             shown = scene.replace(points=scene.points.select(usable.keep), tracks=None)
-            _write_previews(options, shown, total, methods, clock)
+            write_previews(
+                shown, seeds, total, methods, options.method, options.seed, options.output, clock
+            )
         seconds = clock.seconds()
-    _summarise(options, scene, report, seconds, far)
+    summarise(scene, seeds, report, seconds, found, options.output, options.preview)
     for sentence in notes:
         print_note(sentence)
+
+
+def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
+    """The options with the method that is taken: the default needs photographs."""
+    if options.method != DEFAULT_METHOD:
+        return options
+    method = method_for(scene, options.method, notes.append)
+    return dataclasses.replace(options, method=str(method))
+
+
+def _planned(options: Options, method: Upsampler, usable: UsablePoints) -> int | None:
+    """Points in all; None where the photographs say how many."""
+    count = int(usable.keep.sum())
+    new = number_of_new(method, options.method, count, options.ratio, options.num_points)
+    return None if new is None else count + new
+
+
+def _make(
+    options: Options,
+    scene: Scene,
+    method: Upsampler,
+    total: int | None,
+    usable: UsablePoints,
+    clock: StageClock,
+    notes: list[str],
+) -> PointCloud:
+    """The originals and the new points."""
+    # Points that writing leaves out are asked for on top, so that the output has ``total``.
+    asked = None if total is None else total + int((~usable.keep).sum())
+    return upsample(
+        scene, method, num_points=asked, budget=options.budget, cover=options.cover_cell, verify=options.verify, seed=options.seed,
+        progress=clock, note=notes.append,
+    )  # fmt: skip
+
+
+def _check(
+    scene: Scene, seeds: PointCloud, method: Upsampler, usable: UsablePoints
+) -> dict[str, float]:
+    """What can be said of the points: how far off they are, or how much of the pictures they cover."""
+    found = {}
+    new = seeds.xyz[seeds.source != ORIGINAL]
+    if usable.keep.any() and not chooses_number(method):
+        found["far"] = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
+    if scene.images:
+        found["before"] = share_covered(scene, scene.points)
+        found["after"] = share_covered(scene, seeds)
+    return found
 
 
 def _read(options: Options, method: Upsampler) -> Scene:
@@ -183,7 +253,7 @@ def _read(options: Options, method: Upsampler) -> Scene:
 
 
 def _announce(
-    options: Options, scene: Scene, method: Upsampler, total: int, idle: Sequence[str]
+    options: Options, scene: Scene, method: Upsampler, total: int | None, idle: Sequence[str]
 ) -> None:
     """Say what will be done, before it is done, and which flags have no part in it."""
     for warning in scene.warnings:
@@ -192,10 +262,11 @@ def _announce(
         print_note(f"The flags of {name} change nothing with --method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
     parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]
+    number = "as many as the photographs need" if total is None else f"{total:,} points"
     OUT.print(
         f"{options.scene} ({kind}, {len(scene.images)} images, {len(scene.points):,} points)\n"
         f"  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n"
-        f"  -> {options.output} ({total:,} points, seed {options.seed})",
+        f"  -> {options.output} ({number}, seed {options.seed})",
         highlight=False,
         markup=False,
         soft_wrap=True,
@@ -234,68 +305,8 @@ def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
         "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
         "ratio": options.ratio,
         "num_points_asked": options.num_points,
+        "budget": options.budget,
+        "cover": options.cover_cell,
+        "verify": options.verify,
         "seed": options.seed,
     }
-
-
-def _write_previews(
-    options: Options,
-    scene: Scene,
-    total: int,
-    methods: dict[str, Upsampler],
-    clock: StageClock,
-) -> None:
-    """Two pictures: before and after, and every method side by side."""
-    from splatseed.preview import preview_methods, preview_pair  # noqa: PLC0415  (Pillow)
-
-    clouds = {}
-    for name in methods_for(scene):
-        # Too few points for one of the methods, or depth that does not fit: show the others.
-        with suppress(PointCloudError, SceneFormatError):
-            clouds[name] = upsample(
-                scene, methods[name], num_points=total, seed=options.seed, progress=clock
-            )
-    clock("preview", 0.0)
-    shown = clouds[options.method]
-    preview_pair(scene, shown, options.output / "preview.png", title=options.method)
-    clock("preview", 0.5)
-    preview_methods(scene, clouds, options.output / "preview_methods.png")
-    clock("preview", 1.0)
-
-
-def _summarise(
-    options: Options,
-    scene: Scene,
-    report: WriteReport,
-    seconds: dict[str, float],
-    far: float | None,
-) -> None:
-    """The closing table and the commands to go on with."""
-    dropped = report.dropped_nonfinite + report.dropped_duplicates
-    rows = [
-        ("points in", f"{len(scene.points):,}"),
-        ("points out", f"{report.num_points:,}"),
-        ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
-        ("output", str(options.output)),
-    ]
-    if far is not None:
-        share = f"{far:.2%} of the new points lie over 3 spacings away"
-        rows.insert(2, ("far from any original", share))
-    if dropped:
-        rows.insert(
-            2,
-            (
-                "left out",
-                f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate",
-            ),
-        )
-    if options.preview:
-        rows.append(("pictures", str(options.output / "preview.png")))
-        rows.append(("", str(options.output / "preview_methods.png")))
-    print_pairs("splatseed upsample", rows)
-    for note in report.notes:
-        print_note(note)
-    if report.layout == "transforms":
-        print_note("gsplat's examples and graphdeco's code read COLMAP only: --format colmap.")
-    if scene.images and scene.source is not None and scene.source.image_dir is not None:
-        print_commands("train it with", training_commands(options.output, report.layout))

@@ -24,11 +24,11 @@ from splatseed.depth.fits import (
     robust_line,
 )
 from splatseed.depth.planar import map_camera, ray_length
-from splatseed.depth.sightings import SeenPoints, camera_points, find_sightings
 from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
+from splatseed.views.sightings import SeenPoints, camera_points, find_sightings
 
 __all__ = ["Alignment", "Fit", "align", "align_map", "reject_outliers", "trust_units", "values_at"]
 

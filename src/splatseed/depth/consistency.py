@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float32, UInt8
 from splatseed.depth.settings import Settings
 from splatseed.depth.views import Reduced
 from splatseed.jit import inline
+from splatseed.views.projection import place
 
 __all__ = ["Support", "find_support"]
 
@@ -59,7 +60,7 @@ def find_support(
     limit = np.inf if settings.color_tolerance is None else 3 * 255 * settings.color_tolerance
     rgb = np.empty((len(xyz), 3), np.uint8)
     _own_colors(xyz, own.grid_from_world, own.rgb, own.rgb_from_grid, rgb)
-    for place, other in enumerate(others):
+    for rank, other in enumerate(others):
         _ask(
             xyz,
             rgb,
@@ -71,7 +72,7 @@ def find_support(
             settings.tolerance,
             limit,
             settings.min_agreeing,
-            place >= ALWAYS,
+            rank >= ALWAYS,
             agreeing,
             seen_through,
         )
@@ -82,7 +83,7 @@ def find_support(
 def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[no-untyped-def]
     """The colours of a view's own reduced photograph at its candidates: as smooth as the others'."""
     for k in range(len(xyz)):
-        column, row, _ = _project(xyz[k], grid_from_world)
+        column, row, _ = place(xyz[k], grid_from_world)
         p, q = _block(column, row, rgb_from_grid, rgb.shape)
         for channel in range(3):
             out[k, channel] = rgb[p, q, channel]
@@ -109,7 +110,7 @@ def _ask(  # type: ignore[no-untyped-def]
     for k in range(len(xyz)):
         if only_unconfirmed and agreeing[k] >= enough:
             continue
-        column, row, depth = _project(xyz[k], grid_from_world)
+        column, row, depth = place(xyz[k], grid_from_world)
         if depth > 0.0 and -0.5 <= column < width - 0.5 and -0.5 <= row < height - 0.5:
             verdict = _compare(z, column, row, depth / factor, tolerance)
             if verdict == LOOKS_THROUGH:
@@ -138,17 +139,6 @@ def _compare(z, column, row, depth, tolerance):  # type: ignore[no-untyped-def]
     if a > far and b > far and c > far and d > far:
         return LOOKS_THROUGH
     return SAYS_NOTHING
-
-
-@inline
-def _project(point, m):  # type: ignore[no-untyped-def]
-    """Column, row and depth of a world point on a grid; it is behind the camera if depth <= 0."""
-    x, y, z = np.float64(point[0]), np.float64(point[1]), np.float64(point[2])
-    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-    inverse = 1.0 / depth
-    column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * inverse
-    row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * inverse
-    return column, row, depth
 
 
 @inline

@@ -27,6 +27,7 @@ from splatseed.depth.fits import SIGMA_OF_MEDIAN
 from splatseed.depth.views import View
 from splatseed.jit import inline
 from splatseed.progress import Progress, in_threads
+from splatseed.views.projection import place
 
 __all__ = ["harmonize"]
 
@@ -125,12 +126,10 @@ def _compare_pair(samples, z, factor, m, out):  # type: ignore[no-untyped-def]
     logs = np.empty(len(samples))
     count = 0
     for k in range(len(samples)):
-        x, y, w = np.float64(samples[k, 0]), np.float64(samples[k, 1]), np.float64(samples[k, 2])
-        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * w + m[2, 3]
+        across, down, depth = place(samples[k], m)
         if depth <= 0.0:
             continue
-        column = int(np.floor((m[0, 0] * x + m[0, 1] * y + m[0, 2] * w + m[0, 3]) / depth + 0.5))
-        row = int(np.floor((m[1, 0] * x + m[1, 1] * y + m[1, 2] * w + m[1, 3]) / depth + 0.5))
+        column, row = int(np.floor(across + 0.5)), int(np.floor(down + 0.5))
         if not (0 <= column < z.shape[1] and 0 <= row < z.shape[0] and z[row, column] > 0):
             continue
         log = np.log(factor * z[row, column] / depth)

@@ -19,12 +19,12 @@ from jaxtyping import Float32, Float64, UInt8
 from splatseed.depth.alignment import reject_outliers
 from splatseed.depth.candidates import NEAR_EDGE, UNCONFIRMED, choose, gather
 from splatseed.depth.settings import Settings
-from splatseed.depth.sightings import find_sightings
 from splatseed.depth.views import Reader, View
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.pointcloud import ORIGINAL
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
+from splatseed.views.sightings import find_sightings
 
 __all__ = ["Lifted", "lift"]
 

@@ -17,6 +17,7 @@ from jaxtyping import Float64, Int64
 from splatseed.depth.views import View
 from splatseed.jit import inline, kernel, parallel_range
 from splatseed.progress import Progress, in_threads
+from splatseed.views.projection import place
 
 __all__ = ["choose_neighbors"]
 
@@ -123,7 +124,7 @@ def _choose(covers, out):  # type: ignore[no-untyped-def]
 def _weigh(samples, m, size, center, other, out):  # type: ignore[no-untyped-def]
     """How much a view covers each sample, by frame and angle."""
     for s in range(len(samples)):
-        depth, column, row = _place(samples[s], m)
+        depth, column, row = _nearest(samples[s], m)
         if 0.0 < depth < np.inf and 0 <= column < size[1] and 0 <= row < size[0]:
             out[s] = _angle_weight(samples[s], center, other)
 
@@ -133,18 +134,16 @@ def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]
     """Take back what is hidden from the view, or unknown to it."""
     for s in range(len(samples)):
         if out[s] > 0.0:
-            depth, column, row = _place(samples[s], m)
+            depth, column, row = _nearest(samples[s], m)
             if not abs(factor * z[row, column] / depth - 1.0) < SEEN:
                 out[s] = 0.0
 
 
 @inline
-def _place(point, m):  # type: ignore[no-untyped-def]
+def _nearest(point, m):  # type: ignore[no-untyped-def]
     """Depth of a point in a view, and the nearest point of its grid; column -1 where there is none."""
-    x, y, z = np.float64(point[0]), np.float64(point[1]), np.float64(point[2])
-    depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-    column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + 0.5
-    row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + 0.5
+    column, row, depth = place(point, m)
+    column, row = column + 0.5, row + 0.5
     if not (0.0 <= column < FAR and 0.0 <= row < FAR):
         return depth, -1, -1
     return depth, int(column), int(row)

@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from splatseed.camera import CAMERA_MODELS, Camera
+from splatseed.camera import Camera
 from splatseed.depth.alignment import Alignment, align_map, trust_units
 from splatseed.depth.drawing import Drawn, draw_pixels
 from splatseed.depth.planar import PlanarDepth, lift_pixels, map_camera
 from splatseed.depth.settings import Settings
-from splatseed.depth.sightings import SeenPoints, Sightings, camera_points
 from splatseed.depthmap import ASPECT_SLACK, DepthMap, DepthMaps
 from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.jit import inline
 from splatseed.scene import Image
+from splatseed.views.sightings import SeenPoints, Sightings, camera_points
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage
@@ -171,11 +171,10 @@ def check_lens(image: Image) -> None:
     Raises:
         SceneFormatError: It has some.
     """
-    lens = image.intrinsics
-    if not lens.is_pinhole and any(lens.params[CAMERA_MODELS[lens.model].num_focal + 2 :]):
+    if image.intrinsics.has_distortion:
         raise SceneFormatError(
             "cameras without lens distortion (PINHOLE), along whose rays pixels are lifted",
-            found=f"{lens.model} for {image.name}",
+            found=f"{image.intrinsics.model} for {image.name}",
             fix="Undistort the scene first: colmap image_undistorter, or splatseed sfm.",
         )
 

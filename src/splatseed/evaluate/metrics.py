@@ -24,7 +24,7 @@ from splatseed.progress import Progress, silent
 from splatseed.train.losses import psnr, ssim as ssim_inside
 from splatseed.train.parameters import photograph
 from splatseed.train.ssim import WINDOW
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["Render", "evaluate_views"]
 

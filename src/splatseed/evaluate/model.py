@@ -30,7 +30,8 @@ from splatseed.train.gaussians import Gaussians
 from splatseed.train.parameters import render_view
 from splatseed.train.pictures import beside_truth, picture_name, write_picture
 from splatseed.train.ply import read_gaussians
-from splatseed.train.views import View, load_views, poses_of
+from splatseed.train.ssim import WINDOW
+from splatseed.views.view import View, load_views, poses_of
 
 __all__ = [
     "TrainedModel",
@@ -91,7 +92,14 @@ def load_model(
             found=f"{len(scene.images)}",
             fix="Name the scene with its cameras and photographs.",
         )
-    views = load_views(scene, test, data_factor=data_factor, cache_dir=cache_dir, progress=progress)
+    views = load_views(
+        scene,
+        test,
+        data_factor=data_factor,
+        min_side=WINDOW,  # smaller views have no SSIM
+        cache_dir=cache_dir,
+        progress=progress,
+    )
     render = gaussian_renderer(gaussians, frame_of_scene(scene, test_every), device)
     return TrainedModel(gaussians, views, render)
 

@@ -1,7 +1,7 @@
 """The two sets of files that trainers look for: COLMAP's, and nerfstudio's ``transforms.json``.
 
 Notation: ``keep`` [N] marks the scene's points that ``points`` is made of. Promise: every point
-file in a layout holds the same points in the same order; COLMAP's root holds no PLY, for Brush
+file in a layout holds the same points in the same order, ``seeds.npz`` too; COLMAP's root holds no PLY, for Brush
 takes any it finds there. Writers write straight into ``folder`` and let ``OSError`` pass.
 """
 
@@ -21,6 +21,7 @@ from splatseed.io import colmap_binary
 from splatseed.io._colmap_scene import read_model_cameras
 from splatseed.io._image_folders import frame_folders, image_folders
 from splatseed.io._model_ids import Renumbered, renumber
+from splatseed.io._seeds_npz import write_seeds
 from splatseed.io._transforms_json import (
     NERFSTUDIO_FROM_COLMAP,
     frame_paths,
@@ -50,6 +51,7 @@ def write_colmap(
     colmap_binary.write_images(model_dir / "images.bin", model.images)
     colmap_binary.write_points3d(model_dir / "points3D.bin", points, model.tracks)
     write_ply(model_dir / "points3D.ply", points)
+    write_seeds(folder, points)
     notes = [*_copy_extras(scene, folder, model_dir), *_model_notes(scene, model)]
     return notes, image_folders(scene)
 
@@ -69,12 +71,20 @@ def write_transforms(
     else:
         content = transforms_json(scene)
         folders = image_folders(scene)
-        xyz = apply_transform(NERFSTUDIO_FROM_COLMAP, points.xyz).astype(np.float32)
-        points = points.replace(xyz=xyz)
+        points = _in_nerfstudio_space(points)
     write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
     write_ply(folder / "sparse_pc.ply", points)
     shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
+    write_seeds(folder, points)
     return [], folders
+
+
+def _in_nerfstudio_space(points: PointCloud) -> PointCloud:
+    """The points, and their normals, as nerfstudio turns those of a COLMAP model."""
+    xyz = apply_transform(NERFSTUDIO_FROM_COLMAP, points.xyz).astype(np.float32)
+    if points.normals is None:
+        return points.replace(xyz=xyz)
+    return points.replace(xyz=xyz, normals=points.normals @ NERFSTUDIO_FROM_COLMAP[:, :3].T)
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:

@@ -18,7 +18,9 @@ __all__ = ["MANIFEST", "add_files", "unlisted_files"]
 MANIFEST = "splatseed.json"
 """The file that marks a folder as written by splatseed: only such a folder is ever replaced."""
 
-_PICTURES = ("preview.png", "preview_methods.png")  # made after the manifest
+_PICTURES = tuple(  # made after the manifest
+    f"preview{which}.png" for which in ("", "_methods", "_maps", "_cells", "_origins")
+)
 _FILE_MANAGERS = (".DS_Store", "Thumbs.db")  # made by looking at the folder
 
 

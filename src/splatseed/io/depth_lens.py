@@ -1,6 +1,6 @@
 """Depth maps of a distorted lens, brought to the pixels of undistorted photographs.
 
-Notation: ``lens`` is the camera that took the maps, in COLMAP's FULL_OPENCV model; the photographs
+Notation: ``lens`` is the camera that took the maps, in one of COLMAP's models; the photographs
 were undistorted to pinhole cameras at the same place. Promise: planar depth belongs to the ray and not
 to the pixel, so values are moved, never changed; a pixel takes the nearest value, so that no depth
 between two surfaces is made up, and NaN where the lens did not look.
@@ -12,11 +12,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32
 
 from splatseed.camera import Intrinsics
+from splatseed.lens import image_points
 
-__all__ = ["Undistortion", "distort"]
+__all__ = ["Undistortion"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +25,7 @@ class Undistortion:
     """Moves the values of a map to where undistorted photographs have them.
 
     Args:
-        lens: The FULL_OPENCV camera of the maps.
+        lens: The camera of the maps.
         cameras: The pinhole camera of each photograph, by its name.
     """
 
@@ -42,21 +43,10 @@ class Undistortion:
         height, width = values.shape
         column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
         fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
-        uv = distort(self.lens, np.stack([(column - cx) / fx, (row - cy) / fy], axis=-1))
+        uv = image_points(self.lens, np.stack([(column - cx) / fx, (row - cy) / fy], axis=-1))
         uv *= [width / self.lens.width, height / self.lens.height]
         inside = np.all((uv >= 0) & (uv < [width, height]), axis=-1)
         column, row = (
             np.floor(np.where(inside[..., None], uv, 0)).astype(np.intp).transpose(2, 0, 1)
         )
         return np.where(inside, values[row, column], np.float32(np.nan))
-
-
-def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
-    """Pixels of rays (x, y, 1) through a FULL_OPENCV lens (OpenCV's rational model)."""
-    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6 = lens.params
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    v = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    return np.stack([fx * u + cx, fy * v + cy], axis=-1)

@@ -13,7 +13,7 @@ from pathlib import Path
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io._cloud import cloud_warnings
 from splatseed.io._colmap_scene import find_model, read_colmap_scene, scene_root
-from splatseed.io._earlier import mark_generated
+from splatseed.io._earlier import recall_seeds
 from splatseed.io._manifest import MANIFEST
 from splatseed.io._transforms_scene import read_transforms_scene
 from splatseed.io.ply import read_ply
@@ -39,7 +39,8 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     Returns:
         The scene in the world of its files, cameras in OpenCV axes. Points are as in the file,
         non-finite ones and duplicates included; ``warnings`` tells of them. Points that splatseed
-        added before have ``source`` 255 (``GENERATED``) and no tracks.
+        added before have no tracks, and the ``source`` and attributes that ``seeds.npz`` says, or
+        else ``source`` 255 (``GENERATED``).
 
     Raises:
         SceneNotFoundError: There is no scene, or it has no points.
@@ -57,7 +58,7 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     if require_points and not len(scene.points):
         fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
-    scene = mark_generated(scene)
+    scene = recall_seeds(scene)
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
 
 

@@ -1,7 +1,8 @@
 """A photograph's file: its bytes, its size, its pixels.
 
 Promise: pixels are as stored, before any EXIF rotation, which is how COLMAP counts them; transparent
-ones are laid over black, which Gaussians are drawn on; every failure names the file.
+ones are laid over black, which Gaussians are drawn on; grey of 16 bits, and floats of 0 to 1, become the
+nearest of 8 bits, colours of 16 bits their upper 8 (Pillow's way); every failure names the file.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from __future__ import annotations
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 
@@ -19,6 +22,8 @@ __all__ = ["check_photograph", "decode_photograph", "open_photograph", "photogra
 
 _CHECK_SCALE = 8
 """JPEG is checked at an eighth of its size: all of it is read, a fraction of it is computed."""
+_WIDE_GREY = ("I", "F")
+"""Pillow's modes for one channel of more than 8 bits, which it cuts off at 255 when it converts them."""
 _DECODER_FAILURES = (OSError, ValueError, SyntaxError)
 
 
@@ -59,9 +64,11 @@ def decode_photograph(path: Path, raw: bytes) -> PilImage.Image:
     """The pixels in a file's bytes, as RGB.
 
     Raises:
-        SceneFormatError: It is no image, or is cut short or damaged.
+        SceneFormatError: It is no image, is cut short or damaged, or has numbers of unknown range.
     """
     picture = open_photograph(path, raw)
+    if picture.mode.startswith(_WIDE_GREY):
+        return _eight_bits(path, picture).convert("RGB")
     try:
         if "A" in picture.getbands() or "transparency" in picture.info:
             return _over_black(picture.convert("RGBA"))
@@ -85,6 +92,30 @@ def check_photograph(path: Path) -> tuple[int, int]:
     except _DECODER_FAILURES as error:
         raise _damaged(path, error) from None
     return size
+
+
+def _eight_bits(path: Path, picture: PilImage.Image) -> PilImage.Image:
+    """Grey of 16 bits or of floats, as 8 bits."""
+    from PIL import Image  # noqa: PLC0415
+
+    try:
+        values = np.asarray(picture)
+    except _DECODER_FAILURES as error:
+        raise _damaged(path, error) from None
+    most = 1.0 if picture.mode == "F" else 65535.0
+    # Integers of 32 bits can have any range; in a PNG they are how some versions of Pillow open 16 bits.
+    known = picture.mode != "I" or picture.format == "PNG"
+    if not (known and values.min() >= 0 and values.max() <= most):  # nor is NaN
+        raise SceneFormatError(
+            f"{path} to have 8 or 16 bits a channel, or floats of 0 to 1",
+            found=f"{values.dtype} from {values.min():g} to {values.max():g}",
+            fix="Export the photograph with 8 bits a channel.",
+        )
+    grey = np.rint(values.astype(np.float32) * np.float32(255 / most)).astype(np.uint8)
+    transparent = picture.info.get("transparency")
+    if transparent is not None:
+        grey[values == transparent] = 0
+    return Image.fromarray(grey)
 
 
 def _over_black(picture: PilImage.Image) -> PilImage.Image:

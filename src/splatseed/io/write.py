@@ -3,7 +3,8 @@
 Notation: *originals* are the points that were read, with their tracks; a *layout* is the set of
 files a trainer looks for. Promise: the folder is there whole or not at all; its points are finite
 and no two coincide; all point files in it say the same; originals keep their float64 positions and
-tracks; point ids are 1..N in the cloud's order. Which trainer asks for what is in docs/formats.md.
+tracks; point ids are 1..N in the cloud's order; what else is known of points is in ``seeds.npz``,
+which no trainer but ours looks for. Which trainer asks for what is in docs/formats.md.
 """
 
 from __future__ import annotations

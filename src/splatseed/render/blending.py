@@ -29,7 +29,7 @@ import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
 from splatseed.render.binning import LOWEST, RECORD, TILE
-from splatseed.render.simd import (
+from splatseed.simd import (
     LANES,
     add,
     aligned,

@@ -24,7 +24,7 @@ import numpy as np
 from splatseed.jit import always_inline, kernel, parallel_range
 from splatseed.render.binning import LOWEST, RECORD, TILE
 from splatseed.render.blending import BLOCKS, CHANNELS, MAX_ALPHA, STOP
-from splatseed.render.simd import (
+from splatseed.simd import (
     LANES,
     add,
     aligned,

@@ -20,7 +20,7 @@ import numpy as np
 
 from splatseed.jit import always_inline, kernel, parallel_range
 from splatseed.render.shuffles import lane, permutation, three_sums, triple
-from splatseed.render.simd import (
+from splatseed.simd import (
     LANES,
     add,
     fma,

@@ -18,7 +18,7 @@ import numpy as np
 from splatseed.jit import always_inline, kernel, parallel_range
 from splatseed.render.binning import RECORD, TILE
 from splatseed.render.blending import BLOCKS, CHANNELS
-from splatseed.render.simd import LANES
+from splatseed.simd import LANES
 
 __all__ = ["from_blocks", "gather", "mark_visible", "scatter", "to_blocks"]
 

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.jit import inline, kernel, parallel_range
 from splatseed.seeding.coverage import check_points, grid_from_world, project_block
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["median_pixels", "parse_budget", "thin"]
 

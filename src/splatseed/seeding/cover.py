@@ -29,7 +29,7 @@ from splatseed.seeding.guess import (
     lift,
     world_from_grid,
 )
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["CoverSeeds", "cover"]
 

@@ -24,7 +24,8 @@ from jaxtyping import Bool, Float32, Float64
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.jit import inline
 from splatseed.progress import Progress, silent
-from splatseed.train.views import View
+from splatseed.views.projection import place
+from splatseed.views.view import View
 
 __all__ = [
     "HIDING",
@@ -155,13 +156,7 @@ def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-unty
 def project_block(xyz, m, at):  # type: ignore[no-untyped-def]  # noqa: ANN201
     """Column, row and depth of points [N, 3] into ``at`` [3, >= N]; NaN or infinite at depth 0."""
     for k in range(len(xyz)):
-        x, y, z = np.float64(xyz[k, 0]), np.float64(xyz[k, 1]), np.float64(xyz[k, 2])
-        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        inverse = 1.0 / depth
-        # m (x, y, z, 1) = depth (column, row, 1)
-        at[0, k] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * inverse
-        at[1, k] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * inverse
-        at[2, k] = depth
+        at[0, k], at[1, k], at[2, k] = place(xyz[k], m)
 
 
 @inline

@@ -21,7 +21,8 @@ from jaxtyping import Float32, Float64, Int64
 from splatseed.jit import inline
 from splatseed.progress import Progress
 from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world
-from splatseed.train.views import View
+from splatseed.views.projection import place
+from splatseed.views.view import View
 
 __all__ = ["Witnesses", "call_witnesses", "guess_depths", "lift", "world_from_grid"]
 
@@ -125,13 +126,9 @@ def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]  # noqa: ANN201
 def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-untyped-def]
     """How many views look through a point."""
     count = 0
-    x, y, z = point
     for v in range(len(matrices)):
-        m = matrices[v]
-        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        column, row, depth = place(point, matrices[v])
         if depth > 0.0:
-            column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth
-            row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth
             rows, cols = shapes[v]
             if 0.0 <= column < cols and 0.0 <= row < rows:
                 there = seen[starts[v] + int(row) * cols + int(column)]

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
+from splatseed.pointcloud import PointCloud
 from splatseed.train.gaussians import Gaussians
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["SCENE_SCALE", "TrainingFrame", "stray_note", "stray_views", "training_frame"]
 
@@ -46,6 +47,15 @@ class TrainingFrame:
     def points_from_world(self, xyz: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
         """World points in the training frame."""
         return np.asarray((xyz.astype(np.float64) - self.origin) * self.scale, np.float32)
+
+    def cloud_from_world(self, cloud: PointCloud) -> PointCloud:
+        """A cloud of the world in the training frame: positions and sizes; nothing turns."""
+        moved = cloud.replace(xyz=self.points_from_world(cloud.xyz))
+        if cloud.sizes is None:
+            return moved
+        limits = np.finfo(np.float32)
+        sizes = np.clip(cloud.sizes.astype(np.float64) * self.scale, limits.tiny, limits.max)
+        return moved.replace(sizes=sizes)
 
     def points_to_world(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Points of the training frame in the world."""

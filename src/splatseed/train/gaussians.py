@@ -60,33 +60,62 @@ def initial_gaussians(
     opacity: float = 0.1,
     scale_factor: float = 1.0,
     largest: Float[np.ndarray, " N"] | None = None,
+    flatness: float = 0.1,
 ) -> Gaussians:
-    """One round Gaussian a seed, as large as the gap to its 3 nearest neighbours.
+    """One Gaussian a seed: as large as the seed's size, or else as the gap to its 3 nearest neighbours.
+
+    It is round, or where the seed's normal is known a disc at right angles to it.
 
     Args:
-        seeds: Finite points.
+        seeds: Finite points; of their attributes sizes and normals count, where they are known.
         sh_degree: Degree up to which colours may come to depend on the direction.
         opacity: Of each, between 0 and 1.
         scale_factor: Multiplies the size.
         largest: Most that each one's size may be, [N]; no bound when left out.
+        flatness: Thickness of a disc, as a part of its size.
 
     Raises:
         PointCloudError: Fewer than two distinct finite points.
     """
     count, rest = len(seeds), (sh_degree + 1) ** 2 - 1
-    sizes = neighbor_distances(seeds.xyz) * scale_factor
+    sizes = _first_sizes(seeds) * scale_factor
     if largest is not None:
         sizes = np.minimum(sizes, largest)
     scales = np.repeat(np.log(sizes)[:, None], 3, axis=1)
+    quats = np.tile(np.array([1.0, 0, 0, 0]), (count, 1))
+    if seeds.normals is not None:
+        known = ~np.isnan(seeds.normals[:, 0])
+        scales[known, 2] += np.log(flatness)
+        quats[known] = _quats_to(seeds.normals[known])
     sh0 = (seeds.rgb / 255.0 - 0.5) / SH_C0
     return Gaussians(
         means=np.array(seeds.xyz, np.float32),
         scales=scales.astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        quats=quats.astype(np.float32),
         opacities=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
         sh0=sh0.astype(np.float32)[:, None],
         shN=np.zeros((count, rest, 3), np.float32),
     )
+
+
+def _first_sizes(seeds: PointCloud) -> Float64[np.ndarray, " N"]:
+    """Each seed's own size where it is known, else that of the gap it stands in."""
+    gaps = neighbor_distances(seeds.xyz)
+    if seeds.sizes is None:
+        return gaps
+    return np.where(np.isnan(seeds.sizes), gaps, seeds.sizes.astype(np.float64))
+
+
+def _quats_to(normals: Float32[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 4"]:
+    """Unit wxyz quaternions of the shortest turns that take the z axis onto normals, or their opposites.
+
+    The turn from z to n is (1 + n_z, z x n) up to its length; a disc has no front, so the n with
+    n_z >= 0 is taken, where that never vanishes.
+    """
+    front = normals.astype(np.float64) * np.where(normals[:, 2:] < 0, -1.0, 1.0)
+    x, y, z = (front / np.linalg.norm(front, axis=1, keepdims=True)).T
+    quats = np.stack([1.0 + z, -y, x, np.zeros_like(z)], axis=1)
+    return np.asarray(quats / np.linalg.norm(quats, axis=1, keepdims=True))
 
 
 def neighbor_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:

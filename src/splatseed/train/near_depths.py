@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["near_depths"]
 

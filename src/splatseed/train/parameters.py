@@ -22,7 +22,7 @@ from splatseed.render import rasterization
 from splatseed.train.frame import SCENE_SCALE
 from splatseed.train.gaussians import Gaussians
 from splatseed.train.schedule import Schedule
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = [
     "NEAR_DEPTHS",

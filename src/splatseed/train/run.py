@@ -33,11 +33,12 @@ from splatseed.train.ply import write_gaussians
 from splatseed.train.run_folder import RunFolder, write_json
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.settings import TrainSettings
+from splatseed.train.ssim import WINDOW
 from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
 from splatseed.train.strategies import make_strategy
 from splatseed.train.tensorboard import Board
 from splatseed.train.trainer import Trainer
-from splatseed.train.views import View, load_split
+from splatseed.views.view import View, load_split
 
 __all__ = ["Render", "RunOptions", "Score", "TrainingRun", "prepare_run"]
 
@@ -105,7 +106,12 @@ def prepare_run(
         check_same_seeds(folder.config, begun, config)
     factor, every, cache = settings.data_factor, settings.test_every, options.cache_dir
     views = load_split(
-        scene, data_factor=factor, test_every=every, cache_dir=cache, progress=progress
+        scene,
+        data_factor=factor,
+        test_every=every,
+        min_side=WINDOW,  # smaller views have no SSIM
+        cache_dir=cache,
+        progress=progress,
     )
     frame, strays = training_frame(views[0]), stray_views(views[0])
     for name in strays:
@@ -273,14 +279,15 @@ def _state(
     strategy, schedule = make_strategy(settings, device), settings.schedule
     if begun and begun.checkpoint.is_file():
         return load_checkpoint(begun.checkpoint, strategy, schedule, device)
-    xyz = frame.points_from_world(seeds.xyz)
-    lengths = near_depths(xyz, views)
+    seeds = frame.cloud_from_world(seeds)
+    lengths = near_depths(seeds.xyz, views)
     gaussians = initial_gaussians(
-        seeds.replace(xyz=xyz),
+        seeds,
         sh_degree=settings.sh_degree,
         opacity=schedule.opacity,
         scale_factor=schedule.scale_factor,
         largest=schedule.largest * lengths,
+        flatness=schedule.flatness,
     )
     params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
     return TrainState(params, make_optimizers(params, schedule), strategy)

@@ -71,6 +71,7 @@ class Schedule:
         opacity: Of the first Gaussians.
         scale_factor: Size of the first Gaussians, as a multiple of the gaps between them.
         largest: And at most so many near depths.
+        flatness: Thickness of the first Gaussians whose normals are used, as a part of their size.
     """
 
     max_steps: int
@@ -89,6 +90,7 @@ class Schedule:
     opacity: float = 0.1
     scale_factor: float = 1.0
     largest: float = math.inf
+    flatness: float = 0.1
 
     def sh_degree(self, step: int, highest: int) -> int:
         """The degree of spherical harmonics in use."""

@@ -48,6 +48,10 @@ class TrainSettings:
     """Of the images sorted by name, every so many-th is kept for the test."""
     opacity_reset: bool = False
     """With strategy default, lower all opacities at times as 3DGS does; gsplat 1.5.3 does not."""
+    seed_sizes: bool = False
+    """Begin with the sizes that ``seeds.npz`` knows, else with those of the gaps between seeds."""
+    seed_normals: bool = False
+    """Begin with flat discs where ``seeds.npz`` knows the normals, else with balls alone."""
 
     def __post_init__(self) -> None:
         for name, least in (("max_steps", 1), ("data_factor", 1), ("seed", 0), ("test_every", 2)):

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.jit import always_inline, inline, kernel, parallel_range
-from splatseed.render.simd import (
+from splatseed.simd import (
     LANES,
     add,
     divide,

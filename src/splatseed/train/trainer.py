@@ -23,7 +23,7 @@ from splatseed.train.losses import photometric_loss, psnr
 from splatseed.train.parameters import optimize, photograph, render_view
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
-from splatseed.train.views import View
+from splatseed.views.view import View
 
 __all__ = ["Trainer"]
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints, Upsampler
@@ -28,8 +28,10 @@ __all__ = [
     "NewPoints",
     "Profile",
     "Upsampler",
+    "chooses_number",
     "configure",
     "methods_for",
+    "number_of_new",
     "planned_size",
     "upsample",
     "upsample_points",
@@ -73,16 +75,28 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
     return dataclasses.replace(chosen, **parameters)  # type: ignore[type-var]
 
 
+def chooses_number(method: str | Upsampler) -> bool:
+    """Whether a method makes as many points as the photographs need, rather than a number asked for."""
+    chosen: Any = METHODS[method] if isinstance(method, str) else method
+    return bool(getattr(chosen, "chooses_number", False))
+
+
 def methods_for(scene: Scene | PointCloud) -> tuple[str, ...]:
-    """The names of the methods that a scene can be upsampled by: some need its depth maps.
+    """The names of the methods for a scene: some need its depth maps, some its photographs.
 
     Example:
         >>> cloud = PointCloud(np.zeros((1, 3)), np.zeros((1, 3), np.uint8))
         >>> "depth" in METHODS, "depth" in methods_for(cloud)
         (True, False)
     """
-    has_depth = isinstance(scene, Scene) and scene.depths is not None
-    return tuple(n for n in METHODS if has_depth or not getattr(METHODS[n], "needs_depth", False))
+    lacking = set()
+    if not isinstance(scene, Scene) or scene.depths is None:
+        lacking.add("needs_depth")
+    if not isinstance(scene, Scene) or not scene.has_photographs:
+        lacking.add("needs_photographs")
+    return tuple(
+        name for name in METHODS if not any(getattr(METHODS[name], need, False) for need in lacking)
+    )
 
 
 def upsample(
@@ -103,7 +117,8 @@ def upsample(
         scene: A scene, or a bare cloud. Points with ``source`` other than 0 are put aside: new
             points are made from originals only, and replace earlier new ones.
         method: A key of ``METHODS``, or a method with its parameters.
-        ratio: Points in all, as a multiple of the originals (r N); 4 when neither is given.
+        ratio: Points in all, as a multiple of the originals (r N); 4 when neither is given. Methods
+            that look at photographs make as many as these need.
         num_points: Points in all, instead of ``ratio``.
         seed: The same seed gives the same bytes, whatever the number of threads.
         profile: "default", or "paper" for the paper's text to the letter.
@@ -112,7 +127,8 @@ def upsample(
         parameters: Fields of the method, such as ``k=12``.
 
     Returns:
-        The N originals, first and unchanged, then the new points; ``source`` tells them apart.
+        The N originals, first and unchanged, then the new points; ``source`` tells them apart, and
+        their attributes are those that the method knows.
 
     Raises:
         ParameterError: An unknown method, profile or parameter, or a value or size out of range.
@@ -133,8 +149,9 @@ def upsample(
 
     points = scene.points if isinstance(scene, Scene) else scene
     originals = points.originals
-    num_new = planned_size(len(originals), ratio, num_points) - len(originals)
     chosen = _choose(method, profile, parameters)
+    name = method if isinstance(method, str) else _name_of(chosen)
+    num_new = number_of_new(chosen, name, len(originals), ratio, num_points)
     rng = _generator(seed)
     if num_new == 0 and len(originals) > 0:
         return originals
@@ -148,13 +165,35 @@ def upsample(
             found="a ratio, or 0",
             fix="Give --num-points.",
         )
-    new = chosen(cloud, num_new, rng, progress)
+    new = NewPoints(*chosen(cloud, num_new or 0, rng, progress))  # a plain tuple will do
     _check_finite(new)
     for sentence in new.notes:
         note(sentence)
-    name = method if isinstance(method, str) else _name_of(chosen)
-    source = np.full(num_new, source_code(name), np.uint8)
-    return PointCloud.concatenate(originals, PointCloud(new.xyz, new.rgb, source))
+    made = len(new.xyz) if num_new is None else num_new
+    return PointCloud.concatenate(originals, _as_cloud(new, made, source_code(name)))
+
+
+def number_of_new(
+    method: Upsampler,
+    name: str,
+    num_original: int,
+    ratio: float | None,
+    num_points: int | None,
+) -> int | None:
+    """How many points are to be made; None where the photographs say it.
+
+    Raises:
+        ParameterError: A number is given though the photographs say it, or it is out of range.
+    """
+    if not chooses_number(method):
+        return planned_size(num_original, ratio, num_points) - num_original
+    if ratio is not None or num_points is not None:
+        raise ParameterError(
+            f"no number of points for the method {name}, which the photographs decide on",
+            found="a ratio" if ratio is not None else "a number of points",
+            fix="Leave it out, bound it with --budget, or choose --method mls.",
+        )
+    return None
 
 
 def upsample_points(
@@ -249,6 +288,23 @@ def _check_finite(new: NewPoints) -> None:
             found=f"{new.xyz[bad].tolist()} at new point {bad}",
             fix="Report this with the scene; float32 may be too small for its coordinates.",
         )
+
+
+def _as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
+    """The new points with all that their method knows of them.
+
+    Raises:
+        PointCloudError: Arrays that do not fit, or new points that are said to be originals.
+    """
+    source = np.full(num_new, code, np.uint8) if new.source is None else np.asarray(new.source)
+    if source.dtype != np.uint8 or (source == ORIGINAL).any():
+        raise PointCloudError(
+            "a uint8 source of new points, of codes from 1 to 255",
+            found=f"{source.dtype}, {np.count_nonzero(source == ORIGINAL):,} with the originals' 0",
+            fix="Leave the method's source out, or take codes of SOURCE_CODES.",
+        )
+    known = {name: getattr(new, name) for name in ATTRIBUTES}
+    return PointCloud(new.xyz, new.rgb, source, **known)
 
 
 def _name_of(method: Upsampler) -> str:

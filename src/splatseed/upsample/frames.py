@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float64, Int32
 
 from splatseed.jit import inline, kernel, parallel_range
 
-__all__ = ["local_frames", "world_frames"]
+__all__ = ["coordinate", "local_frames", "world_frames"]
 
 COLLINEAR = 1e-9
 """Ratio of the two largest variances below which a neighbourhood counts as a line."""
@@ -50,6 +50,16 @@ def _frames(xyz, idx, frames, collinear, tolerance):  # type: ignore[no-untyped-
         covariance = _covariance(xyz, i, idx[i])
         collinear[i] = _principal_axes(covariance, frames[i]) < tolerance
         _fix_signs(xyz, i, idx[i], frames[i])
+
+
+@inline
+def coordinate(xyz, i, j, axis_vector):  # type: ignore[no-untyped-def]
+    """Coordinate of row j along a unit vector, relative to row i."""
+    return (
+        (xyz[j, 0] - xyz[i, 0]) * axis_vector[0]
+        + (xyz[j, 1] - xyz[i, 1]) * axis_vector[1]
+        + (xyz[j, 2] - xyz[i, 2]) * axis_vector[2]
+    )
 
 
 @inline

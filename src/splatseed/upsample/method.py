@@ -37,7 +37,7 @@ __all__ = ["NewPoints", "Upsampler", "check_fields", "require"]
 
 
 class NewPoints(NamedTuple):
-    """What a method returns."""
+    """What a method returns: positions, colours, and whatever more it knows of its points."""
 
     xyz: Float32[np.ndarray, "M 3"]
     """World positions, float32 [M, 3]."""
@@ -45,6 +45,14 @@ class NewPoints(NamedTuple):
     """Colours, uint8 [M, 3]."""
     notes: tuple[str, ...] = ()
     """What the user should know of them, one sentence each."""
+    normals: Float32[np.ndarray, "M 3"] | None = None
+    """Unit normals, world axes, float32 [M, 3]; NaN where unknown."""
+    sizes: Float32[np.ndarray, " M"] | None = None
+    """Radius that a Gaussian there should begin with, float32 [M], scene units; NaN where unknown."""
+    confidence: Float32[np.ndarray, " M"] | None = None
+    """How sure it is that a surface is there, float32 [M], 0 to 1; NaN where unknown."""
+    source: UInt8[np.ndarray, " M"] | None = None
+    """Codes of the methods that made them, uint8 [M], never 0; the method's own when left out."""
 
 
 @runtime_checkable

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from splatseed.jit import inline, kernel, parallel_range
+from splatseed.upsample.frames import coordinate
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
 __all__ = ["Patches", "lift"]
@@ -81,9 +82,7 @@ def _height_range(xyz, i, rows, e_n):  # type: ignore[no-untyped-def]
     """Lowest and highest of the neighbours and the base (at 0) along the normal."""
     low = high = 0.0
     for j in rows:
-        z = 0.0
-        for axis in range(3):
-            z += (xyz[j, axis] - xyz[i, axis]) * e_n[axis]
+        z = coordinate(xyz, i, j, e_n)
         low = min(low, z)
         high = max(high, z)
     return low, high

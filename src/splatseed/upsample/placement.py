@@ -11,7 +11,8 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.jit import kernel, parallel_range
+from splatseed.upsample.frames import coordinate
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
 __all__ = ["place_in_box", "place_in_triangle", "place_on_disc"]
@@ -85,8 +86,8 @@ def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-unt
             root = math.sqrt(np.float64(draws[m, 0]))
             b2 = root * np.float64(draws[m, 1])
             for axis in range(2):
-                p = _coordinate(xyz, i, idx[i, first], frames[i, axis])
-                q = _coordinate(xyz, i, idx[i, second], frames[i, axis])
+                p = coordinate(xyz, i, idx[i, first], frames[i, axis])
+                q = coordinate(xyz, i, idx[i, second], frames[i, axis])
                 uv[m, axis] = (root - b2) * p + b2 * q
 
 
@@ -97,17 +98,7 @@ def _box(xyz, idx, frames, start, count, uv):  # type: ignore[no-untyped-def]
         for axis in range(2):
             low = high = 0.0
             for j in idx[i]:
-                coordinate = _coordinate(xyz, i, j, frames[i, axis])
-                low, high = min(low, coordinate), max(high, coordinate)
+                at = coordinate(xyz, i, j, frames[i, axis])
+                low, high = min(low, at), max(high, at)
             for m in range(start[i], start[i] + count[i]):
                 uv[m, axis] = low + uv[m, axis] * (high - low)
-
-
-@inline
-def _coordinate(xyz, i, j, axis_vector):  # type: ignore[no-untyped-def]
-    """Coordinate of row j along a unit vector, relative to row i."""
-    return (
-        (xyz[j, 0] - xyz[i, 0]) * axis_vector[0]
-        + (xyz[j, 1] - xyz[i, 1]) * axis_vector[1]
-        + (xyz[j, 2] - xyz[i, 2]) * axis_vector[2]
-    )

@@ -13,10 +13,10 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import cast
 
 from splatseed.errors import ParameterError
-from splatseed.pointcloud import GENERATED
+from splatseed.pointcloud import GENERATED, ORIGINAL
 from splatseed.upsample.method import Upsampler
 
-__all__ = ["METHODS", "source_code"]
+__all__ = ["METHODS", "SOURCE_CODES", "origin_name", "source_code"]
 
 GROUP = "splatseed.methods"
 
@@ -28,6 +28,9 @@ BUILT_IN = {
     "voronoi": "splatseed.upsample.voronoi:Voronoi",
     "depth": "splatseed.upsample.depth:Depth",
     "random": "splatseed.upsample.bounding_box:BoundingBox",
+    "stereo": "splatseed.seeding.photographs:Stereo",
+    "cover": "splatseed.seeding.photographs:Cover",
+    "auto": "splatseed.seeding.photographs:Auto",
 }
 
 SOURCE_CODES = {
@@ -38,6 +41,8 @@ SOURCE_CODES = {
     "voronoi": 5,
     "depth": 6,
     "random": 7,
+    "stereo": 8,
+    "cover": 9,
 }
 """What ``PointCloud.source`` holds for the points of each built-in method."""
 
@@ -78,3 +83,9 @@ METHODS = MethodRegistry()
 def source_code(name: str) -> int:
     """The ``PointCloud.source`` code of a method; 255 for every method of a third party."""
     return SOURCE_CODES.get(name, GENERATED)
+
+
+def origin_name(code: int) -> str:
+    """What made the points of a ``PointCloud.source`` code, in a word."""
+    names = {ORIGINAL: "original", **{code: name for name, code in SOURCE_CODES.items()}}
+    return names.get(code, "other")

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = ["load_photograph", "user_cache_dir"]
 
-FILTER = "box-1"
+FILTER = "box-2"
 """Goes into the key: change it with the way copies are made."""
 
 

@@ -11,8 +11,8 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.train.photographs import load_photograph
-from splatseed.train.views import load_split, load_views
+from splatseed.views.photographs import load_photograph
+from splatseed.views.view import load_split, load_views
 
 
 @pytest.fixture
@@ -106,6 +106,6 @@ def test_what_cannot_be_read_is_said(room, tmp_path):
     with pytest.raises(ParameterError, match="never enlarged"):
         load_photograph(bad, 0)
     with pytest.raises(SceneFormatError, match="smaller --data-factor"):
-        load_views(room, room.images[:1], data_factor=9)
+        load_views(room, room.images[:1], data_factor=9, min_side=11)
     with pytest.raises(SceneNotFoundError, match="at least two images"):
         load_split(room.replace(images=()))

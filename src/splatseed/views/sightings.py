@@ -61,10 +61,14 @@ class Sightings:
 
     def of(self, image: Image) -> Float64[np.ndarray, "M 3"]:
         """What an image sees, world positions [M, 3]: by tracks, or else by projection."""
+        return np.asarray(self.xyz[self.rows_of(image)])
+
+    def rows_of(self, image: Image) -> Int64[np.ndarray, " M"]:
+        """The same as rows of ``xyz``."""
         count = self.count.get(image.image_id, 0)
         if count:
             start = self.start[image.image_id]
-            return np.asarray(self.xyz[self.point_idx[start : start + count]])
+            return self.point_idx[start : start + count]
         return _in_front(self.xyz, image.camera)
 
 
@@ -92,8 +96,8 @@ def find_sightings(scene: Scene) -> Sightings:
     )
 
 
-def _in_front(xyz: Float64[np.ndarray, "N 3"], camera: Camera) -> Float64[np.ndarray, "M 3"]:
-    """The points within the image that no other one close by hides."""
+def _in_front(xyz: Float64[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarray, " M"]:
+    """The rows of the points within the image that no other one close by hides."""
     uv, z = camera.project(xyz)
     size = np.array([camera.width, camera.height])
     inside = np.flatnonzero((z > 0) & ((uv >= 0) & (uv < size)).all(axis=1))
@@ -101,4 +105,4 @@ def _in_front(xyz: Float64[np.ndarray, "N 3"], camera: Camera) -> Float64[np.nda
     cell = row * CELLS + column
     nearest = np.full(CELLS * CELLS, np.inf)
     np.minimum.at(nearest, cell, z[inside])
-    return np.asarray(xyz[inside[z[inside] <= HIDDEN * nearest[cell]]])
+    return np.asarray(inside[z[inside] <= HIDDEN * nearest[cell]])

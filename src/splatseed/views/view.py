@@ -1,8 +1,8 @@
-"""Views: posed photographs in memory, at the size at which they are trained and scored.
+"""Views: posed photographs in memory, at the size at which they are looked at.
 
 Notation: a view is W x H pixels; ``K`` is in its own pixels, the centre of the top-left one at
-(0.5, 0.5); ``cam_from_world`` maps the scene's world to OpenCV camera axes. Promise: views come
-from pinhole cameras only; a photograph is made smaller by whole factors, once, and never larger.
+(0.5, 0.5); ``cam_from_world`` maps the scene's world to OpenCV camera axes. Promise: views are
+of pinhole cameras only; a photograph is made smaller by whole factors, once, and never larger.
 """
 
 from __future__ import annotations
@@ -14,18 +14,15 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, UInt8
+from jaxtyping import Bool, Float64, UInt8
 
-from splatseed.camera import CAMERA_MODELS
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.train.photographs import load_photograph
+from splatseed.views.photographs import load_photograph
 
-__all__ = ["View", "check_lens", "load_split", "load_views", "poses_of"]
+__all__ = ["View", "check_lens", "data_factor", "load_split", "load_views", "poses_of"]
 
-MIN_SIDE = 11
-"""The window of SSIM, in pixels: smaller views cannot be scored."""
 ASPECT_SLACK = 0.02
 """By how much a file may be stretched against its camera: rounding of a resized copy."""
 READERS = 4
@@ -42,6 +39,7 @@ class View:
         width: W.
         height: H.
         cam_from_world: World to OpenCV camera axes, float64 [4, 4].
+        mask: Which pixels the photograph shows, bool [H, W]; the others are black. None: all.
     """
 
     name: str
@@ -50,12 +48,36 @@ class View:
     width: int
     height: int
     cam_from_world: Float64[np.ndarray, "4 4"]
+    mask: Bool[np.ndarray, "H W"] | None = None
 
 
-def poses_of(images: Sequence[Image]) -> tuple[View, ...]:
-    """The views of some images without their pixels, for whoever needs their poses alone."""
+def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
+    """The views of some images without their pixels, for whoever needs their frames alone.
+
+    Args:
+        images: Which.
+        data_factor: By how much photographs are made smaller.
+    """
     unseen = np.empty((0, 0, 3), np.uint8)
-    return tuple(View(i.name, unseen, i.camera.K, 0, 0, i.camera.cam_from_world) for i in images)
+    shrink = np.diag([1 / data_factor, 1 / data_factor, 1.0])
+    cameras = [(image.name, image.camera) for image in images]
+    return tuple(
+        View(
+            name,
+            unseen,
+            shrink @ camera.K,
+            camera.width // data_factor,
+            camera.height // data_factor,
+            camera.cam_from_world,
+        )
+        for name, camera in cameras
+    )
+
+
+def data_factor(images: Sequence[Image], max_size: int) -> int:
+    """By how much photographs are made smaller, for the largest to have ``max_size`` pixels a side."""
+    side = max(max(image.camera.width, image.camera.height) for image in images)
+    return max(1, -(-side // max_size))
 
 
 def load_split(
@@ -63,6 +85,7 @@ def load_split(
     *,
     data_factor: int = 1,
     test_every: int = 8,
+    min_side: int = 1,
     cache_dir: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
@@ -72,6 +95,7 @@ def load_split(
         scene: A scene with images, as read from files.
         data_factor: By how much photographs are made smaller.
         test_every: Which views are kept for the test.
+        min_side: Pixels that the shorter side of a view must have.
         cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
         progress: Told how far reading is.
 
@@ -87,7 +111,12 @@ def load_split(
             fix="Name a scene with photographs: a point cloud alone cannot be trained.",
         )
     views = load_views(
-        scene, (*train, *test), data_factor=data_factor, cache_dir=cache_dir, progress=progress
+        scene,
+        (*train, *test),
+        data_factor=data_factor,
+        min_side=min_side,
+        cache_dir=cache_dir,
+        progress=progress,
     )
     return views[: len(train)], views[len(train) :]
 
@@ -97,6 +126,8 @@ def load_views(
     images: Sequence[Image],
     *,
     data_factor: int = 1,
+    min_side: int = 1,
+    undistort: bool = False,
     cache_dir: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[View, ...]:
@@ -106,17 +137,21 @@ def load_views(
         scene: Where they belong, for the folder.
         images: Which.
         data_factor: By how much photographs are made smaller.
+        min_side: Pixels that the shorter side of a view must have.
+        undistort: Take the distortion out of photographs that have some, instead of refusing them.
         cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
         progress: Told how far reading is.
 
     Raises:
         SceneNotFoundError: An image is missing.
-        SceneFormatError: A camera has distortion, or an image cannot be used.
+        SceneFormatError: A camera has distortion that is to stay, or an image cannot be used.
     """
     folder = _image_folder(scene)
-    for image in images:
+    for image in images if not undistort else ():
         check_lens(image)
-    read = partial(_load_view, folder=folder, data_factor=data_factor, cache_dir=cache_dir)
+    read = partial(
+        _load_view, folder=folder, data_factor=data_factor, min_side=min_side, cache_dir=cache_dir
+    )
     views = []
     with ThreadPoolExecutor(READERS) as pool:
         for view in pool.map(read, images):
@@ -142,33 +177,35 @@ def check_lens(image: Image) -> None:
     Raises:
         SceneFormatError: It has.
     """
-    lens = image.intrinsics
-    if not lens.is_pinhole and any(lens.params[_focal_and_center(lens.model) :]):
+    if image.intrinsics.has_distortion:
         raise SceneFormatError(
             "cameras without lens distortion (PINHOLE), which Gaussians are drawn with",
-            found=f"{lens.model} for {image.name}",
+            found=f"{image.intrinsics.model} for {image.name}",
             fix="Undistort the scene first: colmap image_undistorter, or splatseed sfm.",
         )
 
 
-def _focal_and_center(model: str) -> int:
-    return CAMERA_MODELS[model].num_focal + 2
-
-
-def _load_view(image: Image, folder: Path, data_factor: int, cache_dir: Path | None) -> View:
+def _load_view(
+    image: Image, folder: Path, data_factor: int, min_side: int, cache_dir: Path | None
+) -> View:
     path = folder / image.name
     pixels, file_size = load_photograph(path, data_factor, cache_dir)
     height, width = pixels.shape[:2]
-    if min(width, height) < MIN_SIDE:
+    if min(width, height) < min_side:
         raise SceneFormatError(
-            f"{path} to have at least {MIN_SIDE} pixels a side at --data-factor {data_factor}",
+            f"{path} to have at least {min_side} pixels a side at --data-factor {data_factor}",
             found=f"{width} x {height}",
             fix="Choose a smaller --data-factor.",
         )
     camera = image.camera
     scale = _file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor
     K = np.diag([*scale, 1.0]) @ camera.K
-    return View(image.name, pixels, K, width, height, camera.cam_from_world)
+    if not image.intrinsics.has_distortion:
+        return View(image.name, pixels, K, width, height, camera.cam_from_world)
+    from splatseed.views.undistortion import undistort  # noqa: PLC0415  (loads Numba)
+
+    pixels, known = undistort(pixels, image.intrinsics, K)
+    return View(image.name, pixels, K, width, height, camera.cam_from_world, known)
 
 
 def _file_from_camera(

@@ -1,0 +1,73 @@
+"""The arms of ``seeding.py``: seeds of one method, trained on held-out training views.
+
+Notation: rho is Gaussians per pixel of a photograph at the size that is trained. Promise: the views that a run is
+scored on are held out of the training views after the test views were taken out, and no method looks at them.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import splatseed as ss
+from splatseed.evaluate import evaluate_views
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+from splatseed.train import TrainSettings, prepare_run
+from splatseed.upsample import configure
+
+__all__ = ["ARMS", "TEST_EVERY", "train"]
+
+ARMS: Mapping[str, Mapping[str, Any]] = {
+    "sfm": {"method": "linear", "ratio": 1},
+    "mls": {"method": "mls", "ratio": 4},
+    "cover": {"method": "cover"},
+    "stereo": {"method": "stereo"},
+    "auto": {"method": "auto"},
+}
+"""How seeds are made, by what the table calls them; at ratio 1 nothing is added to SfM's points."""
+TEST_EVERY = 8
+SEEDS_SHARE = 0.7
+"""Seeds at most, as a part of the cap: what densification adds is the rest. All, where nothing is added."""
+
+
+def train(
+    scene: str, arm: str, strategy: str, rho: float, max_steps: int, data_factor: int, seed: int
+) -> dict[str, float]:
+    """One run; scores, Gaussians, seeds, and seconds of seeding and of training."""
+    whole = ss.load_scene(Path(scene))
+    validation = whole.replace(images=whole.split(TEST_EVERY)[0])
+    camera = validation.images[0].camera
+    cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
+    start = time.perf_counter()
+    points = _seeds(validation, arm, cap if strategy == "none" else round(SEEDS_SHARE * cap))
+    seeding = time.perf_counter() - start
+    settings = TrainSettings(
+        strategy=strategy, max_steps=max_steps, data_factor=data_factor, seed=seed,
+        cap_max=cap, test_every=TEST_EVERY, backend="cpu",
+    )  # fmt: skip
+    with tempfile.TemporaryDirectory() as folder:
+        run = prepare_run(validation.replace(points=points), Path(folder) / "run", settings)
+        run.train()
+    scores = evaluate_views(run.trainer.render, run.trainer.test_views)
+    return {
+        "psnr": scores.psnr,
+        "ssim": scores.ssim,
+        "gaussians": len(run.state.params["means"]),
+        "seeds": len(points),
+        "seeding": seeding,
+        "seconds": run.state.watch.seconds,
+    }
+
+
+def _seeds(scene: Scene, arm: str, most: int) -> PointCloud:
+    """The points that a run begins with, thinned where there are more than may be trained."""
+    chosen = dict(ARMS[arm])
+    name = chosen.pop("method")
+    looks = hasattr(ss.METHODS[name], "hold_out")
+    method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)
+    points = ss.upsample(scene, method, budget=most, **chosen)
+    return points.select(points.distinct)

@@ -1,0 +1,110 @@
+"""The options of ``splatseed depth``, and which of them go together.
+
+Promise: an option that would have no effect is refused, not passed over.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from splatseed.depthmap import DepthKind
+from splatseed.errors import ParameterError
+from splatseed.monocular import DeviceName
+
+__all__ = ["Options", "check_together"]
+
+Channels = tuple[float, float, float]
+
+
+def _number(default: str) -> Any:
+    """How an optional number shows in the help."""
+    return tyro.conf.arg(constructor=int, metavar="INT", help_behavior_hint=f"(default: {default})")
+
+
+_BESIDE = tyro.conf.arg(help_behavior_hint="(default: as beside the file, else ImageNet's)")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Make a depth map for every photograph of a scene: by a network, or from the photographs alone.
+
+    Nothing is downloaded.
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A scene with photographs."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The folder of maps to write: one float32 .npy an image."""
+    model: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(or --stereo)")] = None
+    """A folder in transformers' format, an id that Hugging Face's cache holds, or an .onnx file."""
+    stereo: bool = False
+    """Match the photographs with each other instead: no network, on the CPU; normals and confidence too."""
+    colmap: bool = False
+    """With --stereo: write a COLMAP dense workspace, which colmap stereo_fusion makes a cloud of."""
+    grid: Annotated[int | None, _number("4")] = None
+    """With --stereo: a pixel of the map for every block of GRID x GRID of the photograph's."""
+    seed: Annotated[int | None, _number("0")] = None
+    """With --stereo: the same seed gives the same bytes."""
+    preview: bool = False
+    """With --stereo: also write preview_maps.png, some photographs beside their maps."""
+    batch: int = 1
+    """Photographs that the network sees at once: more is faster on a GPU, and takes more memory."""
+    device: DeviceName = "auto"
+    """Where to run; auto takes a GPU if there is one that can be used."""
+    max_size: Annotated[int | None, _number("1600; 800 with --stereo")] = None
+    """Photographs with a longer side are reduced to this many pixels, and so are their maps."""
+    depth_kind: Annotated[
+        DepthKind | None, tyro.conf.arg(help_behavior_hint="(default: what config.json tells)")
+    ] = None
+    """What the network predicts: planar depth, distance along the ray, or inverse depth."""
+    input_size: Annotated[int | None, _number("as beside the file, else 518")] = None
+    """Of an .onnx file that leaves it open: what the sides are scaled to, in pixels."""
+    input_multiple: Annotated[int | None, _number("as beside the file, else 14")] = None
+    """Of such a file: what the sides are then rounded to a multiple of."""
+    mean: Annotated[Channels | None, _BESIDE] = None
+    """Of an .onnx file: taken away from red, green and blue in 0..1."""
+    std: Annotated[Channels | None, _BESIDE] = None
+    """Of an .onnx file: what red, green and blue are divided by then."""
+    overwrite: bool = False
+    """Replace an output folder that splatseed wrote before."""
+
+
+_OF_NETWORK = (
+    *("batch", "device", "depth_kind"),
+    *("input_size", "input_multiple", "mean", "std"),
+)
+_OF_STEREO = ("colmap", "grid", "seed", "preview")
+
+
+def check_together(options: Options) -> None:
+    """Check that the options name one source of depth, and none that only the other has.
+
+    Raises:
+        ParameterError: They do not.
+    """
+    if options.stereo == (options.model is not None):
+        raise ParameterError(
+            "either --model or --stereo",
+            found="both" if options.stereo else "neither",
+            fix="Name a network with --model, or match the photographs themselves with --stereo.",
+        )
+    idle = _given(options, _OF_NETWORK if options.stereo else _OF_STEREO)
+    if idle:
+        raise ParameterError(
+            "options of " + ("--stereo" if options.stereo else "--model"),
+            found=", ".join(f"--{name.replace('_', '-')}" for name in idle),
+            fix="Leave them out" + ("." if options.stereo else ", or add --stereo."),
+        )
+
+
+def _given(options: Options, names: tuple[str, ...]) -> list[str]:
+    """Which of the options are not as they are by default."""
+    return [
+        field.name
+        for field in fields(options)
+        if field.name in names and getattr(options, field.name) != field.default
+    ]

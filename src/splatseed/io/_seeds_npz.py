@@ -1,0 +1,146 @@
+"""``seeds.npz``: what is known of an output's points that point files have no place for.
+
+Notation: N points, in the order of the point files; ``source`` uint8 [N], ``normals`` float16 [N, 3],
+``sizes`` float32 [N] and ``confidence`` float16 [N], in the scene's world, each there if it is known
+of any point; ``digest`` is the fingerprint of the positions that they belong to. Promise: the file
+has the same bytes for the same cloud; one of other points, or damaged, is told of and not used; no
+pickle is loaded, and nothing is allocated on the word of a header.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import tokenize
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy.lib import format as npy_format
+
+from splatseed.errors import PointCloudError
+from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
+
+__all__ = ["SEEDS", "KnownOfSeeds", "read_seeds", "write_seeds"]
+
+SEEDS = "seeds.npz"
+
+_STORED: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {
+    "source": ((), np.dtype("u1")),
+    # Half precision turns a normal by 0.03 degrees at most; sizes have no bounded range.
+    **{
+        name: (shape, np.dtype("<f4" if name == "sizes" else "<f2"))
+        for name, shape in ATTRIBUTES.items()
+    },
+}
+"""Shape of one point's value, and type in the file."""
+_DIGEST_BYTES = 16
+_MOST_HEADER = 4096
+_FAILURES = (
+    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError, NotImplementedError),
+    *(OSError, EOFError, ValueError, TypeError, KeyError, SyntaxError, RuntimeError, MemoryError),
+    PointCloudError,
+)
+
+
+class KnownOfSeeds(NamedTuple):
+    """What a file says of a cloud's points.
+
+    Args:
+        points: The cloud with the attributes of the file, and its ``source`` where it has one.
+        has_source: Whether it has one.
+        warning: Why the file was left aside; empty where it was not.
+    """
+
+    points: PointCloud
+    has_source: bool = False
+    warning: str = ""
+
+
+def write_seeds(folder: Path, points: PointCloud) -> None:
+    """Write the file into an output, if there is anything to write.
+
+    Args:
+        folder: Of the output.
+        points: As the point files have them.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    arrays = _known(points)
+    if not arrays:
+        return
+    digest = np.frombuffer(_digest(points.xyz), np.uint8)
+    np.savez_compressed(folder / SEEDS, digest=digest, **arrays)  # type: ignore[arg-type]
+
+
+def read_seeds(folder: Path, points: PointCloud) -> KnownOfSeeds:
+    """What the file in a folder says of points that were read from there; all unchanged without it.
+
+    Args:
+        folder: The scene's root.
+        points: As the point files have them.
+    """
+    path = folder / SEEDS
+    try:
+        if not path.is_file():
+            return KnownOfSeeds(points)
+        with zipfile.ZipFile(path) as archive:
+            digest = _member(archive, "digest", (_DIGEST_BYTES,), np.dtype("u1"))
+            if digest.tobytes() != _digest(points.xyz):
+                told = f"{SEEDS} was left aside: it belongs to other points than are in the scene."
+                return KnownOfSeeds(points, warning=told)
+            arrays = _members(archive, len(points))
+        return KnownOfSeeds(points.replace(**arrays), "source" in arrays)
+    except _FAILURES as error:
+        told = f"{SEEDS} was left aside: it is damaged, or none of splatseed's"
+        return KnownOfSeeds(points, warning=f"{told} ({type(error).__name__}).")
+
+
+def _known(points: PointCloud) -> dict[str, np.ndarray]:
+    """Arrays of which any point has more than the other files say, as they are stored."""
+    arrays: dict[str, np.ndarray] = {}
+    if not np.isin(points.source, (ORIGINAL, GENERATED)).all():
+        arrays["source"] = points.source
+    arrays |= {n: values for n, values in points.attributes.items() if not np.isnan(values).all()}
+    return {name: values.astype(_STORED[name][1]) for name, values in arrays.items()}
+
+
+def _digest(xyz: Float32[np.ndarray, "N 3"]) -> bytes:
+    """A fingerprint of positions, whichever zero they have and whatever the machine's byte order."""
+    rows = np.ascontiguousarray(xyz + np.float32(0.0), "<f4")  # adding turns -0.0 into 0.0
+    return hashlib.blake2b(rows.tobytes(), digest_size=_DIGEST_BYTES).digest()
+
+
+def _members(archive: zipfile.ZipFile, num_points: int) -> dict[str, np.ndarray]:
+    """The arrays of an archive that are ours, as a cloud has them."""
+    there = {name.removesuffix(".npy") for name in archive.namelist()}
+    arrays = {
+        name: _member(archive, name, (num_points, *shape), dtype)
+        for name, (shape, dtype) in _STORED.items()
+        if name in there
+    }
+    return {n: a if n == "source" else a.astype(np.float32) for n, a in arrays.items()}
+
+
+def _member(
+    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]
+) -> np.ndarray | UInt8[np.ndarray, " N"]:
+    """An array that must have just this shape and type.
+
+    Raises:
+        ValueError: It has another, or fewer bytes than that.
+        KeyError: There is none.
+    """
+    info = archive.getinfo(f"{name}.npy")
+    count = int(np.prod(shape, dtype=np.int64))
+    if info.file_size > count * dtype.itemsize + _MOST_HEADER:
+        raise ValueError(name)
+    stream = io.BytesIO(archive.read(info))
+    version = npy_format.read_magic(stream)
+    if version != (1, 0) or npy_format.read_array_header_1_0(stream) != (shape, False, dtype):
+        raise ValueError(name)
+    return np.frombuffer(stream.getvalue(), dtype, count, stream.tell()).reshape(shape)

@@ -1,0 +1,14 @@
+"""Depth maps with normals, as stereo makes them, in files: a COLMAP dense workspace, a plain folder."""
+
+from splatseed.io.dense.maps import DenseMap
+from splatseed.io.dense.plain import write_dense_maps
+from splatseed.io.dense.report import DenseReport
+from splatseed.io.dense.workspace import check_dense_scene, write_dense_workspace
+
+__all__ = [
+    "DenseMap",
+    "DenseReport",
+    "check_dense_scene",
+    "write_dense_maps",
+    "write_dense_workspace",
+]

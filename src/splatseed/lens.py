@@ -1,0 +1,138 @@
+"""Lens distortion: where rays of the pinhole camera meet the image of a real lens.
+
+Notation: a ray (x, y, 1) in camera axes is named by its place (x, y) on the plane at depth 1; the lens
+moves it to another place (u, v) there, and pixels are (fx u + cx, fy v + cy). Parameters are those of
+COLMAP's camera models, by its definitions (src/colmap/sensor/models.h), the first of which are OpenCV's.
+Promise: float64; pure functions of arrays of any shape.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.camera import CAMERA_MODELS, Intrinsics
+
+__all__ = ["distort", "fold_radius", "image_points"]
+
+DIRECTIONS, STEPS = 8, 1024
+"""Rays along which a fold is looked for, and places on each."""
+
+
+def image_points(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
+    """Pixel coordinates of rays (x, y, 1), float64 [*B, 2]; the first pixel's centre is (0.5, 0.5).
+
+    Args:
+        lens: The camera.
+        xy: Places on the plane at depth 1.
+    """
+    K = lens.K
+    return np.asarray(distort(lens, xy) * K[[0, 1], [0, 1]] + K[:2, 2])
+
+
+def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
+    """Where the lens moves places on the plane at depth 1, float64 [*B, 2].
+
+    Args:
+        lens: The camera, of which focal length and centre are left out.
+        xy: Places on the plane; far out, where a polynomial has lost its meaning, so has the result.
+    """
+    x, y = xy[..., 0], xy[..., 1]
+    k = lens.params[CAMERA_MODELS[lens.model].num_focal + 2 :]
+    if lens.model.endswith("FISHEYE"):
+        x, y = _equidistant(x, y)
+    if lens.model == "FOV":
+        return np.stack(_field_of_view(x, y, k[0]), axis=-1)
+    if lens.model == "RAD_TAN_THIN_PRISM_FISHEYE":  # tangential terms of what the radial ones give
+        x, y = _moved(x, y, _Terms(radial=k[:6]))
+        return np.stack(_moved(x, y, _Terms(tangential=k[7:5:-1], prism=k[8:])), axis=-1)
+    return np.stack(_moved(x, y, _terms(lens.model, k)), axis=-1)
+
+
+def fold_radius(lens: Intrinsics, most: float) -> float:
+    """The distance from (0, 0) at which the lens folds: farther rays would come nearer to the centre.
+
+    Polynomials are fitted to the image; beyond it they turn back sooner or later, and would show the
+    image a second time.
+
+    Args:
+        lens: The camera.
+        most: How far to look, on the plane at depth 1; the result where there is no fold up to there.
+    """
+    radius = np.linspace(0.0, most, STEPS + 1)
+    angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    rays = np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None] * radius[:, None]
+    with np.errstate(all="ignore"):  # a rational model may have poles out there
+        reached = np.linalg.norm(distort(lens, rays) - distort(lens, np.zeros(2)), axis=-1)
+        grows = np.all(np.diff(reached, axis=1) > 0, axis=0)
+    return float(most if grows.all() else radius[np.argmin(grows)])
+
+
+class _Terms(NamedTuple):
+    """Coefficients of a lens: of r^2, r^4, ... in numerator and denominator, p1 and p2, and a prism's.
+
+    The prism's are of r^2 and r^4, first for u, then for v.
+    """
+
+    radial: tuple[float, ...] = ()
+    denominator: tuple[float, ...] = ()
+    tangential: tuple[float, ...] = (0.0, 0.0)
+    prism: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+
+
+def _terms(model: str, k: tuple[float, ...]) -> _Terms:
+    """A model's own order of parameters, sorted out."""
+    match model:
+        case "OPENCV":
+            return _Terms(k[:2], tangential=k[2:])
+        case "FULL_OPENCV":
+            return _Terms((*k[:2], k[4]), k[5:], k[2:4])
+        case "THIN_PRISM_FISHEYE":
+            return _Terms((*k[:2], *k[4:6]), tangential=k[2:4], prism=(k[6], 0.0, k[7], 0.0))
+        case _:
+            return _Terms(k)  # radial alone, or nothing
+
+
+Plane = tuple[np.ndarray, np.ndarray]
+"""First and second coordinate of places on the plane."""
+
+
+def _moved(x: np.ndarray, y: np.ndarray, terms: _Terms) -> Plane:
+    """Brown and Conrady's model, with a denominator and a thin prism."""
+    p1, p2 = terms.tangential
+    a1, a2, b1, b2 = terms.prism
+    r2 = x * x + y * y
+    # radial = (1 + k1 r^2 + k2 r^4 + ...) / (1 + k4 r^2 + ...)
+    radial = _polynomial(r2, terms.radial) / _polynomial(r2, terms.denominator)
+    # u = x radial + 2 p1 x y + p2 (r^2 + 2 x^2) + a1 r^2 + a2 r^4, and v likewise
+    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (a1 + r2 * a2)
+    v = y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y) + r2 * (b1 + r2 * b2)
+    return u, v
+
+
+def _polynomial(t: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """1 + c1 t + c2 t^2 + ..., by Horner's rule."""
+    total = np.zeros_like(t)
+    for coefficient in reversed(coefficients):
+        total = t * (coefficient + total)
+    return 1 + total
+
+
+def _equidistant(x: np.ndarray, y: np.ndarray) -> Plane:
+    """A fisheye's plane: as far from the centre as the angle from the axis, theta = atan r."""
+    r = np.hypot(x, y)
+    scale = np.divide(np.arctan(r), r, out=np.ones_like(r), where=r > 0)
+    return x * scale, y * scale
+
+
+def _field_of_view(x: np.ndarray, y: np.ndarray, omega: float) -> Plane:
+    """Devernay and Faugeras: the image's radius is atan(2 r tan(omega / 2)) / omega."""
+    if not omega:
+        return x, y
+    r = np.hypot(x, y)
+    slope = 2 * np.tan(omega / 2)
+    scale = np.full_like(r, slope / omega)  # the limit at r = 0
+    np.divide(np.arctan(r * slope), r * omega, out=scale, where=r > 0)
+    return x * scale, y * scale

@@ -1,0 +1,122 @@
+"""Pages: pictures of one size in rows, each with its label above.
+
+Notation: a picture is uint8 [H, W, 3]; a tile is a picture with its label. Promise: files appear whole
+or not at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image as PillowImage, ImageDraw, ImageFont
+
+from splatseed.io.staging import atomic_file
+
+__all__ = [
+    "GRID_SIDE",
+    "INK",
+    "PAPER",
+    "Tile",
+    "centered",
+    "columns_for",
+    "fitted",
+    "font",
+    "write_grid",
+]
+
+GRID_SIDE = 600
+"""The longer side of a picture in a grid, in pixels."""
+
+LABEL_SIZES = (20, 11)
+"""Of letters, usually and at least."""
+
+PAPER = (255, 255, 255)
+INK = (20, 20, 20)
+
+
+class Tile(NamedTuple):
+    """A picture and the words above it."""
+
+    label: str
+    picture: UInt8[np.ndarray, "H W 3"]
+
+
+def columns_for(num_tiles: int) -> int:
+    """Three or four, whichever leaves fewer places empty; fewer where that is enough."""
+    return num_tiles if num_tiles < 3 else min((3, 4), key=lambda columns: -num_tiles % columns)
+
+
+def fitted(width: int, height: int, side: int = GRID_SIDE) -> tuple[int, int]:
+    """Width and height that keep their ratio and whose longer one is ``side``."""
+    factor = side / max(width, height)
+    return max(round(width * factor), 1), max(round(height * factor), 1)
+
+
+def centered(tiles: Sequence[Tile]) -> list[Tile]:
+    """The tiles on white, all as large as the largest: images of a scene may be of several sizes."""
+    height, width = np.max([tile.picture.shape[:2] for tile in tiles], axis=0)
+    return [Tile(tile.label, _centered(tile.picture, height, width)) for tile in tiles]
+
+
+def _centered(
+    picture: UInt8[np.ndarray, "h w 3"], height: int, width: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    tile = np.full((height, width, 3), PAPER, np.uint8)
+    top, left = (height - len(picture)) // 2, (width - picture.shape[1]) // 2
+    tile[top : top + len(picture), left : left + picture.shape[1]] = picture
+    return tile
+
+
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The font of labels."""
+    return ImageFont.load_default(size=size)
+
+
+def _letters(label: str, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The font in which a label is no wider than its tile, if it is legible so."""
+    size = LABEL_SIZES[0]
+    needed = font(size).getlength(label)
+    return font(max(min(size, int(size * width / max(needed, 1.0))), LABEL_SIZES[1]))
+
+
+def write_grid(
+    tiles: Sequence[Tile],
+    path: Path | str,
+    *,
+    columns: int,
+    footer: UInt8[np.ndarray, "H W 3"] | None = None,
+) -> Path:
+    """Set pictures of one size in rows, each with its label above, and write the PNG.
+
+    Args:
+        tiles: At least one, set row by row.
+        path: The PNG to write.
+        columns: Tiles in a row.
+        footer: A strip below all, no wider than the page.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    gap, label_height = 12, 34
+    height, width = tiles[0].picture.shape[:2]
+    rows = -(-len(tiles) // columns)
+    foot = 0 if footer is None else len(footer)
+    page_width = columns * (width + gap) + gap
+    page_height = rows * (height + label_height) + gap + foot
+    page = PillowImage.new("RGB", (page_width, page_height), PAPER)
+    draw = ImageDraw.Draw(page)
+    for i, tile in enumerate(tiles):
+        x = gap + (i % columns) * (width + gap)
+        y = (i // columns) * (height + label_height)
+        letters = _letters(tile.label, width)
+        draw.text((x, y + label_height / 2), tile.label, fill=INK, font=letters, anchor="lm")
+        page.paste(PillowImage.fromarray(tile.picture), (x, y + label_height))
+    if footer is not None:
+        page.paste(PillowImage.fromarray(footer), (gap, page_height - foot))
+    with atomic_file(Path(path)) as partial:
+        page.save(partial, format="PNG")
+    return Path(path)

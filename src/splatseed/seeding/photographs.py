@@ -1,0 +1,259 @@
+"""Methods that look at the photographs: ``auto``, ``stereo`` and ``cover``.
+
+``stereo`` puts seeds on surfaces, found by comparing photographs; ``cover`` gives every part of every photograph that
+no point falls in one seed to look at; ``auto`` does both, in this order. Promise: how many seeds there are follows from
+the photographs, not from a ratio; held-out views are never looked at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, ClassVar, Self
+
+import numpy as np
+
+from splatseed.errors import SceneNotFoundError
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Progress
+from splatseed.scene import Image, Scene
+from splatseed.upsample.method import NewPoints, check_fields, require
+from splatseed.upsample.registry import source_code
+
+if TYPE_CHECKING:
+    from splatseed.upsample.neighbors import PreparedCloud
+    from splatseed.views.view import View
+
+__all__ = [
+    "MAX_SIZE",
+    "Auto",
+    "Cover",
+    "PhotographMethod",
+    "Stereo",
+    "cover_cloud",
+    "photographed",
+    "read_views",
+]
+
+MAX_SIZE = 800
+"""Pixels of the longer side at which photographs are looked at."""
+
+
+@dataclass(frozen=True)
+class PhotographMethod:
+    """What the three have in common."""
+
+    max_size: int = MAX_SIZE
+    """Photographs are made smaller by a whole factor until their longer side has so many pixels."""
+    hold_out: int = 0
+    """Leave out every so many-th image by name, as trainers do for the test (8); 0 = use all."""
+
+    name: ClassVar[str]
+    needs_points: ClassVar[bool] = False
+    needs_photographs: ClassVar[bool] = True
+    chooses_number: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        require(self.max_size >= 64, f"{self.name}.max_size of at least 64", self.max_size)
+        require(
+            self.hold_out != 1 and self.hold_out >= 0,
+            f"{self.name}.hold_out of 0 or 2 and more",
+            self.hold_out,
+        )
+        for field in fields(self):
+            if field.name in {"spacing", "cell"}:
+                value = getattr(self, field.name)
+                require(1 <= value <= 256, f"{self.name}.{field.name} from 1 to 256", value)
+
+    @classmethod
+    def paper(cls) -> Self:
+        """The defaults: the paper has no such method."""
+        return cls()
+
+    def __call__(
+        self,
+        cloud: PreparedCloud,
+        num_new: int,  # noqa: ARG002  (the photographs say how many)
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        """Look at a scene's photographs and make seeds."""
+        if cloud.scene is None:
+            raise SceneNotFoundError(
+                f"a scene with photographs for the method {self.name}",
+                found="a cloud of points alone",
+                fix="Load the scene they were made from.",
+            )
+        return self.seed(cloud.scene, rng, progress)
+
+    def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
+        """The new points of a scene."""
+        images = photographed(scene, self.hold_out)
+        views = read_views(scene, images, self.max_size, progress)
+        return self._look(scene, images, views, rng, progress)
+
+    def _look(
+        self,
+        scene: Scene,
+        images: Sequence[Image],
+        views: Sequence[View],
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Stereo(PhotographMethod):
+    """Seeds on surfaces, found by comparing photographs with each other."""
+
+    spacing: float = 8.0
+    """Pixels between seeds in the photographs; not below the grid."""
+    grid: int = 4
+    """Every so many-th pixel along a row and a column gets a depth."""
+
+    name: ClassVar[str] = "stereo"
+
+    def _look(
+        self,
+        scene: Scene,
+        images: Sequence[Image],
+        views: Sequence[View],
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        return _stereo(scene, images, views, self.spacing, self.grid, rng, progress)
+
+
+@dataclass(frozen=True)
+class Cover(PhotographMethod):
+    """A seed for every part of every photograph that no point falls in."""
+
+    cell: int = 8
+    """Side of such a part, in pixels."""
+
+    name: ClassVar[str] = "cover"
+
+    def _look(
+        self,
+        scene: Scene,
+        images: Sequence[Image],  # noqa: ARG002
+        views: Sequence[View],
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        return cover_cloud(views, scene.points.originals, self.cell, rng, progress)
+
+
+@dataclass(frozen=True)
+class Auto(PhotographMethod):
+    """Stereo, then cover: a seed for every part of every photograph, on surfaces where they are found."""
+
+    spacing: float = 8.0
+    """Pixels between stereo's seeds in the photographs; not below the grid."""
+    grid: int = 4
+    """Every so many-th pixel along a row and a column gets a depth."""
+    cell: int = 8
+    """Side of the parts, in pixels, that get a seed where none falls in."""
+
+    name: ClassVar[str] = "auto"
+
+    def _look(
+        self,
+        scene: Scene,
+        images: Sequence[Image],
+        views: Sequence[View],
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        found = _stereo(scene, images, views, self.spacing, self.grid, rng, progress)
+        known = PointCloud.concatenate(scene.points.originals, PointCloud(found.xyz, found.rgb))
+        return _join(found, cover_cloud(views, known, self.cell, rng, progress))
+
+
+def photographed(scene: Scene, hold_out: int = 0) -> tuple[Image, ...]:
+    """The images whose photographs are looked at, by name.
+
+    Raises:
+        SceneNotFoundError: There are none.
+    """
+    folder = scene.source.image_dir if scene.source else None
+    ordered = sorted(scene.images, key=lambda image: image.name)
+    used = [image for i, image in enumerate(ordered) if not hold_out or i % hold_out]
+    if folder is not None:
+        used = [image for image in used if (folder / image.name).is_file()]
+    if folder is None or not used:
+        raise SceneNotFoundError(
+            "photographs of the scene",
+            found=f"none of {len(ordered)} images" if folder else "no folder with images",
+            fix="Put them beside the model in a folder named images, or choose --method mls.",
+        )
+    return tuple(used)
+
+
+def read_views(
+    scene: Scene, images: Sequence[Image], max_size: int, progress: Progress
+) -> tuple[View, ...]:
+    """The photographs of some images, undistorted, their longer side at most ``max_size`` pixels."""
+    from splatseed.views.view import data_factor, load_views  # noqa: PLC0415  (loads with use)
+
+    factor = data_factor(images, max_size)
+    return load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
+
+
+def _stereo(
+    scene: Scene,
+    images: Sequence[Image],
+    views: Sequence[View],
+    spacing: float,
+    grid: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> NewPoints:
+    from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
+    from splatseed.stereo.fusion import fuse  # noqa: PLC0415
+    from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415
+    from splatseed.stereo.without_points import known_sightings  # noqa: PLC0415
+
+    seed = int(rng.integers(1 << 32))
+    settings = StereoSettings(grid=grid)
+    found = find_stereo(views, images, known_sightings(scene), settings, seed, progress)
+    seeds = fuse(found, spacing, progress)
+    source = np.full(len(seeds), source_code("stereo"), np.uint8)
+    return NewPoints(seeds.xyz, seeds.rgb, (), seeds.normals, seeds.sizes, seeds.confidence, source)
+
+
+def cover_cloud(
+    views: Sequence[View],
+    cloud: PointCloud,
+    cell: int,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> NewPoints:
+    """A seed for every cell of every view that no point of a cloud falls in.
+
+    Args:
+        views: The photographs.
+        cloud: The points.
+        cell: Side of a cell in pixels of the views.
+        rng: The order of the views.
+        progress: Told how far it is.
+    """
+    from splatseed.seeding.cover import cover  # noqa: PLC0415  (kernels load with use)
+
+    xyz, masks = cloud.xyz[cloud.finite], [view.mask for view in views]
+    seeds = cover(views, xyz, cell=cell, rng=rng, masks=masks, progress=progress)
+    normals = np.full((len(seeds.xyz), 3), np.nan, np.float32)
+    source = np.full(len(seeds.xyz), source_code("cover"), np.uint8)
+    return NewPoints(seeds.xyz, seeds.rgb, (), normals, seeds.size, seeds.confidence, source)
+
+
+def _join(first: NewPoints, second: NewPoints) -> NewPoints:
+    """Points of two methods one after the other."""
+    arrays = {
+        name: np.concatenate([getattr(first, name), getattr(second, name)])
+        for name in NewPoints._fields
+        if name != "notes"
+    }
+    return NewPoints(**arrays, notes=(*first.notes, *second.notes))

@@ -1,0 +1,190 @@
+"""Photometric cost of planes: how unlike two photographs are around a pixel, if it lies on a plane.
+
+Notation: sixteen pixels at a time, a lane each. A plane is its inverse depth in pixels of the reference view,
+w(u, v) = w0 + gx (u - u0) + gy (v - v0), which is exact for planes in space. The point at pixel (u, v) falls in
+a source view at P / P_z with
+
+    P = A (u, v, 1) + b w(u, v),    A = K_s R K_r^-1,    b = K_s t,
+
+R, t from reference to source. A window is 5 x 5 samples, ``STRIDE`` pixels apart. With weights c_i (sum 1) by colour
+and distance to the window's centre, reference samples r_i and source samples s_i, the cost in one source is
+
+    1 - sum a_i s_i / sqrt(var_s + NOISE),    a_i = c_i (r_i - mean_r) / sqrt(var_r + NOISE),
+
+one minus the weighted normalised cross-correlation, drawn to 1 where there is no texture (NOISE). Promise: literal
+float32 arithmetic in a fixed order, so that results do not depend on threads.
+Source: bilaterally weighted NCC as in Schoenberger et al., Pixelwise View Selection (2016).
+"""
+
+# mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatseed.jit import always_inline, inline
+from splatseed.simd import (
+    LANES,
+    add,
+    divide,
+    exp_of_eighth,
+    fma,
+    fnma,
+    load,
+    minimum,
+    multiply,
+    select_greater,
+    splat,
+    store,
+    subtract,
+)
+from splatseed.stereo.quads import sample, square_root
+
+__all__ = ["BEST", "SAMPLES", "UNSEEN", "best_cost", "prepare_window"]
+
+RADIUS, STRIDE = 2, 2
+SIDE = 2 * RADIUS + 1
+SAMPLES = SIDE * SIDE
+SIGMA_GREY = 25.0
+"""Grey levels at which a sample's weight has fallen by exp(-1/2)."""
+SIGMA_PLACE = 5.0
+"""Likewise in pixels."""
+NOISE = 2.0
+"""Variance, grey levels squared, below which texture is noise."""
+UNSEEN = 1.0
+"""Cost in a view whose frame does not hold the point: that of no likeness."""
+BEST = 2
+"""Sources whose costs count: those that see the pixel best, as others may not see it at all."""
+LEAST = np.float32(-0.7)
+"""Where ``exp_of_eighth`` ends."""
+
+_GREY = np.float32(-0.5 / SIGMA_GREY**2 / 8)
+_PLACE = np.float32(-0.5 / SIGMA_PLACE**2 / 8)
+_NOISE, _HALF, _ONE, _NOTHING = (np.float32(each) for each in (NOISE, 0.5, 1.0, 0.0))
+_UNSEEN, _WORST = np.float32(UNSEEN), np.float32(4.0)
+
+
+@inline
+def prepare_window(quads, width, height, u, v, weights, likeness):
+    """Weights c and likeness a of the windows around sixteen pixels.
+
+    Args:
+        quads: The reference view's quad image, flat.
+        width: Its columns, int64.
+        height: Its rows, int64.
+        u: float32 [16], pixels.
+        v: float32 [16].
+        weights: Filled with c, float32 [SAMPLES * 16].
+        likeness: Filled with a, float32 [SAMPLES * 16]; holds r in between.
+    """
+    half = splat(_HALF)
+    column, row = subtract(load(u, 0), half), subtract(load(v, 0), half)
+    center = sample(quads, width, height, column, row)
+    total, mean, square = splat(_NOTHING), splat(_NOTHING), splat(_NOTHING)
+    for k in range(SAMPLES):
+        x, y = STRIDE * (k % SIDE - RADIUS), STRIDE * (k // SIDE - RADIUS)
+        r = sample(
+            quads, width, height, add(column, splat(np.float32(x))), add(row, splat(np.float32(y)))
+        )
+        apart = subtract(r, center)
+        exponent = fma(
+            multiply(apart, apart), splat(_GREY), splat(np.float32(x * x + y * y) * _PLACE)
+        )
+        c = exp_of_eighth(select_greater(splat(LEAST), exponent, splat(LEAST), exponent))
+        total = add(total, c)
+        mean = fma(c, r, mean)
+        square = fma(multiply(c, r), r, square)
+        store(weights, k * LANES, c)
+        store(likeness, k * LANES, r)
+    scale = divide(splat(_ONE), total)
+    mean, square = multiply(mean, scale), multiply(square, scale)
+    inverse = divide(splat(_ONE), square_root(_variance(square, mean)))
+    for k in range(SAMPLES):
+        c = multiply(load(weights, k * LANES), scale)
+        store(weights, k * LANES, c)
+        r = load(likeness, k * LANES)
+        store(likeness, k * LANES, multiply(multiply(c, subtract(r, mean)), inverse))
+
+
+@inline
+def best_cost(sources, sizes, offsets, warps, u, v, planes, weights, likeness, out):
+    """The mean of the ``BEST`` lowest costs over the sources, for a plane in each lane.
+
+    Args:
+        sources: Their quad images behind each other, int32, flat.
+        sizes: Width and height of each, int64 [S, 2].
+        offsets: Where each begins, int64 [S + 1].
+        warps: A row by row and b of each, float32 [S, 12].
+        u: float32 [16], pixels.
+        v: float32 [16].
+        planes: w0, gx, gy, float32 [3 * 16].
+        weights: float32 [SAMPLES * 16].
+        likeness: float32 [SAMPLES * 16].
+        out: Filled with the costs, float32 [16].
+    """
+    least, second = splat(_WORST), splat(_WORST)
+    for s in range(len(sizes)):
+        quads = sources[offsets[s] : offsets[s + 1]]
+        cost = _cost(quads, sizes[s, 0], sizes[s, 1], warps[s], u, v, planes, weights, likeness)
+        worse = select_greater(cost, least, cost, least)
+        least, second = minimum(least, cost), minimum(second, worse)
+    if len(sizes) == 1:
+        store(out, 0, least)
+    else:
+        store(out, 0, multiply(add(least, second), splat(_HALF)))
+
+
+@always_inline
+def _cost(quads, width, height, warp, u, v, planes, weights, likeness):
+    """One minus the correlation in one source."""
+    u0, v0 = load(u, 0), load(v, 0)
+    w, gx, gy = load(planes, 0), load(planes, LANES), load(planes, 2 * LANES)
+    x0, ax, bx = _component(warp, 0, u0, v0, w, gx, gy)
+    y0, ay, by = _component(warp, 1, u0, v0, w, gx, gy)
+    z0, az, bz = _component(warp, 2, u0, v0, w, gx, gy)
+    half = splat(_HALF)
+    like, mean, square = splat(_NOTHING), splat(_NOTHING), splat(_NOTHING)
+    for j in range(SIDE):
+        down = splat(np.float32(STRIDE * (j - RADIUS)))
+        rx, ry, rz = fma(down, bx, x0), fma(down, by, y0), fma(down, bz, z0)
+        for i in range(SIDE):
+            right = splat(np.float32(STRIDE * (i - RADIUS)))
+            inverse = divide(splat(_ONE), fma(right, az, rz))
+            column = subtract(multiply(fma(right, ax, rx), inverse), half)
+            row = subtract(multiply(fma(right, ay, ry), inverse), half)
+            s = sample(quads, width, height, column, row)
+            k = (j * SIDE + i) * LANES
+            c = load(weights, k)
+            like = fma(load(likeness, k), s, like)
+            mean = fma(c, s, mean)
+            square = fma(multiply(c, s), s, square)
+    cost = fnma(like, divide(splat(_ONE), square_root(_variance(square, mean))), splat(_ONE))
+    return _where_seen(cost, x0, y0, z0, width, height)
+
+
+@always_inline
+def _component(warp, i, u, v, w, gx, gy):
+    """Component i of P at the window's centre, and what a pixel to the right and down adds."""
+    a, b = splat(warp[3 * i]), splat(warp[3 * i + 1])
+    c, d = splat(warp[3 * i + 2]), splat(warp[9 + i])
+    start = fma(a, u, fma(b, v, fma(d, w, c)))
+    return start, fma(d, gx, a), fma(d, gy, b)
+
+
+@always_inline
+def _variance(square, mean):
+    """E[x^2] - E[x]^2, with what noise adds; never 0."""
+    noise = splat(_NOISE)
+    variance = fnma(mean, mean, add(square, noise))
+    return select_greater(variance, noise, variance, noise)
+
+
+@always_inline
+def _where_seen(cost, x, y, z, width, height):
+    """The cost, or ``UNSEEN`` where P is behind the camera or outside the frame."""
+    nothing, unseen = splat(_NOTHING), splat(_UNSEEN)
+    cost = select_greater(z, nothing, cost, unseen)
+    cost = select_greater(x, nothing, cost, unseen)
+    cost = select_greater(y, nothing, cost, unseen)
+    cost = select_greater(multiply(z, splat(np.float32(width))), x, cost, unseen)
+    return select_greater(multiply(z, splat(np.float32(height))), y, cost, unseen)

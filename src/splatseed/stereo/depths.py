@@ -1,0 +1,61 @@
+"""Depth maps from photographs alone: every view compared with a few others, then with their maps.
+
+Notation: V views of a scene. Promise: the same scene, settings and seed give the same bytes, whatever the number of
+threads; a depth stands only where other views' maps, found without it, agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.camera import Camera
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image
+from splatseed.stereo.matching import match_views
+from splatseed.stereo.result import Stereo
+from splatseed.stereo.settings import StereoSettings
+from splatseed.stereo.start import Hints, hints_from
+from splatseed.stereo.without_points import TOO_FEW, glimpse
+from splatseed.views.pairs import choose_sources
+from splatseed.views.sightings import Sightings
+from splatseed.views.view import View
+
+__all__ = ["find_stereo"]
+
+
+def find_stereo(
+    views: Sequence[View],
+    images: Sequence[Image],
+    sightings: Sightings,
+    settings: StereoSettings,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Stereo:
+    """Compare photographs with each other.
+
+    Args:
+        views: The photographs at the size to compare.
+        images: The images they are of, in the same order.
+        sightings: The points that each image sees, which depth is looked for around. Where there are too few,
+            small copies of the photographs are compared first, to have some.
+        settings: How.
+        seed: The same seed gives the same bytes.
+        progress: Told how far it is.
+    """
+    if len(sightings.xyz) < TOO_FEW:
+        sightings = glimpse(views, seed, progress)
+    seen = [sightings.rows_of(image) for image in images]
+    centers = np.stack([image.camera.center for image in images])
+    sources = choose_sources(seen, sightings.xyz, centers, settings.num_witnesses)
+    hints = [_hints(view, sightings.xyz[rows]) for view, rows in zip(views, seen, strict=True)]
+    return match_views(views, hints, sources, settings, seed, progress)
+
+
+def _hints(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Hints | None:
+    """What the points that a view sees say of its depth."""
+    uv, z = Camera(view.K, view.width, view.height, view.cam_from_world).project(xyz)
+    front = z > 0
+    return hints_from(uv[front], 1.0 / z[front]) if front.any() else None

@@ -1,0 +1,219 @@
+"""PatchMatch: planes handed from pixel to pixel and changed at random, where that lowers their cost.
+
+Notation: planes (w, gx, gy) float32 [3, h, w], inverse depth at a grid point's place and its slopes a pixel; costs
+float32 [h, w]. Grid point (i, j) lies at pixel ((j + 0.5) g, (i + 0.5) g). Points are red and black as on a
+chequerboard; a half sweep visits those of one colour, sixteen of a row at a time, and reads only the other colour.
+Promise: the planes depend on the pictures, the start and ``key`` alone: random numbers are hashed from the key and
+the point, so no order of work shows.
+Source: PatchMatch stereo (Bleyer et al. 2011), in the chequerboard order of Gipuma (Galliani et al. 2015), with the
+best of each arm as in ACMH (Xu and Tao 2019).
+"""
+
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Int32, Int64
+
+from splatseed.jit import always_inline, inline
+from splatseed.simd import LANES
+from splatseed.stereo.cost import SAMPLES, best_cost, prepare_window
+
+__all__ = ["Pictures", "begin", "sweep"]
+
+ARM = 11
+"""How far a plane may come from in one visit, in grid points."""
+REFINEMENTS = 3
+"""Random changes of the best plane a visit, each half of the one before."""
+STEEPEST = 6.0
+"""Slope of a surface against the picture, as the tangent of the angle: 80 degrees."""
+DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5
+"""Largest random changes, of inverse depth as a share and of the tangent; halved each sweep."""
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX_A, _MIX_B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+
+
+class Pictures(NamedTuple):
+    """A view and those it is compared with, as kernels take them."""
+
+    quads: Int32[np.ndarray, " P"]
+    """The view's quad image, flat."""
+    size: Int64[np.ndarray, " 2"]
+    """Its width and height."""
+    sources: Int32[np.ndarray, " Q"]
+    """Quad images of the others, one after another."""
+    sizes: Int64[np.ndarray, "S 2"]
+    offsets: Int64[np.ndarray, " S+1"]
+    warps: Float32[np.ndarray, "S 12"]
+    """A row by row and b of each (see ``cost``)."""
+    grid: int
+    """Pixels between grid points."""
+    focal: float
+    """Pixels."""
+    bounds: Float32[np.ndarray, " 2"]
+    """Least and largest inverse depth that is tried."""
+
+
+@inline
+def begin(pictures, guesses, planes, costs):
+    """The best of K given planes at each point.
+
+    Args:
+        pictures: ``Pictures``.
+        guesses: float32 [K, 3, h, w].
+        planes: Filled, float32 [3, h, w].
+        costs: Filled, float32 [h, w].
+    """
+    height, width = costs.shape
+    costs[:] = np.inf
+    lanes, places, window, tried, found = _buffers()
+    for row in range(height):
+        for first in range(0, width, LANES):
+            _fill_lanes(first, 1, width, lanes)
+            _look(pictures, row, lanes, places, window)
+            for k in range(len(guesses)):
+                for lane in range(LANES):
+                    for part in range(3):
+                        tried[part * LANES + lane] = guesses[k, part, row, lanes[lane]]
+                _try(pictures, row, lanes, places, window, tried, found, planes, costs)
+
+
+@inline
+def sweep(pictures, color, number, key, planes, costs):
+    """Visit the points of one colour.
+
+    Args:
+        pictures: ``Pictures``.
+        color: 0 or 1.
+        number: Of the sweep, from 0.
+        key: uint64, what random numbers are hashed from.
+        planes: Changed in place, float32 [3, h, w].
+        costs: Likewise, float32 [h, w].
+    """
+    height, width = costs.shape
+    lanes, places, window, tried, found = _buffers()
+    for row in range(height):
+        for first in range((row + color) % 2, width, 2 * LANES):
+            _fill_lanes(first, 2, width, lanes)
+            _look(pictures, row, lanes, places, window)
+            for way in range(8):
+                _hand_on(pictures.grid, way, row, lanes, planes, costs, tried)
+                _try(pictures, row, lanes, places, window, tried, found, planes, costs)
+            for k in range(REFINEMENTS):
+                change = 0.5 ** (number + k)
+                _change(pictures, row, lanes, change, key + np.uint64(k), planes, tried)
+                _try(pictures, row, lanes, places, window, tried, found, planes, costs)
+
+
+@inline
+def _buffers():
+    """Columns of the lanes, their pixels u and v, weights and likeness of windows, planes, costs."""
+    return (
+        np.zeros(LANES, np.int64),
+        np.zeros((2, LANES), np.float32),
+        np.zeros((2, SAMPLES * LANES), np.float32),
+        np.zeros(3 * LANES, np.float32),
+        np.zeros(LANES, np.float32),
+    )
+
+
+@inline
+def _fill_lanes(first, step, width, lanes):
+    """Sixteen columns; beyond the row's end the last one again."""
+    last = first + (width - 1 - first) // step * step
+    for lane in range(LANES):
+        lanes[lane] = min(first + lane * step, last)
+
+
+@inline
+def _look(pictures, row, lanes, places, window):
+    """Prepare the windows around the points of sixteen lanes."""
+    for lane in range(LANES):
+        places[0, lane] = (lanes[lane] + 0.5) * pictures.grid
+        places[1, lane] = (row + 0.5) * pictures.grid
+    width, height = pictures.size[0], pictures.size[1]
+    prepare_window(pictures.quads, width, height, places[0], places[1], window[0], window[1])
+
+
+@inline
+def _try(pictures, row, lanes, places, window, tried, found, planes, costs):
+    """Take the planes that are tried where they cost less."""
+    best_cost(
+        pictures.sources, pictures.sizes, pictures.offsets, pictures.warps,
+        places[0], places[1], tried, window[0], window[1], found,
+    )  # fmt: skip
+    for lane in range(LANES):
+        column = lanes[lane]
+        if found[lane] < costs[row, column] and _allowed(pictures, tried, lane):
+            costs[row, column] = found[lane]
+            for part in range(3):
+                planes[part, row, column] = tried[part * LANES + lane]
+
+
+@always_inline
+def _allowed(pictures, tried, lane):
+    """Whether a plane lies between the bounds and is not too steep."""
+    w, gx, gy = tried[lane], tried[LANES + lane], tried[2 * LANES + lane]
+    if not pictures.bounds[0] <= w <= pictures.bounds[1]:
+        return False
+    limit = STEEPEST * w / pictures.focal
+    return gx * gx + gy * gy <= limit * limit
+
+
+@inline
+def _hand_on(grid, way, row, lanes, planes, costs, tried):
+    """The planes of neighbours: next to each point (ways 0-3), or the best along an arm (4-7)."""
+    height, width = costs.shape
+    across, down = _direction(way % 4)
+    for lane in range(LANES):
+        column = lanes[lane]
+        best = 1 if way < 4 else 3
+        if way >= 4:
+            least = np.float32(np.inf)
+            for far in range(3, ARM + 1, 2):
+                y, x = row + far * down, column + far * across
+                if 0 <= y < height and 0 <= x < width and costs[y, x] < least:
+                    best, least = far, costs[y, x]
+        y, x = row + best * down, column + best * across
+        if not (0 <= y < height and 0 <= x < width):
+            y, x = row, column
+        gx, gy = planes[1, y, x], planes[2, y, x]
+        # w(u, v) = w0 + gx (u - u0) + gy (v - v0)
+        tried[lane] = planes[0, y, x] + grid * (gx * (column - x) + gy * (row - y))
+        tried[LANES + lane], tried[2 * LANES + lane] = gx, gy
+
+
+@always_inline
+def _direction(way):
+    """Columns and rows to go: right, left, down, up."""
+    return (1 - 2 * way if way < 2 else 0), (5 - 2 * way if way >= 2 else 0)
+
+
+@inline
+def _change(pictures, row, lanes, share, key, planes, tried):
+    """The planes of the points themselves, changed at random: in depth, or in slope as well."""
+    width = planes.shape[2]
+    for lane in range(LANES):
+        column = lanes[lane]
+        number = np.uint64(row * width + column) * np.uint64(4)
+        w = planes[0, row, column] * (1.0 + DEPTH_CHANGE * share * _random(key, number))
+        slope = SLOPE_CHANGE * share * w / pictures.focal
+        tried[lane] = w
+        tried[LANES + lane] = planes[1, row, column] + slope * _random(key, number + np.uint64(1))
+        tried[2 * LANES + lane] = planes[2, row, column] + slope * _random(
+            key, number + np.uint64(2)
+        )
+
+
+@always_inline
+def _random(key, number):
+    """Evenly from -1 to 1, hashed (SplitMix64)."""
+    z = key + (number + np.uint64(1)) * _GOLDEN
+    z = (z ^ (z >> np.uint64(30))) * _MIX_A
+    z = (z ^ (z >> np.uint64(27))) * _MIX_B
+    z ^= z >> np.uint64(31)
+    return np.float64(z >> np.uint64(11)) * (2.0 / 9007199254740992.0) - 1.0

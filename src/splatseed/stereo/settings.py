@@ -1,0 +1,60 @@
+"""The choices of stereo, with their defaults."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from splatseed.errors import ParameterError
+
+__all__ = ["StereoSettings"]
+
+MOST_SOURCES = 8
+"""Bits of the byte that says who agrees."""
+
+
+@dataclass(frozen=True)
+class StereoSettings:
+    """How depth is found from photographs alone."""
+
+    max_size: int = 800
+    """Photographs are made smaller by a whole factor until their longer side has so many pixels."""
+    grid: int = 4
+    """Every so many-th pixel along a row and a column gets a depth."""
+    sweeps: int = 4
+    """Times that planes are handed on and refined."""
+    num_sources: int = 5
+    """Views that a plane is tried in."""
+    num_witnesses: int = 8
+    """Views that may confirm a depth."""
+    min_agreeing: int = 2
+    """How many of them must."""
+    tolerance: float = 0.01
+    """Relative difference at which two depths agree."""
+    max_cost: float = 0.5
+    """Pixels whose cost (one minus correlation, 0 to 2) is larger are left out."""
+
+    def __post_init__(self) -> None:
+        _check(self.max_size >= 32, "stereo.max_size of at least 32", self.max_size)
+        _check(1 <= self.grid <= 32, "stereo.grid from 1 to 32", self.grid)
+        _check(self.sweeps >= 1, "stereo.sweeps of at least 1", self.sweeps)
+        most = MOST_SOURCES
+        _check(
+            1 <= self.num_sources <= most, f"stereo.num_sources from 1 to {most}", self.num_sources
+        )
+        _check(
+            1 <= self.num_witnesses <= most,
+            f"stereo.num_witnesses from 1 to {most}",
+            self.num_witnesses,
+        )
+        _check(
+            1 <= self.min_agreeing <= self.num_witnesses,
+            f"stereo.min_agreeing from 1 to {self.num_witnesses}",
+            self.min_agreeing,
+        )
+        _check(0 < self.tolerance < 1, "stereo.tolerance between 0 and 1", self.tolerance)
+        _check(0 < self.max_cost <= 2, "stereo.max_cost above 0, 2 at most", self.max_cost)
+
+
+def _check(condition: bool, expected: str, found: object) -> None:
+    if not condition:
+        raise ParameterError(expected, found=repr(found), fix="Choose such a value.")

@@ -1,0 +1,88 @@
+"""Planes to begin with: through the points that Structure-from-Motion has near a pixel.
+
+Notation: a view sees M points at pixels uv [M, 2] with inverse depth w [M]; the grid has h x w points. Promise: K
+guesses a grid point, finite and positive; where a view sees too few points, inverse depths drawn evenly between the
+bounds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64
+from scipy.spatial import cKDTree
+
+__all__ = ["Hints", "first_planes", "hints_from"]
+
+NEAREST = 3
+"""Points whose depth is tried as it is."""
+FITTED = 8
+"""Points that a plane is laid through."""
+RANDOM = 16
+"""Guesses where nothing is known."""
+MARGIN = 1.3
+"""Bounds reach so many times beyond the nearest and the farthest point."""
+RIDGE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """What is known of a view's depth before it is compared.
+
+    Args:
+        uv: Pixels of points that it sees, float64 [M, 2].
+        w: Their inverse depths, float64 [M].
+        bounds: Least and largest inverse depth that is looked for, float32 [2].
+    """
+
+    uv: Float64[np.ndarray, "M 2"]
+    w: Float64[np.ndarray, " M"]
+    bounds: Float32[np.ndarray, " 2"]
+
+
+def hints_from(uv: Float64[np.ndarray, "M 2"], w: Float64[np.ndarray, " M"]) -> Hints:
+    """Hints by some points, at least one: planes are looked for a little beyond them."""
+    low, high = np.percentile(w, [0.5, 99.5])
+    return Hints(uv, w, np.array([low / MARGIN, high * MARGIN], np.float32))
+
+
+def first_planes(
+    hints: Hints, shape: tuple[int, int], grid: int, rng: np.random.Generator
+) -> Float32[np.ndarray, "K 3 h w"]:
+    """The planes to try first at each grid point.
+
+    Args:
+        hints: Of the view.
+        shape: Rows and columns of the grid, neither 0.
+        grid: Pixels between grid points.
+        rng: For guesses where too few points are seen.
+    """
+    rows, columns = shape
+    w = hints.w
+    if len(w) < FITTED:
+        guesses = np.zeros((RANDOM, 3, rows, columns), np.float32)
+        guesses[:, 0] = rng.uniform(hints.bounds[0], hints.bounds[1], (RANDOM, rows, columns))
+        return guesses
+    place = (np.indices(shape)[::-1].reshape(2, -1).T + 0.5) * grid
+    nearest = cKDTree(hints.uv).query(place, FITTED)[1]
+    guesses = np.zeros((NEAREST + 1, 3, rows * columns), np.float32)
+    guesses[:NEAREST, 0] = w[nearest[:, :NEAREST]].T
+    guesses[NEAREST] = _fit(hints.uv[nearest] - place[:, None], w[nearest])
+    return np.ascontiguousarray(guesses.reshape(-1, 3, rows, columns))
+
+
+def _fit(
+    apart: Float64[np.ndarray, "G K 2"], w: Float64[np.ndarray, "G K"]
+) -> Float64[np.ndarray, "3 G"]:
+    """Least-squares w + gx du + gy dv through K points each, slopes drawn a little to 0."""
+    design = np.concatenate([np.ones((*w.shape, 1)), apart], axis=2)
+    normal = np.swapaxes(design, 1, 2) @ design
+    spread = np.trace(normal[:, 1:, 1:], axis1=1, axis2=2)
+    normal[:, [1, 2], [1, 2]] += RIDGE * (1.0 + spread)[:, None]
+    right = np.swapaxes(design, 1, 2) @ w[..., None]
+    fitted = np.linalg.solve(normal, right)[..., 0].T
+    low, high = w.min(axis=1), w.max(axis=1)
+    outside = (fitted[0] < low / MARGIN) | (fitted[0] > high * MARGIN)
+    fitted[:, outside] = [w[outside].mean(axis=1), np.zeros(outside.sum()), np.zeros(outside.sum())]
+    return np.asarray(fitted)

@@ -1,0 +1,166 @@
+"""Points for a scene that has none: from its depth maps, or from a glimpse at small photographs.
+
+Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, twice. First some views are compared with
+neighbours chosen by pose, and any depth is tried at which the picture moves by less than its width; half of the good
+pixels are nearer than the *middle* depth that this gives. Then all views are compared with those that see such depths
+from well beside, and what others confirm are points. Promise: as for all of stereo, the same bytes for a seed; points
+that no photographs confirm are not made up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from splatseed.camera import Camera
+from splatseed.depthmap import DepthMap
+from splatseed.progress import Progress
+from splatseed.scene import Image, Scene
+from splatseed.stereo.fusion import block_means, fuse
+from splatseed.stereo.matching import match_views
+from splatseed.stereo.settings import StereoSettings
+from splatseed.stereo.start import Hints
+from splatseed.views.pairs import choose_by_pose, choose_sources
+from splatseed.views.sightings import Sightings, find_sightings
+from splatseed.views.view import View
+
+__all__ = ["TOO_FEW", "glimpse", "known_sightings"]
+
+TOO_FEW = 30
+"""With fewer points a scene counts as having none."""
+SMALL = 200
+"""Pixels of the longer side of a small photograph."""
+LOOK = StereoSettings(grid=2, sweeps=6, tolerance=0.03, max_cost=0.4)
+CELL = 4.0
+"""Pixels of the small photographs between points."""
+LOOKED_AT = 24
+"""Views that tell the middle depths of all."""
+GOOD = 0.15
+"""Cost of a pixel that may tell."""
+LEAST_MOVE = 0.2
+"""Pixels that a picture moves by at the farthest depth that is tried first."""
+AROUND = 3.0
+"""Depth is then looked for up to so many times beyond that of the nearest and farthest tenth."""
+MOST_POINTS = 30_000
+SAMPLES = 18
+"""Rows and columns at which a depth map is asked."""
+
+
+def known_sightings(scene: Scene) -> Sightings:
+    """The points that each image sees: SfM's; where there are none, places of the scene's depth maps."""
+    sightings, maps = find_sightings(scene), scene.depths
+    if len(sightings.xyz) >= TOO_FEW or maps is None:
+        return sightings
+    known = [image for image in scene.images if image.name in maps]
+    places = [_places(image, maps.read(image.name)) for image in known]
+    return _unseen(np.concatenate(places)) if places else sightings
+
+
+def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Sightings:
+    """Points that small copies of photographs confirm.
+
+    Args:
+        views: The photographs, two at least.
+        seed: The same seed gives the same points.
+        progress: Told how far it is.
+    """
+    small = [_small(view) for view in views]
+    spread = _spread_of_depth(small, seed, progress)
+    xyz, seen = _imagined_points(small, spread)
+    centers = np.stack([_camera(view).center for view in small])
+    sources = choose_sources(seen, xyz, centers, LOOK.num_witnesses)
+    hints = [_between(low / AROUND, high * AROUND) for low, _, high in spread]
+    found = match_views(small, hints, sources, LOOK, seed, progress)
+    return _unseen(fuse(found, CELL).xyz.astype(np.float64))
+
+
+def _places(image: Image, depth: DepthMap) -> Float64[np.ndarray, "N 3"]:
+    """World points at a few pixels of a map."""
+    camera = depth.camera(image.camera)
+    row, column = (
+        ((np.arange(SAMPLES) + 0.5) * side / SAMPLES).astype(np.int64)
+        for side in depth.values.shape
+    )
+    row, column = (each.ravel() for each in np.meshgrid(row, column, indexing="ij"))
+    z = depth.values[row, column].astype(np.float64)
+    known = np.isfinite(z) & (z > 0) & (depth.kind != "inverse")
+    uv = np.stack([column, row], axis=1)[known] + 0.5
+    z = z[known]
+    if depth.kind == "ray":
+        rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ np.linalg.inv(camera.K).T
+        z /= np.linalg.norm(rays, axis=1)
+    return camera.unproject(uv, z)
+
+
+def _unseen(xyz: Float64[np.ndarray, "N 3"]) -> Sightings:
+    """Points of which it is not known who sees them, not too many."""
+    every = max(1, -(-len(xyz) // MOST_POINTS))
+    return Sightings(xyz[::every], np.empty(0, np.int64), {}, {})
+
+
+def _camera(view: View) -> Camera:
+    return Camera(view.K, view.width, view.height, view.cam_from_world)
+
+
+def _small(view: View) -> View:
+    """A view made smaller by a whole factor."""
+    factor = max(1, round(max(view.width, view.height) / SMALL))
+    image = block_means(view.image, factor)
+    K = np.diag([1 / factor, 1 / factor, 1.0]) @ view.K
+    mask = None
+    if view.mask is not None:
+        mask = block_means(view.mask[..., None].astype(np.uint8), factor)[..., 0] > 0
+    return View(view.name, image, K, image.shape[1], image.shape[0], view.cam_from_world, mask)
+
+
+def _between(low: float, high: float) -> Hints:
+    """Hints of a view of whose depth only bounds are known."""
+    return Hints(np.empty((0, 2)), np.empty(0), np.array([low, high], np.float32))
+
+
+def _spread_of_depth(
+    views: Sequence[View], seed: int, progress: Progress
+) -> Float64[np.ndarray, "V 3"]:
+    """Of each view, the inverse depths that a tenth, half, and nine tenths of its pixels are beyond."""
+    sources = choose_by_pose(np.stack([view.cam_from_world for view in views]), LOOK.num_sources)
+    looked = np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).round().astype(np.int64))
+    hints: list[Hints | None] = [None] * len(views)
+    for i in looked:
+        hints[i] = _any_depth(views, int(i), sources[i])
+    found = match_views(views, hints, sources, LOOK, seed, progress)
+    good = [found.planes[i][0][found.costs[i] < GOOD] for i in looked]
+    told = np.array([np.quantile(w, [0.1, 0.5, 0.9]) if len(w) else [np.nan] * 3 for w in good])
+    if np.isnan(told).all():
+        return np.ones((len(views), 3))
+    told = np.where(np.isnan(told), np.nanmedian(told, axis=0), told)
+    nearest = np.abs(np.arange(len(views))[:, None] - looked).argmin(axis=1)
+    return np.asarray(told[nearest])
+
+
+def _any_depth(views: Sequence[View], i: int, sources: Int64[np.ndarray, " K"]) -> Hints | None:
+    """From where the picture hardly moves to where it moves by its width."""
+    others = sources[sources >= 0]
+    apart = [np.linalg.norm(_camera(views[j]).center - _camera(views[i]).center) for j in others]
+    moves = views[i].K[0, 0] * float(np.median(apart)) if apart else 0.0
+    return _between(LEAST_MOVE / moves, views[i].width / moves) if moves > 0 else None
+
+
+def _imagined_points(
+    views: Sequence[View], spread: Float64[np.ndarray, "V 3"]
+) -> tuple[Float64[np.ndarray, "P 3"], list[Int64[np.ndarray, " M"]]]:
+    """Places that views may be seeing, and which of them fall into each view."""
+    points = []
+    for view, inverse in zip(views, spread, strict=True):
+        share = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
+        uv = np.tile(share * [view.width, view.height], (3, 1))
+        points.append(_camera(view).unproject(uv, np.repeat(1 / inverse, 20)))
+    xyz = np.concatenate(points)
+    return xyz, [_inside(_camera(view), xyz) for view in views]
+
+
+def _inside(camera: Camera, xyz: Float64[np.ndarray, "P 3"]) -> Int64[np.ndarray, " M"]:
+    """The points that fall into an image."""
+    uv = camera.project(xyz)[0]  # NaN behind the camera
+    return np.flatnonzero(((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1))

@@ -1,0 +1,30 @@
+"""From a point of the world to a place on a view's grid.
+
+Notation: ``matrix`` [3, 4] maps homogeneous world points to (column z, row z, z). With K @
+``cam_from_world[:3]`` columns and rows are pixel coordinates, the centre of the first at (0.5, 0.5); a
+coarser grid, or one whose points lie at whole numbers, has its own first matrix instead of K. Promise:
+computed in float64 with one division, in the order written, whatever the type of the point.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from splatseed.jit import inline
+
+__all__ = ["place"]
+
+
+@inline
+def place(point, matrix):  # type: ignore[no-untyped-def]
+    """Column, row and planar depth of a world point [3], as floats.
+
+    The point is behind the camera if the depth is negative; at 0 column and row are not finite.
+    """
+    x, y, z = np.float64(point[0]), np.float64(point[1]), np.float64(point[2])
+    # (column z, row z, z) = matrix (x, y, z, 1)
+    depth = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+    inverse = 1.0 / depth
+    column = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) * inverse
+    row = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) * inverse
+    return column, row, depth

@@ -1,0 +1,122 @@
+"""``upsample``: photographs by default, a fallback without them, cover, verify and budgets for all."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numba
+import numpy as np
+import pytest
+
+import splatseed as ss
+from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.seeding.upsampling import share_covered
+from splatseed.upsample.registry import SOURCE_CODES
+from splatseed.views import view
+
+PHOTOGRAPH_METHODS = ("stereo", "cover", "auto")
+STEREO, COVER = SOURCE_CODES["stereo"], SOURCE_CODES["cover"]
+
+
+@pytest.fixture(scope="module")
+def seeds(room):
+    return ss.upsample(room)
+
+
+def test_by_default_surfaces_are_found_and_gaps_filled(room, room_capture, seeds):
+    count = len(room.points)
+    assert set(seeds.source[:count]) == {0}
+    assert {STEREO, COVER} <= set(seeds.source[count:])
+    np.testing.assert_array_equal(seeds.xyz[:count], room.points.xyz)
+    assert seeds.finite.all()
+    off = room_capture.surfaces.distance(seeds.xyz[seeds.source == STEREO])
+    assert np.median(off) < 0.02  # metres
+    assert share_covered(room, room.points) < 0.9 < share_covered(room, seeds)
+
+
+def test_seeds_know_their_normals_sizes_and_confidence(seeds):
+    stereo, cover = seeds.source == STEREO, seeds.source == COVER
+    assert np.isfinite(seeds.normals[stereo]).all()
+    assert np.isnan(seeds.normals[seeds.source == 0]).all()
+    assert (seeds.sizes[stereo | cover] > 0).all()
+    assert np.median(seeds.confidence[stereo]) > np.median(seeds.confidence[cover])
+
+
+@pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)
+def test_the_same_seed_gives_the_same_bytes_on_any_number_of_threads(method, room):
+    first = ss.upsample(room, method, seed=3)
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        second = ss.upsample(room, method, seed=3)
+    finally:
+        numba.set_num_threads(threads)
+    assert first.xyz.tobytes() == second.xyz.tobytes()
+    assert first.rgb.tobytes() == second.rgb.tobytes()
+    assert first.source.tobytes() == second.source.tobytes()
+
+
+@pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)
+def test_held_out_photographs_are_never_read(method, room, monkeypatch):
+    read = []
+    load = view.load_photograph
+    monkeypatch.setattr(
+        view, "load_photograph", lambda path, *a: (read.append(path.name), load(path, *a))[1]
+    )
+    ss.upsample(room, method, hold_out=4)
+    names = sorted(image.name for image in room.images)
+    assert sorted(read) == [name for i, name in enumerate(names) if i % 4]
+
+
+def test_without_photographs_mls_stands_in_and_says_so(room):
+    notes = []
+    seeds = ss.upsample(room.points, note=notes.append)
+    assert len(seeds) == 4 * len(room.points)
+    assert set(seeds.source) == {0, SOURCE_CODES["mls"]}
+    assert any("photographs" in note and "mls" in note for note in notes)
+
+
+@pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)
+def test_methods_that_look_say_what_they_lack(method, room):
+    bare = dataclasses.replace(room, source=None)
+    with pytest.raises(SceneNotFoundError, match="photographs"):
+        ss.upsample(bare, ss.METHODS[method](hold_out=8) if method != "auto" else "stereo")
+
+
+@pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)
+@pytest.mark.parametrize("size", [{"ratio": 4}, {"num_points": 5000}], ids=str)
+def test_the_photographs_say_how_many(method, size, room):
+    with pytest.raises(ParameterError, match="--budget"):
+        ss.upsample(room, method, **size)
+
+
+def test_cover_fills_the_gaps_of_any_method(room):
+    plain = ss.upsample(room, "linear", ratio=2)
+    covered = ss.upsample(room, "linear", ratio=2, cover=8)
+    np.testing.assert_array_equal(covered.xyz[: len(plain)], plain.xyz)
+    assert set(covered.source[len(plain) :]) == {COVER}
+    assert share_covered(room, plain) < 0.9 < share_covered(room, covered)
+
+
+@pytest.mark.parametrize("method", ["linear", "auto"])
+def test_a_budget_is_met_and_keeps_the_pictures_covered(method, room, seeds):
+    whole = seeds if method == "auto" else ss.upsample(room, method)
+    num = len(whole) // 2
+    thinned = ss.upsample(room, method, budget=num)
+    assert len(thinned) == num
+    assert {row.tobytes() for row in thinned.xyz} <= {row.tobytes() for row in whole.xyz}
+    at_random = whole.select(np.random.default_rng(0).permutation(len(whole))[:num])
+    assert share_covered(room, thinned) > share_covered(room, at_random)
+
+
+def test_a_budget_may_be_below_the_originals_and_a_share_of_the_pixels(room):
+    count = len(room.points)
+    assert len(ss.upsample(room, "linear", budget=count // 2)) == count // 2
+    pixels = 160 * 120
+    assert len(ss.upsample(room, "cover", budget=f"{count / 2 / pixels}rho")) == round(count / 2)
+
+
+@pytest.mark.parametrize("budget", ["many", "-3", "0", "0rho", "1e3x"])
+def test_a_budget_that_is_none_is_refused(budget, room):
+    with pytest.raises(ParameterError, match="budget"):
+        ss.upsample(room, "linear", budget=budget)

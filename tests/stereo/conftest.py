@@ -1,0 +1,62 @@
+"""Fixtures of the stereo tests: what takes seconds is made once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from splatseed.scene import Scene
+from splatseed.stereo.depths import Stereo, find_stereo
+from splatseed.stereo.settings import StereoSettings
+from splatseed.synthetic.surfaces import Union
+from splatseed.views.sightings import find_sightings
+from splatseed.views.view import load_views
+
+from .made import arc, ball_before_wall, photograph, tilted_plane
+
+SETTINGS = StereoSettings(grid=2)
+"""The made views are small: a finer grid gives more to judge by."""
+
+
+@dataclass(frozen=True, eq=False)
+class Planted:
+    """A made scene, its surfaces, and what stereo found."""
+
+    scene: Scene
+    surfaces: Union
+    stereo: Stereo
+
+
+def find(scene: Scene) -> Stereo:
+    views = load_views(scene, scene.images)
+    return find_stereo(views, scene.images, find_sightings(scene), SETTINGS)
+
+
+def plant(folder, surfaces: Union, **options) -> Planted:
+    scene = photograph(folder, surfaces, arc(), **options)
+    return Planted(scene, surfaces, find(scene))
+
+
+@pytest.fixture(scope="session")
+def plane(tmp_path_factory) -> Planted:
+    return plant(tmp_path_factory.mktemp("plane"), tilted_plane())
+
+
+@pytest.fixture(scope="session")
+def ball(tmp_path_factory) -> Planted:
+    return plant(tmp_path_factory.mktemp("ball"), ball_before_wall())
+
+
+@pytest.fixture
+def rough(rng: np.random.Generator):
+    """Makes grey images of noise, a few pixels wide, so that interpolation has something to do."""
+
+    def make(height: int, width: int) -> np.ndarray:
+        image = rng.uniform(0, 255, (height, width))
+        for axis in (0, 1):
+            image = (np.roll(image, 1, axis) + 2 * image + np.roll(image, -1, axis)) / 4
+        return image.astype(np.uint8)
+
+    return make

@@ -1,0 +1,124 @@
+"""Made captures of single surfaces, a few small views each, and what is true of their maps.
+
+Notation: V views on an arc, W x H pixels; the surfaces stand about the world's origin, the cameras ``FAR`` before
+it on -z. Promise: photographs are ray cast, so that depth and normals at any place of any view are exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image as PillowImage
+
+from splatseed.camera import Camera, Intrinsics, quat_from_rotation
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Scene, SceneSource
+from splatseed.stereo.maps import StereoMap
+from splatseed.synthetic.raycast import pixel_rays, render_view
+from splatseed.synthetic.room import Room
+from splatseed.synthetic.surfaces import Rectangle, Sphere, Surface, Union
+from splatseed.synthetic.texture import Mottled, Plain, Texture
+from splatseed.viewpoint import look_at
+
+WIDTH, HEIGHT, FOCAL = 96, 80, 100.0
+FAR = 3.0
+ANGLES = (0.0, -7.0, 7.0, -14.0, 14.0)
+"""Degrees of the cameras on their arc."""
+DOWN = np.array([0.0, -1.0, 0.0])
+
+STONE = Mottled(((0.1,) * 3, (0.9,) * 3), (7.0, 7.0, 7.0), octaves=3, contrast=3.0)
+GREY = Plain((0.5, 0.5, 0.5))
+
+
+def arc(
+    angles: Sequence[float] = ANGLES, size: tuple[int, int] = (WIDTH, HEIGHT), focal: float = FOCAL
+) -> list[Camera]:
+    """Cameras that look at the origin from so many degrees to the side."""
+    K = np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1.0]])
+    turns = np.radians(angles)
+    eyes = [FAR * np.array([np.sin(turn), 0.1 * np.sin(3 * turn), -np.cos(turn)]) for turn in turns]
+    return [Camera(K, *size, look_at(eye, np.zeros(3), DOWN)) for eye in eyes]
+
+
+def tilted_plane(degrees: float = 30.0) -> Union:
+    """A plane through the origin, turned about the vertical."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    along = np.array([c, 0.0, s])
+    return Union((Rectangle(-4 * along - 4 * DOWN, 8 * along, 8 * DOWN),))
+
+
+def ball_before_wall() -> Union:
+    """A sphere at the origin, a wall a little behind it."""
+    wall = Rectangle(np.array([-4.0, 4.0, 0.8]), np.array([8.0, 0, 0]), np.array([0, -8.0, 0]))
+    return Union((Sphere(np.zeros(3), 0.7), wall))
+
+
+def photograph(
+    folder: Path,
+    surfaces: Union,
+    cameras: Sequence[Camera],
+    *,
+    texture: Texture = STONE,
+    num_points: int = 100,
+) -> Scene:
+    """A scene of the surfaces in front of the cameras, its photographs in a folder."""
+    room = Room(("made",) * len(surfaces.parts), surfaces, (texture,) * len(surfaces.parts))
+    folder.mkdir(parents=True, exist_ok=True)
+    images = []
+    for i, camera in enumerate(cameras):
+        name = f"{i:02d}.png"
+        PillowImage.fromarray(render_view(room, camera)[0]).save(folder / name)
+        images.append(_image(i + 1, name, camera))
+    points = PointCloud(
+        _points(surfaces, cameras[0], num_points), np.zeros((num_points, 3), np.uint8)
+    )
+    source = SceneSource("colmap", folder, folder, image_dir=folder)
+    return Scene(points, tuple(images), tuple(i.intrinsics for i in images), source=source)
+
+
+def _image(number: int, name: str, camera: Camera) -> Image:
+    lens = Intrinsics(
+        number, "PINHOLE", camera.width, camera.height,
+        (camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]),
+    )  # fmt: skip
+    pose = camera.cam_from_world
+    return Image(name, number, lens, quat_from_rotation(pose[:3, :3]), pose[:3, 3])
+
+
+def _points(surfaces: Surface, camera: Camera, num: int) -> np.ndarray:
+    """Points where random rays of a camera meet the surfaces, float32 [num, 3]."""
+    rays = pixel_rays(camera)
+    rays = rays[np.random.default_rng(0).choice(len(rays), num, replace=False)]
+    return (camera.center + surfaces.intersect(camera.center, rays)[:, None] * rays).astype(
+        np.float32
+    )
+
+
+def true_depth(surfaces: Surface, camera: Camera) -> np.ndarray:
+    """Planar depth at the centres of a camera's pixels, [H, W]."""
+    depth = surfaces.intersect(camera.center, pixel_rays(camera))
+    return depth.reshape(camera.height, camera.width)
+
+
+def true_normals(surfaces: Surface, camera: Camera) -> np.ndarray:
+    """Unit normals there in the camera's axes, towards it, [H, W, 3]."""
+    rays = pixel_rays(camera)
+    xyz = camera.center + surfaces.intersect(camera.center, rays)[:, None] * rays
+    normals = surfaces.normals(xyz)
+    normals = normals * -np.sign(np.einsum("ij,ij->i", normals, rays))[:, None]
+    return (normals @ camera.cam_from_world[:3, :3].T).reshape(camera.height, camera.width, 3)
+
+
+def relative_error(surfaces: Surface, found: StereoMap) -> np.ndarray:
+    """Of the depths that a map has, against the truth, [M]."""
+    known = np.isfinite(found.depth)
+    return np.abs(found.depth[known] / true_depth(surfaces, found.camera)[known] - 1.0)
+
+
+def degrees_off(surfaces: Surface, found: StereoMap) -> np.ndarray:
+    """Angles between the normals of a map and the true ones, [M]."""
+    known = np.isfinite(found.depth)
+    cosine = (found.normal * true_normals(surfaces, found.camera)).sum(axis=-1)[known]
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

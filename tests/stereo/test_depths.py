@@ -1,0 +1,180 @@
+"""Depth and normals of planted surfaces, and of captures that stereo can say little about."""
+
+from __future__ import annotations
+
+import os
+
+import numba
+import numpy as np
+import pytest
+
+from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.pointcloud import PointCloud
+from splatseed.stereo import stereo_depths
+from splatseed.stereo.settings import StereoSettings
+
+from .conftest import SETTINGS
+from .made import (
+    GREY,
+    HEIGHT,
+    WIDTH,
+    arc,
+    degrees_off,
+    photograph,
+    relative_error,
+    tilted_plane,
+    true_depth,
+    true_normals,
+)
+
+
+def maps_of(planted):
+    return [planted.stereo.map(i) for i in range(len(planted.stereo.views))]
+
+
+def test_a_tilted_plane(plane):
+    for found in maps_of(plane):
+        error, angle = relative_error(plane.surfaces, found), degrees_off(plane.surfaces, found)
+        assert found.known_share > 0.7
+        assert (error < 0.01).mean() > 0.95
+        assert np.median(error) < 0.003
+        assert np.median(angle) < 6
+        assert np.quantile(angle, 0.9) < 15
+
+
+def test_a_ball_before_a_wall(ball):
+    for found in maps_of(ball):
+        error, angle = relative_error(ball.surfaces, found), degrees_off(ball.surfaces, found)
+        assert found.known_share > 0.55
+        assert (error < 0.01).mean() > 0.9
+        assert np.median(angle) < 10
+
+
+def test_a_map_says_where_it_is_and_what_it_knows(ball):
+    for image, found in zip(ball.scene.images, maps_of(ball), strict=True):
+        known = np.isfinite(found.depth)
+        assert found.name == image.name
+        assert known.shape == (HEIGHT // SETTINGS.grid, WIDTH // SETTINGS.grid)
+        assert (found.camera.height, found.camera.width) == known.shape
+        np.testing.assert_array_equal(np.isfinite(found.normal).all(axis=-1), known)
+        np.testing.assert_array_equal(found.confidence > 0, known)
+        assert (np.bitwise_count(found.agreeing[known]) >= SETTINGS.min_agreeing).all()
+        assert not found.agreeing[~known].any()
+        assert set(found.sources) == {other.name for other in ball.scene.images} - {found.name}
+        rays = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in known.shape[::-1])), axis=-1)
+        rays = np.concatenate([rays, np.ones((*known.shape, 1))], axis=-1)
+        towards = (rays @ np.linalg.inv(found.camera.K).T * found.normal).sum(axis=-1)
+        assert (towards[known] < 0).all()
+
+
+def test_confidence_is_higher_where_depth_is_right(ball):
+    right, confidence = [], []
+    for found in maps_of(ball):
+        right.append(relative_error(ball.surfaces, found) < 0.005)
+        confidence.append(found.confidence[np.isfinite(found.depth)])
+    right, confidence = np.concatenate(right), np.concatenate(confidence)
+    assert confidence[right].mean() > confidence[~right].mean()
+
+
+def test_the_same_bytes_on_any_number_of_threads(ball, monkeypatch):
+    before = numba.get_num_threads()
+    try:
+        for threads in (1, 2):
+            monkeypatch.setattr(os, "cpu_count", lambda threads=threads: threads)
+            numba.set_num_threads(min(threads, before))
+            for old, new in zip(maps_of(ball), stereo_depths(ball.scene, SETTINGS), strict=True):
+                for field in ("depth", "normal", "confidence", "agreeing"):
+                    assert getattr(old, field).tobytes() == getattr(new, field).tobytes()
+    finally:
+        numba.set_num_threads(before)
+
+
+def test_another_seed_gives_other_bytes_as_good(plane):
+    found = stereo_depths(plane.scene, SETTINGS, seed=1)[0]
+    assert found.depth.tobytes() != maps_of(plane)[0].depth.tobytes()
+    assert (relative_error(plane.surfaces, found) < 0.01).mean() > 0.95
+
+
+def test_two_views_confirm_each_other(tmp_path):
+    surfaces = tilted_plane()
+    scene = photograph(tmp_path, surfaces, arc((-4.0, 4.0)))
+    for found in stereo_depths(scene, SETTINGS):
+        assert found.known_share > 0.5
+        assert (relative_error(surfaces, found) < 0.01).mean() > 0.9
+
+
+@pytest.mark.parametrize("num", [0, 1])
+def test_stereo_takes_two(num, tmp_path):
+    scene = photograph(tmp_path, tilted_plane(), arc((0.0,)))
+    with pytest.raises(SceneNotFoundError, match="two"):
+        stereo_depths(scene.replace(images=scene.images[:num]))
+
+
+def test_views_that_see_nothing_of_each_other_keep_nothing(tmp_path):
+    front, back = arc((0.0, 180.0))
+    scene = photograph(tmp_path, tilted_plane(0.0), [front, back])
+    for found in stereo_depths(scene, SETTINGS):
+        assert found.known_share == 0.0
+        assert not found.confidence.any()
+
+
+def test_grey_walls_get_no_invented_depth(tmp_path):
+    scene = photograph(tmp_path, tilted_plane(), arc(), texture=GREY)
+    for found in stereo_depths(scene, SETTINGS):
+        assert found.known_share < 0.02
+
+
+def test_views_of_different_sizes_and_lenses(tmp_path):
+    surfaces = tilted_plane()
+    cameras = [*arc((0.0, 8.0)), *arc((-8.0, 14.0), (70, 90), 80.0), *arc((-14.0,), (120, 64), 120)]
+    scene = photograph(tmp_path, surfaces, cameras)
+    for found, camera in zip(stereo_depths(scene, SETTINGS), cameras, strict=True):
+        assert found.depth.shape == (camera.height // 2, camera.width // 2)
+        assert found.known_share > 0.5
+        assert (relative_error(surfaces, found) < 0.01).mean() > 0.9
+
+
+def test_a_view_smaller_than_its_grid_has_an_empty_map(tmp_path):
+    cameras = [*arc((0.0, 6.0)), *arc((-6.0,), (20, 16), 20.0)]
+    scene = photograph(tmp_path, tilted_plane(), cameras)
+    maps = stereo_depths(scene, StereoSettings(grid=20))
+    assert [found.depth.shape for found in maps] == [(4, 4), (4, 4), (0, 1)]
+
+
+@pytest.mark.parametrize("shift", [0.0, -50.0])
+def test_points_at_and_behind_the_cameras(shift, tmp_path):
+    """A third of the points is moved to where no camera can see them; tracks or not."""
+    surfaces = tilted_plane()
+    scene = photograph(tmp_path, surfaces, arc((0.0, 7.0, -7.0)))
+    xyz = scene.points.xyz.copy()
+    xyz[:30] = scene.images[0].camera.center + np.array([0, 0, shift], np.float32)
+    moved = scene.replace(points=PointCloud(xyz, scene.points.rgb))
+    for found in stereo_depths(moved, SETTINGS):
+        assert found.known_share > 0.5
+        assert (relative_error(surfaces, found) < 0.01).mean() > 0.9
+
+
+def test_the_yardstick_itself(plane):
+    """The truth of the made plane, by its equation: normal . x = 0."""
+    for found in maps_of(plane):
+        depth = true_depth(plane.surfaces, found.camera)
+        row, column = np.indices(depth.shape).reshape(2, -1)
+        uv = np.stack([column, row], axis=1) + 0.5
+        xyz = found.camera.unproject(uv, depth.ravel())
+        normals = true_normals(plane.surfaces, found.camera).reshape(-1, 3)
+        assert (
+            np.abs((xyz * (normals @ found.camera.cam_from_world[:3, :3])).sum(axis=1)).max() < 1e-6
+        )
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"max_size": 31}, {"grid": 0}, {"grid": 33}, {"sweeps": 0}, {"num_sources": 9},
+        {"num_sources": 0}, {"num_witnesses": 9}, {"min_agreeing": 0}, {"min_agreeing": 9},
+        {"tolerance": 0.0}, {"max_cost": 0.0}, {"max_cost": 2.1},
+    ],
+)  # fmt: skip
+def test_settings_out_of_range_are_refused(changes):
+    with pytest.raises(ParameterError, match=f"stereo.{next(iter(changes))}"):
+        StereoSettings(**changes)

@@ -1,0 +1,83 @@
+"""Seeds from maps: on the surface, spread as asked, each with what is known of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatseed.camera import Camera
+from splatseed.stereo.fusion import SAME, fuse
+
+CELL = 6.0
+
+
+@pytest.fixture(scope="module")
+def seeds(ball):
+    return fuse(ball.stereo, CELL)
+
+
+def cells_of(view, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where world points fall in a view, in cells, and their inverse depths."""
+    uv, z = Camera(view.K, view.width, view.height, view.cam_from_world).project(xyz)
+    return np.floor(uv / CELL).astype(int), 1.0 / z
+
+
+def test_seeds_lie_on_the_surface_and_know_its_normals(seeds, ball):
+    xyz = seeds.xyz.astype(np.float64)
+    assert np.quantile(ball.surfaces.distance(xyz), 0.9) < 0.04
+    cosine = np.abs((ball.surfaces.normals(xyz) * seeds.normals).sum(axis=1))
+    assert np.degrees(np.arccos(np.median(cosine))) < 12
+    np.testing.assert_allclose(np.linalg.norm(seeds.normals, axis=1), 1.0, atol=1e-5)
+
+
+def test_normals_face_the_view_they_come_from(seeds, ball):
+    centers = np.stack([image.camera.center for image in ball.scene.images])
+    towards = centers[seeds.view_idx] - seeds.xyz
+    assert ((towards * seeds.normals).sum(axis=1) > 0).all()
+
+
+def test_a_cell_of_a_view_has_one_seed_at_a_depth(seeds, ball):
+    """Asked of the view that each comes from, where it certainly counts."""
+    for i, view in enumerate(ball.stereo.views):
+        mine = np.flatnonzero(seeds.view_idx == i)
+        cells, w = cells_of(view, seeds.xyz[mine].astype(float))
+        for cell in np.unique(cells, axis=0):
+            here = np.sort(w[(cells == cell).all(axis=1)])
+            assert (np.diff(here) / here[:-1] > SAME / (1 + SAME) - 1e-4).all()
+
+
+def test_every_kept_pixel_has_a_seed_near_it(seeds, ball):
+    """What was not taken was left out for a seed of its cell, in its own view or a confirming one."""
+    stereo, xyz = ball.stereo, seeds.xyz.astype(float)
+    for i in range(len(stereo.views)):
+        found = stereo.map(i)
+        row, column = np.nonzero(stereo.kept(i))
+        points = found.camera.unproject(
+            np.stack([column, row], axis=1) + 0.5, found.depth[row, column]
+        )
+        gap = np.linalg.norm(points[:, None] - xyz, axis=2).min(axis=1)
+        # A cell's diagonal across the line of sight, and as much along it.
+        assert (
+            np.quantile(gap / (CELL * found.depth[row, column] / stereo.views[i].K[0, 0]), 0.99) < 3
+        )
+
+
+def test_sizes_are_those_of_a_cell(seeds, ball):
+    for i, view in enumerate(ball.stereo.views):
+        mine = seeds.view_idx == i
+        w = cells_of(view, seeds.xyz[mine].astype(float))[1]
+        np.testing.assert_allclose(seeds.sizes[mine], CELL / w / view.K[0, 0], rtol=1e-4)
+
+
+def test_larger_cells_give_fewer_seeds_and_never_finer_than_the_maps(seeds, ball):
+    assert len(fuse(ball.stereo, 2 * CELL)) < 0.7 * len(seeds) < len(seeds)
+    finest = fuse(ball.stereo, 2.0)
+    np.testing.assert_array_equal(fuse(ball.stereo, 0.1).xyz, finest.xyz)
+    assert len(finest) > len(seeds)
+
+
+def test_best_first_within_a_view(seeds):
+    for i in np.unique(seeds.view_idx):
+        assert (np.diff(seeds.confidence[seeds.view_idx == i]) <= 0).all()
+    assert (np.diff(seeds.view_idx) >= 0).all()
+    assert ((seeds.confidence > 0) & (seeds.confidence <= 1)).all()

@@ -1,0 +1,76 @@
+"""Lenses against pycolmap's, by inversion, and where they fold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.lens import distort, fold_radius, image_points
+
+
+def make_lens(model, rng, size=0.03):
+    """A lens of a model with moderate distortion."""
+    info = CAMERA_MODELS[model]
+    pinhole = ((50.0, 55.0) if info.num_focal == 2 else (50.0,)) + (32.0, 24.0)
+    rest = rng.normal(scale=size, size=info.num_params - len(pinhole))
+    return Intrinsics(1, model, 64, 48, (*pinhole, *((0.7,) if model == "FOV" else rest)))
+
+
+@pytest.fixture(params=CAMERA_MODELS)
+def lens(request, rng):
+    return make_lens(request.param, rng)
+
+
+@pytest.fixture
+def rays(rng):
+    """Places within some 45 degrees of the axis, and the axis itself."""
+    return np.concatenate([np.zeros((1, 2)), rng.uniform(-0.8, 0.8, (200, 2))])
+
+
+def test_pixels_are_colmaps(lens, rays):
+    pycolmap = pytest.importorskip("pycolmap", reason="the reference for camera models")
+    camera = pycolmap.Camera(
+        model=lens.model, width=lens.width, height=lens.height, params=list(lens.params)
+    )
+    expected = camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+    np.testing.assert_allclose(image_points(lens, rays), expected, atol=1e-10)
+
+
+def test_the_way_back_leads_to_the_ray(lens, rays):
+    """Newton's method, with slopes from differences, undoes the lens."""
+    goal, xy, step = distort(lens, rays), rays * 0.9, 1e-6
+    for _ in range(20):
+        slopes = [
+            (distort(lens, xy + move) - distort(lens, xy - move)) / (2 * step)
+            for move in step * np.eye(2)
+        ]
+        jacobian = np.stack(slopes, axis=-1)
+        xy = xy + np.linalg.solve(jacobian, (goal - distort(lens, xy))[..., None])[..., 0]
+    np.testing.assert_allclose(xy, rays, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", [name for name in CAMERA_MODELS if "FISHEYE" not in name])
+def test_without_coefficients_a_lens_is_a_pinhole(model, rng, rays):
+    lens = make_lens(model, rng)
+    zeros = len(lens.params) - CAMERA_MODELS[model].num_focal - 2
+    straight = Intrinsics(1, model, 64, 48, (*lens.params[: -zeros or None], *[0.0] * zeros))
+    np.testing.assert_array_equal(distort(straight, rays), rays)
+    assert not straight.has_distortion
+    assert lens.has_distortion == (zeros > 0)
+
+
+def test_a_fisheye_without_coefficients_still_bends_lines(rays):
+    lens = Intrinsics(1, "RADIAL_FISHEYE", 64, 48, (50.0, 32.0, 24.0, 0.0, 0.0))
+    assert lens.has_distortion
+    radius = np.linalg.norm(distort(lens, rays), axis=-1)
+    np.testing.assert_allclose(radius, np.arctan(np.linalg.norm(rays, axis=-1)), atol=1e-12)
+
+
+def test_a_lens_folds_where_its_radius_is_largest():
+    """r (1 + k r^2) turns back at r = sqrt(-1 / 3k)."""
+    lens = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, -0.3))
+    assert fold_radius(lens, 2.0) == pytest.approx(np.sqrt(1 / 0.9), abs=2.0 / 500)
+    assert fold_radius(lens, 1.0) == 1.0
+    opening = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, 0.3))
+    assert fold_radius(opening, 5.0) == 5.0
