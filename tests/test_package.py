@@ -37,6 +37,7 @@ ORDER = (
     "depth",
     "stereo",
     "upsample",
+    "seeding",
     "geometry",
     "viewpoint",
     "preview",

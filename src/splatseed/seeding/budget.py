@@ -1,0 +1,308 @@
+"""A budget: how many seeds, and which are kept of too many.
+
+Notation: N points, of which ``num`` are kept. The views that see a point most closely are those in whose
+frame it falls at the smallest depth / focal length: ``CLOSEST`` of them. With a *spacing* of s pixels, a
+view's frame is cut into cells of s x s pixels, and its depth into slices of ``DEEP`` times that.
+A point is *needed* at a spacing if, in the view that sees it most closely, no kept point lies in its cell.
+Promise: points are asked in order, the originals first and then by priority; each is kept if it is
+needed, at the smallest spacing that keeps no more than ``num``; what is left of the number is filled
+up at smaller spacings. So the only point of a cell is kept before the second of any, nothing is drawn
+at random, and the bytes do not depend on the threads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32, Int64
+
+from splatseed.errors import ParameterError, PointCloudError
+from splatseed.jit import inline, kernel, parallel_range
+from splatseed.seeding.coverage import check_points, grid_from_world, project_block
+from splatseed.views.view import View
+
+__all__ = ["median_pixels", "parse_budget", "thin"]
+
+CLOSEST = 4
+"""Views in which a kept point is marked: enough that neighbours share one, few enough to be quick."""
+DEEP = 4.0
+"""Slices of depth, in cells: deep enough that noise along the ray makes no new cell."""
+CHUNKS = 64
+BLOCK = 512
+FINEST, COARSEST = 1.0 / 16, 1 << 14
+"""Spacings that are tried, in pixels."""
+CLOSE_ENOUGH = 0.02
+"""How many fewer than the number a spacing may keep."""
+STEPS = 24
+LEAST_POWER = 0.2
+"""Of the number kept as a power of 1 / spacing, lest a step be too long; on surfaces it is 2."""
+ACROSS = 4096.0
+"""Pixels that a cloud without views is taken to measure."""
+FREE = np.uint64(0)
+
+
+def parse_budget(budget: str | float, pixels: float) -> int:
+    """The number of seeds that a budget asks for.
+
+    Args:
+        budget: A number such as 50000 or "50000", or "0.25rho", Gaussians per pixel of one image.
+        pixels: Pixels of one image; see ``median_pixels``.
+
+    Raises:
+        ParameterError: It is neither, or below one seed.
+    """
+    text = str(budget).strip().lower()
+    factor = pixels if text.endswith("rho") else 1.0
+    try:
+        number = float(text.removesuffix("rho")) * factor
+    except ValueError:
+        number = np.nan
+    if not (np.isfinite(number) and round(number) >= 1):
+        raise ParameterError(
+            "a budget such as 50000, or 0.25rho (a quarter of the pixels of an image)",
+            found=repr(budget),
+            fix="Give a number of at least one seed.",
+        )
+    return round(number)
+
+
+def median_pixels(views: Sequence[View]) -> float:
+    """Pixels of the median view.
+
+    Raises:
+        ParameterError: There is no view.
+    """
+    if not views:
+        raise ParameterError(
+            "images, for a budget in rho", found="none", fix="Give a number of seeds instead."
+        )
+    return float(np.median([view.width * view.height for view in views]))
+
+
+def thin(
+    xyz: Float32[np.ndarray, "N 3"],
+    views: Sequence[View],
+    num: int,
+    *,
+    first: int = 0,
+    priority: Float[np.ndarray, " N"] | None = None,
+) -> Int64[np.ndarray, " num"]:
+    """Which points to keep of too many.
+
+    Args:
+        xyz: The points, in the world.
+        views: Of which only cameras and sizes are looked at. Without any, cells are cubes in space.
+        num: How many to keep, at least 1.
+        first: How many of the points, from the first on, are asked before the others: the originals.
+        priority: The higher is asked earlier, among originals and among the others; all equal when left
+            out. Points of equal priority are asked in their order.
+
+    Returns:
+        Indices, rising, int64 [min(num, N)].
+
+    Raises:
+        ParameterError: ``num`` is below 1.
+        PointCloudError: ``xyz`` is not of shape [N, 3], or ``priority`` not of shape [N].
+    """
+    xyz = check_points(views, xyz, 1) if views else _check_bare(xyz)
+    if num < 1:
+        raise ParameterError("at least 1 point to keep", found=f"{num}", fix="Ask for more.")
+    places = _places_in_views(xyz, views) if views else _places_in_space(xyz)
+    order = _order(len(xyz), first, priority)
+    if len(xyz) <= num:
+        return np.arange(len(xyz))
+    kept, spacing = _keep_at_one_spacing(places, order, num)
+    while spacing > FINEST and np.count_nonzero(kept) < num:
+        spacing /= 2
+        places.keep(order, spacing, num, kept)
+    rest = order[~kept[order]]  # they coincide with others, or, asked last, no view has them
+    rest = rest[np.argsort(places.group[rest, 0] < 0, stable=True)]
+    kept[rest[: num - np.count_nonzero(kept)]] = True
+    return np.flatnonzero(kept)
+
+
+def _check_bare(xyz: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
+    return check_points((None,), xyz, 1)  # type: ignore[arg-type]  # no view is looked at
+
+
+def _order(
+    num: int, first: int, priority: Float[np.ndarray, " N"] | None
+) -> Int64[np.ndarray, " N"]:
+    """The points in the order in which they are asked."""
+    if priority is None:
+        return np.arange(num)
+    priority = np.asarray(priority, np.float64)
+    if priority.shape != (num,):
+        raise PointCloudError(
+            f"priority of shape [{num}]",
+            found=f"{list(priority.shape)}",
+            fix="Pass one number a point, or leave it out.",
+        )
+    return np.lexsort((-priority, np.arange(num) >= first))  # stable
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """Where points are in the views that see them most closely.
+
+    Args:
+        group: The views, closest first, int32 [N, k]; -1 where there are no more.
+        place: Column, row and slice of depth in pixels, float32 [N, k, 3].
+    """
+
+    group: Int32[np.ndarray, "N k"]
+    place: Float32[np.ndarray, "N k 3"]
+
+    def keep(
+        self,
+        order: Int64[np.ndarray, " N"],
+        spacing: float,
+        limit: int,
+        kept: Bool[np.ndarray, " N"],
+    ) -> int:
+        """Keep more points, up to ``limit`` in all, and say how many are kept then."""
+        slots = 1 << int(2 * limit * self.group.shape[1]).bit_length()  # at most half full
+        return int(_keep(order, self.group, self.place, spacing, limit, slots, kept))
+
+
+def _keep_at_one_spacing(
+    places: _Places, order: Int64[np.ndarray, " N"], num: int
+) -> tuple[Bool[np.ndarray, " N"], float]:
+    """What the smallest spacing keeps that keeps no more than ``num``, and that spacing."""
+    best = np.zeros(len(order), np.bool_)
+    low, high = FINEST, float(COARSEST)
+    target, spacing, power = (1.0 - CLOSE_ENOUGH / 2) * num, 2.0, 2.0
+    known: tuple[float, float] | None = None
+    for _ in range(STEPS):
+        kept = np.zeros(len(order), np.bool_)
+        limit = min(2 * num, len(order))
+        count = places.keep(order, spacing, limit, kept)
+        if count > num:
+            low = spacing
+        else:
+            best, high = kept, spacing
+            if count >= (1.0 - CLOSE_ENOUGH) * num or spacing == FINEST:
+                break
+        if count < limit:  # else it is where counting stopped
+            if known is not None and count != known[1]:
+                power = math.log(count / known[1]) / math.log(known[0] / spacing)
+            known = spacing, count
+        guess = max(spacing * (count / target) ** (1.0 / max(power, LEAST_POWER)), FINEST)
+        inside = low < guess < high or (guess == low == FINEST)
+        spacing = guess if inside else math.sqrt(low * high)
+    return best, high
+
+
+def _places_in_space(xyz: Float32[np.ndarray, "N 3"]) -> _Places:
+    """Places without views: the cloud is taken to be some thousand pixels across."""
+    finite = np.isfinite(xyz).all(axis=1)
+    inside = xyz[finite].astype(np.float64)
+    low = inside.min(axis=0, initial=np.inf)
+    extent = (inside - low).max(initial=0.0) or 1.0
+    place = np.zeros((len(xyz), 1, 3), np.float32)
+    place[finite, 0] = (inside - low) * (ACROSS / extent)
+    return _Places(np.where(finite, 0, -1).astype(np.int32)[:, None], place)
+
+
+def _places_in_views(xyz: Float32[np.ndarray, "N 3"], views: Sequence[View]) -> _Places:
+    """Places in the views that see a point most closely."""
+    matrices = np.stack([grid_from_world(view, 1) for view in views])
+    focals = np.array([np.sqrt(abs(view.K[0, 0] * view.K[1, 1])) for view in views])
+    sizes = np.array([[view.width, view.height] for view in views], np.float64)
+    shape = len(xyz), min(CLOSEST, len(views))
+    group, place = np.full(shape, -1, np.int32), np.zeros((*shape, 3), np.float32)
+    _find_closest(xyz, matrices, focals, sizes, group, place)
+    return _Places(group, place)
+
+
+@kernel
+def _find_closest(xyz, matrices, focals, sizes, group, place):  # type: ignore[no-untyped-def]
+    for c in parallel_range(CHUNKS):
+        at = np.empty((3, BLOCK))
+        stop = len(xyz) * (c + 1) // CHUNKS
+        for start in range(len(xyz) * c // CHUNKS, stop, BLOCK):
+            num = min(BLOCK, stop - start)
+            closeness = np.zeros((num, group.shape[1]))
+            for v in range(len(matrices)):
+                project_block(xyz[start : start + num], matrices[v], at)
+                for k in range(num):
+                    inside = 0.0 <= at[0, k] < sizes[v, 0] and 0.0 <= at[1, k] < sizes[v, 1]
+                    close = focals[v] / at[2, k]
+                    if inside and closeness[k, -1] < close < np.inf:
+                        # the scale of depth: a slice is DEEP cells, z / focal each
+                        at[2, k] = np.log(at[2, k]) * focals[v] / DEEP
+                        _insert(
+                            close, v, at[:, k], closeness[k], group[start + k], place[start + k]
+                        )
+
+
+@inline
+def _insert(close, v, at, closeness, group, place):  # type: ignore[no-untyped-def]
+    """Put a view in its place among the closest; of equals the earlier stays before."""
+    k = len(closeness) - 1
+    while k > 0 and closeness[k - 1] < close:
+        closeness[k], group[k], place[k] = closeness[k - 1], group[k - 1], place[k - 1]
+        k -= 1
+    closeness[k], group[k] = close, v
+    for axis in range(3):
+        place[k, axis] = at[axis]
+
+
+@inline
+def _keep(order, group, place, spacing, limit, slots, kept):  # type: ignore[no-untyped-def]
+    """Mark the points that are needed, in order, beside those that are marked already."""
+    table = np.full(slots, FREE)
+    count = 0
+    for i in order:
+        if kept[i]:
+            count += 1
+            _mark_cells(group[i], place[i], spacing, table)
+    for i in order:
+        if count >= limit:
+            break
+        if not kept[i] and group[i, 0] >= 0:
+            key = _key(group[i, 0], place[i, 0], spacing)
+            if table[_slot(key, table)] == FREE:
+                kept[i] = True
+                count += 1
+                _mark_cells(group[i], place[i], spacing, table)
+    return count
+
+
+@inline
+def _mark_cells(group, place, spacing, table):  # type: ignore[no-untyped-def]
+    for k in range(len(group)):
+        if group[k] >= 0:
+            key = _key(group[k], place[k], spacing)
+            table[_slot(key, table)] = key
+
+
+@inline
+def _key(group, place, spacing):  # type: ignore[no-untyped-def]
+    """A number of 64 bits for a cell of a view; that two share one is not to be expected."""
+    key = _mix(np.uint64(group))
+    for axis in range(3):
+        key = _mix(key ^ np.uint64(np.int64(np.floor(place[axis] / spacing))))
+    return max(key, np.uint64(1))  # 0 is a free slot
+
+
+@inline
+def _mix(x):  # type: ignore[no-untyped-def]
+    """Scramble, one to one: the finaliser of splitmix64 (Steele, Lea and Flood, 2014)."""
+    x += np.uint64(0x9E3779B97F4A7C15)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+@inline
+def _slot(key, table):  # type: ignore[no-untyped-def]
+    """Where a key is in a hash table with open addressing, or the free slot where it belongs."""
+    last = np.uint64(len(table) - 1)
+    slot = key & last
+    while table[slot] != FREE and table[slot] != key:
+        slot = (slot + np.uint64(1)) & last
+    return slot
