@@ -104,7 +104,9 @@ def test_a_budget_is_met_and_keeps_the_pictures_covered(method, room, seeds):
     num = len(whole) // 2
     thinned = ss.upsample(room, method, budget=num)
     assert len(thinned) == num
-    assert {row.tobytes() for row in thinned.xyz} <= {row.tobytes() for row in whole.xyz}
+    known = thinned.select(thinned.source != COVER)  # cover is made anew for what is left
+    assert {row.tobytes() for row in known.xyz} <= {row.tobytes() for row in whole.xyz}
+    assert len(known) >= 0.7 * num
     at_random = whole.select(np.random.default_rng(0).permutation(len(whole))[:num])
     assert share_covered(room, thinned) > share_covered(room, at_random)
 
