@@ -122,3 +122,22 @@ def test_a_budget_may_be_below_the_originals_and_a_share_of_the_pixels(room):
 def test_a_budget_that_is_none_is_refused(budget, room):
     with pytest.raises(ParameterError, match="budget"):
         ss.upsample(room, "linear", budget=budget)
+
+
+def test_verify_moves_and_drops_interpolated_points(room, room_capture):
+    notes = []
+    plain = ss.upsample(room, "mls", ratio=4)
+    checked = ss.upsample(room, "mls", ratio=4, verify=True, note=notes.append)
+    count = len(room.points)
+    np.testing.assert_array_equal(checked.xyz[:count], room.points.xyz)
+    assert count < len(checked) < len(plain)
+    off = room_capture.surfaces.distance
+    assert off(checked.xyz[count:]).mean() < 0.8 * off(plain.xyz[count:]).mean()
+    assert any("agree with the photographs" in each for each in notes)
+
+
+def test_verify_leaves_what_was_seen(room, seeds):
+    notes = []
+    checked = ss.upsample(room, verify=True, note=notes.append)
+    assert checked.xyz.tobytes() == seeds.xyz.tobytes()
+    assert any("no interpolated points" in each for each in notes)

@@ -11,18 +11,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from splatseed.pointcloud import PointCloud
+import numpy as np
+
+from splatseed.pointcloud import ATTRIBUTES, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views, with_cover
 from splatseed.seeding.thinning import frames_of, points_within, thin_to
 from splatseed.upsample import Profile, Upsampler, upsample as add_points
+from splatseed.upsample.method import NewPoints
+from splatseed.upsample.registry import source_code
 
 __all__ = [
     "CELL",
     "DEFAULT_METHOD",
     "FALLBACK",
+    "INTERPOLATING",
     "add_cover",
+    "add_verified",
     "method_for",
     "share_covered",
     "upsample",
@@ -32,6 +38,9 @@ DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """What makes the points, and what does where there are no photographs to look at."""
 CELL = 8
 """Side in pixels of the cells by which coverage is measured."""
+
+INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
+"""Methods whose points are guesses between others, which ``verify`` holds against the photographs."""
 
 Note = Callable[[str], None]
 
@@ -98,7 +107,7 @@ def upsample(
         progress=progress, note=note, **parameters,
     )  # fmt: skip
     if verify:
-        cloud = _verified(whole, cloud, progress, note)
+        cloud = add_verified(whole, cloud, progress=progress, note=note)
     if cover is not None:
         cloud = add_cover(whole, cloud, cell=cover, seed=seed, progress=progress)
     if most is not None:
@@ -132,6 +141,41 @@ def add_cover(
     points = scene.points if cloud is None else cloud
     views = read_views(scene, photographed(scene), MAX_SIZE, progress)
     return with_cover(views, points, cell, seed, progress)
+
+
+def add_verified(
+    scene: Scene, cloud: PointCloud, *, progress: Progress = silent, note: Note = lambda _: None
+) -> PointCloud:
+    """A cloud whose interpolated points were held against the photographs: moved, kept or dropped.
+
+    Args:
+        scene: Whose photographs are looked at.
+        cloud: The points; those of ``INTERPOLATING`` methods are looked at, the others stay.
+        progress: Told how far it is.
+        note: Told how many had which fate, one sentence each.
+
+    Raises:
+        SceneNotFoundError: There are no photographs.
+    """
+    from splatseed.seeding.verify import verify  # noqa: PLC0415  (kernels load with use)
+    from splatseed.views.sightings import find_sightings  # noqa: PLC0415
+
+    codes = [source_code(name) for name in INTERPOLATING]
+    guessed = np.isin(cloud.source, codes)
+    if not guessed.any():
+        note("There are no interpolated points to verify.")
+        return cloud
+    images = photographed(scene)
+    views = read_views(scene, images, MAX_SIZE, progress)
+    points = cloud.select(guessed)
+    new = NewPoints(points.xyz, points.rgb, (), source=points.source)
+    checked = verify(views, images, find_sightings(scene), new, progress)
+    for sentence in checked.notes:
+        note(sentence)
+    known = {name: getattr(checked, name) for name in ATTRIBUTES}
+    assert checked.source is not None  # noqa: S101  (it was given)
+    kept = PointCloud(checked.xyz, checked.rgb, checked.source, **known)
+    return PointCloud.concatenate(cloud.select(~guessed), kept)
 
 
 def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
