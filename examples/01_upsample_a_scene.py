@@ -20,7 +20,7 @@ def main(scene_dir: Path, out: Path) -> None:
         write_capture(make_capture(seed=0, num_views=12, width=200, height=150), scene_dir)
 
     scene = ss.load_scene(scene_dir)
-    seeds = ss.upsample(scene, method="mls", ratio=8, seed=0)
+    seeds = ss.upsample(scene)  # looks at the photographs
     report = ss.write_scene(scene.replace(points=seeds), out, overwrite=True)
 
     print(f"{len(scene.images)} images, {len(scene.points):,} points -> {len(seeds):,}")
@@ -29,5 +29,5 @@ def main(scene_dir: Path, out: Path) -> None:
 
 if __name__ == "__main__":
     words = [Path(word) for word in sys.argv[1:]]
-    defaults = [Path("example_room"), Path("example_room_mls8")]
+    defaults = [Path("example_room"), Path("example_room_auto")]
     main(*words[:2], *defaults[len(words) :])

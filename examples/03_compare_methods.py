@@ -17,6 +17,7 @@ from splatseed.synthetic import SHAPES, Surface
 NUM_POINTS = 2000
 NOISE = 0.1
 """Of the originals, in units of their spacing."""
+NEED_PHOTOGRAPHS = ("depth", "stereo", "cover", "auto")
 
 
 def noisy_cloud(surface: Surface, rng: np.random.Generator) -> ss.PointCloud:
@@ -38,7 +39,7 @@ def score(surface: Surface, method: str) -> tuple[float, float]:
 
 def main() -> None:
     """Print one row a shape, one column a method."""
-    methods = [method for method in ss.METHODS if method != "depth"]  # which needs photographs
+    methods = [name for name in ss.METHODS if name not in NEED_PHOTOGRAPHS]
     print("error / coverage".ljust(18) + "".join(f"{method:>15}" for method in methods))
     for name, make_shape in SHAPES.items():
         scores = [score(make_shape(), method) for method in methods]
