@@ -17,7 +17,7 @@ from typing import Any
 import splatseed
 from children import call
 
-__all__ = ["ARMS", "Arm", "apply_edits", "scores_of"]
+__all__ = ["ARMS", "FOLIAGE", "Arm", "apply_edits", "scores_of"]
 
 PACKAGE = Path(splatseed.__file__).parent
 COST, MATCH, START = "stereo/cost.py", "stereo/patchmatch.py", "stereo/start.py"
@@ -76,11 +76,31 @@ ARMS: dict[str, Arm] = {
 }  # fmt: skip
 """A dash is the default with one choice undone."""
 
+FOLIAGE: dict[str, Arm] = {
+    "stereo": Arm(),
+    "window at every pixel": Arm(edits=[(COST, "RADIUS, STRIDE = 2, 2", "RADIUS, STRIDE = 2, 1")]),
+    "window of 7 x 7": Arm(edits=[(COST, "RADIUS, STRIDE = 2, 2", "RADIUS, STRIDE = 3, 2")]),
+    "8 sources": Arm({"num_sources": 8}),
+    "3 sources": Arm({"num_sources": 3}),
+    "grid of 2": Arm({"grid": 2}),
+    "grid of 1": Arm({"grid": 1}),
+    "half size": Arm({"max_size": 400}),
+    "8 sweeps": Arm({"sweeps": 8}),
+    "cost up to 0.8": Arm({"max_cost": 0.8}),
+    "confirmed by 1": Arm({"min_agreeing": 1}),
+    "within 2%": Arm({"tolerance": 0.02}),
+}
+"""What might help where nothing is smooth."""
 
-def scores_of(
-    arm: Arm, names: Sequence[str], cache: Path, limit: int, without: str = ""
-) -> dict[str, dict[str, float]]:
-    """The scores of an arm by scene, measured in a process of its own."""
+
+def scores_of(arm: Arm, function: str, **arguments: Any) -> dict[str, dict[str, float]]:
+    """What a function of a module beside this file says of an arm, measured in a process of its own.
+
+    Args:
+        arm: Which.
+        function: ``module:name``; it takes ``settings``.
+        arguments: What else it takes.
+    """
     with tempfile.TemporaryDirectory() as folder:
         environment = {}
         if arm.edits:
@@ -89,11 +109,10 @@ def scores_of(
             )
             apply_edits(Path(folder) / "splatseed", arm.edits)
             environment["PYTHONPATH"] = folder
+        settings = dict(arm.settings)
         found = call(
-            "stereo_truth:score_all", threads=THREADS, environment=environment,
-            names=list(names), cache=str(cache), settings=dict(arm.settings), limit=limit,
-            without=without,
-        )  # fmt: skip
+            function, threads=THREADS, environment=environment, settings=settings, **arguments
+        )
     return dict(found)
 
 

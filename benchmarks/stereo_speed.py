@@ -115,7 +115,7 @@ def _best(function: Callable[[], Any], repeats: int = REPEATS) -> float:
     return min(seconds)
 
 
-def whole_run(folder: str, clock: Clock, threads: int) -> dict[str, Any]:
+def whole_run(folder: str, clock: Clock, threads_used: int) -> dict[str, Any]:
     """Seconds by stage of photographs to seeds, seeds, and the process's peak memory in bytes."""
     scene = ss.load_scene(folder)
     settings = StereoSettings(grid=GRID)
@@ -125,7 +125,7 @@ def whole_run(folder: str, clock: Clock, threads: int) -> dict[str, Any]:
         ),
         CELL,
     )  # compiles
-    read = time.perf_counter if clock == "wall" else lambda: time.process_time() / threads
+    read = time.perf_counter if clock == "wall" else lambda: time.process_time() / threads_used
     stages: dict[str, float] = {}
     last = read()
 
