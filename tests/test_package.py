@@ -27,6 +27,7 @@ ORDER = (
     "progress",
     "kernel_sources",
     "jit",
+    "simd",
     "camera",
     "lens",
     "pointcloud",
@@ -93,9 +94,10 @@ def test_imports_run_one_way(part):
         assert ["splatseed"] not in names, f"{path.name} imports the whole package"
 
 
-@pytest.mark.parametrize("part", ["views", "depth", "upsample"])
+@pytest.mark.parametrize("part", ["views", "depth", "stereo", "upsample", "seeding"])
 def test_what_makes_seeds_needs_little(part):
-    allowed = {"splatseed", "PIL", *LIGHT} if part != "upsample" else {"splatseed", *LIGHT}
+    more = {"views": {"PIL"}, "depth": {"PIL"}, "stereo": {"llvmlite"}}.get(part, set())
+    allowed = {"splatseed", *more, *LIGHT}
     for path in _files(part):
         tops = {name.split(".")[0] for name in _imports(path)}
         assert tops <= {*allowed, *sys.stdlib_module_names}, path.name

@@ -2,7 +2,7 @@
 
 >>> import splatseed as ss
 >>> sorted(ss.METHODS)[:3]
-['depth', 'linear', 'mls']
+['auto', 'cover', 'depth']
 """
 
 from splatseed.camera import Camera
