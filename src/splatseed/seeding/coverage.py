@@ -153,7 +153,7 @@ def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-unty
 
 
 @inline
-def project_block(xyz, m, at):  # type: ignore[no-untyped-def]  # noqa: ANN201
+def project_block(xyz, m, at):  # type: ignore[no-untyped-def]
     """Column, row and depth of points [N, 3] into ``at`` [3, >= N]; NaN or infinite at depth 0."""
     for k in range(len(xyz)):
         at[0, k], at[1, k], at[2, k] = place(xyz[k], m)

@@ -113,7 +113,7 @@ def _guess(depths, empty, back, matrices, shapes, starts, seen, guesses, reach):
 
 
 @inline
-def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]  # noqa: ANN201
+def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]
     """The point at a depth on the ray through the centre of cell (i, j)."""
     z = np.float64(depth)
     x, y = (j + 0.5) * z, (i + 0.5) * z
