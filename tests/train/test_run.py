@@ -43,10 +43,14 @@ def _stop_after(step):
     return on_step
 
 
-@pytest.mark.parametrize(("strategy", "gain"), [("default", 2.0), ("mcmc", 1.0), ("none", 4.0)])
+# MCMC's own cap, a million Gaussians, is reached in a short run too, and takes most of a minute.
+SMALL = {"default": {}, "mcmc": {"cap_max": 4000}, "none": {}}
+
+
+@pytest.mark.parametrize(("strategy", "gain"), [("default", 2.0), ("mcmc", 2.5), ("none", 4.0)])
 def test_training_makes_unseen_views_better(begin, strategy, gain):
-    """By at least half of what it gained when this was written; MCMC begins dark and sparse."""
-    run = begin(strategy=strategy, max_steps=100)
+    """By about half of what it gained when this was written, or more."""
+    run = begin(strategy=strategy, max_steps=100, **SMALL[strategy])
     before = run.trainer.test_psnr()
     assert run.train()
     assert run.trainer.test_psnr() > before + gain
@@ -269,7 +273,7 @@ def test_what_does_not_fit_the_memory_is_refused_with_what_would(begin, monkeypa
 
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
 def test_memory_holds_growth_and_the_run_says_so(begin, monkeypatch, strategy):
-    settings = {"strategy": strategy, "max_steps": 100}
+    settings = {"strategy": strategy, "max_steps": 100, **SMALL[strategy]}
     free = begin("free", **settings)
     assert free.train()
     begun, grown = free.state.records[0].num_gaussians, len(free.state.params["means"])
