@@ -20,7 +20,7 @@ from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import Hints, first_planes
 from splatseed.views.view import View
 
-__all__ = ["match_views", "other_from_view"]
+__all__ = ["make_pictures", "match_views", "other_from_view"]
 
 Found = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
 Grey = UInt8[np.ndarray, "H W"]
@@ -74,7 +74,7 @@ def _match(
     planes, costs = np.full((3, *shape), np.nan, np.float32), np.full(shape, np.inf, np.float32)
     if not others or hints is None or not costs.size:
         return planes, costs
-    pictures = _pictures(
+    pictures = make_pictures(
         view, greys[i], [views[j] for j in others], [greys[j] for j in others], grid, hints.bounds
     )
     begin(pictures, first_planes(hints, shape, grid, rng), planes, costs)
@@ -93,7 +93,7 @@ def _blocks_known(mask: Bool[np.ndarray, "H W"], grid: int) -> Bool[np.ndarray, 
     return np.asarray(blocks.all(axis=(1, 3)))
 
 
-def _pictures(
+def make_pictures(
     view: View,
     grey: Grey,
     others: Sequence[View],
@@ -101,6 +101,16 @@ def _pictures(
     grid: int,
     bounds: Float32[np.ndarray, " 2"],
 ) -> Pictures:
+    """A view and those it is compared with, as kernels take them.
+
+    Args:
+        view: The reference.
+        grey: Its brightness.
+        others: The views it is compared with.
+        greys: Their brightness.
+        grid: Pixels between grid points.
+        bounds: Least and largest inverse depth that is tried.
+    """
     offsets = np.cumsum([0, *(each.size for each in greys)])
     sources: Int32[np.ndarray, " Q"] = np.empty(offsets[-1], np.int32)
     for start, stop, each in zip(offsets, offsets[1:], greys, strict=False):

@@ -15,7 +15,7 @@ from jaxtyping import Float64, Int64
 
 from splatseed.jit import inline, kernel, parallel_range
 
-__all__ = ["choose_by_pose", "choose_sources"]
+__all__ = ["choose_by_pose", "choose_sources", "views_of_points"]
 
 LEAST, FULL, WIDE, MOST = 1.0, 4.0, 15.0, 45.0
 """Degrees between which the weight rises, stays full, and falls."""
@@ -44,7 +44,7 @@ def choose_sources(
     count = len(seen)
     worth = np.zeros((count, count))
     if count > 1 and len(xyz):
-        order, offsets = _views_of_points(seen, len(xyz))
+        order, offsets = views_of_points(seen, len(xyz))
         asked = [each[:: -(-len(each) // MOST_POINTS) or 1] for each in seen]
         starts = np.cumsum([0, *map(len, asked)])
         rows = np.concatenate(asked)
@@ -77,10 +77,15 @@ def choose_by_pose(
     return chosen
 
 
-def _views_of_points(
+def views_of_points(
     seen: Sequence[Int64[np.ndarray, " M"]], num_points: int
 ) -> tuple[Int64[np.ndarray, " T"], Int64[np.ndarray, " P+1"]]:
-    """The views of each point, behind each other, and where each point's begin."""
+    """The views of each point, int64 [T], and where each point's begin, int64 [P + 1].
+
+    Args:
+        seen: The points that each view sees, as rows from 0 to ``num_points``.
+        num_points: P.
+    """
     view = np.repeat(np.arange(len(seen)), [len(each) for each in seen])
     point = np.concatenate(seen)
     offsets = np.zeros(num_points + 1, np.int64)
