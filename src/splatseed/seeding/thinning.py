@@ -20,7 +20,7 @@ from splatseed.views.view import View, data_factor, poses_of
 __all__ = ["frames_of", "points_within", "thin_to"]
 
 COVER = source_code("cover")
-MOST_COVER = 0.25
+MOST_COVER = 0.1
 """Part of a budget that cover's guesses may take, at most; their cells grow until they fit."""
 COARSER = 1.25
 """By how much."""
@@ -54,7 +54,8 @@ def thin_to(
     """At most ``num`` of a cloud's points, originals before others where both would do.
 
     Cover is made anew for what thinning leaves: a guess fills a gap, and must not take the place of a
-    point that is known.
+    point that is known. Where there are more originals than may stay, they alone are thinned: they are
+    dense where there is detail, which is where few Gaussians are needed most.
 
     Args:
         scene: Where the points belong.
@@ -72,6 +73,10 @@ def thin_to(
     if not guessed.any() or guessed.all():
         return _keep(scene, points, num)
     known = points.select(~guessed)
+    if (
+        known.num_original >= num
+    ):  # what is known to have texture comes first where little is allowed
+        known = known.originals
     views = read_views(scene, photographed(scene, hold_out), MAX_SIZE, progress)
     room = max(num - len(known), round(MOST_COVER * num))
     kept = _keep(scene, known, num - room)
