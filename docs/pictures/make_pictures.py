@@ -21,11 +21,11 @@ from jaxtyping import Float32, Float64, UInt8
 from matplotlib import colormaps
 from PIL import Image as PillowImage, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
+from splatseed.depth.sightings import find_sightings
 
 import splatseed as ss
 from splatseed.commands._depth_picture import write_depth_picture
 from splatseed.depth import align
-from splatseed.depth.sightings import find_sightings
 from splatseed.geometry import spacing
 from splatseed.io import depth_folder, find_depths
 from splatseed.io.staging import atomic_file
