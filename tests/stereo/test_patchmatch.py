@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.stereo.depths import other_from_view
+from splatseed.stereo.matching import other_from_view
 from splatseed.stereo.patchmatch import STEEPEST, Pictures, begin, sweep
 from splatseed.stereo.quads import make_quads
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from splatseed.render import simd
+from splatseed import simd
 from splatseed.simd import LANES
 
 SPECIAL = np.array(
