@@ -27,7 +27,7 @@ VERBS = {
     "train": "Train 3D Gaussians on a scene, on a GPU or on the CPU.",
     "evaluate": "Score a trained model: PSNR, SSIM, LPIPS.",
     "bench": "Compare methods by training: many runs, resumable, then a report.",
-    "depth": "Make depth maps of the photographs: by a network you have, or by stereo.",
+    "depth": "Make depth maps of the photographs, by a network or by stereo.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",
     "demo": "Make a small scene, upsample it by every method, measure, train.",

@@ -20,14 +20,14 @@ def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
     run = splatseed(*WORDS, "--preview", "-o", out, "--train-steps", "8")
     assert run.code == 0, run
     counts = {}
-    for name in ("sfm", "mls"):
+    for name in ("sfm", "auto"):
         metrics = json.loads((out / f"run_{name}/metrics.json").read_text())
         config = json.loads((out / f"run_{name}/config.json").read_text())
         assert metrics["steps"] == 8
         assert config["strategy"] == "none"
         counts[name] = metrics["num_gaussians"]
         assert f"{metrics['psnr']:.2f}" in run.out
-    assert counts["mls"] == 2 * counts["sfm"]
+    assert counts["auto"] > counts["sfm"]
     assert "8 steps" in run.out  # when the SfM run reached its own last PSNR
     assert "no error bars" in run.out
     with Image.open(out / "preview_trained.png") as file:
@@ -35,7 +35,7 @@ def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
     assert pixels.shape[1] > 3 * 400
     assert pixels.shape[0] > 2 * 300
     # What the demo says to run next works: its runs know their scenes by where they lie now.
-    again = splatseed("evaluate", out / "run_mls")
+    again = splatseed("evaluate", out / "run_auto")
     assert again.code == 0, again
     assert f"{metrics['psnr']:.2f}" in again.out
 

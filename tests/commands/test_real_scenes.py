@@ -36,7 +36,9 @@ def test_colmap_scenes_are_upsampled_and_open(name, method, scenes, tmp_path, sp
 
 def test_a_transforms_scene_made_of_fern(scenes, tmp_path, splatseed):
     write_scene(load_scene(scenes / "fern"), tmp_path / "nerf", format="transforms")
-    run = splatseed("upsample", tmp_path / "nerf", "--ratio", 2, "-o", tmp_path / "out")
+    run = splatseed(
+        "upsample", tmp_path / "nerf", "--method", "mls", "--ratio", 2, "-o", tmp_path / "out"
+    )
     assert run.code == 0
     assert len(load_scene(tmp_path / "out").points) == 2 * len(load_scene(tmp_path / "nerf").points)
     assert "ns-train splatfacto" in run.out
@@ -58,12 +60,16 @@ def test_info_on_real_captures(name, scenes, splatseed):
 
 
 @pytest.mark.parametrize("name", ["replica/room0", "7scenes_redkitchen"])
-def test_depth_captures_have_no_points_yet(name, scenes, tmp_path, splatseed):
+def test_depth_captures_need_no_points_for_the_default(name, scenes, tmp_path, splatseed):
     run = splatseed("info", scenes / name)
     assert run.code == 0
     assert "--poses-from" in run.out
     assert "nan" not in run.out
-    run = splatseed("upsample", scenes / name, "-o", tmp_path / "out")
+    run = splatseed("upsample", scenes / name, "--method", "mls", "-o", tmp_path / "out")
     assert run.code == 2
     assert "--poses-from" in run.err
     assert not list(tmp_path.iterdir())
+    few = ["--auto.hold-out", 0, "--auto.max-size", 320]
+    run = splatseed("upsample", scenes / name, *few, "-o", tmp_path / "out")
+    assert run.code == 0
+    assert len(load_scene(tmp_path / "out").points) > 3000

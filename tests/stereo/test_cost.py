@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatseed.simd import LANES
-from splatseed.stereo.cost import SAMPLES, UNSEEN, best_cost, prepare_window
+from splatseed.stereo.cost import NOISE, SAMPLES, UNSEEN, best_cost, prepare_window
 from splatseed.stereo.quads import make_quads
 
 from .references import OFFSETS, best_of, bilinear, cost_in, window_weights
@@ -67,7 +67,7 @@ def test_weights_and_likeness_are_those_of_the_formula(rough, places):
         np.testing.assert_allclose(weights[:, lane], c, rtol=1e-3)
         r = np.array([bilinear(image, u + dx - 0.5, v + dy - 0.5) for dx, dy in OFFSETS])
         apart = r - c @ r
-        expected = c * apart / np.sqrt(c @ apart**2 + 2.0)
+        expected = c * apart / np.sqrt(c @ apart**2 + NOISE)
         np.testing.assert_allclose(likeness[:, lane], expected, atol=2e-4)
 
 
