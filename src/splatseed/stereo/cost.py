@@ -49,7 +49,7 @@ SIGMA_GREY = 25.0
 """Grey levels at which a sample's weight has fallen by exp(-1/2)."""
 SIGMA_PLACE = 5.0
 """Likewise in pixels."""
-NOISE = 0.5
+NOISE = 0.1
 """Variance, grey levels squared, below which texture is noise."""
 UNSEEN = 1.0
 """Cost in a view whose frame does not hold the point: that of no likeness."""
