@@ -232,7 +232,8 @@ def triangulated(name: str, cache: Path) -> Scene:
     if not folder.is_dir():
         words = ["sfm", SCENES / name / "results", "--poses-from", SCENES / name, "-o", folder]
         folder.parent.mkdir(parents=True, exist_ok=True)
-        subprocess.run([sys.executable, "-m", "splatseed", *map(str, words)], check=True)
+        program = Path(sys.executable).with_name("splatseed")
+        subprocess.run([program, *map(str, words)], check=True)
     scene = ss.load_scene(folder)
     return scene.replace(depths=find_depths(scene, SCENES / name))
 

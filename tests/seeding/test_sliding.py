@@ -1,0 +1,146 @@
+"""Sliding points to where photographs agree, held to the search and its cost as literal loops."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatseed.seeding.sliding import FLOOR, OFFSETS, REACH, REFINEMENTS, slide
+from splatseed.seeding.verify import TEXTURE
+from splatseed.stereo.patchmatch import Pictures
+from splatseed.stereo.quads import make_quads
+
+from ..stereo.references import (  # noqa: TID252  (tests are no package)
+    OFFSETS as WINDOW,
+    best_of,
+    bilinear,
+    cost_in,
+    window_weights,
+)
+
+HEIGHT, WIDTH = 34, 46
+NUM = 21
+"""Points: sixteen lanes, and some more."""
+
+
+@pytest.fixture
+def images(rng):
+    """A picture and three others: the same shifted by its planes' parallax, darker, and noise in it."""
+    wide = rng.uniform(0, 255, (HEIGHT, WIDTH + 40))
+    for axis in (0, 1):
+        wide = (np.roll(wide, 1, axis) + 2 * wide + np.roll(wide, -1, axis)) / 4
+    shifts = (8, -9, 14)
+    moved = [wide[:, 20 + shift : 20 + shift + WIDTH] for shift in shifts]
+    noisy = [0.7 * each + rng.normal(scale=3, size=each.shape) for each in moved]
+    return [each.astype(np.uint8) for each in (wide[:, 20 : 20 + WIDTH], *noisy)]
+
+
+@pytest.fixture
+def warps():
+    """Cameras to the side: at inverse depth 1 the pictures above lie on each other."""
+    return [np.hstack([np.eye(3), [[-shift], [0.0], [0.0]]]) for shift in (8.0, -9.0, 14.0)]
+
+
+@pytest.fixture
+def points(rng):
+    """Pixels, planes and how far a spacing moves them: uv, planes, reach."""
+    uv = rng.uniform([2, 2], [WIDTH - 2, HEIGHT - 2], (NUM, 2)).astype(np.float32)
+    w = rng.uniform(0.7, 1.3, NUM)
+    planes = np.stack([w, *rng.normal(scale=0.005, size=(2, NUM))], axis=1).astype(np.float32)
+    return uv, planes, rng.uniform(-0.3, -0.1, NUM).astype(np.float32)
+
+
+def run(images, warps, uv, planes, reach):
+    quads = [make_quads(image).ravel() for image in images]
+    packed = np.array([[*warp[:, :3].ravel(), *warp[:, 3]] for warp in warps], np.float32)
+    pictures = Pictures(
+        quads[0], np.array([WIDTH, HEIGHT], np.int64), np.concatenate(quads[1:]),
+        np.array([[WIDTH, HEIGHT]] * len(warps), np.int64),
+        np.cumsum([0, *map(len, quads[1:])]), packed, 1, 1.0, np.array([0.0, np.inf], np.float32),
+    )  # fmt: skip
+    moves, costs, variances = np.full((3, len(uv)), np.nan, np.float32)
+    slide(pictures, uv, planes, reach, moves, costs, variances)
+    return moves, costs, variances
+
+
+def cost_of(images, warps, uv, plane, reach, t):
+    """The cost of a point that has moved by t spacings."""
+    moved = plane.astype(float) / (1 + t * float(reach))
+    u, v = uv.astype(float)
+    return best_of(
+        [cost_in(images[0], o, w, u, v, moved) for o, w in zip(images[1:], warps, strict=True)]
+    )
+
+
+def search(cost):
+    """Evenly spaced places, then half steps about the best: the t that wins, and its value."""
+    values = {}
+
+    def best(places):
+        for t in places:
+            values.setdefault(t, (cost(t) + FLOOR) * (1 + t * t))
+        return min(values, key=values.__getitem__)
+
+    step = 2 * REACH / (OFFSETS - 1)
+    t = best([step * (k - OFFSETS // 2) for k in range(OFFSETS)])
+    for _ in range(REFINEMENTS):
+        step /= 2
+        t = best([t - step, t + step])
+    return t, values[t]
+
+
+@pytest.mark.parametrize("num_sources", [1, 3])
+def test_the_place_is_that_of_the_loop(num_sources, images, warps, points):
+    images, warps = images[: num_sources + 1], warps[:num_sources]
+    moves, costs, _ = run(images, warps, *points)
+    same = 0
+    for i, (uv, plane, reach) in enumerate(zip(*points, strict=True)):
+
+        def cost(t, at=(uv, plane, reach)):
+            return cost_of(images, warps, *at, t)
+
+        t, value = search(cost)
+        assert costs[i] == pytest.approx(cost(float(moves[i])), abs=2e-3)
+        # Rounding may decide between places that are as good.
+        assert (costs[i] + FLOOR) * (1 + moves[i] ** 2) == pytest.approx(value, abs=1e-2)
+        same += abs(moves[i] - t) < 1e-6
+    assert same >= 0.8 * NUM
+    assert np.ptp(moves) > 1.0  # the loop above compared different things
+
+
+def test_the_place_is_where_the_pictures_lie_on_each_other(images, warps, points):
+    uv, planes, reach = points
+    planes = planes * [[1, 0, 0]]
+    inside = (uv[:, 0] > 16) & (uv[:, 0] < WIDTH - 16)
+    t = (planes[:, 0] - 1) / reach  # w / (1 + t h / (n X)) = 1
+    near = inside & (np.abs(t) < 1.2)
+    assert near.sum() > 3
+    moves, costs, _ = run(images, warps, uv, planes.astype(np.float32), reach)
+    np.testing.assert_allclose(moves[near], t[near], atol=0.08)
+    assert costs[near].max() < 0.1
+
+
+def test_the_variance_is_that_of_the_window(images, warps, points):
+    faint = (images[0] // 10).astype(np.uint8)  # as faint as what has to be told from no texture
+    _, _, variances = run([faint, *images[1:]], warps, *points)
+    assert variances.min() < TEXTURE < variances.max()
+    for (u, v), found in zip(points[0].astype(float), variances, strict=True):
+        c = window_weights(faint, u, v)
+        r = np.array([bilinear(faint, u + dx - 0.5, v + dy - 0.5) for dx, dy in WINDOW])
+        assert found == pytest.approx(c @ (r - c @ r) ** 2, rel=0.02)
+
+
+def test_a_point_does_not_depend_on_its_neighbours_in_the_list(images, warps, points, rng):
+    whole, order = run(images, warps, *points), rng.permutation(NUM)[: NUM - 4]
+    part = run(images, warps, *(each[order] for each in points))
+    for one, other in zip(whole, part, strict=True):
+        assert one[order].tobytes() == other.tobytes()
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_nothing_moves_where_there_is_nothing_to_see(level, images, warps, points):
+    grey = [np.full((HEIGHT, WIDTH), level, np.uint8) for _ in images]
+    moves, costs, variances = run(grey, warps, *points)
+    np.testing.assert_array_equal(moves, 0)
+    np.testing.assert_allclose(costs, 1.0, atol=5e-3)
+    assert variances.max() < 0.1
