@@ -15,7 +15,16 @@ from splatseed.scene import Scene
 from splatseed.seeding.sliding import REACH
 from splatseed.seeding.surroundings import Surroundings
 from splatseed.seeding.upsampling import add_verified
-from splatseed.seeding.verify import BARE_CONFIDENCE, MAX_COST, TEXTURE, _decide, _Trials
+from splatseed.seeding.verify import (
+    BARE_CONFIDENCE,
+    FARTHEST,
+    MAX_COST,
+    STEEPEST,
+    TEXTURE,
+    _decide,
+    _planes,
+    _Trials,
+)
 
 from ..stereo.made import WIDTH  # noqa: TID252  (tests are no package)
 from .planted import (
@@ -171,6 +180,31 @@ def test_one_and_two_threads_give_the_same_bytes(views, places, rng, monkeypatch
     for one, other in zip(first, second, strict=True):
         same = one == other if isinstance(one, tuple) or one is None else None
         assert same or one.tobytes() == other.tobytes()
+
+
+def test_planes_go_through_their_points_and_face_the_camera(views, rng):
+    """Inverse depths beside a pixel are those of rays that meet the plane; steep ones lean back."""
+    view = views[3]
+    center = -view.cam_from_world[:3, :3].T @ view.cam_from_world[:3, 3]
+    xyz, normals = rng.uniform(-0.5, 0.5, (40, 3)), rng.normal(size=(40, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals[0] = np.nan
+    uv, planes, reach = _planes(view, xyz, normals, np.full(40, 0.05))
+    np.testing.assert_allclose(uv, project(view, xyz), rtol=1e-5)
+    assert (reach < 0).all()
+    steep = 0
+    for point, normal, pixel, plane, moved in zip(xyz, normals, uv, planes, reach, strict=True):
+        ray = point - center
+        n = -ray / np.linalg.norm(ray) if np.isnan(normal).any() else normal
+        if abs(n @ ray) < STEEPEST * np.linalg.norm(ray):
+            steep += 1
+            continue
+        assert moved == pytest.approx(max(-0.05 / abs(n @ ray), -FARTHEST), rel=1e-5)
+        for step in ([0, 0], [3, 0], [0, -4]):
+            there = np.linalg.inv(view.K) @ [*(pixel + step), 1.0]  # depth 1 in the camera's axes
+            w = (n @ view.cam_from_world[:3, :3].T @ there) / (n @ ray)
+            assert plane @ [1, *step] == pytest.approx(w, rel=1e-4, abs=1e-4)
+    assert 0 < steep < 20
 
 
 @given(
