@@ -57,12 +57,14 @@ ORDER = (
 )
 """Parts of the package: each imports only parts before it, or itself."""
 
+LAZY = re.compile(r"[a-z_]+(\.[a-z_]+)+:[A-Z]\w+")
+
 LIGHT = {"numpy", "jaxtyping", "numba", "scipy"}
 """What methods may need beside the standard library: no PyTorch."""
 
 
 def _imports(path):
-    """The modules that a file imports anywhere, also within functions."""
+    """The modules that a file imports anywhere, also within functions, or names as "module:Class"."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -72,6 +74,8 @@ def _imports(path):
                 yield from (f"splatseed.{alias.name}" for alias in node.names)
             else:
                 yield str(node.module)
+        elif isinstance(node, ast.Constant) and LAZY.fullmatch(str(node.value)):
+            yield str(node.value).partition(":")[0]
 
 
 def _files(part):

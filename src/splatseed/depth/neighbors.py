@@ -17,6 +17,7 @@ from jaxtyping import Float64, Int64
 from splatseed.depth.views import View
 from splatseed.jit import inline, kernel, parallel_range
 from splatseed.progress import Progress, in_threads
+from splatseed.views.parallax import cosine_between
 from splatseed.views.projection import place
 
 __all__ = ["choose_neighbors"]
@@ -152,11 +153,5 @@ def _nearest(point, m):  # type: ignore[no-untyped-def]
 @inline
 def _angle_weight(point, first, second):  # type: ignore[no-untyped-def]
     """From little where the rays coincide to 1, and to 0 where they are 90 degrees apart."""
-    dot, first_squared, second_squared = 0.0, 0.0, 0.0
-    for axis in range(3):
-        a, b = point[axis] - first[axis], point[axis] - second[axis]
-        dot += a * b
-        first_squared += a * a
-        second_squared += b * b
-    cosine = dot / np.sqrt(first_squared * second_squared)
+    cosine = cosine_between(point, first, second)
     return min(max((1.0 - cosine) / FULL, LEAST), 1.0) * min(max(2.0 * cosine, 0.0), 1.0)

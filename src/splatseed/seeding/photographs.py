@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -38,6 +38,18 @@ __all__ = [
 
 MAX_SIZE = 800
 """Pixels of the longer side at which photographs are looked at."""
+
+
+class _Given(NamedTuple):
+    """What a method looks at."""
+
+    scene: Scene
+    images: Sequence[Image]
+    """Those whose photographs are looked at."""
+    views: Sequence[View]
+    """These, in the same order."""
+    rng: np.random.Generator
+    progress: Progress
 
 
 @dataclass(frozen=True)
@@ -92,16 +104,9 @@ class PhotographMethod:
         """The new points of a scene."""
         images = photographed(scene, self.hold_out)
         views = read_views(scene, images, self.max_size, progress)
-        return self._look(scene, images, views, rng, progress)
+        return self._look(_Given(scene, images, views, rng, progress))
 
-    def _look(
-        self,
-        scene: Scene,
-        images: Sequence[Image],
-        views: Sequence[View],
-        rng: np.random.Generator,
-        progress: Progress,
-    ) -> NewPoints:
+    def _look(self, given: _Given) -> NewPoints:
         raise NotImplementedError
 
 
@@ -110,21 +115,32 @@ class Stereo(PhotographMethod):
     """Seeds on surfaces, found by comparing photographs with each other."""
 
     spacing: float = 8.0
-    """Pixels between seeds in the photographs; not below the grid."""
+    """Pixels between stereo's seeds in the photographs; not below the grid."""
     grid: int = 4
     """Every so many-th pixel along a row and a column gets a depth."""
 
     name: ClassVar[str] = "stereo"
 
-    def _look(
-        self,
-        scene: Scene,
-        images: Sequence[Image],
-        views: Sequence[View],
-        rng: np.random.Generator,
-        progress: Progress,
-    ) -> NewPoints:
-        return _stereo(scene, images, views, self.spacing, self.grid, rng, progress)
+    def _look(self, given: _Given) -> NewPoints:
+        from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
+        from splatseed.stereo.fusion import fuse  # noqa: PLC0415
+        from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415
+        from splatseed.stereo.without_points import known_sightings  # noqa: PLC0415
+
+        seed, sightings = int(given.rng.integers(1 << 32)), known_sightings(given.scene)
+        found = find_stereo(
+            given.views,
+            given.images,
+            sightings,
+            StereoSettings(grid=self.grid),
+            seed,
+            given.progress,
+        )
+        seeds = fuse(found, self.spacing, given.progress)
+        source = np.full(len(seeds), source_code("stereo"), np.uint8)
+        return NewPoints(
+            seeds.xyz, seeds.rgb, (), seeds.normals, seeds.sizes, seeds.confidence, source
+        )
 
 
 @dataclass(frozen=True)
@@ -136,41 +152,26 @@ class Cover(PhotographMethod):
 
     name: ClassVar[str] = "cover"
 
-    def _look(
-        self,
-        scene: Scene,
-        images: Sequence[Image],  # noqa: ARG002
-        views: Sequence[View],
-        rng: np.random.Generator,
-        progress: Progress,
-    ) -> NewPoints:
-        return cover_cloud(views, scene.points.originals, self.cell, rng, progress)
+    def _look(self, given: _Given) -> NewPoints:
+        originals = given.scene.points.originals
+        return cover_cloud(given.views, originals, self.cell, given.rng, given.progress)
 
 
 @dataclass(frozen=True)
-class Auto(PhotographMethod):
+class Auto(Stereo):
     """Stereo, then cover: a seed for every part of every photograph, on surfaces where they are found."""
 
-    spacing: float = 8.0
-    """Pixels between stereo's seeds in the photographs; not below the grid."""
-    grid: int = 4
-    """Every so many-th pixel along a row and a column gets a depth."""
     cell: int = 8
     """Side of the parts, in pixels, that get a seed where none falls in."""
 
     name: ClassVar[str] = "auto"
 
-    def _look(
-        self,
-        scene: Scene,
-        images: Sequence[Image],
-        views: Sequence[View],
-        rng: np.random.Generator,
-        progress: Progress,
-    ) -> NewPoints:
-        found = _stereo(scene, images, views, self.spacing, self.grid, rng, progress)
-        known = PointCloud.concatenate(scene.points.originals, PointCloud(found.xyz, found.rgb))
-        return _join(found, cover_cloud(views, known, self.cell, rng, progress))
+    def _look(self, given: _Given) -> NewPoints:
+        found = super()._look(given)
+        new = PointCloud(found.xyz, found.rgb)
+        known = PointCloud.concatenate(given.scene.points.originals, new)
+        gaps = cover_cloud(given.views, known, self.cell, given.rng, given.progress)
+        return _join(found, gaps)
 
 
 def photographed(scene: Scene, hold_out: int = 0) -> tuple[Image, ...]:
@@ -201,28 +202,6 @@ def read_views(
 
     factor = data_factor(images, max_size)
     return load_views(scene, images, data_factor=factor, undistort=True, progress=progress)
-
-
-def _stereo(
-    scene: Scene,
-    images: Sequence[Image],
-    views: Sequence[View],
-    spacing: float,
-    grid: int,
-    rng: np.random.Generator,
-    progress: Progress,
-) -> NewPoints:
-    from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
-    from splatseed.stereo.fusion import fuse  # noqa: PLC0415
-    from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415
-    from splatseed.stereo.without_points import known_sightings  # noqa: PLC0415
-
-    seed = int(rng.integers(1 << 32))
-    settings = StereoSettings(grid=grid)
-    found = find_stereo(views, images, known_sightings(scene), settings, seed, progress)
-    seeds = fuse(found, spacing, progress)
-    source = np.full(len(seeds), source_code("stereo"), np.uint8)
-    return NewPoints(seeds.xyz, seeds.rgb, (), seeds.normals, seeds.sizes, seeds.confidence, source)
 
 
 def cover_cloud(

@@ -111,38 +111,14 @@ def upsample(
     note: Callable[[str], None] = lambda _: None,
     **parameters: Any,
 ) -> PointCloud:
-    """Upsample the points of a scene.
+    """The originals of a scene, then the new points of one method: the first step of ``splatseed.upsample``.
 
-    Args:
-        scene: A scene, or a bare cloud. Points with ``source`` other than 0 are put aside: new
-            points are made from originals only, and replace earlier new ones.
-        method: A key of ``METHODS``, or a method with its parameters.
-        ratio: Points in all, as a multiple of the originals (r N); 4 when neither is given. Methods
-            that look at photographs make as many as these need.
-        num_points: Points in all, instead of ``ratio``.
-        seed: The same seed gives the same bytes, whatever the number of threads.
-        profile: "default", or "paper" for the paper's text to the letter.
-        progress: Told each stage and the fraction done.
-        note: Told what the method left out or made do with, one sentence each.
-        parameters: Fields of the method, such as ``k=12``.
+    That function's arguments of the same names say what these are, its errors and its promises are this one's; here
+    the method is ``mls`` when none is given.
 
     Returns:
         The N originals, first and unchanged, then the new points; ``source`` tells them apart, and
         their attributes are those that the method knows.
-
-    Raises:
-        ParameterError: An unknown method, profile or parameter, or a value or size out of range.
-        PointCloudError: Too few distinct finite points for the method.
-        SceneNotFoundError: The method needs photographs or depth maps that are not there.
-        SceneFormatError: One of these files is damaged, or they do not fit the scene.
-
-    Example:
-        >>> import numpy as np, splatseed as ss
-        >>> rng = np.random.default_rng(0)
-        >>> xyz, rgb = rng.random((100, 3)), rng.integers(0, 255, (100, 3), np.uint8)
-        >>> seeds = ss.upsample(ss.PointCloud(xyz, rgb), method="mls", ratio=8, seed=0)
-        >>> len(seeds), seeds.num_original
-        (800, 100)
     """
     from splatseed.upsample.neighbors import prepare  # noqa: PLC0415  (loads SciPy and Numba)
     from splatseed.upsample.trust import trusted_originals  # noqa: PLC0415  (likewise)

@@ -1,6 +1,7 @@
 """METHODS: every upsampling method by name, imported when first looked up.
 
-Built-in methods come first, then what installed packages register under the entry-point group
+Built-in methods come first: this folder's, and those that parts of the package above it add when they are imported,
+as all are with the package (``add_built_in``). Then come what installed packages register under the entry-point group
 ``splatseed.methods`` (``name = "package.module:Class"``). A built-in name cannot be taken over.
 """
 
@@ -16,7 +17,7 @@ from splatseed.errors import ParameterError
 from splatseed.pointcloud import GENERATED, ORIGINAL
 from splatseed.upsample.method import Upsampler
 
-__all__ = ["METHODS", "SOURCE_CODES", "origin_name", "source_code"]
+__all__ = ["METHODS", "SOURCE_CODES", "add_built_in", "origin_name", "source_code"]
 
 GROUP = "splatseed.methods"
 
@@ -28,9 +29,6 @@ BUILT_IN = {
     "voronoi": "splatseed.upsample.voronoi:Voronoi",
     "depth": "splatseed.upsample.depth:Depth",
     "random": "splatseed.upsample.bounding_box:BoundingBox",
-    "stereo": "splatseed.seeding.photographs:Stereo",
-    "cover": "splatseed.seeding.photographs:Cover",
-    "auto": "splatseed.seeding.photographs:Auto",
 }
 
 SOURCE_CODES = {
@@ -78,6 +76,15 @@ class MethodRegistry(Mapping[str, type[Upsampler]]):
 
 
 METHODS = MethodRegistry()
+
+
+def add_built_in(methods: Mapping[str, str]) -> None:
+    """Let a part of the package that imports this one have methods of its own.
+
+    Args:
+        methods: "module:Class" by name; none is imported before it is looked up.
+    """
+    BUILT_IN.update(methods)
 
 
 def source_code(name: str) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatseed.jit import inline, kernel, parallel_range
+from splatseed.views.parallax import cosine_between
 
 __all__ = ["choose_by_pose", "choose_sources", "views_of_points"]
 
@@ -108,13 +109,7 @@ def _add_up(rows, starts, xyz, centers, order, offsets, worth):  # type: ignore[
 @inline
 def _weight(point, first, second):  # type: ignore[no-untyped-def]
     """By the angle at a point between the rays of two cameras."""
-    dot, first_squared, second_squared = 0.0, 0.0, 0.0
-    for axis in range(3):
-        a, b = point[axis] - first[axis], point[axis] - second[axis]
-        dot += a * b
-        first_squared += a * a
-        second_squared += b * b
-    cosine = dot / np.sqrt(first_squared * second_squared)
+    cosine = cosine_between(point, first, second)
     angle = np.degrees(np.arccos(min(max(cosine, -1.0), 1.0)))
     rising = min(max((angle - LEAST) / (FULL - LEAST), 0.0), 1.0)
     falling = min(max((MOST - angle) / (MOST - WIDE), 0.0), 1.0)
