@@ -207,9 +207,17 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(room, tmp_path,
 def test_previews_show_something(room, tmp_path, splatseed):
     out = tmp_path / "out"
     run = splatseed("upsample", room, "-o", out, "--preview")
-    for name in ("preview.png", "preview_methods.png"):
+    for name in ("preview.png", "preview_methods.png", "preview_maps.png"):
         assert str(out / name) in run.out
         _assert_drawn(out / name)
+
+
+def test_only_methods_that_begin_with_stereo_show_its_maps(room, tmp_path, splatseed):
+    for method, shown in (("stereo", True), ("cover", False), ("linear", False)):
+        out = tmp_path / method
+        run = splatseed("upsample", room, "--method", method, "-o", out, "--preview")
+        assert (out / "preview_maps.png").is_file() == shown
+        assert (str(out / "preview_maps.png") in run.out) == shown
 
 
 def _assert_drawn(path):

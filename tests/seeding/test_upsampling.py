@@ -10,6 +10,7 @@ import pytest
 
 import splatseed as ss
 from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.progress import silent
 from splatseed.seeding.upsampling import share_covered
 from splatseed.upsample.registry import SOURCE_CODES
 from splatseed.views import view
@@ -40,6 +41,18 @@ def test_seeds_know_their_normals_sizes_and_confidence(seeds):
     assert np.isnan(seeds.normals[seeds.source == 0]).all()
     assert (seeds.sizes[stereo | cover] > 0).all()
     assert np.median(seeds.confidence[stereo]) > np.median(seeds.confidence[cover])
+
+
+def test_the_maps_are_those_that_seeds_are_made_of(room, seeds):
+    """Where a pixel of a map has the seed of its cell in it, both have one depth to the bit."""
+    xyz = seeds.xyz[seeds.source == STEREO]
+    close = 0
+    for found in ss.METHODS["auto"]().maps(room, [0, 7], 0, silent):
+        uv, z = found.camera.project(xyz)
+        inside = (z > 0) & ((uv >= 0) & (uv < found.depth.shape[::-1])).all(axis=1)
+        column, row = uv[inside].astype(int).T
+        close += (np.abs(found.depth[row, column] / z[inside] - 1) < 1e-6).sum()
+    assert close > 50
 
 
 @pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)

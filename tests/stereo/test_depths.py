@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 
 import numba
@@ -11,7 +12,10 @@ import pytest
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
 from splatseed.stereo import stereo_depths
+from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.settings import StereoSettings
+from splatseed.views.sightings import find_sightings
+from splatseed.views.view import load_views
 
 from .conftest import SETTINGS
 from .made import (
@@ -178,3 +182,15 @@ def test_the_yardstick_itself(plane):
 def test_settings_out_of_range_are_refused(changes):
     with pytest.raises(ParameterError, match=f"stereo.{next(iter(changes))}"):
         StereoSettings(**changes)
+
+
+def test_the_maps_of_some_views_are_those_of_all(ball):
+    scene, only = ball.scene, [3, 0]
+    views = load_views(scene, scene.images)
+    settings = dataclasses.replace(SETTINGS, num_witnesses=2)
+    every = find_stereo(views, scene.images, find_sightings(scene), settings)
+    some = find_stereo(views, scene.images, find_sightings(scene), settings, only=only)
+    for i in only:
+        assert some.map(i).depth.tobytes() == every.map(i).depth.tobytes()
+        assert some.map(i).normal.tobytes() == every.map(i).normal.tobytes()
+    assert sum(np.isfinite(cost).any() for cost in some.costs) < len(views)

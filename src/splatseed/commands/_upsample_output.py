@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,18 +13,25 @@ from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.io import WriteReport
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
-from splatseed.scene import Scene
-from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views
+from splatseed.scene import Image, Scene
+from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views
 from splatseed.seeding.upsampling import CELL
 from splatseed.trainers import training_commands
 from splatseed.upsample import Upsampler, chooses_number, methods_for, upsample
 from splatseed.upsample.registry import origin_name
 
-__all__ = ["summarise", "write_previews"]
+__all__ = ["summarise", "write_map_preview", "write_previews"]
 
-PICTURES = ("preview.png", "preview_methods.png", "preview_origins.png", "preview_cells.png")
-CELLS_SHOWN = 4
-"""Photographs whose cells are drawn."""
+MAPS = "preview_maps.png"
+PICTURES = (
+    "preview.png",
+    "preview_methods.png",
+    "preview_origins.png",
+    "preview_cells.png",
+    MAPS,
+)
+PHOTOGRAPHS_SHOWN = 4
+"""Those whose cells and maps are drawn."""
 
 
 def write_previews(
@@ -83,8 +90,7 @@ def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
     from splatseed.seeding.coverage import covered_cells  # noqa: PLC0415  (kernels load with use)
 
     images = photographed(scene)
-    chosen = [images[i] for i in np.linspace(0, len(images) - 1, CELLS_SHOWN).astype(int)]
-    views = read_views(scene, list(dict.fromkeys(chosen)), MAX_SIZE, silent)
+    views = read_views(scene, [images[i] for i in _some_of(images)], MAX_SIZE, silent)
     clouds = [cloud.xyz[cloud.finite] for cloud in (scene.points, seeds)]
     before, after = (covered_cells(views, xyz, CELL) for xyz in clouds)
     shown = [
@@ -92,6 +98,35 @@ def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
         for view, old, new in zip(views, before, after, strict=True)
     ]
     preview_cells(shown, path)
+
+
+def write_map_preview(
+    scene: Scene, method: Upsampler, seed: int, folder: Path, clock: StageClock
+) -> None:
+    """What stereo found of some photographs, if the method begins with it.
+
+    Args:
+        scene: As the method got it.
+        method: The one that was used.
+        seed: As was used.
+        folder: Where the picture goes.
+        clock: Told the stages.
+    """
+    from splatseed.preview import preview_maps  # noqa: PLC0415  (Pillow)
+
+    if isinstance(method, Stereo):
+        shown = _some_of(photographed(scene, method.hold_out))
+        # Found again, of the few that are shown: to keep the maps of all would take as much memory as the views.
+        maps = method.maps(scene, shown, seed, clock)
+        clock("preview", 0.9)
+        preview_maps(scene, maps, folder / MAPS)
+        clock("preview", 1.0)
+
+
+def _some_of(images: Sequence[Image]) -> list[int]:
+    """At most ``PHOTOGRAPHS_SHOWN``, evenly chosen."""
+    places = np.linspace(0, len(images) - 1, min(PHOTOGRAPHS_SHOWN, len(images)))
+    return np.unique(places.round().astype(int)).tolist()
 
 
 def summarise(

@@ -12,7 +12,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands._options import parse_options
-from splatseed.commands._upsample_output import summarise, write_previews
+from splatseed.commands._upsample_output import summarise, write_map_preview, write_previews
 from splatseed.console import (
     OUT,
     StageClock,
@@ -118,7 +118,7 @@ class Options:
     align: bool = True
     """For --method depth: --no-align takes metric depth and poses as they are (--depth.no-align)."""
     preview: bool = False
-    """Also write pictures: before and after, every method, seeds by origin, and cells covered."""
+    """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's maps."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write; auto keeps the input's."""
     copy_images: bool = False
@@ -181,6 +181,7 @@ def run(arguments: list[str]) -> None:
             write_previews(
                 shown, seeds, total, methods, options.method, options.seed, options.output, clock
             )
+            write_map_preview(scene, method, options.seed, options.output, clock)
         seconds = clock.seconds()
     summarise(scene, seeds, report, seconds, found, options.output, options.preview)
     for sentence in notes:

@@ -21,6 +21,8 @@ from splatseed.upsample.method import NewPoints, check_fields, require
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
+    from splatseed.stereo.maps import StereoMap
+    from splatseed.stereo.result import Stereo as FoundStereo
     from splatseed.upsample.neighbors import PreparedCloud
     from splatseed.views.view import View
 
@@ -102,9 +104,12 @@ class PhotographMethod:
 
     def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
         """The new points of a scene."""
+        return self._look(self._read(scene, rng, progress))
+
+    def _read(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> _Given:
         images = photographed(scene, self.hold_out)
         views = read_views(scene, images, self.max_size, progress)
-        return self._look(_Given(scene, images, views, rng, progress))
+        return _Given(scene, images, views, rng, progress)
 
     def _look(self, given: _Given) -> NewPoints:
         raise NotImplementedError
@@ -121,25 +126,39 @@ class Stereo(PhotographMethod):
 
     name: ClassVar[str] = "stereo"
 
-    def _look(self, given: _Given) -> NewPoints:
-        from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
-        from splatseed.stereo.fusion import fuse  # noqa: PLC0415
-        from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415
-        from splatseed.stereo.without_points import known_sightings  # noqa: PLC0415
+    def maps(
+        self, scene: Scene, only: Sequence[int], seed: int, progress: Progress
+    ) -> tuple[StereoMap, ...]:
+        """Depth and normals of some photographs: those that ``upsample`` with this seed makes seeds of.
 
-        seed, sightings = int(given.rng.integers(1 << 32)), known_sightings(given.scene)
-        found = find_stereo(
-            given.views,
-            given.images,
-            sightings,
-            StereoSettings(grid=self.grid),
-            seed,
-            given.progress,
-        )
-        seeds = fuse(found, self.spacing, given.progress)
+        Args:
+            scene: The scene.
+            only: Which of ``photographed(scene, hold_out)``.
+            seed: The same seed gives the same bytes.
+            progress: Told how far it is.
+        """
+        given = self._read(scene, np.random.default_rng(seed), progress)
+        found = self._find(given, only)
+        return tuple(found.map(i) for i in only)
+
+    def _look(self, given: _Given) -> NewPoints:
+        from splatseed.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
+
+        seeds = fuse(self._find(given), self.spacing, given.progress)
         source = np.full(len(seeds), source_code("stereo"), np.uint8)
         return NewPoints(
             seeds.xyz, seeds.rgb, (), seeds.normals, seeds.sizes, seeds.confidence, source
+        )
+
+    def _find(self, given: _Given, only: Sequence[int] | None = None) -> FoundStereo:
+        from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
+        from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415
+        from splatseed.stereo.without_points import known_sightings  # noqa: PLC0415
+
+        settings, seed = StereoSettings(grid=self.grid), int(given.rng.integers(1 << 32))
+        sightings = known_sightings(given.scene)
+        return find_stereo(
+            given.views, given.images, sightings, settings, seed, given.progress, only
         )
 
 

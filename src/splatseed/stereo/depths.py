@@ -33,6 +33,7 @@ def find_stereo(
     settings: StereoSettings,
     seed: int = 0,
     progress: Progress = silent,
+    only: Sequence[int] | None = None,
 ) -> Stereo:
     """Compare photographs with each other.
 
@@ -44,13 +45,19 @@ def find_stereo(
         settings: How.
         seed: The same seed gives the same bytes.
         progress: Told how far it is.
+        only: The views whose maps are wanted: these have the same bytes as if all were, and of the others no more
+            is found than what confirms them. All when left out.
     """
     if len(sightings.xyz) < TOO_FEW:
         sightings = glimpse(views, seed, progress)
     seen = [sightings.rows_of(image) for image in images]
     centers = np.stack([image.camera.center for image in images])
     sources = choose_sources(seen, sightings.xyz, centers, settings.num_witnesses)
-    hints = [_hints(view, sightings.xyz[rows]) for view, rows in zip(views, seen, strict=True)]
+    needed = range(len(views)) if only is None else {*only, *sources[list(only)].ravel().tolist()}
+    hints = [
+        _hints(view, sightings.xyz[rows]) if i in needed else None
+        for i, (view, rows) in enumerate(zip(views, seen, strict=True))
+    ]
     return match_views(views, hints, sources, settings, seed, progress)
 
 
