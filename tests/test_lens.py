@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.lens import distort, fold_radius, image_points
+from splatseed.lens import distort, fold_radius, image_points, rays_through
 
 
 def make_lens(model, rng, size=0.03):
@@ -38,16 +38,21 @@ def test_pixels_are_colmaps(lens, rays):
 
 
 def test_the_way_back_leads_to_the_ray(lens, rays):
-    """Newton's method, with slopes from differences, undoes the lens."""
-    goal, xy, step = distort(lens, rays), rays * 0.9, 1e-6
-    for _ in range(20):
-        slopes = [
-            (distort(lens, xy + move) - distort(lens, xy - move)) / (2 * step)
-            for move in step * np.eye(2)
-        ]
-        jacobian = np.stack(slopes, axis=-1)
-        xy = xy + np.linalg.solve(jacobian, (goal - distort(lens, xy))[..., None])[..., 0]
-    np.testing.assert_allclose(xy, rays, atol=1e-9)
+    np.testing.assert_allclose(rays_through(lens, image_points(lens, rays)), rays, atol=1e-7)
+    grid = rays[:200].reshape(20, 10, 2)
+    assert rays_through(lens, image_points(lens, grid)).shape == grid.shape
+    assert rays_through(lens, np.empty((0, 2))).shape == (0, 2)
+
+
+def test_no_ray_leads_to_pixels_beyond_the_fold():
+    """u = x - x^3 / 10 grows up to x = 1.83, where it is 1.22."""
+    lens = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, -0.1))
+    u = np.array([0.0, 0.5, 1.2, 1.23, 5.0, 1e6])
+    x, y = rays_through(lens, np.stack([32 + 50 * u, 24 + 0 * u], axis=-1)).T
+    np.testing.assert_allclose(x[:3] - x[:3] ** 3 / 10, u[:3], atol=1e-9)
+    assert (x[:3] < 1.83).all()
+    np.testing.assert_allclose(y[:3], 0, atol=1e-9)
+    assert np.isnan(x[3:]).all()
 
 
 @pytest.mark.parametrize("model", [name for name in CAMERA_MODELS if "FISHEYE" not in name])

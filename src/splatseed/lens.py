@@ -15,10 +15,12 @@ from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 
-__all__ = ["distort", "fold_radius", "image_points"]
+__all__ = ["distort", "fold_radius", "image_points", "rays_through"]
 
 DIRECTIONS, STEPS = 8, 1024
 """Rays along which a fold is looked for, and places on each."""
+TRIES, DIFFERENCE, ARRIVED = 30, 1e-6, 1e-9
+"""Newton's method: its steps, the differences that slopes are from, and how near is there."""
 
 
 def image_points(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
@@ -49,6 +51,32 @@ def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.nda
         x, y = _moved(x, y, _Terms(radial=k[:6]))
         return np.stack(_moved(x, y, _Terms(tangential=k[7:5:-1], prism=k[8:])), axis=-1)
     return np.stack(_moved(x, y, _terms(lens.model, k)), axis=-1)
+
+
+def rays_through(lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
+    """The rays (x, y, 1) that a lens brings to pixels: ``image_points`` undone, by Newton's method.
+
+    Args:
+        lens: The camera.
+        uv: Pixel coordinates; the first pixel's centre is (0.5, 0.5).
+
+    Returns:
+        Places on the plane at depth 1, float64 [*B, 2]; NaN where no ray within the lens's fold leads there.
+    """
+    K = lens.K
+    goal = (np.asarray(uv, np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]
+    xy, ahead = goal.copy(), DIFFERENCE * np.eye(2)
+    with np.errstate(all="ignore"):  # far out nothing needs to be finite
+        for _ in range(TRIES):
+            columns = [distort(lens, xy + move) - distort(lens, xy - move) for move in ahead]
+            (a, c), (b, d) = (np.moveaxis(each / (2 * DIFFERENCE), -1, 0) for each in columns)
+            left = goal - distort(lens, xy)
+            u, v = left[..., 0], left[..., 1]
+            xy = xy + np.stack([d * u - b * v, a * v - c * u], axis=-1) / (a * d - b * c)[..., None]
+        there = np.linalg.norm(goal - distort(lens, xy), axis=-1) < ARRIVED
+    radius = np.where(there, np.linalg.norm(xy, axis=-1), 0.0)
+    there &= radius <= fold_radius(lens, float(radius.max(initial=0.0)))
+    return np.where(there[..., None], xy, np.nan)
 
 
 def fold_radius(lens: Intrinsics, most: float) -> float:

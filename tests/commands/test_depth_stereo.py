@@ -15,8 +15,9 @@ import pytest
 
 import splatseed.stereo
 from splatseed.io import find_depths, load_scene
-from splatseed.synthetic import make_capture
+from splatseed.synthetic import make_capture, write_capture
 
+from ..bent import bend  # noqa: TID252
 from ..stereo_maps import true_maps  # noqa: TID252
 
 
@@ -71,6 +72,34 @@ def test_a_workspace_and_the_command_to_fuse_it(room, tmp_path, splatseed):
         pytest.skip("colmap is not installed: the command that was printed is not run")
     subprocess.run(command, shell=True, check=True, capture_output=True)  # noqa: S602
     assert (out / "fused.ply").stat().st_size > 10_000
+
+
+def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(tmp_path, splatseed):
+    """From its own stereo to COLMAP's fusion."""
+    capture = make_capture(0, num_views=16, width=160, height=120)
+    scene = write_capture(bend(capture), tmp_path / "bent")
+    out = tmp_path / "dense"
+    words = ("--stereo", "--colmap", "--grid", 2, "--preview")
+    run = splatseed("depth", scene, *words, "-o", out)
+    assert (run.code, run.err) == (0, "")
+    assert f"splatseed info {out} --depth {out}" in run.out
+    assert splatseed("info", out, "--depth", out).code == 0
+    if shutil.which("colmap") is None:
+        pytest.skip("colmap is not installed: the command that was printed is not run")
+    line = next(line for line in run.out.splitlines() if "stereo_fusion" in line)
+    subprocess.run(line.split()[1:], check=True, capture_output=True)
+    xyz = load_scene(out / "fused.ply").points.xyz
+    assert len(xyz) > 1_000
+    assert np.median(capture.surfaces.distance(xyz.astype(float))) < 0.01  # metres
+
+
+@pytest.mark.usefixtures("stereo")
+def test_a_plain_folder_of_a_distorted_capture_says_what_it_fits(tmp_path, splatseed):
+    capture = make_capture(0, num_views=12, width=120, height=90)
+    scene = write_capture(bend(capture), tmp_path / "bent")
+    run = splatseed("depth", scene, "--stereo", "-o", tmp_path / "maps")
+    assert "--colmap writes both" in run.out
+    assert "--method depth" not in run.out
 
 
 def test_an_image_that_nothing_confirms_is_named(room, tmp_path, splatseed, stereo, maps):

@@ -23,7 +23,9 @@ from splatseed.io import find_depths, load_scene
 from splatseed.io.dense import write_dense_maps, write_dense_workspace
 from splatseed.io.ply import read_ply
 from splatseed.synthetic import make_capture, write_capture
+from splatseed.views.undistortion import undistort
 
+from ..bent import bend  # noqa: TID252
 from ..stereo_maps import true_maps  # noqa: TID252
 
 ON_SURFACE = 1e-5
@@ -166,6 +168,57 @@ def _check_fused(path, capture, factor):
     away = np.abs(capture.surfaces.distance(points.xyz.astype(np.float64)))
     assert np.median(away) < 2 * ON_SURFACE  # 0.3 pixels without the move to COLMAP's rays
     assert np.quantile(away, 0.95) < PIXEL / 2 * factor
+
+
+@pytest.fixture(scope="module")
+def bent_room(capture, tmp_path_factory):
+    """The same room through a lens with distortion."""
+    return load_scene(write_capture(bend(capture), tmp_path_factory.mktemp("bent") / "room"))
+
+
+def test_distorted_photographs_come_without_their_distortion(bent_room, room, maps, tmp_path):
+    write_dense_workspace(bent_room, maps[4], tmp_path / "w", undistort=undistort)
+    scene = load_scene(tmp_path / "w")
+    assert {lens.model for lens in scene.intrinsics} == {"PINHOLE"}
+    assert not (tmp_path / "w/images").is_symlink()
+    for straight, lens, image in zip(room.images, bent_room.images, scene.images, strict=True):
+        np.testing.assert_allclose(image.camera.K, straight.camera.K)
+        np.testing.assert_allclose(image.observations.xy, straight.observations.xy, atol=1e-6)
+        found, bent, truth = (
+            np.asarray(PilImage.open(each.source.image_dir / image.name).convert("RGB"))
+            for each in (scene, bent_room, room)
+        )
+        expected, _ = undistort(bent, lens.intrinsics, image.camera.K)
+        np.testing.assert_array_equal(found, expected)
+        error, before = (np.abs(each.astype(int) - truth).mean() for each in (found, bent))
+        assert error < 0.8 * before  # two interpolations blur
+
+
+def test_a_workspace_of_distorted_photographs_is_fused(bent_room, capture, maps, tmp_path):
+    if shutil.which("colmap") is None:
+        pytest.skip("colmap is not on the path (Debian: apt install colmap)")
+    write_dense_workspace(bent_room, maps[1], tmp_path / "w", undistort=undistort)
+    fused = tmp_path / "fused.ply"
+    words = ("--workspace_path", tmp_path / "w", "--output_path", fused)
+    subprocess.run(["colmap", "stereo_fusion", *words], check=True, capture_output=True)
+    _check_fused(fused, capture, 1)
+
+
+def test_of_mixed_photographs_only_distorted_ones_are_written(bent_room, room, maps, tmp_path):
+    mixed = bent_room.replace(images=(*bent_room.images[:2], *room.images[2:]))
+    write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort)
+    links = [(tmp_path / "w/images" / image.name).is_symlink() for image in mixed.images]
+    assert links == [False, False, *[True] * 6]
+    write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort, overwrite=True)
+
+
+def test_a_photograph_that_cannot_be_written_again_is_refused(bent_room, maps, tmp_path):
+    name = "view.psd"
+    images = (replace(bent_room.images[0], name=name), *bent_room.images[1:])
+    with pytest.raises(SceneFormatError, match=name):
+        write_dense_workspace(
+            bent_room.replace(images=images), maps[4], tmp_path / "w", undistort=undistort
+        )
 
 
 def test_cameras_are_those_of_reduced_photographs(capture, maps, tmp_path):

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from splatseed.commands._depth_options import Options
 from splatseed.console import OUT, StageClock, print_commands, print_note, stage_display
@@ -44,20 +44,13 @@ def run_stereo(options: Options) -> None:
         scene = load_scene(options.scene, require_points=False)
         check_output(options.output, overwrite=options.overwrite, protect=[options.scene])
         if options.colmap:
-            check_dense_scene(scene)
+            check_dense_scene(scene, undistorts=True)
         maps = _maps(scene, options, clock)
-        write = write_dense_workspace if options.colmap else write_dense_maps
-        report = write(
-            scene,
-            maps,
-            options.output,
-            overwrite=options.overwrite,
-            provenance=provenance(options, PACKAGES),
-            progress=clock,
-        )
+        report = _write(scene, maps, options, clock)
         if options.preview:
             _draw(options, scene, maps, clock)
-    _summarise(options, maps, report, time.perf_counter() - start)
+    bent = any(image.intrinsics.has_distortion for image in scene.images)
+    _summarise(options, maps, report, time.perf_counter() - start, bent=bent)
 
 
 def provenance(options: Options, packages: Sequence[str]) -> dict[str, object]:
@@ -81,6 +74,21 @@ def _maps(scene: Scene, options: Options, clock: StageClock) -> tuple[StereoMap,
     return stereo_depths(scene, progress=clock, **given)
 
 
+def _write(
+    scene: Scene, maps: Sequence[StereoMap], options: Options, clock: StageClock
+) -> DenseReport:
+    how: dict[str, Any] = {
+        "overwrite": options.overwrite,
+        "provenance": provenance(options, PACKAGES),
+        "progress": clock,
+    }
+    if not options.colmap:
+        return write_dense_maps(scene, maps, options.output, **how)
+    from splatseed.views.undistortion import undistort  # noqa: PLC0415  (Numba)
+
+    return write_dense_workspace(scene, maps, options.output, undistort=undistort, **how)
+
+
 def _draw(options: Options, scene: Scene, maps: Sequence[StereoMap], clock: StageClock) -> None:
     from splatseed.preview import preview_maps  # noqa: PLC0415  (Pillow)
 
@@ -90,7 +98,12 @@ def _draw(options: Options, scene: Scene, maps: Sequence[StereoMap], clock: Stag
 
 
 def _summarise(
-    options: Options, maps: Sequence[StereoMap], report: DenseReport, seconds: float
+    options: Options,
+    maps: Sequence[StereoMap],
+    report: DenseReport,
+    seconds: float,
+    *,
+    bent: bool,
 ) -> None:
     OUT.print(
         f"{report.num_maps:,} depth maps of {_sizes(maps)}: {report.share_known:.0%} of their pixels"
@@ -105,7 +118,12 @@ def _summarise(
         more = len(report.empty) - NAMES_SHOWN
         shown = ", ".join(report.empty[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
         print_note(f"no other view confirms any pixel of: {shown}")
-    print_commands("next", _next(options, report))
+    if bent and not options.colmap:
+        print_note(
+            "the cameras have lens distortion, and these maps are of the photographs without it: "
+            "--colmap writes both, as a scene to go on with"
+        )
+    print_commands("next", _next(options, report, bent=bent))
 
 
 def _sizes(maps: Sequence[StereoMap]) -> str:
@@ -115,12 +133,14 @@ def _sizes(maps: Sequence[StereoMap]) -> str:
     return " to ".join(f"{width} x {height}" for height, width in ends)
 
 
-def _next(options: Options, report: DenseReport) -> list[tuple[str, str]]:
-    scene, maps = (shlex.quote(str(path)) for path in (options.scene, report.path))
+def _next(options: Options, report: DenseReport, *, bent: bool) -> list[tuple[str, str]]:
+    # The workspace is a scene itself, without distortion.
+    shown = report.path if options.colmap else options.scene
+    scene, maps = (shlex.quote(str(path)) for path in (shown, report.path))
     look = ("look", f"splatseed info {scene} --depth {maps} --picture depth.png")
     if not options.colmap:
         seeds = f"splatseed upsample {scene} --method depth --depth {maps} --ratio 16 -o OUT"
-        return [look, ("use", seeds)]
+        return [look] if bent else [look, ("use", seeds)]
     fused = shlex.quote(str(report.path / "fused.ply"))
     fuse = (
         f"colmap stereo_fusion --workspace_path {maps} --output_path {fused}"

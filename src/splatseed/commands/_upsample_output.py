@@ -126,7 +126,7 @@ def write_map_preview(
 def _some_of(images: Sequence[Image]) -> list[int]:
     """At most ``PHOTOGRAPHS_SHOWN``, evenly chosen."""
     places = np.linspace(0, len(images) - 1, min(PHOTOGRAPHS_SHOWN, len(images)))
-    return np.unique(places.round().astype(int)).tolist()
+    return [int(place) for place in np.unique(places.round())]
 
 
 def summarise(

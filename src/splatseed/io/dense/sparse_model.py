@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
 from splatseed.camera import Camera, Intrinsics
 from splatseed.io import colmap_binary
@@ -19,6 +20,7 @@ from splatseed.io._cloud import find_usable
 from splatseed.io._model_ids import Renumbered, renumber
 from splatseed.io.dense.maps import scaled_K
 from splatseed.io.dense.overlap import OverlapPoints
+from splatseed.lens import rays_through
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene
 
@@ -87,7 +89,7 @@ def photograph_model(scene: Scene, sizes: Mapping[str, Size]) -> SparseModel:
     colours at the record's pixels, so that the two must agree.
 
     Args:
-        scene: Its cameras are free of distortion.
+        scene: Of a camera with distortion, the pinhole one is written that its undistorted photographs have.
         sizes: Of each photograph, by its name.
     """
     cameras: dict[tuple[int, Size], Intrinsics] = {}
@@ -109,6 +111,14 @@ def _pinhole(camera_id: int, camera: Camera, size: Size) -> Intrinsics:
 def _in_pixels_of(image: Image, record: Intrinsics) -> Image:
     old, seen = image.intrinsics, image.observations
     if seen is not None:
+        if old.has_distortion:
+            seen = Observations(_straightened(old, seen.xy), seen.point_ids)
         scale = np.array([record.width / old.width, record.height / old.height])
         seen = Observations(seen.xy * scale, seen.point_ids)
     return replace(image, intrinsics=record, observations=seen)
+
+
+def _straightened(lens: Intrinsics, uv: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 2"]:
+    """Where an undistorted photograph has the features of a lens; as they are where none of its rays leads."""
+    straight = rays_through(lens, uv) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
+    return np.where(np.isnan(straight), uv, straight)

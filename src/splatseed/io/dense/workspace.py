@@ -4,7 +4,7 @@ Notation: ``images/``, ``sparse/`` and ``stereo/`` as COLMAP's image_undistorter
 places pixel (column, row) of a map at (column, row) of its camera where everyone else, and its own
 sparse model, has (column + 0.5, row + 0.5). Promise: depths are those along COLMAP's rays, so that
 fused points lie where the scene has them, whatever the size of the maps; the folder appears whole or
-not at all; photographs are linked, or copied, and never written to.
+not at all.
 """
 
 from __future__ import annotations
@@ -15,26 +15,22 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseed.camera import CAMERA_MODELS
-from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io._image_folders import bring, image_folders
+from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io._layouts import write_json
 from splatseed.io.dense.colmap_files import write_consistency_graph, write_map
 from splatseed.io.dense.maps import DenseMap, check_map, depth_along, scaled_K
 from splatseed.io.dense.overlap import OverlapPoints
+from splatseed.io.dense.photographs import Undistort, bring_photographs, check_image
 from splatseed.io.dense.report import DenseCount, DenseReport
 from splatseed.io.dense.sparse_model import Size, SparseModel, photograph_model
-from splatseed.io.depth_folder import safe_parts
-from splatseed.io.photograph import open_photograph, photograph_bytes
 from splatseed.io.staging import MANIFEST, output_folder
 from splatseed.progress import Progress, silent
-from splatseed.scene import Image, Scene
+from splatseed.scene import Scene
 
 __all__ = ["check_dense_scene", "write_dense_workspace"]
 
 _KINDS = ("photometric", "geometric")
 """COLMAP's two passes; stereo_fusion reads the second unless told otherwise."""
-_ASPECT_SLACK = 0.02
 _CORNER = 0.0
 """Where COLMAP's dense stereo has a pixel's centre."""
 
@@ -46,6 +42,7 @@ def write_dense_workspace(
     *,
     overwrite: bool = False,
     copy_images: bool = False,
+    undistort: Undistort | None = None,
     provenance: Mapping[str, object] | None = None,
     progress: Progress = silent,
 ) -> DenseReport:
@@ -55,11 +52,14 @@ def write_dense_workspace(
     ``.npy`` with depths at pixel centres, which ``find_depths`` prefers.
 
     Args:
-        scene: A scene with photographs and pinhole cameras.
+        scene: A scene with photographs.
         maps: Of some of its images, in any order and of any size; taken one by one.
         path: The folder to make.
         overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the photographs instead of linking them.
+        undistort: What takes the distortion of a lens out of a photograph, such as
+            ``splatseed.views.undistortion.undistort``. The workspace gets what it makes, and pinhole cameras of the
+            same matrix; maps are of these. Without it, distorted cameras are refused.
         provenance: How the maps came about, for ``splatseed.json``.
         progress: Told how many maps are written.
 
@@ -69,14 +69,14 @@ def write_dense_workspace(
     Raises:
         ParameterError: There is no map, or one does not belong to the scene.
         SceneNotFoundError: The scene has no photographs, or one is missing.
-        SceneFormatError: A camera has distortion, or a photograph has not its shape.
+        SceneFormatError: A camera has distortion that nothing takes out, or a photograph has not its shape.
         OutputError: The folder is taken or cannot be written, or an image's name leads out of it.
     """
-    model = photograph_model(scene, check_dense_scene(scene))
+    model = photograph_model(scene, check_dense_scene(scene, undistorts=undistort is not None))
     count, overlap = DenseCount(), OverlapPoints()
     total = length_hint(maps, len(scene.images)) or 1
     with output_folder(Path(path), overwrite=overwrite, protect=_inputs(scene)) as folder:
-        linked = _bring_photographs(scene, folder, copy=copy_images)
+        brought = bring_photographs(scene, folder, undistort, progress, copy=copy_images)
         stereo = _Stereo(folder / "stereo", model)
         progress("write maps", 0.0)
         for dense in maps:
@@ -88,20 +88,24 @@ def write_dense_workspace(
             raise ParameterError("at least one depth map", found="none", fix="Make some first.")
         stereo.write_lists()
         model.write(folder / "sparse", overlap)
-        files = ["sparse", "stereo", *linked, MANIFEST]
+        files = ["sparse", "stereo", *brought, MANIFEST]
         write_json(folder / MANIFEST, {**(provenance or {}), "files": files})
     return count.report(Path(path))
 
 
-def check_dense_scene(scene: Scene) -> dict[str, Size]:
+def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Size]:
     """Check that a scene can become a dense workspace, before any work is done.
+
+    Args:
+        scene: The scene.
+        undistorts: Whether distortion will be taken out.
 
     Returns:
         Width and height of each photograph, by its name.
 
     Raises:
         SceneNotFoundError: It has no photographs, or one is missing.
-        SceneFormatError: A camera has distortion, or a photograph is not of its shape.
+        SceneFormatError: A camera has distortion that stays, or a photograph is not of its shape.
         OutputError: An image's name leads out of its folder.
     """
     folder = scene.source.image_dir if scene.source else None
@@ -111,32 +115,7 @@ def check_dense_scene(scene: Scene) -> dict[str, Size]:
             found="no images" if folder else "no folder of images",
             fix="Name a scene with cameras, and put its photographs into a folder named images.",
         )
-    return {image.name: _checked_size(image, folder) for image in scene.images}
-
-
-def _checked_size(image: Image, folder: Path) -> Size:
-    lens = image.intrinsics
-    if not lens.is_pinhole and any(lens.params[CAMERA_MODELS[lens.model].num_focal + 2 :]):
-        raise SceneFormatError(
-            "cameras without lens distortion (PINHOLE), as COLMAP's dense tools need them",
-            found=f"{lens.model} for {image.name}",
-            fix="Undistort the scene first: colmap image_undistorter, or splatseed sfm.",
-        )
-    if "/".join(safe_parts(image.name)) != image.name or "\n" in image.name:
-        raise OutputError(
-            "image names that stay inside their folder",
-            found=repr(image.name),
-            fix="Rename the image.",
-        )
-    path = folder / image.name
-    size = open_photograph(path, photograph_bytes(path)).size
-    if abs(size[0] / size[1] / (lens.width / lens.height) - 1) > _ASPECT_SLACK:
-        raise SceneFormatError(
-            f"{path} to have the shape of its camera, {lens.width} x {lens.height}",
-            found=f"{size[0]} x {size[1]}",
-            fix="Use the images that the model was made from, or a resized copy of them.",
-        )
-    return size
+    return {image.name: check_image(image, folder, undistorts=undistorts) for image in scene.images}
 
 
 def _inputs(scene: Scene) -> tuple[Path, ...]:
@@ -145,16 +124,6 @@ def _inputs(scene: Scene) -> tuple[Path, ...]:
     if source is None:
         return ()
     return tuple(each for each in (source.root, source.model_dir, source.image_dir) if each)
-
-
-def _bring_photographs(scene: Scene, folder: Path, *, copy: bool) -> list[str]:
-    sources = image_folders(scene)
-    photographs = {
-        name: source
-        for name, source in sources.items()
-        if name == "images" or name.startswith("images/")
-    }
-    return bring(photographs, folder, copy=copy)
 
 
 class _Stereo:
