@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,9 +30,11 @@ from PIL import Image as PilImage
 from scipy.spatial import cKDTree
 
 import splatseed as ss
+from clouds import find_scenes
 from machine import describe, warn_if_busy
 from markdown import table
 from splatseed.depth.planar import map_camera
+from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.preview import choose_camera, render_points
@@ -224,6 +226,16 @@ def draw(scene: Scene, clouds: dict[str, ss.PointCloud], path: Path) -> None:
     pictures = [render_points(cloud, choose_camera(scene), point_size=2.0) for cloud in shown]
     path.parent.mkdir(parents=True, exist_ok=True)
     PilImage.fromarray(np.concatenate(pictures, axis=1)).save(path)
+
+
+def at_hand(names: Sequence[str]) -> list[str]:
+    """Those scenes that need no capture, and the others where there are captures; says which are skipped."""
+    try:
+        find_scenes()
+    except SceneNotFoundError as error:
+        print(f"skipped {', '.join(CAPTURES)}: {error}\n")
+        return [name for name in names if name not in CAPTURES]
+    return list(names)
 
 
 def triangulated(name: str, cache: Path) -> Scene:

@@ -18,10 +18,10 @@ import tyro
 from children import avx2_environment, call
 from clocks import Clock
 from clouds import find_scenes
-from depth import CAPTURES
+from depth import at_hand
 from machine import describe, warn_if_busy
 from markdown import table
-from splatseed.errors import ParameterError, SceneNotFoundError, SplatseedError
+from splatseed.errors import ParameterError, SplatseedError
 from splatseed.views.photographs import user_cache_dir
 from stereo_arms import ARMS, FOLIAGE, scores_of
 from stereo_points import PointScore
@@ -121,7 +121,7 @@ def print_whole(settings: Settings) -> None:
 
 def print_truth(settings: Settings) -> None:
     """Every arm against true depth."""
-    names = _scenes_at_hand(settings.scenes)
+    names = at_hand(settings.scenes)
     prepare(names, settings.cache)
     arguments = {"cache": str(settings.cache), "limit": settings.limit}
     header = ["kept", "within 1%", "within 5%", "reached", "CPU s"]
@@ -147,7 +147,7 @@ def _print_against_points(settings: Settings, names: Sequence[str], arms: Sequen
 
 def print_bare(settings: Settings) -> None:
     """The scenes with their points, without, and with depth maps instead."""
-    names = [name for name in _scenes_at_hand(settings.scenes) if name != "made, no texture"]
+    names = [name for name in at_hand(settings.scenes) if name != "made, no texture"]
     prepare(names, settings.cache)
     arguments = {"names": names, "cache": str(settings.cache), "limit": settings.limit}
     for_each = {"SfM's points": "", "no points": "depths", "depth maps": "points"}
@@ -159,16 +159,6 @@ def print_bare(settings: Settings) -> None:
     for name in names:
         rows = [[label, *Score(**scores[name]).cells()] for label, scores in found.items()]
         print(f"{table([f'{name}: {header[0]}', *header[1:]], rows)}\n", flush=True)
-
-
-def _scenes_at_hand(names: Sequence[str]) -> list[str]:
-    """Those scenes that need no capture, and the others where there are captures."""
-    try:
-        find_scenes()
-    except SceneNotFoundError as error:
-        print(f"skipped {', '.join(CAPTURES)}: {error}\n")
-        return [name for name in names if name not in CAPTURES]
-    return list(names)
 
 
 def _print_arms(

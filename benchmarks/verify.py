@@ -10,7 +10,7 @@ captures are only read; speed is measured in a process of its own, on the made r
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -22,8 +22,7 @@ import tyro
 
 import splatseed as ss
 from children import call
-from clouds import find_scenes
-from depth import CAPTURES, FAR, HELD_OUT, RATIO, Truth, triangulated
+from depth import CAPTURES, FAR, HELD_OUT, RATIO, Truth, at_hand, triangulated
 from machine import describe, warn_if_busy
 from markdown import table
 from memory import status_bytes
@@ -256,16 +255,6 @@ def main(settings: Settings) -> None:
         print_speed(settings)
     for name in at_hand(settings.scenes):
         print(f"{quality(name, settings.cache)}\n", flush=True)
-
-
-def at_hand(names: Sequence[str]) -> Sequence[str]:
-    """The captures, if there are any here."""
-    try:
-        find_scenes()
-    except SplatseedError as error:
-        print(f"skipped {', '.join(CAPTURES)}: {error}\n")
-        return [name for name in names if name not in CAPTURES]
-    return names
 
 
 if __name__ == "__main__":
