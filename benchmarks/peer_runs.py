@@ -29,7 +29,7 @@ from splatseed.train.allocator import keep_freed_memory
 from splatseed.train.device import Capacity
 from splatseed.train.schedule import FULL_RUN
 from splatseed.train.seeds import usable_seeds
-from splatseed.train.strategies import _Capped
+from splatseed.train.strategies.densification import Capped
 from splatseed.views.view import View, load_split
 
 __all__ = ["Split", "read_scene", "train_ours", "train_peer"]
@@ -104,7 +104,7 @@ def _adjust(config: Any, settings: TrainSettings, *, capped: bool) -> None:
     """What its command line cannot say."""
     config.max_steps = settings.max_steps  # its own product may be rounded down to one less
     if settings.strategy == "default" and capped:
-        config.strategy = _Capped(**vars(config.strategy))
+        config.strategy = Capped(**vars(config.strategy))
         config.strategy.capacity = Capacity(settings.cap, CPU)
     # Runs of less than 300 steps would divide by an interval of 0.
     config.sh_degree_interval = max(1, config.sh_degree_interval)

@@ -27,7 +27,7 @@ from peer_runs import Split, read_scene
 from peer_stand_ins import check_examples
 from splatseed.errors import ParameterError, SplatseedError
 from splatseed.train import TrainSettings
-from splatseed.train.settings import MCMC_CAP, StrategyName
+from splatseed.train.settings import BUDGET, StrategyName
 from splatseed.views.view import load_split
 
 __all__: list[str] = []
@@ -158,7 +158,7 @@ def heading(path: Path, settings: Settings) -> str:
     """
     scene = read_scene(path, settings.split)
     train, held_out = load_split(scene, data_factor=settings.data_factor)
-    cap = f"{settings.cap_max or MCMC_CAP:,}{'' if settings.cap_default else ' for mcmc'}"
+    cap = f"{settings.cap_max or BUDGET:,}{'' if settings.cap_default else ' for mcmc'}"
     return (
         f"### Peer: gsplat's trainer, {path.name}, {settings.max_steps:,} steps\n\n"
         f"{len(train)} training and {len(held_out)} {settings.split} views of {train[0].width} x "

@@ -52,7 +52,9 @@ SPEEDS: Mapping[str, _Speed] = MappingProxyType(
     }
 )
 CORES_MEASURED = 2
-GROWTH: Mapping[Densification, float] = MappingProxyType({"none": 1.0, "default": 3.0, "mcmc": 3.0})
+GROWTH: Mapping[Densification, float] = MappingProxyType(
+    {"none": 1.0, "default": 3.0, "grow": 3.0, "mcmc": 3.0}
+)
 """Gaussians at the end of a run, per seed; with default and mcmc, a guess."""
 
 

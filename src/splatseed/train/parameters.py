@@ -34,6 +34,7 @@ __all__ = [
     "make_parameters",
     "optimize",
     "photograph",
+    "render_features",
     "render_view",
     "yardsticks",
 ]
@@ -131,13 +132,30 @@ def render_view(
         view: Whose camera is used.
         sh_degree: Degree of spherical harmonics in use; coefficients beyond it are left out.
     """
+    images, info = _rasterize(params, view, _harmonics(params, sh_degree), sh_degree)
+    return images, info
+
+
+def render_features(
+    params: Parameters | Mapping[str, Tensor], view: View, features: Float[Tensor, "N D"]
+) -> Float[Tensor, "H W D"]:
+    """What the Gaussians look like from a view if these numbers, whatever they mean, are their colours."""
+    return _rasterize(params, view, features, None)[0]
+
+
+def _rasterize(
+    params: Parameters | Mapping[str, Tensor],
+    view: View,
+    colors: Tensor | tuple[Tensor, Tensor],
+    sh_degree: int | None,
+) -> tuple[Float[Tensor, "H W D"], dict[str, Any]]:
     means = params["means"]
     images, _, info = rasterization(
         means=means,
         quats=params["quats"],
         scales=torch.exp(params["scales"]),
         opacities=torch.sigmoid(params["opacities"]),
-        colors=_harmonics(params, sh_degree),
+        colors=colors,
         viewmats=_on_device(view.cam_from_world, means)[None],
         Ks=_on_device(view.K, means)[None],
         width=view.width,

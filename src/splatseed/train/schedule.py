@@ -17,7 +17,7 @@ from typing import Literal
 
 __all__ = ["FULL_RUN", "LEARNING_RATES", "Densification", "Schedule", "make_schedule"]
 
-Densification = Literal["default", "mcmc", "none"]
+Densification = Literal["default", "grow", "mcmc", "none"]
 
 FULL_RUN = 30_000
 LEARNING_RATES: Mapping[str, float] = MappingProxyType(
@@ -35,7 +35,9 @@ DECAYS: Mapping[str, float] = MappingProxyType({"means": 0.01})
 """What learning rates fall to by the end, as a part of the first; exponential between."""
 GROWTH = 1.05
 """By what MCMC multiplies the number of Gaussians at a time, until the cap."""
-LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType({"default": 6, "mcmc": 24, "none": 1})
+LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType(
+    {"default": 6, "grow": 1, "mcmc": 24, "none": 1}
+)
 """A short run densifies so many times, if need be more often than every 100 steps: gradients averaged
 over few photographs are noise."""
 MOST_SPEEDUP: Mapping[str, float] = MappingProxyType(
@@ -44,6 +46,11 @@ MOST_SPEEDUP: Mapping[str, float] = MappingProxyType(
 """Learning rates of a short run are multiplied by how many times shorter it is than a full one, but by
 no more than this. Positions have as far to go in a short run as in a long one; with a higher rate of
 opacities, Gaussians die that are needed later."""
+GROW_EVERY = FULL_RUN // 15
+"""Steps of a full run from one round of ``grow`` to the next, and to the first: each round looks at
+contributions for as many photographs as it can."""
+MEAN_FROM = 0.8
+"""Part of a run from which on the mean of the Gaussians is taken."""
 LARGEST = 0.05
 """Largest size of a first Gaussian, in near depths. Where SfM has few points the gaps between them are
 wide, and what fills one hides all that lies behind it."""
@@ -72,6 +79,8 @@ class Schedule:
         scale_factor: Size of the first Gaussians, as a multiple of the gaps between them.
         largest: And at most so many near depths.
         flatness: Thickness of the first Gaussians whose normals are used, as a part of their size.
+        mean_from: After so many steps the mean of the Gaussians is taken, with which the run ends; None
+            for the last step's.
     """
 
     max_steps: int
@@ -91,6 +100,7 @@ class Schedule:
     scale_factor: float = 1.0
     largest: float = math.inf
     flatness: float = 0.1
+    mean_from: int | None = None
 
     def sh_degree(self, step: int, highest: int) -> int:
         """The degree of spherical harmonics in use."""
@@ -140,6 +150,9 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
     stop = _scaled(25_000 if mcmc else 15_000, max_steps)
     shrunk = 100 * max_steps / FULL_RUN
     every = max(1, round(shrunk), min(100, stop // LEAST_ROUNDS[densification]))
+    start = _scaled(500, max_steps)
+    if densification == "grow":
+        every = start = _scaled(GROW_EVERY, max_steps)
     return Schedule(
         max_steps=max_steps,
         near_depths=True,
@@ -148,13 +161,14 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
         },
         decays=DECAYS,
         sh_every=_scaled(1000, max_steps),
-        refine_start=_scaled(500, max_steps),
+        refine_start=start,
         refine_stop=stop,
         refine_every=every,
         reset_every=_scaled(3000, max_steps),
         growth=GROWTH ** (every / shrunk),
         opacity=0.5 if mcmc else 0.1,
         largest=LARGEST,
+        mean_from=max(stop, round(MEAN_FROM * max_steps)),
     )
 
 

@@ -12,12 +12,13 @@ from typing import Literal, cast
 from splatseed.errors import ParameterError
 from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule
 
-__all__ = ["AS_3DGS", "MCMC_CAP", "Backend", "StrategyName", "TrainSettings"]
+__all__ = ["AS_3DGS", "BUDGET", "Backend", "StrategyName", "TrainSettings"]
 
-StrategyName = Literal["default", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"]
+StrategyName = Literal["default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"]
 Backend = Literal["auto", "cpu", "cuda"]
 
-MCMC_CAP = 1_000_000
+BUDGET = 1_000_000
+"""Most Gaussians of the strategies that have a budget, where none is given."""
 AS_3DGS = "-3dgs"
 
 
@@ -30,8 +31,8 @@ class TrainSettings:
     """
 
     strategy: StrategyName = "default"
-    """How Gaussians are added and removed: 3DGS's densification, MCMC up to a cap, or not at all;
-    with ``-3dgs`` also in 3DGS's own conventions of rates, sizes and schedules."""
+    """How Gaussians are added and removed: 3DGS's densification, growth within a budget where the
+    photographs are wrong, MCMC up to a cap, or not at all; with ``-3dgs`` also in 3DGS's own conventions of rates, sizes and schedules."""
     max_steps: int = FULL_RUN
     """Training steps; schedules and learning rates are adapted to them."""
     data_factor: int = 1
@@ -39,7 +40,7 @@ class TrainSettings:
     seed: int = 0
     """On the CPU the same seed gives the same bytes."""
     cap_max: int | None = None
-    """Most Gaussians: more seeds are thinned out (default: 1,000,000 for mcmc, else no limit)."""
+    """Most Gaussians: more seeds are thinned out (default: 1,000,000 for grow and mcmc, else no limit)."""
     backend: Backend = "auto"
     """Where to train; auto takes a GPU if PyTorch sees one."""
     sh_degree: int = 3
@@ -81,6 +82,6 @@ class TrainSettings:
     @property
     def cap(self) -> int | None:
         """Most Gaussians; None for no limit."""
-        if self.cap_max is None and self.densification == "mcmc":
-            return MCMC_CAP
+        if self.cap_max is None and self.densification in ("grow", "mcmc"):
+            return BUDGET
         return self.cap_max

@@ -25,7 +25,7 @@ from splatseed.train.strategies import Strategy
 
 __all__ = ["Stopwatch", "TrainState", "load_checkpoint", "save_checkpoint"]
 
-FORMAT = 2
+FORMAT = 3
 
 
 class Stopwatch:
@@ -58,6 +58,7 @@ class TrainState:
         records: The curve so far.
         watch: Time spent training.
         losses: Of the steps since the last record.
+        mean: Of the Gaussians over the end of the run; see ``averaging``.
     """
 
     params: Parameters
@@ -67,6 +68,7 @@ class TrainState:
     records: list[Record] = field(default_factory=list)
     watch: Stopwatch = field(default_factory=Stopwatch)
     losses: list[Tensor] = field(default_factory=list)
+    mean: dict[str, Any] = field(default_factory=dict)
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
@@ -84,6 +86,8 @@ def save_checkpoint(path: Path, state: TrainState) -> None:
         "params": {name: value.detach() for name, value in state.params.items()},
         "optimizers": {name: each.state_dict() for name, each in state.optimizers.items()},
         "strategy": state.strategy.state,
+        "held_at": state.strategy.capacity and state.strategy.capacity.held_at,
+        "mean": state.mean,
     }
     with atomic_file(path) as partial:
         torch.save(content, partial)
@@ -109,10 +113,12 @@ def load_checkpoint(
     for name, optimizer in optimizers.items():
         optimizer.load_state_dict(content["optimizers"][name])
     strategy.state = content["strategy"]
+    if strategy.capacity:
+        strategy.capacity.held_at = content["held_at"]
     records = [Record(*row) for row in content["records"]]
     watch = Stopwatch(content["seconds"])
     step, losses = content["step"], content["losses"]
-    return TrainState(params, optimizers, strategy, step, records, watch, losses)
+    return TrainState(params, optimizers, strategy, step, records, watch, losses, content["mean"])
 
 
 def _load(path: Path, device: torch.device) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseed.train.allocator import keep_freed_memory
+from splatseed.train.averaging import add_to_mean, take_mean
 from splatseed.train.curve import Record
 from splatseed.train.interruption import interruption
 from splatseed.train.losses import photometric_loss, psnr
@@ -108,8 +109,18 @@ class Trainer:
         penalty = strategy.regularization(params)
         (loss if penalty is None else loss + penalty).backward()
         optimize(params, optimizers, schedule.rates(step))
+        strategy.observe(params, view, render, truth, step)
         strategy.after(params, optimizers, step, info)
+        self._average(step + 1)
         return render.detach(), truth
+
+    def _average(self, steps_done: int) -> None:
+        """Take the Gaussians into their mean at the end of a run, and end with it."""
+        begin, state = self.settings.schedule.mean_from, self.state
+        if begin is not None and steps_done > begin:
+            add_to_mean(state.mean, state.params)
+            if steps_done == self.settings.max_steps:
+                take_mean(state.params, state.mean)
 
     def _record(self, render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> None:
         """Note how far the run is; the clock stands still meanwhile."""

@@ -1,4 +1,4 @@
-"""How Gaussians are added and removed: gsplat's strategies behind one small interface.
+"""gsplat's strategies behind one small interface.
 
 Notation: ``info`` is the rasteriser's; ``before`` runs ahead of the backward pass, ``after`` behind
 the optimisers. Promise: what runs are subclasses of gsplat's strategies, on both backends, which
@@ -10,7 +10,6 @@ a checkpoint must hold of them. gsplat 1.5.3 never resets opacities (it writes
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,62 +24,20 @@ from splatseed.train.device import Capacity
 from splatseed.train.frame import SCENE_SCALE
 from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters, yardsticks
 from splatseed.train.schedule import LEARNING_RATES
-from splatseed.train.settings import MCMC_CAP, TrainSettings
+from splatseed.train.settings import TrainSettings
+from splatseed.train.strategies.base import Strategy
 
-__all__ = ["Strategy", "make_strategy"]
-
-
-class Strategy(ABC):
-    """What changes the number of Gaussians.
-
-    Attributes:
-        state: What it remembers from step to step.
-        capacity: How many Gaussians it may make; None if it makes none.
-    """
-
-    def __init__(self, capacity: Capacity | None = None) -> None:
-        self.state: dict[str, Any] = {}
-        self.capacity = capacity
-
-    def regularization(self, params: Parameters) -> Float[Tensor, ""] | None:  # noqa: ARG002
-        """What is added to the loss; nothing by default."""
-        return None
-
-    @abstractmethod
-    def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        """To be called ahead of the backward pass."""
-
-    @abstractmethod
-    def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        """To be called behind the optimisers; may replace parameters and their moments."""
+__all__ = ["Capped", "Default", "Fixed", "Mcmc"]
 
 
-def make_strategy(settings: TrainSettings, device: torch.device | None = None) -> Strategy:
-    """The strategy that the settings name, on their schedule.
-
-    Args:
-        settings: How to train.
-        device: Whose memory bounds the number of Gaussians; the CPU's by default.
-    """
-    device = device or torch.device("cpu")
-    if settings.densification == "default":
-        return _Default(settings, Capacity(settings.cap, device))
-    if settings.densification == "mcmc":
-        return _Mcmc(settings, Capacity(settings.cap or MCMC_CAP, device))
-    return _Fixed()
-
-
-class _Fixed(Strategy):
+class Fixed(Strategy):
     """The seeds as they are: neither more nor fewer."""
 
-    def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        pass
-
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        pass
+        """Change nothing."""
 
 
-class _Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
+class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
     """gsplat's strategy, but that only the largest image gradients that there is room for grow.
 
     On the CPU its running sums are kept in another way, equal up to rounding.
@@ -135,13 +92,13 @@ def _add_gradients(state: Any, info: Any) -> None:
         state["count"] += seen[camera]
 
 
-class _Default(Strategy):
+class Default(Strategy):
     """3DGS's densification: clone and split where the image gradient is large, prune the faint."""
 
     def __init__(self, settings: TrainSettings, capacity: Capacity) -> None:
         super().__init__(capacity)
         schedule = settings.schedule
-        self.inner = _Capped(
+        self.inner = Capped(
             refine_start_iter=schedule.refine_start,
             refine_stop_iter=schedule.refine_stop,
             refine_every=schedule.refine_every,
@@ -153,9 +110,11 @@ class _Default(Strategy):
         self.state = self.inner.initialize_state()
 
     def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        """Have the image gradients kept."""
         self.inner.step_pre_backward(params, optimizers, self.state, step, info)
 
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        """Clone, split, prune, and where asked for reset opacities."""
         # gsplat takes one number, or hands on one of each Gaussian like the rest of its state.
         self.state["scene_scale"] = yardsticks(params) if NEAR_DEPTHS in params else SCENE_SCALE
         self.inner.step_post_backward(params, optimizers, self.state, step, info)
@@ -186,7 +145,7 @@ class _Bounded(MCMCStrategy):
             self.noise_lr = self.noise / yardsticks(params)[:, None]
 
     def _add_new_gs(self, params: Parameters, optimizers: Any, binoms: Any) -> int:
-        assert self.capacity is not None  # noqa: S101  (given in ``_Mcmc``)
+        assert self.capacity is not None  # noqa: S101  (given in ``Mcmc``)
         count = len(params["means"])
         added = max(0, self.capacity.limit(count, int(self.growth * count)) - count)
         if added:
@@ -195,7 +154,7 @@ class _Bounded(MCMCStrategy):
         return added
 
 
-class _Mcmc(Strategy):
+class Mcmc(Strategy):
     """3DGS as MCMC: move the faint to where there is more to show, add up to a cap, add noise."""
 
     def __init__(self, settings: TrainSettings, capacity: Capacity) -> None:
@@ -213,15 +172,14 @@ class _Mcmc(Strategy):
         self.state = self.inner.initialize_state()
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""]:
+        """Mean opacity and mean size, weighed."""
         opacities, sizes = torch.sigmoid(params["opacities"]), torch.exp(params["scales"])
         if NEAR_DEPTHS in params:
             sizes = sizes / yardsticks(params)[:, None]
         return self.schedule.penalty * (opacities.mean() + sizes.mean())
 
-    def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        pass
-
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        """Relocate, add, and shake."""
         self.inner.set_noise(params)
         # 3DGS's rate of positions, however fast they move here: noise must not move them more.
         lr = LEARNING_RATES["means"] * self.schedule.decay("means", step)

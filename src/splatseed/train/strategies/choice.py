@@ -1,0 +1,32 @@
+"""The strategy that settings name."""
+
+from __future__ import annotations
+
+import torch
+
+from splatseed.train.device import Capacity
+from splatseed.train.settings import TrainSettings
+from splatseed.train.strategies.base import Strategy
+from splatseed.train.strategies.densification import Default, Fixed, Mcmc
+from splatseed.train.strategies.growing import Growing
+
+__all__ = ["make_strategy"]
+
+
+def make_strategy(settings: TrainSettings, device: torch.device | None = None) -> Strategy:
+    """The strategy that the settings name, on their schedule.
+
+    Args:
+        settings: How to train.
+        device: Whose memory bounds the number of Gaussians; the CPU's by default.
+    """
+    capacity = Capacity(settings.cap, device or torch.device("cpu"))
+    match settings.densification:
+        case "default":
+            return Default(settings, capacity)
+        case "mcmc":
+            return Mcmc(settings, capacity)
+        case "grow":
+            return Growing(settings, capacity)
+        case "none":
+            return Fixed()

@@ -1,0 +1,146 @@
+"""Strategy ``grow``: a fixed budget, spent where the photographs are still wrong.
+
+Notation: of each Gaussian, over the views looked at since the last round: *pixels* c = sum w, *error* E = sum w e
+with e the absolute error of a pixel (see ``contributions``), and *most pixels*, c in the one view where it is
+largest. Promise: the number of Gaussians never exceeds the budget; which ones grow depends on the views and the
+seed alone. The idea of growing by the error that a Gaussian paints is that of S. Rota Bulo et al., "Revising
+Densification in Gaussian Splatting" (2024); what is taken away, when, and by what the error is divided were chosen
+on held-out training views: see benchmarks/README.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from gsplat.strategy.ops import remove, split
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from splatseed.train.device import Capacity
+from splatseed.train.parameters import Optimizers, Parameters, yardsticks
+from splatseed.train.settings import TrainSettings
+from splatseed.train.strategies.base import Strategy
+from splatseed.train.strategies.contributions import contributions
+from splatseed.views.view import View
+
+__all__ = ["Growing"]
+
+LOOK_EVERY = 2
+"""Steps from one look at contributions to the next: a look costs half a step."""
+FAINT = 0.005
+"""Opacity below which a Gaussian goes, as in 3DGS."""
+LEAST_PIXELS = 0.5
+"""A Gaussian that paints less than this of a pixel in every view that shows it goes."""
+RECYCLED = 0.1
+"""Part of a full budget that is taken from those with the fewest pixels, and spent again, a round."""
+FULL = 0.95
+"""From this part of the budget on it counts as full."""
+FULL_AT = 0.35
+"""Part of the run by which the budget is spent."""
+FASTEST = 0.5
+"""Gaussians that are added in a round at most, as a part of those there are."""
+LEAST_VIEWS = 2
+"""Looks that must have shown a Gaussian before it is taken away for what it paints."""
+
+
+class Growing(Strategy):
+    """Take away what paints little, split what paints wrong pixels, within a budget.
+
+    Args:
+        settings: How to train.
+        capacity: The budget.
+    """
+
+    capacity: Capacity
+
+    def __init__(self, settings: TrainSettings, capacity: Capacity) -> None:
+        super().__init__(capacity)
+        self.schedule = settings.schedule
+
+    def observe(
+        self,
+        params: Parameters,
+        view: View,
+        render: Float[Tensor, "H W 3"],
+        truth: Float[Tensor, "H W 3"],
+        step: int,
+    ) -> None:
+        """Add what this view says of each Gaussian to the sums."""
+        if step % LOOK_EVERY or step > self.schedule.refine_stop:
+            return
+        pixels, errors = contributions(params, view, (render.detach() - truth).abs().mean(dim=-1))
+        sums = self._sums(params)
+        sums["errors"] += errors
+        sums["pixels"] += pixels
+        sums["views"] += pixels > 0
+        torch.maximum(sums["most_pixels"], pixels, out=sums["most_pixels"])
+
+    def after(
+        self,
+        params: Parameters,
+        optimizers: Optimizers,
+        step: int,
+        info: Any,  # noqa: ARG002  (gsplat's own need it)
+    ) -> None:
+        """At the end of a round, change the Gaussians and begin the next."""
+        schedule = self.schedule
+        if (
+            not schedule.refine_start <= step <= schedule.refine_stop
+            or step % schedule.refine_every
+        ):
+            return
+        needless = self._needless(params)
+        if len(needless) - int(needless.sum()) < LEAST_VIEWS:
+            return  # nothing is seen: leave all of it to the user's eyes
+        remove(params, optimizers, self.state, needless)
+        self._grow(params, optimizers, step)
+        self.state = {"first": self.state["first"]}
+
+    def _sums(self, params: Parameters) -> dict[str, Any]:
+        """The sums of this round, [N] each, in the state."""
+        if "errors" not in self.state:
+            for name in ("errors", "pixels", "most_pixels", "views"):
+                self.state[name] = torch.zeros_like(params["opacities"].detach())
+        return self.state
+
+    def _needless(self, params: Parameters) -> Bool[Tensor, " N"]:
+        """Which Gaussians go: the faint, the too large, and those that paint least."""
+        sums, count = self._sums(params), len(params["means"])
+        sizes = torch.exp(params["scales"].detach()).amax(dim=-1) / yardsticks(params)
+        shown = sums["views"] >= LEAST_VIEWS
+        needless = torch.sigmoid(params["opacities"].detach()) < FAINT
+        needless |= sizes > self.schedule.prune_size
+        needless |= shown & (sums["most_pixels"] < LEAST_PIXELS)
+        more = round(RECYCLED * count) - int(needless.sum())
+        if more > 0 and self.capacity.cap and count >= FULL * self.capacity.cap:
+            usable = shown & ~needless
+            pixels = torch.where(usable, sums["most_pixels"], torch.inf)
+            least = torch.topk(pixels, min(more, int(usable.sum())), largest=False).indices
+            needless[least] = True
+        return needless
+
+    def _grow(self, params: Parameters, optimizers: Optimizers, step: int) -> None:
+        """Split those with the most E / sqrt(c): E alone favours the large, E / c the accidental."""
+        sums = self._sums(params)
+        scores = sums["errors"] / sums["pixels"].clamp_min(1e-6).sqrt()
+        wanted = self._room(len(scores), step)
+        number = min(wanted, int((scores > 0).sum()))
+        if number > 0:
+            chosen = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
+            chosen[torch.topk(scores, number).indices] = True
+            # The opacity of both halves together is that of the whole.
+            split(params, optimizers, {}, chosen, revised_opacity=True)
+
+    def _room(self, count: int, step: int) -> int:
+        """How many may be added now: the budget is reached evenly, at ``FULL_AT`` of the run."""
+        schedule, budget = self.schedule, self.capacity.cap or count
+        first = self.state.setdefault("first", count)
+        rounds = max(
+            1,
+            round((FULL_AT * schedule.max_steps - schedule.refine_start) / schedule.refine_every)
+            + 1,
+        )
+        done = (step - schedule.refine_start) // schedule.refine_every + 1
+        target = round(first + (budget - first) * min(1.0, done / rounds))
+        return min(self.capacity.limit(count, target) - count, round(FASTEST * count))
