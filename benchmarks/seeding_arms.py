@@ -30,8 +30,8 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
 }
 """How seeds are made, by what the table calls them; at ratio 1 nothing is added to SfM's points."""
 TEST_EVERY = 8
-SEEDS_SHARE = 0.7
-"""Seeds at most, as a part of the cap: what densification adds is the rest. All, where nothing is added."""
+SEEDS_SHARE: Mapping[str, float] = {"default": 0.7, "mcmc": 0.7}
+"""Seeds at most, as a part of the cap: what densification adds is the rest. All, where what is there may go."""
 
 
 def train(
@@ -43,7 +43,7 @@ def train(
     camera = validation.images[0].camera
     cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
     start = time.perf_counter()
-    points = _seeds(validation, arm, cap if strategy == "none" else round(SEEDS_SHARE * cap))
+    points = _seeds(validation, arm, round(SEEDS_SHARE.get(strategy, 1.0) * cap))
     seeding = time.perf_counter() - start
     settings = TrainSettings(
         strategy=strategy, max_steps=max_steps, data_factor=data_factor, seed=seed,

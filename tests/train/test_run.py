@@ -15,7 +15,8 @@ import torch
 from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
-from splatseed.train import device
+from splatseed.train import device, trainer
+from splatseed.train.averaging import add_to_mean
 from splatseed.train.parameters import gaussians_of
 from splatseed.train.ply import read_gaussians
 from splatseed.train.run import RunOptions, prepare_run
@@ -44,10 +45,12 @@ def _stop_after(step):
 
 
 # MCMC's own cap, a million Gaussians, is reached in a short run too, and takes most of a minute.
-SMALL = {"default": {}, "mcmc": {"cap_max": 4000}, "none": {}}
+SMALL = {"default": {}, "grow": {"cap_max": 4000}, "mcmc": {"cap_max": 4000}, "none": {}}
 
 
-@pytest.mark.parametrize(("strategy", "gain"), [("default", 2.0), ("mcmc", 2.5), ("none", 4.0)])
+@pytest.mark.parametrize(
+    ("strategy", "gain"), [("default", 2.0), ("grow", 2.0), ("mcmc", 2.5), ("none", 4.0)]
+)
 def test_training_makes_unseen_views_better(begin, strategy, gain):
     """By about half of what it gained when this was written, or more."""
     run = begin(strategy=strategy, max_steps=100, **SMALL[strategy])
@@ -56,17 +59,18 @@ def test_training_makes_unseen_views_better(begin, strategy, gain):
     assert run.trainer.test_psnr() > before + gain
 
 
-@pytest.mark.parametrize("strategy", ["default", "mcmc", "none"])
-def test_going_on_equals_never_having_stopped(begin, strategy):
+@pytest.mark.parametrize("strategy", ["default", "grow", "mcmc", "none"])
+@pytest.mark.parametrize("stop", [17, 55])  # while Gaussians are added; while the mean is taken
+def test_going_on_equals_never_having_stopped(begin, strategy, stop):
     settings = {"strategy": strategy, "cap_max": 700}
     straight = begin("straight", **settings)
     assert straight.train()
     stopped = begin("stopped", **settings)
-    assert not stopped.train(_stop_after(37))
-    assert stopped.state.step == 37
+    assert not stopped.train(_stop_after(stop))
+    assert stopped.state.step == stop
     assert stopped.folder.checkpoint.is_file()
     resumed = begin("stopped", RESUME, **settings)
-    assert resumed.state.step == 37
+    assert resumed.state.step == stop
     assert resumed.train()
     assert _bytes(resumed) == _bytes(straight)
     of_both = [[r._replace(seconds=0) for r in run.state.records] for run in (straight, resumed)]
@@ -75,7 +79,7 @@ def test_going_on_equals_never_having_stopped(begin, strategy):
     assert grew == (strategy != "none")
 
 
-@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+@pytest.mark.parametrize("strategy", ["default", "grow", "mcmc"])
 def test_bytes_depend_on_the_seed_and_not_on_the_threads(begin, strategy):
     torch_threads, numba_threads = torch.get_num_threads(), numba.get_num_threads()
     results = []
@@ -135,6 +139,30 @@ def test_default_strategy_keeps_to_its_cap(begin):
     capped.train()
     assert max(record.num_gaussians for record in free.state.records) > 400
     assert 290 < max(record.num_gaussians for record in capped.state.records) <= 300
+
+
+def test_a_run_ends_with_the_mean_of_its_last_fifth(begin, monkeypatch):
+    run = begin(strategy="none", max_steps=40)
+    seen = []
+
+    def note(mean, params):
+        add_to_mean(mean, params)
+        seen.append({name: value.detach().clone() for name, value in params.items()})
+
+    monkeypatch.setattr(trainer, "add_to_mean", note)
+    run.train()
+    assert len(seen) == 8
+    for name in ("means", "scales", "quats", "opacities", "sh0", "shN"):
+        expected = torch.stack([each[name] for each in seen]).to(torch.float64).mean(dim=0)
+        got = run.state.params[name].detach().to(torch.float64)
+        torch.testing.assert_close(got, expected, rtol=1e-5, atol=1e-6)
+        assert not torch.equal(got, seen[-1][name].to(torch.float64))
+
+
+def test_3dgs_conventions_end_with_the_last_step(begin):
+    run = begin(strategy="none-3dgs", max_steps=20)
+    run.train()
+    assert not run.state.mean
 
 
 def test_opacities_are_reset_on_request(begin):
@@ -271,7 +299,7 @@ def test_what_does_not_fit_the_memory_is_refused_with_what_would(begin, monkeypa
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("strategy", ["default", "mcmc"])
+@pytest.mark.parametrize("strategy", ["default", "grow", "mcmc"])
 def test_memory_holds_growth_and_the_run_says_so(begin, monkeypatch, strategy):
     settings = {"strategy": strategy, "max_steps": 100, **SMALL[strategy]}
     free = begin("free", **settings)

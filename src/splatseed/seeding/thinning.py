@@ -54,7 +54,7 @@ def thin_to(
     """At most ``num`` of a cloud's points, originals before others where both would do.
 
     Cover is made anew for what thinning leaves: a guess fills a gap, and must not take the place of a
-    point that is known. Where there are more originals than may stay, they alone are thinned: they are
+    point that is known. Where there are no fewer originals than may stay, only originals do: they are
     dense where there is detail, which is where few Gaussians are needed most.
 
     Args:
@@ -73,10 +73,8 @@ def thin_to(
     if not guessed.any() or guessed.all():
         return _keep(scene, points, num)
     known = points.select(~guessed)
-    if (
-        known.num_original >= num
-    ):  # what is known to have texture comes first where little is allowed
-        known = known.originals
+    if known.num_original >= num:
+        return _keep(scene, known.originals, num)
     views = read_views(scene, photographed(scene, hold_out), MAX_SIZE, progress)
     room = max(num - len(known), round(MOST_COVER * num))
     kept = _keep(scene, known, num - room)

@@ -30,8 +30,9 @@ LOOK_EVERY = 2
 """Steps from one look at contributions to the next: a look costs half a step."""
 FAINT = 0.005
 """Opacity below which a Gaussian goes, as in 3DGS."""
-LEAST_PIXELS = 0.5
-"""A Gaussian that paints less than this of a pixel in every view that shows it goes."""
+LEAST_PIXELS, LEAST_PART = 0.5, 0.1
+"""A Gaussian goes that paints less than this of a pixel, and less than this part of what Gaussians paint on
+average, in every view that shows it: where there are more Gaussians than pixels, all paint little."""
 RECYCLED = 0.1
 """Part of a full budget that is taken from those with the fewest pixels, and spent again, a round."""
 FULL = 0.95
@@ -99,6 +100,7 @@ class Growing(Strategy):
 
     def _sums(self, params: Parameters) -> dict[str, Any]:
         """The sums of this round, [N] each, in the state."""
+        self.state.setdefault("first", len(params["means"]))
         if "errors" not in self.state:
             for name in ("errors", "pixels", "most_pixels", "views"):
                 self.state[name] = torch.zeros_like(params["opacities"].detach())
@@ -111,7 +113,7 @@ class Growing(Strategy):
         shown = sums["views"] >= LEAST_VIEWS
         needless = torch.sigmoid(params["opacities"].detach()) < FAINT
         needless |= sizes > self.schedule.prune_size
-        needless |= shown & (sums["most_pixels"] < LEAST_PIXELS)
+        needless |= shown & (sums["most_pixels"] < _least(sums["most_pixels"][shown]))
         more = round(RECYCLED * count) - int(needless.sum())
         if more > 0 and self.capacity.cap and count >= FULL * self.capacity.cap:
             usable = shown & ~needless
@@ -135,12 +137,17 @@ class Growing(Strategy):
     def _room(self, count: int, step: int) -> int:
         """How many may be added now: the budget is reached evenly, at ``FULL_AT`` of the run."""
         schedule, budget = self.schedule, self.capacity.cap or count
-        first = self.state.setdefault("first", count)
         rounds = max(
             1,
             round((FULL_AT * schedule.max_steps - schedule.refine_start) / schedule.refine_every)
             + 1,
         )
         done = (step - schedule.refine_start) // schedule.refine_every + 1
+        first = self.state["first"]
         target = round(first + (budget - first) * min(1.0, done / rounds))
         return min(self.capacity.limit(count, target) - count, round(FASTEST * count))
+
+
+def _least(most_pixels: Float[Tensor, " M"]) -> float:
+    """The fewest pixels that are worth a Gaussian, where those that are shown paint so many."""
+    return min(LEAST_PIXELS, LEAST_PART * float(most_pixels.mean())) if len(most_pixels) else 0.0
