@@ -131,6 +131,16 @@ def test_a_budget_may_be_below_the_originals_and_a_share_of_the_pixels(room):
     assert len(ss.upsample(room, "cover", budget=f"{count / 2 / pixels}rho")) == round(count / 2)
 
 
+def test_a_budget_that_originals_fill_is_theirs_alone(room):
+    """As if new points had been made and thinned away; the user is told."""
+    count, notes = room.points.num_original, []
+    thinned = ss.upsample(room, budget=count // 2, note=notes.append)
+    assert len(thinned) == thinned.num_original == count // 2
+    assert "are thinned, and none is added" in notes[-1]
+    made = ss.upsample(room, cover=8, budget=count // 2)  # the long way
+    np.testing.assert_array_equal(made.xyz, thinned.xyz)
+
+
 @pytest.mark.parametrize("budget", ["many", "-3", "0", "0rho", "1e3x"])
 def test_a_budget_that_is_none_is_refused(budget, room):
     with pytest.raises(ParameterError, match="budget"):
