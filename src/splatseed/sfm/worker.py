@@ -20,6 +20,7 @@ from typing import Any, BinaryIO, cast
 
 from splatseed import errors
 from splatseed.errors import ReconstructionError, SplatseedError
+from splatseed.interpreter import child_command, child_environment
 from splatseed.progress import Progress
 from splatseed.sfm.jobs import Found, ReconstructJob, TriangulateJob
 from splatseed.sfm.settings import check_cuda, require_pycolmap
@@ -49,11 +50,11 @@ def run_job(
     with (
         log.open("wb") as sink,
         subprocess.Popen(  # noqa: S603  (our own interpreter and module)
-            [sys.executable, "-c", _CHILD, str(int(verbose))],
+            child_command(_CHILD, str(int(verbose))),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=None if verbose else sink,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env=child_environment(),
             process_group=0,  # Ctrl-C comes to us alone, and we end the child
         ) as child,
     ):
