@@ -41,12 +41,12 @@ def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
             fix="Choose another folder.",
         )
     if not marked and not (folder / LEDGER).is_file():
-        check_output(folder, protect=protect)
+        check_output(folder, kind="bench", protect=protect)
         return
     for scene in protect:
         within = folder.resolve() in scene.resolve().parents
         if within and scene.resolve() != (folder / "scenes" / "demo").resolve():
-            check_output(folder, overwrite=True, protect=[scene])
+            check_output(folder, kind="bench", overwrite=True, protect=[scene])
 
 
 def make_bench_folder(folder: Path) -> None:

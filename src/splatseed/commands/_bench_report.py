@@ -98,7 +98,7 @@ def run_compare(arguments: list[str]) -> None:
     """
     options = parse_options(CompareOptions, "bench compare", arguments)
     if options.output is not None:
-        check_output(options.output, protect=(options.a, options.b))
+        check_output(options.output, kind="bench compare", protect=(options.a, options.b))
     found = compare(_rows(options.a), _rows(options.b))
     if found is None:
         raise SceneNotFoundError(

@@ -42,7 +42,12 @@ def run_stereo(options: Options) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
-        check_output(options.output, overwrite=options.overwrite, protect=[options.scene])
+        check_output(
+            options.output,
+            kind="depth",
+            overwrite=options.overwrite,
+            protect=[options.scene],
+        )
         if options.colmap:
             check_dense_scene(scene)
         maps = _maps(scene, options, clock)

@@ -42,7 +42,9 @@ def _run_network(options: Options) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
-        check_output(options.output, overwrite=options.overwrite, protect=[options.scene])
+        check_output(
+            options.output, kind="depth", overwrite=options.overwrite, protect=[options.scene]
+        )
         clock("load network", 0.0)
         network = _network(options)
         report = estimate_depths(

@@ -17,7 +17,7 @@ from splatseed.errors import (
     ParameterError,
     SceneNotFoundError,
 )
-from splatseed.io.staging import MANIFEST, atomic_file, check_output, output_folder
+from splatseed.io.staging import atomic_file, check_output, output_folder
 from splatseed.requirements import require
 from splatseed.train.run_folder import RunFolder
 from splatseed.train.settings import Backend, TrainSettings
@@ -28,7 +28,6 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
 
 __all__ = ["run"]
 
-MANIFEST_TEXT = '{"command": "evaluate"}\n'
 PathOrNone = Annotated[
     Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
 ]
@@ -138,7 +137,10 @@ def _check_outputs(options: Options, task: _Task) -> None:
     """Refuse what cannot be written before any work is done."""
     if options.renders is not None:
         check_output(
-            options.renders, overwrite=options.overwrite, protect=[task.scene, options.model]
+            options.renders,
+            kind="evaluate",
+            overwrite=options.overwrite,
+            protect=[task.scene, options.model],
         )
     if options.output is not None and options.output.exists() and not options.overwrite:
         raise ParameterError(
@@ -183,9 +185,8 @@ def _evaluate(
     )
     result = evaluate_model(model, lpips=lpips, lpips_reason=reason, progress=clock)
     if options.renders is not None:
-        with output_folder(options.renders, overwrite=options.overwrite) as folder:
+        with output_folder(options.renders, kind="evaluate", overwrite=options.overwrite) as folder:
             write_renders(model, folder, clock)
-            (folder / MANIFEST).write_text(MANIFEST_TEXT, encoding="utf-8")
     if options.output is not None:
         _write_json(options.output, options, task, result)
     return result

@@ -160,7 +160,7 @@ def run(arguments: list[str]) -> None:
     options, methods = parse(arguments)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     inputs = [path for path in (options.scene, options.depth_maps) if path is not None]
-    check_output(options.output, overwrite=options.overwrite, protect=inputs)
+    check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=inputs)
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)

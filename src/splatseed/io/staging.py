@@ -17,9 +17,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatseed.errors import OutputError
-from splatseed.io._manifest import MANIFEST, add_files, unlisted_files
+from splatseed.io._manifest import MANIFEST, add_files, seal, why_kept
 
-__all__ = ["MANIFEST", "add_files", "atomic_file", "check_output", "output_folder"]
+__all__ = ["MANIFEST", "add_files", "atomic_file", "check_apart", "check_output", "output_folder"]
 
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -27,17 +27,18 @@ _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 @contextmanager
 def output_folder(
-    path: Path, *, overwrite: bool = False, protect: Sequence[Path] = ()
+    path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
 ) -> Iterator[Path]:
     """A folder to write into that appears at ``path`` when the block ends without an error.
 
     Missing parents are made. An empty folder at ``path`` is used up; a full one is replaced only
-    with ``overwrite`` and only if it holds ``splatseed.json``, so the block should write one. If
-    that lists ``files``, the folder may hold nothing else.
+    with ``overwrite``, and only if its ``splatseed.json`` says that the same kind wrote it and lists
+    all that is in it. That of the new one is written at the end, with what the block has put there.
 
     Args:
         path: Where the output is to be.
-        overwrite: Whether an earlier output of splatseed may be replaced.
+        kind: What writes it, a verb of the command line if it has one.
+        overwrite: Whether an earlier output of this kind may be replaced.
         protect: Files and folders that are read: the output may be neither one of them, nor inside
             one, nor around one.
 
@@ -47,28 +48,31 @@ def output_folder(
     Raises:
         OutputError: ``path`` is taken or protected, or writing failed.
     """
-    check_output(path, overwrite=overwrite, protect=protect)
+    check_output(path, kind=kind, overwrite=overwrite, protect=protect)
     target = Path(path).resolve()
     partial = _partial_name(target)
     with _oserror_as_output_error(target), _parents(target.parent):
         try:
             partial.mkdir()
             yield partial
-            _put_in_place(partial, target)
+            seal(partial, kind)
+            _put_in_place(partial, target, kind)
         except BaseException as error:
             _remove_after(error, partial)
             raise
 
 
-def check_output(path: Path, *, overwrite: bool = False, protect: Sequence[Path] = ()) -> None:
-    """Refuse what ``output_folder`` would refuse, before any work is done.
+def check_output(
+    path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
+) -> None:
+    """Refuse what ``output_folder`` would refuse, before any work is done; arguments as there.
 
     Raises:
         OutputError: ``path`` is taken or protected.
     """
+    check_apart(path, protect)
     target = Path(path).resolve()
-    _check_apart(target, protect)
-    _check_replaceable(target, overwrite=overwrite)
+    _check_replaceable(target, kind, overwrite=overwrite)
 
 
 @contextmanager
@@ -104,7 +108,13 @@ def _partial_name(target: Path, suffix: str = "") -> Path:
     return target.with_name(f".{target.name}.partial-{secrets.token_hex(4)}{suffix}")
 
 
-def _check_apart(target: Path, protect: Sequence[Path]) -> None:
+def check_apart(path: Path, protect: Sequence[Path]) -> None:
+    """Refuse an output that is one of ``protect``, lies inside one, or around one.
+
+    Raises:
+        OutputError: It is, or does.
+    """
+    target = Path(path).resolve()
     for source in (Path(kept).resolve() for kept in protect):
         if target == source or source in target.parents or target in source.parents:
             raise OutputError(
@@ -121,31 +131,20 @@ def _check_apart(target: Path, protect: Sequence[Path]) -> None:
         )
 
 
-def _check_replaceable(target: Path, *, overwrite: bool) -> None:
+def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
     with _oserror_as_output_error(target):
         if not target.exists() or (target.is_dir() and not any(target.iterdir())):
             return
     if not target.is_dir():
-        found, fix = "a file", "Choose another name."
-    elif not (target / MANIFEST).is_file():
-        found = f"files that splatseed did not write (no {MANIFEST})"
-        fix = "Choose another folder, or empty this one yourself."
-    elif not overwrite:
-        found, fix = "an earlier output", "Pass --overwrite to replace it, or choose another name."
-    elif foreign := _foreign_files(target):
-        found = f"an earlier output with files that splatseed did not write: {foreign}"
-        fix = "Move them elsewhere, or choose another name."
+        kept = "a file", "Choose another name."
     else:
-        return
-    raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
-
-
-def _foreign_files(target: Path) -> str:
-    """Up to three files of the user's in an earlier output, and how many more there are."""
-    with _oserror_as_output_error(target):
-        names = unlisted_files(target)
-    more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more
+        with _oserror_as_output_error(target):
+            kept = why_kept(target, kind)
+        if kept is None and not overwrite:
+            kept = "an earlier output", "Pass --overwrite to replace it, or choose another name."
+    if kept is not None:
+        found, fix = kept
+        raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
 
 
 @contextmanager
@@ -162,7 +161,7 @@ def _parents(folder: Path) -> Iterator[None]:
         raise
 
 
-def _put_in_place(partial: Path, target: Path) -> None:
+def _put_in_place(partial: Path, target: Path, kind: str) -> None:
     """Rename ``partial`` to ``target``; what was there steps aside and comes back on failure."""
     if not target.exists():
         partial.rename(target)
@@ -177,7 +176,7 @@ def _put_in_place(partial: Path, target: Path) -> None:
         raise
     finally:
         if old.exists() and target.exists():
-            _discard(old, target)
+            _discard(old, target, kind)
 
 
 def _restore(old: Path, target: Path) -> None:
@@ -191,9 +190,16 @@ def _restore(old: Path, target: Path) -> None:
         ) from error
 
 
-def _discard(old: Path, target: Path) -> None:
+def _discard(old: Path, target: Path, kind: str) -> None:
     """Remove the earlier output, now that the new one is in its place."""
     try:
+        kept = why_kept(old, kind) if any(old.iterdir()) else None
+        if kept is not None:  # somebody wrote there while we worked
+            raise OutputError(
+                f"nothing but the earlier output in {target}",
+                found=kept[0],
+                fix=f"The new output is complete there; the earlier one was kept as {old}.",
+            )
         _remove_tree(old)
     except OSError as error:
         raise OutputError(

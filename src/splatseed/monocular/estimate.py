@@ -86,7 +86,7 @@ def estimate_depths(
             raise ParameterError(f"--{name} of 1 or more", found=f"{number}", fix="Raise it.")
     folder = _image_folder(scene)
     protect = (folder,) if scene.source is None else (folder, scene.source.root)
-    check_output(output, overwrite=overwrite, protect=protect)
+    check_output(output, kind="depth", overwrite=overwrite, protect=protect)
     sizes = _check_images(scene.images, folder, max_size, progress)
     start, flat, done = time.perf_counter(), [], 0
     with depth_folder(

@@ -144,7 +144,7 @@ def triangulate(
 @contextmanager
 def _staged(images: Path, output: Path, *, overwrite: bool) -> Iterator[Path]:
     """The folder to make the scene in, with ``.work`` for scratch files, on the output's disk."""
-    with output_folder(output, overwrite=overwrite, protect=(images,)) as staging:
+    with output_folder(output, kind="sfm", overwrite=overwrite, protect=(images,)) as staging:
         work = staging / ".work"
         work.mkdir()
         yield staging.absolute()
@@ -164,10 +164,10 @@ def _report(output: Path, photos: tuple[Photo, ...], found: Found) -> SfmReport:
     )
 
 
-def _write_manifest(staging: Path, command: str, settings: Settings, report: SfmReport) -> None:
-    """Mark the folder as ours, so that ``overwrite`` may replace it, and say how it was made."""
+def _write_manifest(staging: Path, job: str, settings: Settings, report: SfmReport) -> None:
+    """Say how the scene was made."""
     manifest = {
-        "command": command,
+        "job": job,
         "version": version("splatseed"),
         "settings": asdict(settings),
         "report": {key: value for key, value in asdict(report).items() if key != "path"},

@@ -123,6 +123,8 @@ def prepare_run(
     if state.step:
         note(f"Going on after step {state.step:,} of {settings.max_steps:,}.")
     board = Board(folder.tensorboard, state.step) if options.tensorboard else None
+    if board:
+        folder.claim([folder.tensorboard])
     run = TrainingRun(folder, settings, frame, state, views, board)
     progress("compile", 0.0)
     run.trainer.warm_up()
@@ -251,9 +253,11 @@ class TrainingRun:
 
     def _write_renders(self, progress: Progress) -> None:
         views = self.trainer.test_views
-        for i, view in enumerate(views):
+        paths = [self.folder.renders / picture_name(view.name) for view in views]
+        self.folder.claim(paths)
+        for i, (view, path) in enumerate(zip(views, paths, strict=True)):
             picture = beside_truth(view.image, self.trainer.render(view).cpu().numpy())
-            write_picture(self.folder.renders / picture_name(view.name), picture)
+            write_picture(path, picture)
             progress("write", (i + 1) / len(views))
 
 
