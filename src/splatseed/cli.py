@@ -68,7 +68,7 @@ def _run(verb: str, words: list[str]) -> None:
         _fail(str(error))
     except MemoryError as error:
         _fail(
-            f"expected enough memory; found {error or 'none left'}. "
+            f"expected enough memory; found {str(error) or 'none left'}. "
             "Ask for fewer points, or close other programs."
         )
     except KeyboardInterrupt as stop:

@@ -18,7 +18,7 @@ from splatseed.bench.plan import Plan
 from splatseed.bench.plan_file import plan_text
 from splatseed.bench.records import RunRow, RunSpec
 from splatseed.commands._bench_display import run_display, spoken_time
-from splatseed.commands._bench_machine import Machine, open_machine
+from splatseed.commands._bench_machine import Machine, check_machine, open_machine
 from splatseed.commands._bench_options import PLAN, Asked, Options, asked_plan
 from splatseed.commands._bench_prepare import Prepared, prepare
 from splatseed.commands._bench_summary import print_summary
@@ -53,6 +53,7 @@ def _run(options: Options, asked: Asked, bench: Path, arguments: Sequence[str]) 
         job_options = _job_options(asked.plan)
         with stage_display() as clock:
             prepared = prepare(asked, machine.backend, bench / "scenes", clock)
+            _check_fits(prepared, machine)
         ledger = _enter(bench, prepared, arguments, retry=options.retry_failed)
         ended = _run_all(bench, prepared, machine, ledger, job_options)
     rows = _rows(ledger, prepared)
@@ -61,6 +62,12 @@ def _run(options: Options, asked: Asked, bench: Path, arguments: Sequence[str]) 
         sys.exit(INTERRUPTED)
     if any(row.status == "failed" for row in rows):
         sys.exit(SOME_FAILED)
+
+
+def _check_fits(prepared: Prepared, machine: Machine) -> None:
+    """Refuse a plan with a run that the memory cannot hold, rather than have it killed."""
+    estimator = Estimator(prepared.scenes, [], machine.threads)
+    check_machine(machine, max(map(estimator.seeds, prepared.runs), default=0))
 
 
 def _run_all(
@@ -166,6 +173,7 @@ def _dry_run(options: Options, asked: Asked) -> None:
         kept = options.output / "scenes" if options.output else Path(made)
         scenes = kept if (kept / "demo").is_dir() else Path(made)
         prepared = prepare(asked, machine.backend, scenes, clock)
+        _check_fits(prepared, machine)
     rows = _rows_if_there(options, prepared)
     estimator = Estimator(prepared.scenes, rows, machine.threads)
     told = [
