@@ -7,12 +7,14 @@ never written to.
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePath
 
+from splatseed.io._files import open_file
 from splatseed.scene import Scene
 
 __all__ = ["bring", "frame_folders", "image_folders"]
@@ -88,13 +90,25 @@ def _linked(source: Path, target: Path) -> bool:
 def _copy(source: Path, target: Path) -> None:
     """Copy contents without modes: a copy of a read-only folder could not be removed again."""
     if not source.is_dir():
-        shutil.copyfile(source, target)
+        _copy_file(source, target)
         return
     for parent, _, names in os.walk(source, followlinks=True, onerror=_raise):
         folder = target / Path(parent).relative_to(source)
+        if any(Path(parent).samefile(above) for above in _above(Path(parent), source)):
+            raise OSError(errno.ELOOP, "a link that leads back into itself", parent)
         folder.mkdir()
         for name in names:
-            shutil.copyfile(Path(parent, name), folder / name)
+            _copy_file(Path(parent, name), folder / name)
+
+
+def _copy_file(source: Path, target: Path) -> None:
+    with open_file(source) as file, target.open("xb") as copy:
+        shutil.copyfileobj(file, copy)
+
+
+def _above(folder: Path, top: Path) -> list[Path]:
+    """The folders between ``folder`` and ``top``, this one included."""
+    return [each for each in folder.parents if each == top or top in each.parents]
 
 
 def _raise(error: OSError) -> None:

@@ -16,6 +16,7 @@ from jaxtyping import Float64, Int64
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
+from splatseed.io._files import read_file
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
@@ -53,7 +54,7 @@ def read_bytes(path: Path) -> bytes:
         SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
     """
     try:
-        return path.read_bytes()
+        return read_file(path)
     except (FileNotFoundError, NotADirectoryError):
         raise SceneNotFoundError(f"a file at {path}", found="none", fix="Check the path.") from None
     except OSError as error:

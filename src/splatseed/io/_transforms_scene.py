@@ -47,7 +47,7 @@ def read_transforms_scene(path: Path) -> Scene:
     warnings = (
         *transforms.warnings,
         *notes,
-        *image_warnings(transforms.images, transforms.image_dir),
+        *image_warnings(transforms.images, transforms.image_dir, path.parent),
         *lens_warnings(transforms.images),
     )
     source = SceneSource(

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io._files import read_file
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage
@@ -35,7 +36,7 @@ def photograph_bytes(path: Path) -> bytes:
         SceneFormatError: It cannot be read.
     """
     try:
-        return path.read_bytes()
+        return read_file(path)
     except FileNotFoundError:
         raise SceneNotFoundError(
             f"the image {path}",
