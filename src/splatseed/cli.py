@@ -14,11 +14,11 @@ from importlib.metadata import version
 from types import FrameType
 from typing import NoReturn
 
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
+from splatseed.console import ERR, OUT
 from splatseed.errors import SplatseedError
+from splatseed.literal import visible
 
 __all__ = ["main"]
 
@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> None:
         _print_help()
         return
     if words[0] == "--version":
-        Console().print(f"splatseed {version('splatseed')}", highlight=False)
+        OUT.print(f"splatseed {version('splatseed')}")
         return
     if words[0] not in VERBS:
         _fail(
@@ -72,7 +72,7 @@ def _run(verb: str, words: list[str]) -> None:
             "Ask for fewer points, or close other programs."
         )
     except KeyboardInterrupt as stop:
-        Console(stderr=True).print("\ninterrupted; nothing was left half-written")
+        ERR.print("\ninterrupted; nothing was left half-written")
         sys.exit(TERMINATED if isinstance(stop, _Termination) else INTERRUPTED)
 
 
@@ -110,10 +110,8 @@ def _let_threads_sleep() -> None:
 
 def _fail(message: str) -> NoReturn:
     """Print one error on stderr and exit with 2."""
-    line = escape(" ".join(message.splitlines()))
-    Console(stderr=True).print(
-        f"[bold red]error:[/bold red] {line}", soft_wrap=True, highlight=False
-    )
+    ERR.print("error:", style="bold red", end=" ")
+    ERR.print(visible(" ".join(message.splitlines())), soft_wrap=True)
     sys.exit(2)
 
 
@@ -121,8 +119,7 @@ def _print_help() -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     for verb, does in VERBS.items():
         table.add_row(f"  {verb}", does)
-    console = Console()
-    console.print("usage: splatseed VERB [options]\n", markup=False, highlight=False)
-    console.print("Better seeds for 3D Gaussian Splatting.\n")
-    console.print(table)
-    console.print("\nsplatseed VERB --help shows a verb's options.", highlight=False)
+    OUT.print("usage: splatseed VERB [options]\n")
+    OUT.print("Better seeds for 3D Gaussian Splatting.\n")
+    OUT.print(table)
+    OUT.print("\nsplatseed VERB --help shows a verb's options.")

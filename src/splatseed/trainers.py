@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
+from splatseed.literal import quoted
 from splatseed.scene import SceneFormat
 
 __all__ = ["training_commands"]
@@ -24,8 +24,8 @@ def training_commands(path: Path, written_format: SceneFormat) -> list[tuple[str
     """
     # Trainers are run from their own checkouts, so a relative path would miss.
     path = path.absolute()
-    scene = shlex.quote(str(path))
-    result = shlex.quote(f"{path}-gsplat"), shlex.quote(f"{path}-graphdeco")
+    scene = quoted(path)
+    result = quoted(f"{path}-gsplat"), quoted(f"{path}-graphdeco")
     brush = ("Brush", f"brush_app {scene} --with-viewer")
     opensplat = ("OpenSplat", f"./opensplat {scene} -n 30000")
     if written_format == "transforms":

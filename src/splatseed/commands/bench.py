@@ -25,6 +25,7 @@ from splatseed.commands._bench_summary import print_summary
 from splatseed.commands._options import parse_options
 from splatseed.console import OUT, print_note, stage_display
 from splatseed.io.staging import atomic_file
+from splatseed.literal import visible
 
 __all__ = ["run"]
 
@@ -127,10 +128,12 @@ def _announce(
     """Say what will be done, before it is done."""
     for note in prepared.notes:
         print_note(note)
-    scenes = ", ".join(f"{each.name} ({each.num_points:,} points)" for each in prepared.scenes)
+    scenes = ", ".join(
+        f"{visible(each.name)} ({each.num_points:,} points)" for each in prepared.scenes
+    )
     lines = [scenes, f"  -> {_counts(rows)}; {machine.words}"]
     lines += [f"  -> {line}" for line in _estimates(prepared.plan, rows, machine, estimator)]
-    OUT.print("\n".join([*lines, f"  -> {bench}"]), highlight=False, markup=False, soft_wrap=True)
+    OUT.print("\n".join([*lines, f"  -> {visible(bench)}"]), soft_wrap=True)
 
 
 def _counts(rows: Sequence[RunRow]) -> str:
@@ -183,7 +186,7 @@ def _dry_run(options: Options, asked: Asked) -> None:
     ]
     comments = "".join(f"# {' '.join(line.split())}\n" for line in told)
     text = f"{plan_text(prepared.plan)}\n{comments}"
-    OUT.print(text, end="", highlight=False, markup=False, soft_wrap=True)
+    OUT.print(text, end="", soft_wrap=True)
 
 
 def _rows_if_there(options: Options, prepared: Prepared) -> list[RunRow]:

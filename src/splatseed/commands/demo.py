@@ -9,7 +9,6 @@ trains for a short while from the points as found and from the upsampled ones, a
 from __future__ import annotations
 
 import csv
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +30,7 @@ from splatseed.errors import MissingDependencyError, ParameterError
 from splatseed.geometry import GeometryScore, measure, spacing
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder
+from splatseed.literal import quoted
 from splatseed.pointcloud import PointCloud
 from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
 from splatseed.requirements import require
@@ -281,14 +281,10 @@ def _say_what_next(options: Options, *, trained: bool) -> None:
     commands = [
         (
             "another method",
-            f"splatseed upsample {_quoted(scene)} --method spline --ratio 16 -o OUT",
+            f"splatseed upsample {quoted(scene)} --method spline --ratio 16 -o OUT",
         ),
-        ("a longer run", f"splatseed train {_quoted(seeded)} --max-steps 3000 -o RUN"),
+        ("a longer run", f"splatseed train {quoted(seeded)} --max-steps 3000 -o RUN"),
     ]
     if trained:
-        commands.append(("the scores again", f"splatseed evaluate {_quoted(run)}"))
+        commands.append(("the scores again", f"splatseed evaluate {quoted(run)}"))
     print_commands("next", commands)
-
-
-def _quoted(path: Path) -> str:
-    return shlex.quote(str(path))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -30,6 +29,7 @@ from splatseed.console import (
     stage_display,
 )
 from splatseed.io import load_scene
+from splatseed.literal import quoted, visible
 from splatseed.requirements import require
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.views.photographs import user_cache_dir
@@ -135,13 +135,11 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
         print_note(note)
     settings, views = training.settings, training.trainer.train_views
     OUT.print(
-        f"{options.scene} ({len(views)} training and {len(training.trainer.test_views)} test views"
+        f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} test views"
         f" of {views[0].width} x {views[0].height}, {len(training.state.params['means']):,} Gaussians)\n"
         f"  -> {settings.strategy}, {settings.max_steps:,} steps, seed {settings.seed},"
         f" on {training.device}\n"
-        f"  -> {options.output}",
-        highlight=False,
-        markup=False,
+        f"  -> {visible(options.output)}",
         soft_wrap=True,
     )
 
@@ -149,7 +147,7 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
 @contextmanager
 def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
     """A function that shows the steps done; nothing is drawn when stderr is not a terminal."""
-    columns = (BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}"))
+    columns = (BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False))
     if not ERR.is_terminal:
         yield lambda _: None
         return
@@ -186,12 +184,10 @@ def _finish(training: TrainingRun, clock: StageClock) -> Mapping[str, Any]:
 
 
 def _say_how_to_go_on(options: Options, training: TrainingRun) -> None:
-    scene, output = shlex.quote(str(options.scene)), shlex.quote(str(options.output))
+    scene, output = quoted(options.scene), quoted(options.output)
     ERR.print(
         f"\ninterrupted after step {training.state.step:,}; saved. Go on with:\n"
         f"  splatseed train {scene} -o {output} --resume",
-        highlight=False,
-        markup=False,
         soft_wrap=True,
     )
 
@@ -216,5 +212,5 @@ def _summarise(options: Options, metrics: Mapping[str, Any]) -> None:
             f"memory held the run at {held:,} Gaussians; on another machine it may end otherwise. "
             f"Pass --cap-max {held} to have the same everywhere."
         )
-    output = shlex.quote(str(options.output))
+    output = quoted(options.output)
     print_commands("next", [("score again, with LPIPS", f"splatseed evaluate {output}")])

@@ -31,6 +31,7 @@ from splatseed.io import (
     write_scene,
 )
 from splatseed.io.staging import check_output
+from splatseed.literal import visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
@@ -264,11 +265,9 @@ def _announce(
     parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]
     number = "as many as the photographs need" if total is None else f"{total:,} points"
     OUT.print(
-        f"{options.scene} ({kind}, {len(scene.images)} images, {len(scene.points):,} points)\n"
+        f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} points)\n"
         f"  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n"
-        f"  -> {options.output} ({number}, seed {options.seed})",
-        highlight=False,
-        markup=False,
+        f"  -> {visible(options.output)} ({number}, seed {options.seed})",
         soft_wrap=True,
     )
 
