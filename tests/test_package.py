@@ -23,6 +23,9 @@ MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__pat
 
 ORDER = (
     "errors",
+    "interpreter",
+    "literal",
+    "memory",
     "requirements",
     "progress",
     "kernel_sources",
