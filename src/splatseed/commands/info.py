@@ -136,7 +136,8 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     if len(sizes) > KINDS_SHOWN:
         cameras.append(f"{len(sizes) - KINDS_SHOWN:,} kinds more")
     train, test = scene.split()
-    images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test)"
+    by = f", by its {scene.listed.origin}" if scene.listed else ""
+    images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
     maps = [] if scene.depths is None else [("depth maps", f"{len(scene.depths):,}")]
     return [
         ("format", scene.source.format if scene.source else "memory"),

@@ -120,6 +120,8 @@ def _prepare(
     scene = load_scene(options.scene)
     for warning in scene.warnings:
         note(warning)
+    if scene.listed is not None:
+        note(scene.listed.sentence)
     how = RunOptions(
         resume=options.resume,
         overwrite=options.overwrite,

@@ -15,6 +15,7 @@ from splatseed.io._cloud import cloud_warnings
 from splatseed.io._colmap_scene import find_model, read_colmap_scene, scene_root
 from splatseed.io._earlier import recall_seeds
 from splatseed.io._manifest import MANIFEST
+from splatseed.io._split import follow_lists
 from splatseed.io._transforms_scene import read_transforms_scene
 from splatseed.io.ply import read_ply
 from splatseed.io.tum import is_tum, load_tum
@@ -58,7 +59,7 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     if require_points and not len(scene.points):
         fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
-    scene = recall_seeds(scene)
+    scene = follow_lists(recall_seeds(scene))
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
 
 
