@@ -32,6 +32,7 @@ ORDER = (
     "jit",
     "simd",
     "camera",
+    "similarity",
     "lens",
     "pointcloud",
     "depthmap",

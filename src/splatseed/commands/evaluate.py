@@ -48,6 +48,17 @@ class Options:
     """By how much photographs are made smaller; a run's own, else 1."""
     test_every: CountOrNone = None
     """Of the images sorted by name, every so many-th is scored; a run's own, else 8."""
+    transform: Annotated[
+        str | None,
+        tyro.conf.arg(
+            constructor=str,
+            metavar="FILE|gsplat|none",
+            help_behavior_hint="(default: the same world)",
+        ),
+    ] = None
+    """From the scene's world to the model's, where its trainer normalised that: a JSON file with a
+    matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for what its
+    examples do; none: score the model where it is, whatever it looks like."""
     lpips_net: Literal["vgg", "alex"] = "vgg"
     """The network that LPIPS compares features of."""
     lpips_weights: PathOrNone = None
@@ -179,6 +190,7 @@ def _evaluate(
         task.scene,
         data_factor=task.data_factor,
         test_every=task.test_every,
+        transform=options.transform,
         device=pick_device(options.backend),
         cache_dir=user_cache_dir(),
         progress=clock,
