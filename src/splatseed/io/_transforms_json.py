@@ -81,20 +81,25 @@ def kept_json(transforms: Transforms, names: Collection[str]) -> dict[str, Any]:
     root = transforms.path.parent
     pairs = zip(transforms.json["frames"], transforms.images, strict=True)
     frames = [frame for frame, image in pairs if image.name in names]
-    lists = _kept_lists(transforms.json, frames, root)
+    dropped = [
+        f
+        for f, image in zip(transforms.json["frames"], transforms.images, strict=True)
+        if image.name not in names
+    ]
+    lists = _kept_lists(transforms.json, dropped, root)
     return {**transforms.json, **lists, "frames": [_portable(frame, root) for frame in frames]}
 
 
 def _kept_lists(
-    content: Mapping[str, Any], frames: Iterable[Mapping[str, Any]], root: Path
+    content: Mapping[str, Any], dropped: Iterable[Mapping[str, Any]], root: Path
 ) -> dict[str, list[str]]:
     """The lists of file names by which nerfstudio splits; it fails over one that is no frame's."""
-    kept = {os.path.normpath(str(frame["file_path"])) for frame in frames}
+    gone = {os.path.normpath(str(frame["file_path"])) for frame in dropped}
     return {
         key: [
             _portable({"file_path": name}, root)["file_path"]
             for name in content[key]
-            if isinstance(name, str) and os.path.normpath(name) in kept
+            if isinstance(name, str) and os.path.normpath(name) not in gone
         ]
         for key in _LIST_KEYS
         if isinstance(content.get(key), list)

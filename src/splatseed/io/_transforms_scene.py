@@ -2,7 +2,7 @@
 
 Notation: the *transforms' space* is the world of the file's poses. Promise: points come from the
 file that the JSON names, else from a PLY known to lie in that space, else from a COLMAP model whose
-cameras prove how it is brought there.
+cameras prove how it is brought there: by a known turn of the axes, or by a similarity that fits them.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ from splatseed.io.ply import read_ply
 from splatseed.io.transforms import Transforms, apply_transform, read_transforms
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
+from splatseed.similarity import fit_similarity
 
 __all__ = ["read_transforms_scene"]
 
 _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """What nerfstudio applied to a COLMAP model before it wrote ``applied_transform``."""
+_FEWEST_FITTED = 4
+"""Of three camera centres a similarity says nothing: it fits any three nearly as well."""
 _POSE_TOLERANCE = 1e-2  # of the cameras' extent, between transforms.json and its COLMAP model
 
 
@@ -105,6 +108,15 @@ def _transform_of_model(
         off = np.abs(apply_transform(candidate, model_centers) - centers).max(axis=1)
         if np.median(off) <= _POSE_TOLERANCE * extent:
             return candidate, []
+    fitted = fit_similarity(model_centers, centers)
+    if fitted is not None:
+        apart = np.abs(fitted.points(model_centers) - centers).max(axis=1)
+        if len(centers) >= _FEWEST_FITTED and np.median(apart) <= _POSE_TOLERANCE * extent:
+            note = (
+                f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and scaled"
+                f" by {fitted.scale:.3g}, as instant-ngp writes them; its points were brought there."
+            )
+            return fitted.matrix, [note]
     raise SceneFormatError(
         f"the cameras of {model_dir} to be those of {transforms.path} after applied_transform",
         found=f"cameras {np.median(off):.3g} apart in a scene of extent {extent:.3g}",
