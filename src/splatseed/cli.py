@@ -64,12 +64,19 @@ def _run(verb: str, words: list[str]) -> None:
         # One verb's imports are enough: --help must not wait for Numba.
         with _termination_raised():
             import_module(f"splatseed.commands.{verb}").run(words)
+            sys.stdout.flush()
     except SplatseedError as error:
         _fail(str(error))
     except MemoryError as error:
         _fail(
             f"expected enough memory; found {str(error) or 'none left'}. "
             "Ask for fewer points, or close other programs."
+        )
+    except OSError as error:
+        where = f" at {error.filename}" if error.filename else ""
+        _fail(
+            "expected to read and write what the command needs, its output among it; found"
+            f" {error.strerror or type(error).__name__}{where}. Check the disk and the place."
         )
     except KeyboardInterrupt as stop:
         ERR.print("\ninterrupted; nothing was left half-written")
@@ -110,9 +117,18 @@ def _let_threads_sleep() -> None:
 
 def _fail(message: str) -> NoReturn:
     """Print one error on stderr and exit with 2."""
+    _forget_output()
     ERR.print("error:", style="bold red", end=" ")
     ERR.print(visible(" ".join(message.splitlines())), soft_wrap=True)
     sys.exit(2)
+
+
+def _forget_output() -> None:
+    """Have nothing more written to a full or closed output, where Python would complain at its exit."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115  (to the end)
 
 
 def _print_help() -> None:

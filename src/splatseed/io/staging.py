@@ -49,7 +49,7 @@ def output_folder(
         OutputError: ``path`` is taken or protected, or writing failed.
     """
     check_output(path, kind=kind, overwrite=overwrite, protect=protect)
-    target = Path(path).resolve()
+    target = _resolved(path)
     partial = _partial_name(target)
     with _oserror_as_output_error(target), _parents(target.parent):
         try:
@@ -71,7 +71,7 @@ def check_output(
         OutputError: ``path`` is taken or protected.
     """
     check_apart(path, protect)
-    target = Path(path).resolve()
+    target = _resolved(path)
     _check_replaceable(target, kind, overwrite=overwrite)
 
 
@@ -89,11 +89,12 @@ def atomic_file(path: Path) -> Iterator[Path]:
         The name of the partial file, which does not exist yet.
 
     Raises:
-        OutputError: ``path`` is a folder, or writing failed.
+        OutputError: ``path`` is a folder or a device, or writing failed.
     """
-    target = Path(path).resolve()
-    if target.is_dir():
-        raise OutputError(f"a file name at {target}", found="a folder", fix="Choose another name.")
+    target = _resolved(path)
+    if target.exists() and not target.is_file():  # a device would be replaced by a file
+        found = "a folder" if target.is_dir() else "a device or a pipe"
+        raise OutputError(f"a file name at {target}", found=found, fix="Choose another name.")
     partial = _partial_name(target, target.suffix)
     with _oserror_as_output_error(target), _parents(target.parent):
         try:
@@ -102,6 +103,17 @@ def atomic_file(path: Path) -> Iterator[Path]:
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
+
+
+def _resolved(path: Path) -> Path:
+    try:
+        return Path(path).resolve()
+    except (OSError, RuntimeError):  # RuntimeError before Python 3.13
+        raise OutputError(
+            f"a name at {path}",
+            found="a link that leads back to itself",
+            fix="Remove the link, or choose another name.",
+        ) from None
 
 
 def _partial_name(target: Path, suffix: str = "") -> Path:
@@ -114,8 +126,8 @@ def check_apart(path: Path, protect: Sequence[Path]) -> None:
     Raises:
         OutputError: It is, or does.
     """
-    target = Path(path).resolve()
-    for source in (Path(kept).resolve() for kept in protect):
+    target = _resolved(path)
+    for source in (_resolved(kept) for kept in protect):
         if target == source or source in target.parents or target in source.parents:
             raise OutputError(
                 "an output folder apart from the input",
