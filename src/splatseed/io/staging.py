@@ -266,5 +266,5 @@ def _oserror_as_output_error(target: Path) -> Iterator[None]:
         raise OutputError(
             f"{target} to be written",
             found=_reason(error),
-            fix=f"{fix} Nothing was left behind.",
+            fix=f"{fix} Nothing half-written was left behind.",
         ) from error
