@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import which
 from typing import TYPE_CHECKING, TypeAlias
 
 from splatseed.bench.job import JobOptions
@@ -16,7 +17,7 @@ from splatseed.bench.watcher import Watcher
 from splatseed.commands._bench_options import Options
 from splatseed.memory import check_memory
 from splatseed.requirements import require
-from splatseed.train.settings import Backend
+from splatseed.train.settings import BYTES_EACH, Backend
 
 if TYPE_CHECKING:
     from splatseed.bench.ray_cluster import Cluster
@@ -88,8 +89,6 @@ def check_machine(machine: Machine, seeds: int) -> None:
     """
     if not machine.is_local or machine.backend != "cpu":
         return
-    from splatseed.train.device import BYTES_EACH  # noqa: PLC0415  (PyTorch)
-
     check_memory(
         seeds,
         BYTES_EACH * machine.jobs,
@@ -99,9 +98,11 @@ def check_machine(machine: Machine, seeds: int) -> None:
 
 
 def _local_machine(options: Options, backend: Backend) -> Machine:
-    from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
+    found: Backend = "cpu"
+    if backend == "cuda" or (backend == "auto" and _has_driver()):
+        from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch, which takes seconds)
 
-    found: Backend = "cuda" if pick_device(backend).type == "cuda" else "cpu"
+        found = "cuda" if pick_device(backend).type == "cuda" else "cpu"
     gpus = _gpus() if found == "cuda" else []
     jobs = options.jobs or max(len(gpus), 1)
     threads = options.threads or max(1, cores() // jobs)
@@ -113,6 +114,16 @@ def _local_machine(options: Options, backend: Backend) -> Machine:
         return LocalExecutor(ledger, bench, environments, how, watcher).run(keys)
 
     return Machine("this machine", found, jobs, threads, run, is_local=True)
+
+
+def _has_driver() -> bool:
+    """Whether there may be a GPU for PyTorch: without a driver there is none."""
+    return (
+        os.name == "nt"
+        or which("nvidia-smi") is not None
+        or Path("/proc/driver").joinpath("nvidia").exists()
+        or which("rocminfo") is not None
+    )
 
 
 def _gpus() -> list[str]:

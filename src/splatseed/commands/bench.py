@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -170,11 +169,10 @@ def _dry_run(options: Options, asked: Asked) -> None:
     """Print the plan as TOML, and the rest as comments in it, so that all can be kept as one."""
     with (
         open_machine(options, asked.plan.backend) as machine,
-        tempfile.TemporaryDirectory() as made,
         stage_display() as clock,
     ):
-        kept = options.output / "scenes" if options.output else Path(made)
-        scenes = kept if (kept / "demo").is_dir() else Path(made)
+        kept = options.output / "scenes" if options.output else None
+        scenes = kept if kept and (kept / "demo").is_dir() else None
         prepared = prepare(asked, machine.backend, scenes, clock)
         _check_fits(prepared, machine)
     rows = _rows_if_there(options, prepared)

@@ -11,15 +11,11 @@ import torch
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.memory import free_memory
-from splatseed.train.settings import Backend
+from splatseed.train.settings import BYTES_EACH, Backend
 
 __all__ = [
-    "Capacity", "check_fits", "device_name", "free_bytes", "peak_gpu_bytes", "pick_device",
+    "BYTES_EACH", "Capacity", "check_fits", "device_name", "free_bytes", "peak_gpu_bytes", "pick_device",
 ]  # fmt: skip
-
-BYTES_EACH = 2000
-"""A Gaussian's 59 numbers, their gradients and two moments (944 bytes), and as much again for the
-rasteriser's lists and for copies while Gaussians are added."""
 
 
 def pick_device(backend: Backend) -> torch.device:

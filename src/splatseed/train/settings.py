@@ -12,13 +12,17 @@ from typing import Literal, cast
 from splatseed.errors import ParameterError
 from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule
 
-__all__ = ["AS_3DGS", "MCMC_CAP", "Backend", "StrategyName", "TrainSettings"]
+__all__ = ["AS_3DGS", "BYTES_EACH", "MCMC_CAP", "Backend", "StrategyName", "TrainSettings"]
 
 StrategyName = Literal["default", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"]
 Backend = Literal["auto", "cpu", "cuda"]
 
 MCMC_CAP = 1_000_000
 AS_3DGS = "-3dgs"
+
+BYTES_EACH = 2000
+"""Memory of a Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes), and as
+much again for the rasteriser's lists and for copies while Gaussians are added."""
 
 
 @dataclass(frozen=True)
