@@ -14,9 +14,11 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress as Bar,
+    ProgressColumn,
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 
 from splatseed.commands._options import parse_options
 from splatseed.console import (
@@ -37,9 +39,10 @@ from splatseed.views.photographs import user_cache_dir
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
 
-__all__ = ["run"]
+__all__ = ["bar_columns", "run"]
 
 INTERRUPTED = 130
+BAR_WIDTH = 12
 DEFAULT = TrainSettings()
 
 
@@ -149,11 +152,10 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
 @contextmanager
 def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
     """A function that shows the steps done; nothing is drawn when stderr is not a terminal."""
-    columns = (BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}", markup=False))
     if not ERR.is_terminal:
         yield lambda _: None
         return
-    with Bar(*columns, TimeRemainingColumn(), console=ERR, transient=True) as bar:
+    with Bar(*bar_columns(), console=ERR, transient=True, expand=True) as bar:
         first, total = training.state.step, training.settings.max_steps
         task = bar.add_task("", total=total, completed=first)
 
@@ -163,17 +165,33 @@ def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
         yield show
 
 
+def bar_columns() -> tuple[ProgressColumn, ...]:
+    """Steps and the time left whole; what else there is to say fills the rest, cut where it ends."""
+
+    def whole() -> Column:
+        return Column(no_wrap=True, overflow="ignore")
+
+    rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")
+    return (
+        BarColumn(BAR_WIDTH, table_column=whole()),
+        MofNCompleteColumn(table_column=whole()),
+        TimeRemainingColumn(table_column=whole()),
+        TextColumn("{task.description}", markup=False, table_column=rest),
+    )
+
+
 def _line(training: TrainingRun, steps_per_second: float | None) -> str:
     records = training.state.records
     if not records:
         return ""
     last = records[-1]
     tested = next((r.test_psnr for r in reversed(records) if r.test_psnr is not None), None)
-    test = "" if tested is None else f" (test {tested:.2f})"
+    test = "" if tested is None else f", test {tested:.2f}"
     speed = "" if steps_per_second is None else f"  {steps_per_second:.1f} steps/s"
+    # The most important first: a narrow terminal cuts the end off.
     return (
-        f"loss {last.loss:.4f}  PSNR {last.train_psnr:.2f}{test} dB"
-        f"  {last.num_gaussians:,} Gaussians{speed}"
+        f"PSNR {last.train_psnr:.2f}{test} dB  {last.num_gaussians:,} Gaussians{speed}"
+        f"  loss {last.loss:.4f}"
     )
 
 
