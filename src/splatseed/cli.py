@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import signal
 import sys
@@ -32,8 +33,8 @@ VERBS = {
     "sfm": "Make a scene from photographs (pycolmap).",
     "demo": "Make a small scene, upsample it by every method, measure, train.",
 }
-INTERRUPTED, TERMINATED = 130, 143
-"""As shells have it: 128 and the number of the signal."""
+TERMINATED = 143
+"""As shells have it: 128 and the number of SIGTERM."""
 
 
 class _Termination(KeyboardInterrupt):
@@ -43,6 +44,7 @@ class _Termination(KeyboardInterrupt):
 def main(arguments: list[str] | None = None) -> None:
     """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
     words = sys.argv[1:] if arguments is None else arguments
+    _show_log()
     _print_any_name()
     _let_threads_sleep()
     if not words or words[0] in {"-h", "--help"}:
@@ -80,7 +82,9 @@ def _run(verb: str, words: list[str]) -> None:
         )
     except KeyboardInterrupt as stop:
         ERR.print("\ninterrupted; nothing was left half-written")
-        sys.exit(TERMINATED if isinstance(stop, _Termination) else INTERRUPTED)
+        from splatseed.train.interruption import exit_code  # noqa: PLC0415  (as late as can be)
+
+        sys.exit(TERMINATED if isinstance(stop, _Termination) else exit_code())
 
 
 @contextmanager
@@ -104,6 +108,20 @@ def _print_any_name() -> None:
     """Let file names that are no valid text be printed, escaped, as Python does on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
+
+
+class _Notes(logging.Handler):
+    """Shows what splatseed logs as notes on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show one."""
+        ERR.print(f"note: {visible(record.getMessage())}", soft_wrap=True)
+
+
+def _show_log() -> None:
+    log = logging.getLogger("splatseed")
+    if not any(isinstance(each, _Notes) for each in log.handlers):
+        log.addHandler(_Notes())
 
 
 def _let_threads_sleep() -> None:

@@ -25,10 +25,10 @@ from splatseed.commands._options import parse_options
 from splatseed.console import OUT, print_note, stage_display
 from splatseed.io.staging import atomic_file
 from splatseed.literal import visible
+from splatseed.train.interruption import exit_code
 
 __all__ = ["run"]
 
-INTERRUPTED = 130
 SOME_FAILED = 1
 REPORTING = {"report": "run_report", "compare": "run_compare"}
 
@@ -59,7 +59,7 @@ def _run(options: Options, asked: Asked, bench: Path, arguments: Sequence[str]) 
     rows = _rows(ledger, prepared)
     print_summary(bench, rows)
     if not ended:
-        sys.exit(INTERRUPTED)
+        sys.exit(exit_code())
     if any(row.status == "failed" for row in rows):
         sys.exit(SOME_FAILED)
 

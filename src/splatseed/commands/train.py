@@ -33,6 +33,7 @@ from splatseed.console import (
 from splatseed.io import load_scene
 from splatseed.literal import quoted, visible
 from splatseed.requirements import require
+from splatseed.train.interruption import exit_code
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 
@@ -41,7 +42,6 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
 
 __all__ = ["bar_columns", "run"]
 
-INTERRUPTED = 130
 BAR_WIDTH = 12
 DEFAULT = TrainSettings()
 
@@ -108,7 +108,7 @@ def run(arguments: list[str]) -> None:
         done = training.train(show)
     if not done:
         _say_how_to_go_on(options, training)
-        sys.exit(INTERRUPTED)
+        sys.exit(exit_code())
     with stage_display(clock):
         metrics = _finish(training, clock)
     _summarise(options, metrics)

@@ -1,7 +1,8 @@
 """Output that is there whole or not at all.
 
 Notation: the *target* is what the user named, the *partial* a hidden sibling ``.NAME.partial-XXXX``
-that is written first and renamed to the target at the end. Promise: whatever interrupts the writing
+that is written first and renamed to the target at the end; a *leftover* is the partial of a process that
+was killed, which the next one for the same target removes. Promise: whatever interrupts the writing
 (an error, a full disk, Ctrl-C), the partial is removed and an older output is still there unharmed;
 an ``OSError`` becomes an ``OutputError`` that says what to do, and what cannot be removed is named.
 """
@@ -9,14 +10,13 @@ an ``OSError`` becomes an ``OutputError`` that says what to do, and what cannot 
 from __future__ import annotations
 
 import errno
-import os
 import secrets
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatseed.errors import OutputError
+from splatseed.io._leftovers import held, remove_leftovers, remove_tree
 from splatseed.io._manifest import MANIFEST, add_files, seal, why_kept
 
 __all__ = ["MANIFEST", "add_files", "atomic_file", "check_apart", "check_output", "output_folder"]
@@ -50,10 +50,12 @@ def output_folder(
     """
     check_output(path, kind=kind, overwrite=overwrite, protect=protect)
     target = _resolved(path)
+    remove_leftovers(target)
     partial = _partial_name(target)
-    with _oserror_as_output_error(target), _parents(target.parent):
+    with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
         try:
             partial.mkdir()
+            hold()
             yield partial
             seal(partial, kind)
             _put_in_place(partial, target, kind)
@@ -212,7 +214,7 @@ def _discard(old: Path, target: Path, kind: str) -> None:
                 found=kept[0],
                 fix=f"The new output is complete there; the earlier one was kept as {old}.",
             )
-        _remove_tree(old)
+        remove_tree(old)
     except OSError as error:
         raise OutputError(
             f"the earlier output, set aside as {old}, to be removed",
@@ -224,7 +226,7 @@ def _discard(old: Path, target: Path, kind: str) -> None:
 def _remove_after(failure: BaseException, partial: Path) -> None:
     """Remove what an interrupted block has written, or say where it is."""
     try:
-        _remove_tree(partial)
+        remove_tree(partial)
     except FileNotFoundError:
         return
     except OSError as error:
@@ -234,17 +236,6 @@ def _remove_after(failure: BaseException, partial: Path) -> None:
             found=_reason(error),
             fix="Remove it yourself before you try again.",
         ) from failure
-
-
-def _remove_tree(folder: Path) -> None:
-    """Remove a folder of our own, also where folders in it are read-only."""
-    folder.chmod(0o700)
-    for parent, names, _ in os.walk(folder):
-        for name in names:
-            child = Path(parent, name)
-            if not child.is_symlink():  # its target is the user's
-                child.chmod(0o700)
-    shutil.rmtree(folder)
 
 
 def _reason(error: OSError) -> str:
