@@ -14,6 +14,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io._cloud import cloud_warnings
 from splatseed.io._colmap_scene import find_model, read_colmap_scene, scene_root
 from splatseed.io._earlier import recall_seeds
+from splatseed.io._foreign import refuse_foreign
 from splatseed.io._manifest import MANIFEST
 from splatseed.io._split import follow_lists
 from splatseed.io._transforms_scene import read_transforms_scene
@@ -92,6 +93,7 @@ def _read_file(path: Path) -> Scene:
         ".ply": _read_bare_ply,
         ".json": read_transforms_scene,
     }
+    refuse_foreign(path)
     reader = readers.get(path.suffix.lower())
     if reader is None and find_model(path.parent) is not None:
         raise SceneFormatError(

@@ -149,6 +149,7 @@ def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
     with _oserror_as_output_error(target):
         if not target.exists() or (target.is_dir() and not any(target.iterdir())):
             return
+    kept: tuple[str, str] | None
     if not target.is_dir():
         kept = "a file", "Choose another name."
     else:
