@@ -122,6 +122,9 @@ def summarise(
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(output)),
     ]
+    if (output / "images").is_symlink():
+        where = (output / "images").resolve()
+        rows.append(("images", f"linked, not copied: {where}; --copy-images to take OUT elsewhere"))
     if report.dropped_nonfinite + report.dropped_duplicates:
         left_out = (
             f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate"

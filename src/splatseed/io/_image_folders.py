@@ -64,7 +64,7 @@ def bring(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]
     for name, source in present.items():
         target = output / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        if copy or not _linked(source.resolve(), target):
+        if copy or not _linked(_goal(source.resolve(), target, output.resolve().parent), target):
             _copy(source, target)
     return sorted(present)
 
@@ -80,9 +80,16 @@ def _siblings(root: Path) -> dict[str, Path]:
     return {name: root / name for name in _SIBLINGS if (root / name).is_dir()}
 
 
+def _goal(source: Path, link: Path, around: Path) -> Path:
+    """What a link says: the way from here if output and source lie side by side, and can move together."""
+    if around not in source.parents or around == Path(around.anchor):
+        return source
+    return Path(os.path.relpath(source, link.parent.resolve()))
+
+
 def _linked(source: Path, target: Path) -> bool:
     with suppress(OSError, NotImplementedError):  # a file system or system without links
-        target.symlink_to(source, target_is_directory=source.is_dir())
+        target.symlink_to(source, target_is_directory=(target.parent / source).is_dir())
         return True
     return False
 
