@@ -137,7 +137,9 @@ def summarise(
     for note in report.notes:
         print_note(note)
     if report.layout == "transforms":
-        print_note("gsplat's examples and graphdeco's code read COLMAP only: --format colmap.")
+        print_note(
+            "gsplat's examples, graphdeco's code and LichtFeld read COLMAP only: --format colmap."
+        )
     if scene.images and scene.source is not None and scene.source.image_dir is not None:
         print_commands("train it with", training_commands(output, report.layout))
 
