@@ -19,7 +19,7 @@ from rich.table import Table
 
 from splatseed.console import ERR, OUT
 from splatseed.errors import SplatseedError
-from splatseed.literal import visible
+from splatseed.literal import did_you_mean, visible
 
 __all__ = ["main"]
 
@@ -50,13 +50,13 @@ def main(arguments: list[str] | None = None) -> None:
     if not words or words[0] in {"-h", "--help"}:
         _print_help()
         return
-    if words[0] == "--version":
+    if words[0] in {"-V", "--version"}:
         OUT.print(f"splatseed {version('splatseed')}")
         return
     if words[0] not in VERBS:
         _fail(
             f"expected a verb ({', '.join(VERBS)}); found {words[0]!r}. "
-            "Run splatseed --help to see what each does."
+            f"{did_you_mean(words[0], VERBS)}Run splatseed --help to see what each does."
         )
     _run(words[0], words[1:])
 
@@ -156,4 +156,4 @@ def _print_help() -> None:
     OUT.print("usage: splatseed VERB [options]\n")
     OUT.print("Better seeds for 3D Gaussian Splatting.\n")
     OUT.print(table)
-    OUT.print("\nsplatseed VERB --help shows a verb's options.")
+    OUT.print("\nsplatseed VERB --help shows a verb's options, splatseed -V the version.")

@@ -9,9 +9,11 @@ from __future__ import annotations
 import os
 import shlex
 import unicodedata
+from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 
-__all__ = ["quoted", "visible"]
+__all__ = ["did_you_mean", "quoted", "visible"]
 
 
 def visible(text: object, keep: str = "") -> str:
@@ -40,6 +42,17 @@ def quoted(path: Path | str) -> str:
     if all(map(_shows, text)):
         return shlex.quote(text)
     return "$'" + "".join(map(_ansi_c, text)) + "'"
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """A question with the known word that is most like another, and a space; nothing if none is.
+
+    Example:
+        >>> did_you_mean("--ratoi", ["--ratio", "--seed"])
+        'Did you mean --ratio? '
+    """
+    close = get_close_matches(word.lower(), list(known), n=1, cutoff=0.6)
+    return f"Did you mean {close[0]}? " if close else ""
 
 
 def _shows(character: str) -> bool:

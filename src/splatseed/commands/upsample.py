@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -46,6 +47,8 @@ from splatseed.upsample import (
 )
 
 __all__ = ["parse", "run"]
+
+HELP_ALL = "--help-all"
 
 
 def _number(kind: type, default: str) -> Any:
@@ -130,6 +133,9 @@ class Options:
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """The options, and every method with its parameters, from the command line's words."""
+    if {"-h", "--help"} & set(arguments):
+        _help(arguments)
+    arguments = ["--help" if word == HELP_ALL else word for word in arguments]
     options = _parse_with({name: METHODS[name]() for name in METHODS}, arguments)
     if options.profile == "paper":
         # The profile sets the defaults of other flags, so it must be known before they are read.
@@ -140,9 +146,21 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     return options, methods
 
 
+def _help(arguments: list[str]) -> None:
+    """Show the common options, those of the method that is named too, and how to see all."""
+    named = [name for name in METHODS if name in arguments or f"--method={name}" in arguments]
+    with suppress(SystemExit):
+        _parse_with({name: METHODS[name]() for name in named}, ["--help"])
+    OUT.print(
+        f"\nsplatseed upsample {HELP_ALL} shows the flags of all methods,"
+        " --method mls --help those of one."
+    )
+    raise SystemExit(0)
+
+
 def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
     """Options with one more field a method, whose default is the method given."""
-    names = tuple(methods)
+    names = tuple(METHODS)
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
     ]
