@@ -31,6 +31,7 @@ VERBS = {
     "depth": "Make depth maps of the photographs, by a network or by stereo.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",
+    "undistort": "Take lens distortion out of a scene (pycolmap).",
     "demo": "Make a small scene, upsample it by every method, measure, train.",
 }
 TERMINATED = 143

@@ -76,4 +76,4 @@ def lens_warnings(images: Sequence[Image]) -> list[str]:
         return []
     lenses = f"Cameras have lens distortion ({', '.join(models)})"
     trainers = "graphdeco's trainer and OpenSplat need PINHOLE"
-    return [f"{lenses}; {trainers}: undistort the images with colmap image_undistorter."]
+    return [f"{lenses}; {trainers}: undistort it with splatseed undistort SCENE -o OUT."]

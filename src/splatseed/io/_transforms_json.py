@@ -134,7 +134,7 @@ def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
         raise OutputError(
             "cameras that transforms.json can express",
             found=f"camera {camera.camera_id} of model {camera.model}",
-            fix="Undistort the scene to PINHOLE, or write the COLMAP layout.",
+            fix="Undistort the scene first (splatseed undistort), or write the COLMAP layout.",
         )
     fisheye = camera.model.endswith("FISHEYE")
     names = _FISHEYE_TERMS if fisheye else _OPENCV_TERMS

@@ -22,7 +22,7 @@ from splatseed import errors
 from splatseed.errors import ReconstructionError, SplatseedError
 from splatseed.interpreter import child_command, child_environment
 from splatseed.progress import Progress
-from splatseed.sfm.jobs import Found, ReconstructJob, TriangulateJob
+from splatseed.sfm.jobs import Found, Job
 from splatseed.sfm.settings import check_cuda, require_pycolmap
 from splatseed.sfm.stages import Stages
 
@@ -32,9 +32,7 @@ _CHILD = "from splatseed.sfm.worker import serve; serve()"
 _REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 
 
-def run_job(
-    job: ReconstructJob | TriangulateJob, log: Path, *, verbose: bool, on_progress: Progress
-) -> Found:
+def run_job(job: Job, log: Path, *, verbose: bool, on_progress: Progress) -> Found:
     """Run ``job`` in a child process and wait for it.
 
     Args:
@@ -66,9 +64,7 @@ def run_job(
             child.kill()
 
 
-def _converse(
-    child: subprocess.Popen[bytes], job: ReconstructJob | TriangulateJob, on_progress: Progress
-) -> Found:
+def _converse(child: subprocess.Popen[bytes], job: Job, on_progress: Progress) -> Found:
     commands, replies = cast("BinaryIO", child.stdin), cast("BinaryIO", child.stdout)
     pickle.dump(job, commands)
     commands.flush()

@@ -121,7 +121,7 @@ def _checked_size(image: Image, folder: Path) -> Size:
         raise SceneFormatError(
             "cameras without lens distortion (PINHOLE), as COLMAP's dense tools need them",
             found=f"{lens.model} for {image.name}",
-            fix="Undistort the scene first: colmap image_undistorter, or splatseed sfm.",
+            fix="Undistort the scene first: splatseed undistort SCENE -o OUT.",
         )
     if "/".join(safe_parts(image.name)) != image.name or "\n" in image.name:
         raise OutputError(
