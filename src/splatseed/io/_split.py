@@ -41,7 +41,7 @@ def follow_lists(scene: Scene) -> Scene:
     Raises:
         SceneFormatError: A list cannot be read.
     """
-    if scene.source is None or not scene.images:
+    if scene.source is None or not scene.images or scene.listed is not None:
         return scene
     warnings = list(scene.warnings)
     for lists in _lists(scene):
@@ -117,10 +117,10 @@ def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str])
     found = frozenset(n for n in names if any(f"{prefix}{n}" in whole for prefix in prefixes))
     if found:
         return found
-    for part in (lambda p: p.name, lambda p: p.stem):
-        parts = [part(PurePosixPath(name)) for name in names]
+    for field in ("name", "stem"):
+        parts = [getattr(PurePosixPath(name), field) for name in names]
         if len(set(parts)) == len(parts):  # else it would not say which image is meant
-            wanted = {part(PurePosixPath(each)) for each in whole}
+            wanted = {getattr(PurePosixPath(each), field) for each in whole}
             found = frozenset(n for n, own in zip(names, parts, strict=True) if own in wanted)
             if found:
                 return found

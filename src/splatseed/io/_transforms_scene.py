@@ -27,7 +27,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.similarity import fit_similarity
 
-__all__ = ["read_transforms_scene"]
+__all__ = ["find_points", "read_transforms_scene"]
 
 _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
@@ -46,7 +46,7 @@ def read_transforms_scene(path: Path) -> Scene:
             JSON does not fit its poses.
     """
     transforms = read_transforms(path)
-    points, points_path, notes = _find_points(transforms)
+    points, points_path, notes = find_points(transforms)
     warnings = (
         *transforms.warnings,
         *notes,
@@ -63,7 +63,7 @@ def read_transforms_scene(path: Path) -> Scene:
     return Scene(points, transforms.images, transforms.intrinsics, source=source, warnings=warnings)
 
 
-def _find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
+def find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
     """The cloud, the file it came from, and what to tell of it."""
     root, notes = transforms.path.parent, []
     named = transforms.json.get("ply_file_path")
