@@ -54,12 +54,24 @@ def main(arguments: list[str] | None = None) -> None:
     if words[0] in {"-V", "--version"}:
         OUT.print(f"splatseed {version('splatseed')}")
         return
+    if words[0] == "--completion":
+        _print_completion(words[1:])
+        return
     if words[0] not in VERBS:
         _fail(
             f"expected a verb ({', '.join(VERBS)}); found {words[0]!r}. "
             f"{did_you_mean(words[0], VERBS)}Run splatseed --help to see what each does."
         )
     _run(words[0], words[1:])
+
+
+def _print_completion(words: list[str]) -> None:
+    from splatseed.commands._completion import completion_script  # noqa: PLC0415  (loads every verb)
+
+    try:
+        OUT.print(completion_script(words, list(VERBS)), end="", soft_wrap=True)
+    except SplatseedError as error:
+        _fail(str(error))
 
 
 def _run(verb: str, words: list[str]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 from importlib.metadata import version
 
 import pytest
@@ -47,3 +49,33 @@ def test_upsamples_help_is_short_and_says_where_the_rest_is(splatseed):
     every = splatseed("upsample", "--help-all").out
     assert "--mls.k" in every
     assert "--spline.k" in every
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs a shell")
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (["ups"], {"upsample"}),
+        (["info", "--pi"], {"--picture"}),
+        (["train", "x", "--max-s"], {"--max-steps"}),
+        (["bench", "--exec"], {"--executor"}),
+        (["train", "sc"], set()),  # files, by the shell itself
+    ],
+)
+def test_a_shell_completes_verbs_and_options(words, offered, splatseed):
+    script = splatseed("--completion", "bash")
+    assert script.code == 0
+    typed = " ".join(["splatseed", *words])
+    program = (
+        f"{script.out}\nCOMP_WORDS=({typed}); COMP_CWORD={len(words)}; _splatseed;"
+        ' printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == offered
+    assert done.stderr == ""
+
+
+def test_another_shell_is_told_what_there_is(splatseed):
+    run = splatseed("--completion", "fish")
+    assert (run.code, "bash or zsh" in run.err) == (2, True)
+    assert splatseed("--completion", "zsh").out.startswith("autoload")
