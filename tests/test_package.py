@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 import splatseed
+from splatseed.requirements import INSTALL
 
 ROOT = Path(__file__).parents[1]
 SOURCE = Path(splatseed.__file__).parent
@@ -23,12 +24,16 @@ MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__pat
 
 ORDER = (
     "errors",
+    "interpreter",
+    "literal",
+    "memory",
     "requirements",
     "progress",
     "kernel_sources",
     "jit",
     "simd",
     "camera",
+    "similarity",
     "lens",
     "pointcloud",
     "depthmap",
@@ -81,6 +86,21 @@ def _imports(path):
 def _files(part):
     """The files of a part of the package, which is a module or a folder."""
     return sorted((SOURCE / part).rglob("*.py")) or [SOURCE / f"{part}.py"]
+
+
+def test_what_errors_tell_to_install_is_what_the_package_asks_for():
+    project = tomllib.loads((SOURCE.parents[1] / "pyproject.toml").read_text("utf-8"))["project"]
+    asked = {each for extra in project["optional-dependencies"].values() for each in extra}
+    assert set(INSTALL.values()) <= asked
+    assert all(wanted.startswith(name) for name, wanted in INSTALL.items())
+
+
+def test_nothing_is_to_be_installed_that_is_not_published():
+    """An index has no splatseed yet, so its extras can be had from its own folder only."""
+    root = SOURCE.parents[1]
+    for path in (*root.glob("*.md"), *root.glob("docs/*.md"), *SOURCE.rglob("*.py")):
+        text = " ".join(path.read_text("utf-8").split())
+        assert not re.search(r"pip install [\"']?splatseed", text), path
 
 
 def test_every_part_has_its_place():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import signal
 import sys
@@ -14,11 +15,11 @@ from importlib.metadata import version
 from types import FrameType
 from typing import NoReturn
 
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
+from splatseed.console import ERR, OUT
 from splatseed.errors import SplatseedError
+from splatseed.literal import did_you_mean, visible
 
 __all__ = ["main"]
 
@@ -30,10 +31,11 @@ VERBS = {
     "depth": "Make depth maps of the photographs, by a network or by stereo.",
     "info": "Show what is in a scene, and what is wrong with it.",
     "sfm": "Make a scene from photographs (pycolmap).",
+    "undistort": "Take lens distortion out of a scene (pycolmap).",
     "demo": "Make a small scene, upsample it by every method, measure, train.",
 }
-INTERRUPTED, TERMINATED = 130, 143
-"""As shells have it: 128 and the number of the signal."""
+TERMINATED = 143
+"""As shells have it: 128 and the number of SIGTERM."""
 
 
 class _Termination(KeyboardInterrupt):
@@ -43,20 +45,33 @@ class _Termination(KeyboardInterrupt):
 def main(arguments: list[str] | None = None) -> None:
     """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
     words = sys.argv[1:] if arguments is None else arguments
+    _show_log()
     _print_any_name()
     _let_threads_sleep()
     if not words or words[0] in {"-h", "--help"}:
         _print_help()
         return
-    if words[0] == "--version":
-        Console().print(f"splatseed {version('splatseed')}", highlight=False)
+    if words[0] in {"-V", "--version"}:
+        OUT.print(f"splatseed {version('splatseed')}")
+        return
+    if words[0] == "--completion":
+        _print_completion(words[1:])
         return
     if words[0] not in VERBS:
         _fail(
             f"expected a verb ({', '.join(VERBS)}); found {words[0]!r}. "
-            "Run splatseed --help to see what each does."
+            f"{did_you_mean(words[0], VERBS)}Run splatseed --help to see what each does."
         )
     _run(words[0], words[1:])
+
+
+def _print_completion(words: list[str]) -> None:
+    from splatseed.commands._completion import completion_script  # noqa: PLC0415  (loads every verb)
+
+    try:
+        OUT.print(completion_script(words, list(VERBS)), end="", soft_wrap=True)
+    except SplatseedError as error:
+        _fail(str(error))
 
 
 def _run(verb: str, words: list[str]) -> None:
@@ -64,16 +79,25 @@ def _run(verb: str, words: list[str]) -> None:
         # One verb's imports are enough: --help must not wait for Numba.
         with _termination_raised():
             import_module(f"splatseed.commands.{verb}").run(words)
+            sys.stdout.flush()
     except SplatseedError as error:
         _fail(str(error))
     except MemoryError as error:
         _fail(
-            f"expected enough memory; found {error or 'none left'}. "
+            f"expected enough memory; found {str(error) or 'none left'}. "
             "Ask for fewer points, or close other programs."
         )
+    except OSError as error:
+        where = f" at {error.filename}" if error.filename else ""
+        _fail(
+            "expected to read and write what the command needs, its output among it; found"
+            f" {error.strerror or type(error).__name__}{where}. Check the disk and the place."
+        )
     except KeyboardInterrupt as stop:
-        Console(stderr=True).print("\ninterrupted; nothing was left half-written")
-        sys.exit(TERMINATED if isinstance(stop, _Termination) else INTERRUPTED)
+        ERR.print("\ninterrupted; nothing was left half-written")
+        from splatseed.train.interruption import exit_code  # noqa: PLC0415  (as late as can be)
+
+        sys.exit(TERMINATED if isinstance(stop, _Termination) else exit_code())
 
 
 @contextmanager
@@ -99,6 +123,20 @@ def _print_any_name() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
+class _Notes(logging.Handler):
+    """Shows what splatseed logs as notes on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show one."""
+        ERR.print(f"note: {visible(record.getMessage())}", soft_wrap=True)
+
+
+def _show_log() -> None:
+    log = logging.getLogger("splatseed")
+    if not any(isinstance(each, _Notes) for each in log.handlers):
+        log.addHandler(_Notes())
+
+
 def _let_threads_sleep() -> None:
     """Have idle threads sleep rather than spin; OpenMP reads this as PyTorch and Numba load it.
 
@@ -110,19 +148,25 @@ def _let_threads_sleep() -> None:
 
 def _fail(message: str) -> NoReturn:
     """Print one error on stderr and exit with 2."""
-    line = escape(" ".join(message.splitlines()))
-    Console(stderr=True).print(
-        f"[bold red]error:[/bold red] {line}", soft_wrap=True, highlight=False
-    )
+    _forget_output()
+    ERR.print("error:", style="bold red", end=" ")
+    ERR.print(visible(" ".join(message.splitlines())), soft_wrap=True)
     sys.exit(2)
+
+
+def _forget_output() -> None:
+    """Have nothing more written to a full or closed output, where Python would complain at its exit."""
+    try:
+        sys.stdout.flush()
+    except (OSError, ValueError):
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115  (to the end)
 
 
 def _print_help() -> None:
     table = Table(show_header=False, box=None, pad_edge=False)
     for verb, does in VERBS.items():
         table.add_row(f"  {verb}", does)
-    console = Console()
-    console.print("usage: splatseed VERB [options]\n", markup=False, highlight=False)
-    console.print("Better seeds for 3D Gaussian Splatting.\n")
-    console.print(table)
-    console.print("\nsplatseed VERB --help shows a verb's options.", highlight=False)
+    OUT.print("usage: splatseed VERB [options]\n")
+    OUT.print("Better seeds for 3D Gaussian Splatting.\n")
+    OUT.print(table)
+    OUT.print("\nsplatseed VERB --help shows a verb's options, splatseed -V the version.")

@@ -1,6 +1,7 @@
 """The terminal: progress bars on stderr, results on stdout.
 
-Promise: nothing is drawn when stderr is not a terminal; a stage's time runs until the next begins.
+Promise: nothing is drawn when stderr is not a terminal; a stage's time runs until the next begins; what is
+printed is shown as it is, so that no file name can colour, move or rewrite anything.
 """
 
 from __future__ import annotations
@@ -8,15 +9,19 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
+
+from splatseed.literal import visible
 
 __all__ = [
     "ERR",
     "OUT",
+    "LiteralConsole",
     "StageClock",
     "print_commands",
     "print_note",
@@ -25,8 +30,20 @@ __all__ = [
     "stage_display",
 ]
 
-OUT = Console()
-ERR = Console(stderr=True)
+
+class LiteralConsole(Console):
+    """A console without markup, emoji codes and highlighting, that escapes what terminals act on."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, highlight=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Text as it is, but for characters that would act; Rich calls this for every string."""
+        return super().render_str(visible(text, keep="\n"), **options)
+
+
+OUT = LiteralConsole()
+ERR = LiteralConsole(stderr=True)
 COMPILE = "compiling kernels"
 
 
@@ -99,7 +116,7 @@ def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
         with _compilation_shown(clock):
             yield clock
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with (
         Bar(*columns, console=ERR, transient=True) as bar,
         clock.shown_on(bar),
@@ -132,7 +149,8 @@ def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
 
 def print_note(note: str) -> None:
     """Print one thing the user should know."""
-    OUT.print(f"[yellow]note:[/yellow] {escape(note)}", soft_wrap=True, highlight=False)
+    OUT.print("note:", style="yellow", end=" ")
+    OUT.print(visible(note), soft_wrap=True)
 
 
 def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -141,7 +159,7 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
     for i, name in enumerate(header):
         table.add_column(name, justify="left" if i == 0 else "right")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(visible, row))
     _print_title(title)
     OUT.print(table)
 
@@ -153,10 +171,10 @@ def print_commands(title: str, commands: Sequence[tuple[str, str]]) -> None:
 
 
 def _print_title(title: str) -> None:
-    OUT.print(f"\n[bold]{escape(title)}[/bold]", soft_wrap=True, highlight=False)
+    OUT.print(f"\n{visible(title)}", style="bold", soft_wrap=True)
 
 
 def _print_columns(rows: Sequence[tuple[str, str]]) -> None:
     width = max((len(label) for label, _ in rows), default=0)
     for label, value in rows:
-        OUT.print(f"  {label:<{width}}  {value}", soft_wrap=True, highlight=False, markup=False)
+        OUT.print(f"  {label:<{width}}  {visible(value)}", soft_wrap=True)

@@ -31,6 +31,8 @@ ATTRIBUTES: Mapping[str, tuple[int, ...]] = MappingProxyType(
 )
 """What may be known of a point beyond place, colour and origin: the shape of one point's value."""
 
+FARTHEST = np.float32(1e15)
+"""Coordinates beyond are no places: the squares of such distances leave single precision."""
 UNIT_TOLERANCE = 1e-2
 """By how much a normal's length may differ from 1: half precision keeps it within 1e-3."""
 
@@ -109,8 +111,8 @@ class PointCloud:
 
     @property
     def finite(self) -> Bool[np.ndarray, " N"]:
-        """Which points have three finite coordinates."""
-        return np.asarray(np.isfinite(self.xyz).all(axis=1))
+        """Which points have three finite coordinates, of which distances can be computed."""
+        return np.asarray((np.abs(self.xyz) < FARTHEST).all(axis=1))  # nor is NaN
 
     @property
     def distinct(self) -> Bool[np.ndarray, " N"]:

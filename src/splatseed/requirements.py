@@ -3,38 +3,37 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from shlex import quote
 
 from splatseed.errors import MissingDependencyError
 
-__all__ = ["require"]
+__all__ = ["INSTALL", "require"]
 
 INSTALL = {
-    "torch": "train",
-    "gsplat": "train",
-    "torchmetrics": "train",
-    "tensorboard": "tensorboard",
-    "transformers": "depth",
-    "onnxruntime": "depth",
-    "OpenEXR": "exr",
-    "ray": "cluster",
+    "torch": "torch>=2.4",
+    "gsplat": "gsplat>=1.5.3,<1.6",
+    "torchmetrics": "torchmetrics>=1.4",
+    "tensorboard": "tensorboard>=2.14",
+    "transformers": "transformers>=5.18",
+    "onnxruntime": "onnxruntime>=1.19",
+    "OpenEXR": "OpenEXR>=3.3",
+    "ray": "ray>=2.40",
 }
-"""Which extra of splatseed brings each package."""
+"""What to ask pip for, as in pyproject.toml: extras of splatseed itself can only be had from its folder."""
 
 
-def require(*packages: str, extra: str | None = None) -> None:
+def require(*packages: str) -> None:
     """Check that packages are installed, without importing them.
 
     Args:
         packages: Their names.
-        extra: The extra of splatseed to advise, where several bring a package.
 
     Raises:
         MissingDependencyError: One is absent.
     """
     missing = [package for package in packages if find_spec(package) is None]
     if missing:
-        extras = extra or ",".join(sorted({INSTALL[package] for package in missing}))
-        advice = f"Install them: pip install 'splatseed[{extras}]'."
+        advice = f"Install them: pip install {' '.join(quote(INSTALL[each]) for each in missing)}."
         if "torch" in missing:
             advice += " On a machine without a GPU, PyTorch's CPU build suffices."
         raise MissingDependencyError(

@@ -20,7 +20,7 @@ from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.depthmap import DepthMaps
 from splatseed.pointcloud import PointCloud
 
-__all__ = ["Image", "Observations", "Scene", "SceneFormat", "SceneSource", "Tracks"]
+__all__ = ["Image", "Observations", "Scene", "SceneFormat", "SceneSource", "Split", "Tracks"]
 
 SceneFormat = Literal["colmap", "transforms", "ply", "rgbd"]
 
@@ -130,6 +130,27 @@ class SceneSource:
     transforms_path: Path | None = None
 
 
+@dataclass(frozen=True)
+class Split:
+    """Which images train and which test, by a list that came with the scene.
+
+    Args:
+        train: Names of the images to train on.
+        test: Names of the others that are to be tested; an image may be in neither.
+        origin: The list, in words.
+    """
+
+    train: frozenset[str]
+    test: frozenset[str]
+    origin: str
+
+    @property
+    def sentence(self) -> str:
+        """What the user should know before training."""
+        count = f"{len(self.train):,} training and {len(self.test):,} test images"
+        return f"The scene's {self.origin} is followed: {count}, whatever --test-every says."
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A capture: points, and the images and cameras that saw them.
@@ -143,6 +164,7 @@ class Scene:
         warnings: What the reader repaired or found odd, one sentence each.
         depths: Depth maps of some of the images; None where there are none. They are read when asked
             for.
+        listed: The split that lists beside the scene give; None where there are none.
     """
 
     points: PointCloud
@@ -152,6 +174,7 @@ class Scene:
     source: SceneSource | None = None
     warnings: tuple[str, ...] = field(default=())
     depths: DepthMaps | None = None
+    listed: Split | None = None
 
     def replace(self, **changes: Any) -> Scene:
         """A copy with some fields replaced.
@@ -173,7 +196,11 @@ class Scene:
         return folder is not None and any((folder / each.name).is_file() for each in self.images)
 
     def split(self, test_every: int = 8) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
-        """Training and test images: names sorted, every ``test_every``-th is a test image."""
+        """Training and test images, by name: the scene's own, else every ``test_every``-th is tested."""
         ordered = sorted(self.images, key=lambda image: image.name)
+        if self.listed is not None:
+            parts = (self.listed.train, self.listed.test)
+            train, test = (tuple(i for i in ordered if i.name in part) for part in parts)
+            return train, test
         train = tuple(image for i, image in enumerate(ordered) if i % test_every)
         return train, tuple(ordered[::test_every])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 
+from splatseed.literal import quoted
 from splatseed.scene import SceneFormat
 
 __all__ = ["training_commands"]
@@ -15,8 +15,8 @@ def training_commands(path: Path, written_format: SceneFormat) -> list[tuple[str
 
     Args:
         path: The scene folder that was written.
-        written_format: "colmap" or "transforms": gsplat's examples and graphdeco's code read only
-            the former.
+        written_format: "colmap" or "transforms": gsplat's examples, graphdeco's code and LichtFeld
+            Studio read only the former.
 
     Example:
         >>> dict(training_commands(Path("/data/out"), "colmap"))["graphdeco"]
@@ -24,9 +24,9 @@ def training_commands(path: Path, written_format: SceneFormat) -> list[tuple[str
     """
     # Trainers are run from their own checkouts, so a relative path would miss.
     path = path.absolute()
-    scene = shlex.quote(str(path))
-    result = shlex.quote(f"{path}-gsplat"), shlex.quote(f"{path}-graphdeco")
-    brush = ("Brush", f"brush_app {scene} --with-viewer")
+    scene = quoted(path)
+    result = [quoted(f"{path}-{name}") for name in ("gsplat", "graphdeco", "lichtfeld")]
+    brush = ("Brush", f"brush {scene} --with-viewer")
     opensplat = ("OpenSplat", f"./opensplat {scene} -n 30000")
     if written_format == "transforms":
         return [("nerfstudio", f"ns-train splatfacto --data {scene}"), brush, opensplat]
@@ -38,4 +38,5 @@ def training_commands(path: Path, written_format: SceneFormat) -> list[tuple[str
         ("nerfstudio", f"ns-train splatfacto --data {scene} {nerfstudio}"),
         brush,
         opensplat,
+        ("LichtFeld", f"./build/LichtFeld-Studio -d {scene} -o {result[2]}"),
     ]

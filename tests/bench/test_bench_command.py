@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
 import shutil
 import signal
@@ -16,6 +17,7 @@ import pytest
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
+from splatseed import synthetic
 from splatseed.bench import folder as folder_module
 from splatseed.bench.ledger import Ledger
 from splatseed.bench.plan import PlannedScene
@@ -207,7 +209,7 @@ def test_the_quick_preset_makes_its_own_scene(bench, tmp_path, monkeypatch):
         made.append(1)
         return make_capture(0, num_views=9, width=64, height=48)
 
-    monkeypatch.setattr(folder_module, "make_capture", small_capture)
+    monkeypatch.setattr(synthetic, "make_capture", small_capture)
     code, out, _ = bench("--preset", "quick", "--dry-run")
     assert code == 0
     assert "# 12 runs" in out
@@ -215,7 +217,25 @@ def test_the_quick_preset_makes_its_own_scene(bench, tmp_path, monkeypatch):
     path = folder_module.make_demo_scene(tmp_path / "B" / "scenes")
     assert len(load_scene(path).images) == 9
     assert bench("--preset", "quick", "--dry-run", "-o", tmp_path / "B")[0] == 0
-    assert len(made) == 2  # the one that is there is taken
+    assert len(made) == 1  # the one that is there is taken, and without one none is made
+
+
+def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
+    """It takes a second; to make the room and to import PyTorch took over a minute."""
+    code = (
+        "import sys; from splatseed.cli import main; main(['bench', '--preset', 'quick', '--dry-run']);"
+        "print(*sys.modules)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(run.stdout.splitlines()[-1].split())
+    assert "# 12 runs" in run.stdout
+    assert not {"torch", "matplotlib", "splatseed.synthetic"} & loaded
+
+
+def test_what_is_said_of_the_room_before_it_is_made_is_so():
+    made = {k: each.default for k, each in inspect.signature(make_capture).parameters.items()}
+    said = folder_module.DEMO_FACTS
+    assert (said.num_images, said.pixels) == (made["num_views"], made["width"] * made["height"])
 
 
 @pytest.mark.parametrize(

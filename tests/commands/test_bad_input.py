@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatseed.commands import info
 from splatseed.io import colmap_binary, load_scene
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
@@ -299,3 +300,12 @@ def test_every_verb_names_bad_words(words, says, tmp_path, splatseed, monkeypatc
 
 def test_sfm_output_rules_are_the_same(own_room, splatseed):
     _assert_refused(splatseed("sfm", own_room / "images", "-o", own_room), "apart from the input")
+
+
+def test_memory_that_ran_out_is_said_so_whatever_the_error_says(splatseed, monkeypatch):
+    for error, says in (
+        (MemoryError(), "found none left."),
+        (MemoryError("a lot"), "found a lot."),
+    ):
+        monkeypatch.setattr(info, "run", lambda _, error=error: (_ for _ in ()).throw(error))
+        _assert_refused(splatseed("info", "somewhere"), says)

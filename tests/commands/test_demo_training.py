@@ -43,14 +43,14 @@ def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
 def test_without_pytorch_the_demo_says_what_to_install(splatseed, tmp_path, monkeypatch):
     def absent(*_):
         raise MissingDependencyError(
-            "the packages", found="no torch", fix="Install them: pip install 'splatseed[train]'."
+            "the packages", found="no torch", fix="Install them: pip install 'torch>=2.4'."
         )
 
     monkeypatch.setattr(demo, "require", absent)
     run = splatseed(*WORDS, "-o", tmp_path / "demo")
     assert run.code == 0, run
     assert "not trained: no torch installed" in run.out
-    assert "splatseed[train]" in run.out
+    assert "pip install 'torch>=2.4'" in run.out
     assert "splatseed evaluate" not in run.out
     assert not (tmp_path / "demo" / "run_sfm").exists()
     assert (tmp_path / "demo" / "geometry.csv").is_file()

@@ -101,7 +101,7 @@ def test_results_are_plain_text_and_the_rest_is_silent(room, tmp_path, splatseed
 def test_the_commands_to_train_with_name_what_is_there(room, tmp_path, splatseed):
     out = tmp_path / "my scene"
     commands = _commands(splatseed("upsample", room, "-o", out).out)
-    assert set(commands) == {"gsplat", "graphdeco", "nerfstudio", "Brush", "OpenSplat"}
+    assert set(commands) == {"gsplat", "graphdeco", "nerfstudio", "Brush", "OpenSplat", "LichtFeld"}
     for words in commands.values():
         assert str(out) in words  # one word, although it has a space
     words = commands["gsplat"]

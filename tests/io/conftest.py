@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import strategies as st
+from hypothesis import assume, strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image as PilImage
 
@@ -34,6 +34,7 @@ class Model(NamedTuple):
 def _intrinsics(draw, camera_id):
     model = draw(st.sampled_from(list(CAMERA_MODELS.values())))
     params = draw(st.lists(FINITE, min_size=model.num_params, max_size=model.num_params))
+    params[: model.num_focal] = [abs(each) or 1.0 for each in params[: model.num_focal]]
     sizes = st.integers(1, 2**31 - 1)
     return Intrinsics(camera_id, model.name, draw(sizes), draw(sizes), tuple(params))
 
@@ -77,6 +78,7 @@ def _models(draw):
     intrinsics = tuple(draw(_intrinsics(i)) for i in camera_ids)
     image_ids = draw(st.lists(U32, max_size=3, unique=True))
     images = tuple(draw(_image(i, intrinsics)) for i in image_ids)
+    assume(len({image.name for image in images}) == len(images))
     tracks = draw(_tracks())
     with np.errstate(over="ignore"):
         xyz = tracks.xyz.astype(np.float32)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
-from splatseed.io import colmap_binary
+from splatseed.io import _model, colmap_binary
 from splatseed.pointcloud import PointCloud
 
 REAL_MODELS = [
@@ -212,7 +212,7 @@ def test_unreadable_files_are_our_errors(read, tmp_path, monkeypatch):
     def deny(_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "read_bytes", deny)
+    monkeypatch.setattr(_model, "read_file", deny)
     with pytest.raises(SceneFormatError, match="Permission denied"):
         read(tmp_path / "model.bin")
 

@@ -98,7 +98,8 @@ def test_only_an_earlier_output_is_replaced(tmp_path):
             writer.write("sub/a.jpg", np.full((2, 2), value, np.float32))
     assert find_depths(scene_of("sub/a.jpg"), path).read("sub/a.jpg").values[0, 0] == 2
     manifest = json.loads((path / MANIFEST).read_text())
-    assert manifest == {"model": "m", "files": [DESCRIPTION, "sub/a.jpg.npy", MANIFEST]}
+    files = [DESCRIPTION, MANIFEST, "sub/a.jpg.npy"]
+    assert manifest == {"model": "m", "command": "depth", "files": files}
     (path / "mine.txt").write_text("keep")
     with pytest.raises(OutputError, match=r"mine\.txt"), depth_folder(path, "z", overwrite=True):
         pass

@@ -260,7 +260,7 @@ def test_camera_with_an_unused_record_keeps_it(scene_dir, model):
 
 
 def test_system_errors_become_ours(scene_dir, model):
-    images = [replace(im, name="n" * 5000) for im in model.images]
+    images = [replace(im, name=f"{i}{'n' * 5000}") for i, im in enumerate(model.images)]
     colmap_binary.write_images(scene_dir / "sparse/0/images.bin", images)
     with pytest.raises(SceneFormatError, match="too long"):
         load_scene(scene_dir)

@@ -59,12 +59,64 @@ def test_pictures_and_image_folders_are_ours(output, copy):
     assert hidden(output.parent) == []
 
 
-@pytest.mark.parametrize("text", ['{"command": "demo"}', "not JSON", "[]"])
-def test_a_manifest_without_a_list_allows_all(output, text):
+@pytest.mark.parametrize("text", ["{}", '{"command": "write_scene"}', "not JSON", "[]"])
+def test_a_manifest_without_a_list_allows_nothing(output, text):
     (output / MANIFEST).write_text(text)
-    (output / "other").touch()
+    before = sorted(output.rglob("*"))
+    with pytest.raises(OutputError, match="does not say what splatseed wrote"):
+        overwrite(output)
+    assert sorted(output.rglob("*")) == before
+
+
+def test_only_the_kind_that_wrote_a_folder_may_replace_it(output):
+    with pytest.raises(OutputError, match="found what splatseed write_scene wrote, not upsample"):
+        overwrite(output, provenance={"command": "upsample"})
+    with output_folder(output.with_name("run"), kind="train") as folder:
+        (folder / "point_cloud.ply").touch()
+    with pytest.raises(OutputError, match="found what splatseed train wrote"):
+        overwrite(output.with_name("run"))
+    assert (output.with_name("run") / "point_cloud.ply").exists()
+
+
+def test_a_note_in_a_folder_of_copies_is_spared(output):
+    overwrite(output, copy_images=True)
+    (output / "images/notes.txt").write_text("the third one is best")
+    with pytest.raises(OutputError, match=r"images/notes\.txt"):
+        overwrite(output)
+
+
+def test_what_is_put_there_while_we_work_is_spared(output):
+    with (
+        pytest.raises(OutputError, match=r"new output is complete there; .* kept as .*\.out\.old-"),
+        output_folder(output, kind="write_scene", overwrite=True),
+    ):
+        (output / "notes.txt").touch()
+    (kept,) = hidden(output.parent)
+    assert (output.with_name(kept) / "notes.txt").exists()
+
+
+def test_an_output_in_an_output_has_its_own_list(output):
+    (output / "run").mkdir()
+    (output / "run" / MANIFEST).write_text('{"command": "train", "files": ["metrics.json"]}')
+    (output / "run/metrics.json").touch()
+    with pytest.raises(OutputError, match=r"run/metrics\.json"):
+        overwrite(output)
+    add_files(output, ["run"])
+    (output / "run/notes.txt").touch()
+    with pytest.raises(OutputError, match=r"did not write: run/notes\.txt"):
+        overwrite(output)
+    (output / "run/notes.txt").unlink()
     overwrite(output)
-    assert not (output / "other").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["images_2_png/left/a.png", ".points.partial-0123abcd", ".a.partial-0123abcd.pt"]
+)
+def test_what_can_be_made_again_is_in_nobodys_way(output, name):
+    (output / name).parent.mkdir(parents=True, exist_ok=True)
+    (output / name).touch()
+    overwrite(output)
+    assert not (output / name).exists()
 
 
 def test_files_may_be_listed_later(output):
@@ -80,7 +132,7 @@ def test_a_made_up_capture_may_be_replaced(tmp_path):
     write_capture(capture, tmp_path / "room")
     write_capture(capture, tmp_path / "room", overwrite=True)
     listed = json.loads((tmp_path / "room" / MANIFEST).read_text())["files"]
-    assert {"images", "depths"} <= set(listed)
+    assert {"images/view_000.png", "depths/depths.json"} <= set(listed)
 
 
 def test_copies_of_read_only_images_are_writable(scene_dir, tmp_path):
@@ -103,12 +155,11 @@ def test_copies_of_read_only_images_are_writable(scene_dir, tmp_path):
 READ_ONLY = """
 import sys
 from pathlib import Path
-from splatseed.io.staging import MANIFEST, output_folder
+from splatseed.io.staging import output_folder
 
 out, pictures = Path(sys.argv[1]) / "out", Path(sys.argv[1]) / "pictures"
 def write():
-    with output_folder(out, overwrite=True) as partial:
-        (partial / MANIFEST).write_text('{"files": ["deep", "link"]}')
+    with output_folder(out, kind="test", overwrite=True) as partial:
         (partial / "deep/er").mkdir(parents=True)
         (partial / "deep/er/file").touch()
         (partial / "link").symlink_to(pictures, target_is_directory=True)
@@ -159,12 +210,12 @@ def test_what_cannot_be_removed_is_told(output, monkeypatch):
     assert [name[:9] for name in hidden(output.parent)] == [".out.old-"]
 
     def fail():
-        with output_folder(output.with_name("new")):
+        with output_folder(output.with_name("new"), kind="test"):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(OutputError, match=r"\.new\.partial-.*No space left.*busy") as caught:
         fail()
-    assert "Nothing was left" not in str(caught.value)
+    assert "was left behind" not in str(caught.value)
 
 
 @pytest.mark.parametrize("renames", [1, 2])

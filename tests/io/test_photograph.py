@@ -151,3 +151,11 @@ def test_grey_of_8_bits_and_palettes_are_as_they_are(rng, tmp_path):
     assert np.array_equal(_decoded(tmp_path / "p.png"), np.asarray(palette.convert("RGB")))
     half = np.stack([grey, np.where(grey > 127, 255, 0).astype(np.uint8)], axis=-1)
     assert np.array_equal(_saved(tmp_path, half, "la.png")[..., 0], np.where(grey > 127, grey, 0))
+
+
+@pytest.mark.parametrize("mode", ["CMYK", "LAB"])
+def test_inks_are_refused_rather_than_guessed(mode, tmp_path):
+    path = tmp_path / ("a.jpg" if mode == "CMYK" else "a.tif")
+    PilImage.new(mode, (8, 8)).save(path)
+    with pytest.raises(SceneFormatError, match=f"found {mode}. Export it as sRGB"):
+        decode_photograph(path, photograph_bytes(path))

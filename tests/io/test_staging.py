@@ -18,18 +18,18 @@ def listing(folder: Path) -> list[str]:
 
 
 def write_output(path: Path, text: str, **options) -> None:
-    with output_folder(path, **options) as partial:
-        (partial / MANIFEST).write_text(text)
+    with output_folder(path, kind="test", **options) as partial:
+        (partial / "text").write_text(text)
 
 
 def test_folder_is_hidden_until_the_end_and_parents_are_made(tmp_path):
     target = tmp_path / "a" / "b" / "out"
-    with output_folder(target) as partial:
+    with output_folder(target, kind="test") as partial:
         assert partial.parent == target.parent
         assert partial.name.startswith(".out.partial-")
         assert not target.exists()
         (partial / "file").write_text("x")
-    assert listing(tmp_path) == ["a", "a/b", "a/b/out", "a/b/out/file"]
+    assert listing(tmp_path) == ["a", "a/b", "a/b/out", "a/b/out/file", f"a/b/out/{MANIFEST}"]
 
 
 @pytest.mark.parametrize(
@@ -39,7 +39,7 @@ def test_nothing_is_left_behind_by_a_failure(tmp_path, failure):
     expected = OutputError if isinstance(failure, OSError) else type(failure)
 
     def fail():
-        with output_folder(tmp_path / "new" / "out") as partial:
+        with output_folder(tmp_path / "new" / "out", kind="test") as partial:
             (partial / "file").write_text("x")
             raise failure
 
@@ -51,7 +51,7 @@ def test_nothing_is_left_behind_by_a_failure(tmp_path, failure):
 def test_full_disk_is_told_with_what_to_do(tmp_path):
     with (
         pytest.raises(OutputError, match=r"No space left.*Free some space"),
-        output_folder(tmp_path / "out"),
+        output_folder(tmp_path / "out", kind="test"),
     ):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -59,10 +59,10 @@ def test_full_disk_is_told_with_what_to_do(tmp_path):
 def test_failure_keeps_the_earlier_output(tmp_path):
     target = tmp_path / "out"
     write_output(target, "first")
-    with pytest.raises(KeyboardInterrupt), output_folder(target, overwrite=True):
+    with pytest.raises(KeyboardInterrupt), output_folder(target, kind="test", overwrite=True):
         raise KeyboardInterrupt
-    assert (target / MANIFEST).read_text() == "first"
-    assert listing(tmp_path) == ["out", f"out/{MANIFEST}"]
+    assert (target / "text").read_text() == "first"
+    assert listing(tmp_path) == ["out", f"out/{MANIFEST}", "out/text"]
 
 
 def test_failing_rename_brings_the_earlier_output_back(tmp_path, monkeypatch):
@@ -78,8 +78,8 @@ def test_failing_rename_brings_the_earlier_output_back(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "rename", rename_unless_partial)
     with pytest.raises(OutputError, match="Input/output error"):
         write_output(target, "second", overwrite=True)
-    assert (target / MANIFEST).read_text() == "first"
-    assert listing(tmp_path) == ["out", f"out/{MANIFEST}"]
+    assert (target / "text").read_text() == "first"
+    assert listing(tmp_path) == ["out", f"out/{MANIFEST}", "out/text"]
 
 
 def test_only_an_output_of_splatseed_is_replaced_and_only_when_asked(tmp_path):
@@ -89,7 +89,7 @@ def test_only_an_output_of_splatseed_is_replaced_and_only_when_asked(tmp_path):
     with pytest.raises(OutputError, match="--overwrite"):
         write_output(target, "second")
     write_output(target, "second", overwrite=True)
-    assert (target / MANIFEST).read_text() == "second"
+    assert (target / "text").read_text() == "second"
     foreign = tmp_path / "photos"
     foreign.mkdir()
     (foreign / "precious.jpg").touch()

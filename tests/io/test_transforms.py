@@ -18,6 +18,7 @@ from splatseed.io import load_scene, write_scene
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.io.transforms import read_transforms
 from splatseed.pointcloud import PointCloud
+from splatseed.similarity import Similarity
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 APPLIED = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
@@ -173,8 +174,36 @@ def test_cameras_tell_how_colmaps_points_are_brought_over(content, scene_dir, mo
     np.testing.assert_allclose(points.xyz, expected, rtol=1e-6)
 
 
-def test_colmap_points_of_another_world_are_refused(content, scene_dir):
-    content["applied_transform"] = LEGACY.tolist()
+def test_instant_ngps_recentred_poses_are_fitted(content, scene_dir, model, rng):
+    """Its converter turns the up axis, moves what cameras look at to 0, and scales by one number."""
+    del content["applied_transform"]
+    rotation = rotation_from_quat(rng.normal(size=4))
+    moved = Similarity(0.37, rotation, rng.normal(size=3))
+    for frame, image in zip(content["frames"], model.images, strict=True):
+        pose = image.camera.world_from_cam.copy()
+        pose[:3, :3] = rotation @ pose[:3, :3]
+        pose[:3, 3] = moved.points(image.camera.center[None])[0] + 1e-4 * rng.normal(size=3)
+        frame["transform_matrix"] = (pose @ FLIP).tolist()
+    scene = load_scene(write_json(scene_dir / "transforms.json", content))
+    np.testing.assert_allclose(scene.points.xyz, moved.points(model.tracks.xyz), atol=2e-3)
+    assert any("turned, moved and scaled by 0.37" in text for text in scene.warnings)
+
+
+def test_three_cameras_fit_nothing(content, scene_dir, rng):
+    for frame in content["frames"][3:]:
+        frame["file_path"] = "images/other.png"
+    for frame in content["frames"][:3]:
+        frame["transform_matrix"] = np.vstack(
+            [np.column_stack([np.eye(3), rng.normal(size=3)]), [0, 0, 0, 1]]
+        ).tolist()
+    with pytest.raises(SceneFormatError, match="after applied_transform"):
+        load_scene(write_json(scene_dir / "transforms.json", content))
+
+
+def test_colmap_points_of_another_world_are_refused(content, scene_dir, rng):
+    for frame in content["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] += rng.normal()
     path = write_json(scene_dir / "transforms.json", content)
     with pytest.raises(SceneFormatError, match=r"ply_file_path.*COLMAP scene"):
         load_scene(path)

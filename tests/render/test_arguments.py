@@ -137,4 +137,4 @@ def test_without_torch_the_error_says_what_to_install() -> None:
         [sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=True
     )
     assert found.stdout.count("\n") == 1
-    assert 'pip install "splatseed[train]"' in found.stdout
+    assert "pip install 'torch>=2.4'" in found.stdout

@@ -104,7 +104,7 @@ def test_without_gsplat_only_the_strategy_is_missing() -> None:
     found = subprocess.run(
         [sys.executable, "-c", WITHOUT_GSPLAT], capture_output=True, text=True, check=True
     )
-    assert found.stdout.count("pip install 'splatseed[train]'") == 2
+    assert found.stdout.count("pip install 'gsplat>=1.5.3,<1.6'") == 2
 
 
 def test_rendering_does_not_import_gsplat() -> None:

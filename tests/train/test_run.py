@@ -7,6 +7,7 @@ import dataclasses
 import json
 import os
 import signal
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -275,6 +276,34 @@ def test_a_run_goes_on_with_what_it_knew_of_its_seeds(room, tmp_path):
 def test_a_run_killed_before_its_first_checkpoint_starts_again(begin):
     begin(max_steps=30)
     assert begin(options=RESUME, max_steps=30).state.step == 0
+
+
+def test_a_disk_that_is_full_at_the_end_costs_nothing(begin, monkeypatch):
+    """The first test view's record leaves a checkpoint, and so does the last step."""
+    run = begin(max_steps=30)
+    write, seen = Path.write_text, []
+    run.train(lambda step: seen.append(run.folder.checkpoint.is_file()) if step == 20 else None)
+    assert seen == [True]
+    whole = _bytes(run)
+
+    def disk_full(path, *words, **options):
+        if "metrics" in path.name:
+            raise OSError(28, "No space left on device")
+        return write(path, *words, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", disk_full)
+        with pytest.raises(
+            OutputError, match=r"No space left.*kept as it was after step 30.*--resume"
+        ):
+            run.finish(_score)
+    resumed = begin(options=RESUME, max_steps=30)
+    assert resumed.state.step == 30
+    assert resumed.train()
+    assert _bytes(resumed) == whole
+    resumed.finish(_score)
+    assert not resumed.folder.checkpoint.exists()
+    assert resumed.folder.metrics.is_file()
 
 
 def test_a_failing_checkpoint_leaves_the_last_one(begin, monkeypatch):

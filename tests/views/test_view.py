@@ -90,7 +90,7 @@ def test_files_resized_beforehand_scale_the_intrinsics(room_path, tmp_path):
 def test_distortion_is_refused(room):
     image = room.images[0]
     lens = Intrinsics(1, "SIMPLE_RADIAL", 96, 72, (80.0, 48.0, 36.0, 0.1))
-    with pytest.raises(SceneFormatError, match="image_undistorter"):
+    with pytest.raises(SceneFormatError, match="splatseed undistort"):
         load_views(room, [dataclasses.replace(image, intrinsics=lens)])
     straight = dataclasses.replace(lens, params=(80.0, 48.0, 36.0, 0.0))
     assert load_views(room, [dataclasses.replace(image, intrinsics=straight)])

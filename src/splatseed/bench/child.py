@@ -23,6 +23,7 @@ from typing import IO, Any
 
 from splatseed.bench.job import JobOptions, Outcome, run_job
 from splatseed.bench.records import RunResult, RunSpec
+from splatseed.interpreter import child_command, child_environment
 from splatseed.progress import Progress
 
 __all__ = ["Child", "Killed", "serve"]
@@ -70,14 +71,13 @@ class Child:
         self._order = _Order(spec.to_json(), str(work), str(target), asdict(options))
         self._log = work.with_suffix(".log")
         self._log.parent.mkdir(parents=True, exist_ok=True)
-        paths = os.pathsep.join(filter(None, sys.path))
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(  # noqa: S603  (our own interpreter and module)
-                [sys.executable, "-c", PROGRAM],
+                child_command(PROGRAM),
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                env={**os.environ, "PYTHONPATH": paths, **environment},
+                env=child_environment(environment),
                 text=True,
                 encoding="utf-8",
                 process_group=0,  # Ctrl-C comes to us alone

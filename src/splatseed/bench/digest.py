@@ -48,6 +48,12 @@ def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str
     images = sorted(scene.images, key=lambda image: image.name)
     for image in images:
         _update_camera(digest, image)
+    if scene.listed is not None:
+        digest.update(
+            repr((sorted(scene.listed.train), sorted(scene.listed.test))).encode(
+                "utf-8", "backslashreplace"
+            )
+        )
     photographs = [folder / image.name for image in images]
     for each in _in_threads(_of_file, photographs, "fingerprint photographs", progress):
         digest.update(each)

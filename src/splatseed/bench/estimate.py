@@ -89,6 +89,10 @@ class Estimator:
         around = self._speed(spec).around + TESTS * tests * RENDER_SHARE * step
         return step * spec.max_steps + around
 
+    def seeds(self, spec: RunSpec) -> int:
+        """Gaussians that a run begins with."""
+        return int(self._counts(spec)[0])
+
     def disk(self, spec: RunSpec, *, models: bool) -> float:
         """Bytes that are kept of a run."""
         pictures = PICTURES * 3 * BYTES_A_PIXEL * self._pixels(spec)

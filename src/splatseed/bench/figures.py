@@ -19,6 +19,7 @@ from splatseed.bench.gains import Gains, gains
 from splatseed.bench.records import CurvePoint, RunResult
 from splatseed.bench.statistics import Difference
 from splatseed.bench.study import BASELINE, Cell, Study, Variant
+from splatseed.preview.fonts import font_families, plain
 from splatseed.train.settings import StrategyName
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
     figure, panels = _panels(len(scenes))
     for scene, axes in zip(scenes, panels, strict=True):
         _draw_curves(axes, study, strategy, scene, arms, by)
-        axes.set_title(scene)
+        axes.set_title(plain(scene), family=font_families())
         axes.set_xlabel(by if by == "steps" else "seconds, upsampling included")
         axes.set_ylabel("PSNR, dB")
     _legend(figure, arms, _marked)
@@ -169,7 +170,8 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
                 _dot(axes, gain, place, variant, across=True)
     axes.axvline(0.0, color=COLORS["sfm"], linewidth=1)
     axes.axhline(len(found.scenes) - 0.5, color="#bbbbbb", linewidth=0.8)
-    axes.set_yticks(range(len(names)), names)
+    labels = [plain(name) for name in names]
+    axes.set_yticks(range(len(names)), labels, family=font_families())
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlabel("gain over sfm, dB")
     axes.grid(visible=True, axis="x", alpha=0.25)

@@ -12,11 +12,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splatseed.bench.ledger import LEDGER, Ledger
+from splatseed.bench.scenes import SceneFacts
 from splatseed.errors import OutputError
 from splatseed.io.staging import MANIFEST, atomic_file, check_output
-from splatseed.synthetic import make_capture, write_capture
 
-__all__ = ["check_bench_folder", "make_bench_folder", "make_demo_scene"]
+__all__ = ["DEMO_FACTS", "check_bench_folder", "make_bench_folder", "make_demo_scene"]
+
+DEMO_FACTS = SceneFacts(
+    "demo", "demo:", "not made yet", 11_364, 40, 400 * 300, depth_digest="not made yet"
+)
+"""What is known of the made-up room before it is made; the number of points nearly."""
 
 
 def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
@@ -41,12 +46,12 @@ def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
             fix="Choose another folder.",
         )
     if not marked and not (folder / LEDGER).is_file():
-        check_output(folder, protect=protect)
+        check_output(folder, kind="bench", protect=protect)
         return
     for scene in protect:
         within = folder.resolve() in scene.resolve().parents
         if within and scene.resolve() != (folder / "scenes" / "demo").resolve():
-            check_output(folder, overwrite=True, protect=[scene])
+            check_output(folder, kind="bench", overwrite=True, protect=[scene])
 
 
 def make_bench_folder(folder: Path) -> None:
@@ -75,6 +80,8 @@ def make_demo_scene(folder: Path) -> Path:
     path = folder / "demo"
     if path.is_dir():
         return path
+    from splatseed.synthetic import make_capture, write_capture  # noqa: PLC0415  (Numba)
+
     try:
         return write_capture(make_capture(), path)
     except OutputError:

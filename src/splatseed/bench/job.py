@@ -96,7 +96,7 @@ def run_job(
         if kept is not None:
             return Outcome("done", kept)
         _remove_leftovers(target)
-        check_output(target, overwrite=True)
+        check_output(target, kind="bench", overwrite=True)
         result = _train(spec, work, target, options or JobOptions(), progress)
     except KeyboardInterrupt:
         return Outcome("interrupted")

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from splatseed.bench.records import RunResult, RunSpec
-from splatseed.io.staging import MANIFEST, output_folder
+from splatseed.io.staging import output_folder
 from splatseed.train.run_folder import RunFolder
 
 __all__ = [
@@ -71,7 +71,7 @@ def write_kept(target: Path, files: Mapping[str, Path | bytes]) -> None:
     Raises:
         OutputError: It cannot be written.
     """
-    with output_folder(target, overwrite=True) as partial:
+    with output_folder(target, kind="bench", overwrite=True) as partial:
         for name, content in files.items():
             path = partial / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -79,8 +79,6 @@ def write_kept(target: Path, files: Mapping[str, Path | bytes]) -> None:
                 path.write_bytes(content)
             else:
                 shutil.move(content, path)
-        listing = {"command": "bench", "files": sorted([*files, MANIFEST])}
-        (partial / MANIFEST).write_text(json.dumps(listing, indent=2) + "\n", "utf-8")
 
 
 def result_bytes(spec: RunSpec, result: RunResult) -> bytes:

@@ -26,13 +26,15 @@ from splatseed.bench.study import Study, studies
 from splatseed.bench.summary import summary
 from splatseed.bench.tables import Table, write_table
 from splatseed.bench.views import ComparedView, compared_views, jpeg
-from splatseed.io.staging import MANIFEST, atomic_file, output_folder
+from splatseed.io.staging import atomic_file, output_folder
 from splatseed.progress import Progress, silent
 
 __all__ = ["REPORT", "Report", "write_report"]
 
 REPORT = "report.html"
 TABLES = "tables"
+KIND = "bench report"
+"""What the folders of tables and figures are marked as."""
 PLAN = "plan.toml"
 CLOUD_SIDE = 1800
 
@@ -185,20 +187,14 @@ def _plan(bench: Path) -> str:
 
 
 def _write_tables(folder: Path, tables: Iterable[Table]) -> None:
-    with output_folder(folder, overwrite=True) as partial:
-        names = [path.name for table in tables for path in write_table(table, partial)]
-        _write_manifest(partial, names)
+    with output_folder(folder, kind=KIND, overwrite=True) as partial:
+        for table in tables:
+            write_table(table, partial)
 
 
 def _write_figures(folder: Path, images: Mapping[str, bytes], pictures: Sequence[Pictures]) -> None:
     keys = {name: key for each in pictures for name, key in each.keys.items()}
-    with output_folder(folder, overwrite=True) as partial:
+    with output_folder(folder, kind=KIND, overwrite=True) as partial:
         for name, png in images.items():
             (partial / f"{name}.png").write_bytes(png)
         (partial / CLOUDS).write_text(json.dumps(keys, indent=2) + "\n", "utf-8")
-        _write_manifest(partial, [*(f"{name}.png" for name in images), CLOUDS])
-
-
-def _write_manifest(folder: Path, names: Iterable[str]) -> None:
-    content = {"command": "bench report", "files": sorted([*names, MANIFEST])}
-    (folder / MANIFEST).write_text(json.dumps(content, indent=2) + "\n", "utf-8")

@@ -111,7 +111,11 @@ def survey(
         images=images,
         depth_path="" if maps is None else str(maps.resolve()),
         depth_digest="" if maps is None else depth_digest(find_depths(scene, maps), progress),
-        warnings=(*scene.warnings, *map(stray_note, stray_views(poses_of(scene.images)))),
+        warnings=(
+            *scene.warnings,
+            *([scene.listed.sentence] if scene.listed else []),
+            *map(stray_note, stray_views(poses_of(scene.images))),
+        ),
     )
 
 

@@ -8,12 +8,12 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-from rich.markup import escape
 from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn
 
 from splatseed.bench.records import RunResult, RunSpec
 from splatseed.bench.watcher import Watcher
 from splatseed.console import ERR, OUT
+from splatseed.literal import visible
 
 __all__ = ["RunDisplay", "describe", "run_display", "spoken_time"]
 
@@ -91,7 +91,7 @@ class RunDisplay(Watcher):
 
     def stopping(self, words: str) -> None:
         """Say what the user waits for."""
-        ERR.print(f"stopping: {words}", highlight=False, markup=False)
+        ERR.print(f"stopping: {words}")
 
     def _end(self, spec: RunSpec) -> float:
         """Take a run off the display; returns the seconds it took."""
@@ -104,7 +104,7 @@ class RunDisplay(Watcher):
 
     def _say(self, text: str, *, count: bool = True) -> None:
         number = f"[{self._ended}/{self._total}] " if count else ""
-        OUT.print(f"{number}{text}", highlight=False, markup=False, soft_wrap=True)
+        OUT.print(f"{number}{text}", soft_wrap=True)
         self._draw()
 
     def _draw(self) -> None:
@@ -115,7 +115,7 @@ class RunDisplay(Watcher):
             f"{self._ended - self._failed} of {self._total} done, {len(self._begun)} running"
             f"{failed}, {spoken_time(self.seconds_left())} left"
         )
-        self._bar.update(self._whole, completed=self._ended, description=escape(label))
+        self._bar.update(self._whole, completed=self._ended, description=label)
 
     def seconds_left(self) -> float:
         """An estimate, made better by what runs have taken so far."""
@@ -137,7 +137,7 @@ def run_display(seconds: Mapping[str, float], done: int, jobs: int) -> Iterator[
     if not ERR.is_terminal:
         yield RunDisplay(seconds, done, jobs)
         return
-    columns = (BarColumn(20), TextColumn("{task.description}"))
+    columns = (BarColumn(20), TextColumn("{task.description}", markup=False))
     # What goes into a file on stdout must not end up on the terminal.
     shared = sys.stdout.isatty()
     with Bar(*columns, console=ERR, transient=True, redirect_stdout=shared) as bar:
@@ -146,7 +146,7 @@ def run_display(seconds: Mapping[str, float], done: int, jobs: int) -> Iterator[
 
 def describe(spec: RunSpec) -> str:
     """A run in a few words."""
-    return f"{spec.scene}, {spec.arm.label}, {spec.arm.strategy}, repeat {spec.repeat + 1}"
+    return f"{visible(spec.scene)}, {spec.arm.label}, {spec.arm.strategy}, repeat {spec.repeat + 1}"
 
 
 def spoken_time(seconds: float) -> str:

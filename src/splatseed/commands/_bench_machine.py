@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import which
 from typing import TYPE_CHECKING, TypeAlias
 
 from splatseed.bench.job import JobOptions
@@ -14,13 +15,14 @@ from splatseed.bench.ledger import Ledger
 from splatseed.bench.local import LocalExecutor, cores, slot_environment
 from splatseed.bench.watcher import Watcher
 from splatseed.commands._bench_options import Options
+from splatseed.memory import check_memory
 from splatseed.requirements import require
-from splatseed.train.settings import Backend
+from splatseed.train.settings import BYTES_EACH, Backend
 
 if TYPE_CHECKING:
     from splatseed.bench.ray_cluster import Cluster
 
-__all__ = ["Machine", "open_machine"]
+__all__ = ["Machine", "check_machine", "open_machine"]
 
 Run: TypeAlias = Callable[[Ledger, Path, Collection[str], JobOptions, Watcher], bool]
 
@@ -35,6 +37,7 @@ class Machine:
         jobs: How many at a time.
         threads: Threads of each on the CPU.
         run: Does those runs of a ledger that have one of these keys; whether it went to the end.
+        is_local: Whether it is the machine that this process runs on.
     """
 
     name: str
@@ -42,6 +45,7 @@ class Machine:
     jobs: int
     threads: int
     run: Run
+    is_local: bool = False
 
     @property
     def words(self) -> str:
@@ -73,10 +77,32 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
         yield _local_machine(options, backend)
 
 
-def _local_machine(options: Options, backend: Backend) -> Machine:
-    from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
+def check_machine(machine: Machine, seeds: int) -> None:
+    """Refuse runs that this machine's memory cannot hold; what nodes of a cluster hold is not known.
 
-    found: Backend = "cuda" if pick_device(backend).type == "cuda" else "cpu"
+    Args:
+        machine: Where they shall run.
+        seeds: Gaussians that the largest of them begins with.
+
+    Raises:
+        ParameterError: So many at a time do not fit.
+    """
+    if not machine.is_local or machine.backend != "cpu":
+        return
+    check_memory(
+        seeds,
+        BYTES_EACH * machine.jobs,
+        f"seeds a run with {machine.jobs} at a time",
+        fix="Pass smaller --ratios, --cap-max {most}, or fewer --jobs.",
+    )
+
+
+def _local_machine(options: Options, backend: Backend) -> Machine:
+    found: Backend = "cpu"
+    if backend == "cuda" or (backend == "auto" and _has_driver()):
+        from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch, which takes seconds)
+
+        found = "cuda" if pick_device(backend).type == "cuda" else "cpu"
     gpus = _gpus() if found == "cuda" else []
     jobs = options.jobs or max(len(gpus), 1)
     threads = options.threads or max(1, cores() // jobs)
@@ -87,7 +113,17 @@ def _local_machine(options: Options, backend: Backend) -> Machine:
     ) -> bool:
         return LocalExecutor(ledger, bench, environments, how, watcher).run(keys)
 
-    return Machine("this machine", found, jobs, threads, run)
+    return Machine("this machine", found, jobs, threads, run, is_local=True)
+
+
+def _has_driver() -> bool:
+    """Whether there may be a GPU for PyTorch: without a driver there is none."""
+    return (
+        os.name == "nt"
+        or which("nvidia-smi") is not None
+        or Path("/proc/driver").joinpath("nvidia").exists()
+        or which("rocminfo") is not None
+    )
 
 
 def _gpus() -> list[str]:

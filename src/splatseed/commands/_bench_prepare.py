@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatseed.bench.environment import package_version
-from splatseed.bench.folder import make_demo_scene
+from splatseed.bench.folder import DEMO_FACTS, make_demo_scene
 from splatseed.bench.plan import DEPTH, Plan, PlannedScene, plan_runs
 from splatseed.bench.records import SFM, RunSpec
 from splatseed.bench.scenes import SceneFacts, survey
@@ -42,13 +42,13 @@ class Prepared:
         return frozenset(spec.key for spec in self.runs)
 
 
-def prepare(asked: Asked, backend: Backend, made: Path, progress: Progress) -> Prepared:
+def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progress) -> Prepared:
     """Look at all scenes of a plan, and list its runs.
 
     Args:
         asked: What the user asks for.
         backend: Where runs are trained: not "auto".
-        made: Where a made-up scene is put.
+        made: Where a made-up scene is put; None to do with what is known of it, without making it.
         progress: Told how far this is.
 
     Raises:
@@ -72,11 +72,13 @@ def prepare(asked: Asked, backend: Backend, made: Path, progress: Progress) -> P
     return Prepared(plan, scenes, runs, [*notes, *_notes(plan, scenes)])
 
 
-def _survey(scene: PlannedScene, plan: Plan, made: Path, progress: Progress) -> SceneFacts:
+def _survey(scene: PlannedScene, plan: Plan, made: Path | None, progress: Progress) -> SceneFacts:
+    if scene.is_demo and made is None:
+        return dataclasses.replace(DEMO_FACTS, name=scene.label)
     if scene.is_demo:
         progress("make the demo scene", 0.0)
     return survey(
-        make_demo_scene(made) if scene.is_demo else Path(scene.path),
+        make_demo_scene(made) if made and scene.is_demo else Path(scene.path),
         scene.label,
         images=scene.images,
         depth=Path(scene.depth) if scene.depth else None,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,6 +31,7 @@ from splatseed.console import (
 )
 from splatseed.errors import SceneNotFoundError
 from splatseed.io.staging import check_output
+from splatseed.literal import quoted
 
 __all__ = ["run_compare", "run_report"]
 
@@ -76,7 +76,7 @@ def run_report(arguments: list[str]) -> None:
 
 def _print_report(bench: Path, report: Report) -> None:
     for sentence in report.summary:
-        OUT.print(sentence, highlight=False, markup=False)
+        OUT.print(sentence)
     for note in report.notes:
         print_note(note)
     print_pairs(
@@ -87,7 +87,7 @@ def _print_report(bench: Path, report: Report) -> None:
             ("figures", f"{report.figures} in {bench / 'figures'}"),
         ],
     )
-    print_commands("next", [("", f"open {shlex.quote(str(report.path))} in a browser")])
+    print_commands("next", [("", f"open {quoted(report.path)} in a browser")])
 
 
 def run_compare(arguments: list[str]) -> None:
@@ -98,7 +98,7 @@ def run_compare(arguments: list[str]) -> None:
     """
     options = parse_options(CompareOptions, "bench compare", arguments)
     if options.output is not None:
-        check_output(options.output, protect=(options.a, options.b))
+        check_output(options.output, kind="bench compare", protect=(options.a, options.b))
     found = compare(_rows(options.a), _rows(options.b))
     if found is None:
         raise SceneNotFoundError(
@@ -126,7 +126,7 @@ def _print_table(table: Table) -> None:
     rows = [[f"{cell_text(cell)} {cell.mark}".strip() for cell in row] for row in table.rows]
     print_table(table.title, table.header, rows)
     for note in table.notes:
-        OUT.print(note, highlight=False, markup=False, style="dim")
+        OUT.print(note, style="dim")
 
 
 def _notes(found: Comparison, tables: Iterable[Table]) -> Iterable[str]:

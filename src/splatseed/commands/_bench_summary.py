@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from splatseed.bench.kept import ERROR, kept_folder
 from splatseed.bench.records import SFM, Arm, RunRow
 from splatseed.commands._bench_display import describe
 from splatseed.console import print_commands, print_note, print_pairs, print_table
+from splatseed.literal import quoted
 
 __all__ = ["print_summary"]
 
@@ -77,7 +77,7 @@ def _pair(row: RunRow) -> tuple[str, ...]:
 
 
 def _print_next(bench: Path, rows: Collection[RunRow], failed: int) -> None:
-    name = shlex.quote(str(bench))
+    name = quoted(bench)
     left = sum(row.status == "pending" for row in rows)
     elsewhere = sum(row.status == "running" for row in rows)
     if elsewhere:

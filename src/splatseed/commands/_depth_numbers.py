@@ -9,7 +9,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
-from rich.markup import escape
 
 from splatseed.console import OUT, print_pairs, print_table
 from splatseed.depth import Alignment
@@ -91,7 +90,7 @@ def _row(name: str, alignment: Alignment, columns: int) -> list[str]:
     numbers = [_number(alignment.scale, ".4g")]
     if columns == 5:
         numbers.append(_number(alignment.shift, ".4g") if numbers != ["-"] else "-")
-    return [escape(name), f"{alignment.num_points:,}", *numbers, _number(alignment.residual, ".2%")]
+    return [name, f"{alignment.num_points:,}", *numbers, _number(alignment.residual, ".2%")]
 
 
 def _number(value: float, style: str) -> str:
@@ -103,7 +102,7 @@ def _print_rejections(alignments: Mapping[str, Alignment], listed: Sequence[str]
     sentences = [f"{name}: {reason}" for name, reason in rejected if reason is not None]
     if not sentences:
         return
-    OUT.print("\n[bold]left out[/bold]")
+    OUT.print("\nleft out", style="bold")
     more = sum(a.rejected is not None for a in alignments.values()) - len(sentences)
     for sentence in [*sentences, *([f"and {more:,} more"] if more else [])]:
-        OUT.print(f"  - {sentence}", soft_wrap=True, highlight=False, markup=False)
+        OUT.print(f"  - {sentence}", soft_wrap=True)

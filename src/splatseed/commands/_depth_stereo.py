@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import platform
-import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -21,6 +20,7 @@ from splatseed.io.dense import (
     write_dense_workspace,
 )
 from splatseed.io.staging import check_output
+from splatseed.literal import quoted, visible
 from splatseed.scene import Scene
 
 if TYPE_CHECKING:
@@ -42,7 +42,12 @@ def run_stereo(options: Options) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
-        check_output(options.output, overwrite=options.overwrite, protect=[options.scene])
+        check_output(
+            options.output,
+            kind="depth",
+            overwrite=options.overwrite,
+            protect=[options.scene],
+        )
         if options.colmap:
             check_dense_scene(scene, undistorts=True)
         maps = _maps(scene, options, clock)
@@ -107,13 +112,11 @@ def _summarise(
 ) -> None:
     OUT.print(
         f"{report.num_maps:,} depth maps of {_sizes(maps)}: {report.share_known:.0%} of their pixels"
-        f" confirmed by other views, in {seconds:.1f} s, written to {report.path}",
+        f" confirmed by other views, in {seconds:.1f} s, written to {visible(report.path)}",
         soft_wrap=True,
-        highlight=False,
-        markup=False,
     )
     if options.preview:
-        OUT.print(f"pictures: {options.output / PICTURE}", soft_wrap=True, highlight=False)
+        OUT.print(f"pictures: {visible(options.output / PICTURE)}", soft_wrap=True)
     if report.empty:
         more = len(report.empty) - NAMES_SHOWN
         shown = ", ".join(report.empty[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
@@ -136,12 +139,12 @@ def _sizes(maps: Sequence[StereoMap]) -> str:
 def _next(options: Options, report: DenseReport, *, bent: bool) -> list[tuple[str, str]]:
     # The workspace is a scene itself, without distortion.
     shown = report.path if options.colmap else options.scene
-    scene, maps = (shlex.quote(str(path)) for path in (shown, report.path))
+    scene, maps = (quoted(path) for path in (shown, report.path))
     look = ("look", f"splatseed info {scene} --depth {maps} --picture depth.png")
     if not options.colmap:
         seeds = f"splatseed upsample {scene} --method depth --depth {maps} --ratio 16 -o OUT"
         return [look] if bent else [look, ("use", seeds)]
-    fused = shlex.quote(str(report.path / "fused.ply"))
+    fused = quoted(report.path / "fused.ply")
     fuse = (
         f"colmap stereo_fusion --workspace_path {maps} --output_path {fused}"
         f" --StereoFusion.min_num_pixels {MIN_PIXELS}"

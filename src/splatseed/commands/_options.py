@@ -9,20 +9,23 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Sequence
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from itertools import dropwhile, takewhile
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
 from splatseed.errors import ParameterError
+from splatseed.literal import did_you_mean
 
-__all__ = ["parse_options"]
+__all__ = ["known_options", "parse_options"]
 
 Options = TypeVar("Options")
 
 COLOR = re.compile(r"\x1b\[[0-9;]*m")
 RULE = re.compile("[─-]{5,}")
+OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
+CHOICE = re.compile(r"invalid choice '([^']*)'.*?one of \(([^)]*)\)")
 TRIED = "Got errors:"
 """What follows lists tyro's attempts to read a value, for its own developers."""
 
@@ -48,8 +51,26 @@ def parse_options(kind: type[Options], verb: str, arguments: Sequence[str]) -> O
         raise ParameterError(
             f"the options of splatseed {verb}",
             found=_sentence(said.getvalue()),
-            fix=f"Run splatseed {verb} --help to see them.",
+            fix=f"{_suggestion(kind, said.getvalue(), arguments)}Run splatseed {verb} --help to see them.",
         ) from None
+
+
+def known_options(kind: type[Any]) -> list[str]:
+    """All options, such as ``--ratio``, that a command line for a dataclass may have."""
+    shown = io.StringIO()
+    with redirect_stdout(shown), suppress(SystemExit):
+        tyro.cli(kind, args=["--help"])
+    return sorted(set(OPTION.findall(COLOR.sub("", shown.getvalue()))))
+
+
+def _suggestion(kind: type[Any], said: str, arguments: Sequence[str]) -> str:
+    """What the user may have meant by an option or a choice that is unknown; nothing if unclear."""
+    box = " ".join(COLOR.sub("", said).replace("│", " ").split())
+    if choice := CHOICE.search(box):
+        return did_you_mean(choice[1], re.findall(r"'([^']+)'", choice[2]))
+    known = known_options(kind)
+    unknown = [word.partition("=")[0] for word in arguments if word.startswith("--")]
+    return next((did_you_mean(word, known) for word in unknown if word not in known), "")
 
 
 def _sentence(box: str) -> str:

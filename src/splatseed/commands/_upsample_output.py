@@ -157,6 +157,9 @@ def summarise(
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(output)),
     ]
+    if (output / "images").is_symlink():
+        where = (output / "images").resolve()
+        rows.append(("images", f"linked, not copied: {where}; --copy-images to take OUT elsewhere"))
     if report.dropped_nonfinite + report.dropped_duplicates:
         left_out = (
             f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate"
@@ -169,7 +172,9 @@ def summarise(
     for note in report.notes:
         print_note(note)
     if report.layout == "transforms":
-        print_note("gsplat's examples and graphdeco's code read COLMAP only: --format colmap.")
+        print_note(
+            "gsplat's examples, graphdeco's code and LichtFeld read COLMAP only: --format colmap."
+        )
     if scene.images and scene.source is not None and scene.source.image_dir is not None:
         print_commands("train it with", training_commands(output, report.layout))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -18,17 +17,18 @@ from splatseed.bench.plan import Plan
 from splatseed.bench.plan_file import plan_text
 from splatseed.bench.records import RunRow, RunSpec
 from splatseed.commands._bench_display import run_display, spoken_time
-from splatseed.commands._bench_machine import Machine, open_machine
+from splatseed.commands._bench_machine import Machine, check_machine, open_machine
 from splatseed.commands._bench_options import PLAN, Asked, Options, asked_plan
 from splatseed.commands._bench_prepare import Prepared, prepare
 from splatseed.commands._bench_summary import print_summary
 from splatseed.commands._options import parse_options
 from splatseed.console import OUT, print_note, stage_display
 from splatseed.io.staging import atomic_file
+from splatseed.literal import visible
+from splatseed.train.interruption import exit_code
 
 __all__ = ["run"]
 
-INTERRUPTED = 130
 SOME_FAILED = 1
 REPORTING = {"report": "run_report", "compare": "run_compare"}
 
@@ -53,14 +53,21 @@ def _run(options: Options, asked: Asked, bench: Path, arguments: Sequence[str]) 
         job_options = _job_options(asked.plan)
         with stage_display() as clock:
             prepared = prepare(asked, machine.backend, bench / "scenes", clock)
+            _check_fits(prepared, machine)
         ledger = _enter(bench, prepared, arguments, retry=options.retry_failed)
         ended = _run_all(bench, prepared, machine, ledger, job_options)
     rows = _rows(ledger, prepared)
     print_summary(bench, rows)
     if not ended:
-        sys.exit(INTERRUPTED)
+        sys.exit(exit_code())
     if any(row.status == "failed" for row in rows):
         sys.exit(SOME_FAILED)
+
+
+def _check_fits(prepared: Prepared, machine: Machine) -> None:
+    """Refuse a plan with a run that the memory cannot hold, rather than have it killed."""
+    estimator = Estimator(prepared.scenes, [], machine.threads)
+    check_machine(machine, max(map(estimator.seeds, prepared.runs), default=0))
 
 
 def _run_all(
@@ -120,10 +127,12 @@ def _announce(
     """Say what will be done, before it is done."""
     for note in prepared.notes:
         print_note(note)
-    scenes = ", ".join(f"{each.name} ({each.num_points:,} points)" for each in prepared.scenes)
+    scenes = ", ".join(
+        f"{visible(each.name)} ({each.num_points:,} points)" for each in prepared.scenes
+    )
     lines = [scenes, f"  -> {_counts(rows)}; {machine.words}"]
     lines += [f"  -> {line}" for line in _estimates(prepared.plan, rows, machine, estimator)]
-    OUT.print("\n".join([*lines, f"  -> {bench}"]), highlight=False, markup=False, soft_wrap=True)
+    OUT.print("\n".join([*lines, f"  -> {visible(bench)}"]), soft_wrap=True)
 
 
 def _counts(rows: Sequence[RunRow]) -> str:
@@ -160,12 +169,12 @@ def _dry_run(options: Options, asked: Asked) -> None:
     """Print the plan as TOML, and the rest as comments in it, so that all can be kept as one."""
     with (
         open_machine(options, asked.plan.backend) as machine,
-        tempfile.TemporaryDirectory() as made,
         stage_display() as clock,
     ):
-        kept = options.output / "scenes" if options.output else Path(made)
-        scenes = kept if (kept / "demo").is_dir() else Path(made)
+        kept = options.output / "scenes" if options.output else None
+        scenes = kept if kept and (kept / "demo").is_dir() else None
         prepared = prepare(asked, machine.backend, scenes, clock)
+        _check_fits(prepared, machine)
     rows = _rows_if_there(options, prepared)
     estimator = Estimator(prepared.scenes, rows, machine.threads)
     told = [
@@ -175,7 +184,7 @@ def _dry_run(options: Options, asked: Asked) -> None:
     ]
     comments = "".join(f"# {' '.join(line.split())}\n" for line in told)
     text = f"{plan_text(prepared.plan)}\n{comments}"
-    OUT.print(text, end="", highlight=False, markup=False, soft_wrap=True)
+    OUT.print(text, end="", soft_wrap=True)
 
 
 def _rows_if_there(options: Options, prepared: Prepared) -> list[RunRow]:

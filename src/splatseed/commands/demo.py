@@ -9,7 +9,6 @@ trains for a short while from the points as found and from the upsampled ones, a
 from __future__ import annotations
 
 import csv
-import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,7 +29,8 @@ from splatseed.console import (
 from splatseed.errors import MissingDependencyError, ParameterError
 from splatseed.geometry import GeometryScore, measure, spacing
 from splatseed.io import find_depths, load_scene, write_scene
-from splatseed.io.staging import atomic_file, output_folder
+from splatseed.io.staging import add_files, atomic_file, output_folder
+from splatseed.literal import quoted
 from splatseed.pointcloud import PointCloud
 from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
 from splatseed.requirements import require
@@ -56,7 +56,6 @@ TEST_EVERY = 8
 SAMPLES = 20_000
 """Places on the surfaces at which coverage is taken."""
 TRAINED_PICTURE = "preview_trained.png"
-MANIFEST_TEXT = '{"command": "demo"}\n'
 
 
 @dataclass(frozen=True)
@@ -85,7 +84,7 @@ def run(arguments: list[str]) -> None:
     _check(options)
     with (
         stage_display() as clock,
-        output_folder(options.output, overwrite=options.overwrite) as folder,
+        output_folder(options.output, kind="demo", overwrite=options.overwrite) as folder,
     ):
         clock("photograph", 0.0)
         capture = make_capture(options.seed, options.views)
@@ -101,7 +100,6 @@ def run(arguments: list[str]) -> None:
         _write_table(folder / "geometry.csv", scores)
         if options.preview:
             _write_pictures(folder, capture, scene, clouds, clock)
-        (folder / "splatseed.json").write_text(MANIFEST_TEXT, encoding="utf-8")
         seconds = clock.seconds()
     _summarise(options, scene, scores, seconds)
     trained = _train(options) if options.train_steps else False
@@ -222,9 +220,11 @@ def _train(options: Options) -> bool:
     from splatseed.train.settings import TrainSettings  # noqa: PLC0415
 
     folder = options.output
+    runs = [f"run_{name}" for name in ("sfm", SHOWN)]
+    add_files(folder, [*runs, TRAINED_PICTURE])
     arms = [
-        Arm("SfM seeds", folder / "scene", folder / "run_sfm"),
-        Arm(SHOWN, folder / f"scene_{SHOWN}", folder / f"run_{SHOWN}"),
+        Arm("SfM seeds", folder / "scene", folder / runs[0]),
+        Arm(SHOWN, folder / f"scene_{SHOWN}", folder / runs[1]),
     ]
     settings = TrainSettings(strategy="none", max_steps=options.train_steps, seed=options.seed)
     with stage_display() as clock:
@@ -281,14 +281,10 @@ def _say_what_next(options: Options, *, trained: bool) -> None:
     commands = [
         (
             "another method",
-            f"splatseed upsample {_quoted(scene)} --method spline --ratio 16 -o OUT",
+            f"splatseed upsample {quoted(scene)} --method spline --ratio 16 -o OUT",
         ),
-        ("a longer run", f"splatseed train {_quoted(seeded)} --max-steps 3000 -o RUN"),
+        ("a longer run", f"splatseed train {quoted(seeded)} --max-steps 3000 -o RUN"),
     ]
     if trained:
-        commands.append(("the scores again", f"splatseed evaluate {_quoted(run)}"))
+        commands.append(("the scores again", f"splatseed evaluate {quoted(run)}"))
     print_commands("next", commands)
-
-
-def _quoted(path: Path) -> str:
-    return shlex.quote(str(path))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import replace
 
 from splatseed.commands._depth_options import Options, check_together
@@ -11,6 +10,7 @@ from splatseed.commands._options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.staging import check_output
+from splatseed.literal import quoted
 from splatseed.monocular import (
     DepthNetwork,
     DepthReport,
@@ -42,7 +42,9 @@ def _run_network(options: Options) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene, require_points=False)
-        check_output(options.output, overwrite=options.overwrite, protect=[options.scene])
+        check_output(
+            options.output, kind="depth", overwrite=options.overwrite, protect=[options.scene]
+        )
         clock("load network", 0.0)
         network = _network(options)
         report = estimate_depths(
@@ -90,7 +92,7 @@ def _summarise(options: Options, network: DepthNetwork, report: DepthReport) -> 
             + shown
             + (f" and {more} more" if more > 0 else "")
         )
-    scene, maps = (shlex.quote(str(path)) for path in (options.scene, report.path))
+    scene, maps = (quoted(path) for path in (options.scene, report.path))
     commands = [
         ("look", f"splatseed info {scene} --depth {maps} --picture depth.png"),
         ("use", f"splatseed upsample {scene} --method depth --depth {maps} --ratio 16 -o OUT"),

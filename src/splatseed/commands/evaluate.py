@@ -17,7 +17,7 @@ from splatseed.errors import (
     ParameterError,
     SceneNotFoundError,
 )
-from splatseed.io.staging import MANIFEST, atomic_file, check_output, output_folder
+from splatseed.io.staging import atomic_file, check_output, output_folder
 from splatseed.requirements import require
 from splatseed.train.run_folder import RunFolder
 from splatseed.train.settings import Backend, TrainSettings
@@ -28,7 +28,6 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
 
 __all__ = ["run"]
 
-MANIFEST_TEXT = '{"command": "evaluate"}\n'
 PathOrNone = Annotated[
     Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
 ]
@@ -49,6 +48,17 @@ class Options:
     """By how much photographs are made smaller; a run's own, else 1."""
     test_every: CountOrNone = None
     """Of the images sorted by name, every so many-th is scored; a run's own, else 8."""
+    transform: Annotated[
+        str | None,
+        tyro.conf.arg(
+            constructor=str,
+            metavar="FILE|gsplat|none",
+            help_behavior_hint="(default: the same world)",
+        ),
+    ] = None
+    """From the scene's world to the model's, where its trainer normalised that: a JSON file with a
+    matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for what its
+    examples do; none: score the model where it is, whatever it looks like."""
     lpips_net: Literal["vgg", "alex"] = "vgg"
     """The network that LPIPS compares features of."""
     lpips_weights: PathOrNone = None
@@ -138,7 +148,10 @@ def _check_outputs(options: Options, task: _Task) -> None:
     """Refuse what cannot be written before any work is done."""
     if options.renders is not None:
         check_output(
-            options.renders, overwrite=options.overwrite, protect=[task.scene, options.model]
+            options.renders,
+            kind="evaluate",
+            overwrite=options.overwrite,
+            protect=[task.scene, options.model],
         )
     if options.output is not None and options.output.exists() and not options.overwrite:
         raise ParameterError(
@@ -177,15 +190,15 @@ def _evaluate(
         task.scene,
         data_factor=task.data_factor,
         test_every=task.test_every,
+        transform=options.transform,
         device=pick_device(options.backend),
         cache_dir=user_cache_dir(),
         progress=clock,
     )
     result = evaluate_model(model, lpips=lpips, lpips_reason=reason, progress=clock)
     if options.renders is not None:
-        with output_folder(options.renders, overwrite=options.overwrite) as folder:
+        with output_folder(options.renders, kind="evaluate", overwrite=options.overwrite) as folder:
             write_renders(model, folder, clock)
-            (folder / MANIFEST).write_text(MANIFEST_TEXT, encoding="utf-8")
     if options.output is not None:
         _write_json(options.output, options, task, result)
     return result

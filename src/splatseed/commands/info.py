@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +27,7 @@ from splatseed.diagnostics import (
 )
 from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
+from splatseed.literal import quoted
 from splatseed.scene import Scene
 
 __all__ = ["run"]
@@ -80,9 +80,9 @@ def run(arguments: list[str]) -> None:
     if alignments is not None:
         print_depth(str(options.depth or "depth"), scene, alignments, list_all=options.list_all)
     problems = find_problems(scene, cloud, regions)
-    OUT.print("\n[bold]problems[/bold]" if problems else "\nno problems found")
+    OUT.print("\nproblems" if problems else "\nno problems found", style="bold" if problems else "")
     for problem in problems:
-        OUT.print(f"  - {problem}", soft_wrap=True, highlight=False, markup=False)
+        OUT.print(f"  - {problem}", soft_wrap=True)
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
@@ -117,17 +117,17 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
 
 def _next_command(options: Options, scene: Scene) -> str:
     """What to run on the scene: points can be upsampled once there are some."""
-    quoted = shlex.quote(str(options.scene))
+    scene_dir = quoted(options.scene)
     if options.depth is not None and len(scene.points):
-        maps = shlex.quote(str(options.depth))
-        return f"splatseed upsample {quoted} --method depth --depth {maps} --ratio 16 -o OUT"
+        maps = quoted(options.depth)
+        return f"splatseed upsample {scene_dir} --method depth --depth {maps} --ratio 16 -o OUT"
     if len(scene.points) and scene.has_photographs:
-        return f"splatseed upsample {quoted} -o OUT"
+        return f"splatseed upsample {scene_dir} -o OUT"
     if len(scene.points):
-        return f"splatseed upsample {quoted} --method mls --ratio 8 -o OUT"
+        return f"splatseed upsample {scene_dir} --method mls --ratio 8 -o OUT"
     images = scene.source.image_dir if scene.source else None
-    photographs = "IMAGES" if images is None else shlex.quote(str(images))
-    return f"splatseed sfm {photographs} --poses-from {quoted} -o OUT"
+    photographs = "IMAGES" if images is None else quoted(images)
+    return f"splatseed sfm {photographs} --poses-from {scene_dir} -o OUT"
 
 
 def _source_rows(scene: Scene) -> list[tuple[str, str]]:
@@ -136,7 +136,8 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     if len(sizes) > KINDS_SHOWN:
         cameras.append(f"{len(sizes) - KINDS_SHOWN:,} kinds more")
     train, test = scene.split()
-    images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test)"
+    by = f", by its {scene.listed.origin}" if scene.listed else ""
+    images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
     maps = [] if scene.depths is None else [("depth maps", f"{len(scene.depths):,}")]
     return [
         ("format", scene.source.format if scene.source else "memory"),

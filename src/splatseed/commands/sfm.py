@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,6 +11,7 @@ import tyro
 from splatseed.commands._options import parse_options
 from splatseed.console import StageClock, print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
+from splatseed.literal import quoted
 from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, triangulate
 
 __all__ = ["run"]
@@ -98,5 +98,5 @@ def _summarise(options: Options, report: SfmReport) -> None:
         shown = ", ".join(report.unregistered[:NAMES_SHOWN])
         more = len(report.unregistered) - NAMES_SHOWN
         print_note(f"without a pose: {shown}" + (f" and {more} more" if more > 0 else ""))
-    command = f"splatseed upsample {shlex.quote(str(options.output))} --method mls --ratio 8 -o OUT --preview"
+    command = f"splatseed upsample {quoted(options.output)} --method mls --ratio 8 -o OUT --preview"
     print_commands("next", [("", command)])

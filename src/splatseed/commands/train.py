@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,9 +14,11 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress as Bar,
+    ProgressColumn,
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 
 from splatseed.commands._options import parse_options
 from splatseed.console import (
@@ -30,16 +31,18 @@ from splatseed.console import (
     stage_display,
 )
 from splatseed.io import load_scene
+from splatseed.literal import quoted, visible
 from splatseed.requirements import require
+from splatseed.train.interruption import exit_code
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
 
-__all__ = ["run"]
+__all__ = ["bar_columns", "run"]
 
-INTERRUPTED = 130
+BAR_WIDTH = 12
 DEFAULT = TrainSettings()
 
 
@@ -105,7 +108,7 @@ def run(arguments: list[str]) -> None:
         done = training.train(show)
     if not done:
         _say_how_to_go_on(options, training)
-        sys.exit(INTERRUPTED)
+        sys.exit(exit_code())
     with stage_display(clock):
         metrics = _finish(training, clock)
     _summarise(options, metrics)
@@ -120,6 +123,8 @@ def _prepare(
     scene = load_scene(options.scene)
     for warning in scene.warnings:
         note(warning)
+    if scene.listed is not None:
+        note(scene.listed.sentence)
     how = RunOptions(
         resume=options.resume,
         overwrite=options.overwrite,
@@ -135,13 +140,11 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
         print_note(note)
     settings, views = training.settings, training.trainer.train_views
     OUT.print(
-        f"{options.scene} ({len(views)} training and {len(training.trainer.test_views)} test views"
+        f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} test views"
         f" of {views[0].width} x {views[0].height}, {len(training.state.params['means']):,} Gaussians)\n"
         f"  -> {settings.strategy}, {settings.max_steps:,} steps, seed {settings.seed},"
         f" on {training.device}\n"
-        f"  -> {options.output}",
-        highlight=False,
-        markup=False,
+        f"  -> {visible(options.output)}",
         soft_wrap=True,
     )
 
@@ -149,11 +152,10 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
 @contextmanager
 def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
     """A function that shows the steps done; nothing is drawn when stderr is not a terminal."""
-    columns = (BarColumn(20), MofNCompleteColumn(), TextColumn("{task.description}"))
     if not ERR.is_terminal:
         yield lambda _: None
         return
-    with Bar(*columns, TimeRemainingColumn(), console=ERR, transient=True) as bar:
+    with Bar(*bar_columns(), console=ERR, transient=True, expand=True) as bar:
         first, total = training.state.step, training.settings.max_steps
         task = bar.add_task("", total=total, completed=first)
 
@@ -163,17 +165,33 @@ def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
         yield show
 
 
+def bar_columns() -> tuple[ProgressColumn, ...]:
+    """Steps and the time left whole; what else there is to say fills the rest, cut where it ends."""
+
+    def whole() -> Column:
+        return Column(no_wrap=True, overflow="ignore")
+
+    rest = Column(ratio=1, no_wrap=True, overflow="ellipsis")
+    return (
+        BarColumn(BAR_WIDTH, table_column=whole()),
+        MofNCompleteColumn(table_column=whole()),
+        TimeRemainingColumn(table_column=whole()),
+        TextColumn("{task.description}", markup=False, table_column=rest),
+    )
+
+
 def _line(training: TrainingRun, steps_per_second: float | None) -> str:
     records = training.state.records
     if not records:
         return ""
     last = records[-1]
     tested = next((r.test_psnr for r in reversed(records) if r.test_psnr is not None), None)
-    test = "" if tested is None else f" (test {tested:.2f})"
+    test = "" if tested is None else f", test {tested:.2f}"
     speed = "" if steps_per_second is None else f"  {steps_per_second:.1f} steps/s"
+    # The most important first: a narrow terminal cuts the end off.
     return (
-        f"loss {last.loss:.4f}  PSNR {last.train_psnr:.2f}{test} dB"
-        f"  {last.num_gaussians:,} Gaussians{speed}"
+        f"PSNR {last.train_psnr:.2f}{test} dB  {last.num_gaussians:,} Gaussians{speed}"
+        f"  loss {last.loss:.4f}"
     )
 
 
@@ -186,12 +204,10 @@ def _finish(training: TrainingRun, clock: StageClock) -> Mapping[str, Any]:
 
 
 def _say_how_to_go_on(options: Options, training: TrainingRun) -> None:
-    scene, output = shlex.quote(str(options.scene)), shlex.quote(str(options.output))
+    scene, output = quoted(options.scene), quoted(options.output)
     ERR.print(
         f"\ninterrupted after step {training.state.step:,}; saved. Go on with:\n"
         f"  splatseed train {scene} -o {output} --resume",
-        highlight=False,
-        markup=False,
         soft_wrap=True,
     )
 
@@ -216,5 +232,5 @@ def _summarise(options: Options, metrics: Mapping[str, Any]) -> None:
             f"memory held the run at {held:,} Gaussians; on another machine it may end otherwise. "
             f"Pass --cap-max {held} to have the same everywhere."
         )
-    output = shlex.quote(str(options.output))
+    output = quoted(options.output)
     print_commands("next", [("score again, with LPIPS", f"splatseed evaluate {output}")])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -31,6 +32,7 @@ from splatseed.io import (
     write_scene,
 )
 from splatseed.io.staging import check_output
+from splatseed.literal import visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
@@ -45,6 +47,8 @@ from splatseed.upsample import (
 )
 
 __all__ = ["parse", "run"]
+
+HELP_ALL = "--help-all"
 
 
 def _number(kind: type, default: str) -> Any:
@@ -129,6 +133,9 @@ class Options:
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """The options, and every method with its parameters, from the command line's words."""
+    if {"-h", "--help"} & set(arguments):
+        _help(arguments)
+    arguments = ["--help" if word == HELP_ALL else word for word in arguments]
     options = _parse_with({name: METHODS[name]() for name in METHODS}, arguments)
     if options.profile == "paper":
         # The profile sets the defaults of other flags, so it must be known before they are read.
@@ -139,9 +146,21 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     return options, methods
 
 
+def _help(arguments: list[str]) -> None:
+    """Show the common options, those of the method that is named too, and how to see all."""
+    named = [name for name in METHODS if name in arguments or f"--method={name}" in arguments]
+    with suppress(SystemExit):
+        _parse_with({name: METHODS[name]() for name in named}, ["--help"])
+    OUT.print(
+        f"\nsplatseed upsample {HELP_ALL} shows the flags of all methods,"
+        " --method mls --help those of one."
+    )
+    raise SystemExit(0)
+
+
 def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
     """Options with one more field a method, whose default is the method given."""
-    names = tuple(methods)
+    names = tuple(METHODS)
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
     ]
@@ -160,7 +179,7 @@ def run(arguments: list[str]) -> None:
     options, methods = parse(arguments)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     inputs = [path for path in (options.scene, options.depth_maps) if path is not None]
-    check_output(options.output, overwrite=options.overwrite, protect=inputs)
+    check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=inputs)
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
@@ -265,11 +284,9 @@ def _announce(
     parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]
     number = "as many as the photographs need" if total is None else f"{total:,} points"
     OUT.print(
-        f"{options.scene} ({kind}, {len(scene.images)} images, {len(scene.points):,} points)\n"
+        f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} points)\n"
         f"  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n"
-        f"  -> {options.output} ({number}, seed {options.seed})",
-        highlight=False,
-        markup=False,
+        f"  -> {visible(options.output)} ({number}, seed {options.seed})",
         soft_wrap=True,
     )
 

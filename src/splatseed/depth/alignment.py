@@ -131,6 +131,9 @@ def align_map(
     value, z = values_at(depth, camera, points)
     if len(value) < max(min_points, 1):
         return Alignment(np.nan, 0.0, len(value), np.nan, _too_few(depth, len(value), min_points))
+    if np.ptp(depth.values[np.isfinite(depth.values)]) == 0:
+        told = "the map has one value everywhere: whatever made it failed on this image"
+        return Alignment(np.nan, 0.0, len(value), np.nan, told)
     scale, shift = _fit(depth.kind, value, z, fit)
     residual = _residual(depth.kind, value, z, scale, shift)
     return Alignment(scale, shift, len(value), residual, _misfit(depth.kind, scale, residual))

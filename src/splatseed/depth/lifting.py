@@ -127,8 +127,8 @@ def _images_with_maps(scene: Scene, hold_out: int) -> list[Image]:
 def _sources(scene: Scene, hold_out: int) -> list[str]:
     """Names of the images that have a map and are not held out."""
     names = sorted({image.name for image in scene.images})
-    held = set(names[::hold_out]) if hold_out else set()
-    return [n for n in names if n not in held and scene.depths is not None and n in scene.depths]
+    used = {image.name for image in scene.split(hold_out)[0]} if hold_out else set(names)
+    return [n for n in names if n in used and scene.depths is not None and n in scene.depths]
 
 
 def _reader(scene: Scene, settings: Settings) -> Reader:
@@ -203,8 +203,7 @@ def _left_out_notes(reasons: Mapping[str, str], images: Sequence[Image]) -> tupl
 
 
 def _missing_notes(scene: Scene, num_used: int, hold_out: int) -> tuple[str, ...]:
-    names = sorted({image.name for image in scene.images})
-    expected = len(names) - (len(names[::hold_out]) if hold_out else 0)
+    expected = len(scene.split(hold_out)[0] if hold_out else scene.images)
     if num_used >= expected:
         return ()
     return (f"{expected - num_used} of {expected} images have no depth map and give no points.",)

@@ -175,7 +175,7 @@ def check_lens(image: Image) -> None:
         raise SceneFormatError(
             "cameras without lens distortion (PINHOLE), along whose rays pixels are lifted",
             found=f"{image.intrinsics.model} for {image.name}",
-            fix="Undistort the scene first: colmap image_undistorter, or splatseed sfm.",
+            fix="Undistort the scene first: splatseed undistort SCENE -o OUT.",
         )
 
 

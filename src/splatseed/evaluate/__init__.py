@@ -2,7 +2,7 @@
 
 ``evaluate_views`` scores any function from a view to an image; ``load_model`` and
 ``evaluate_model`` a trained .ply in the world of its scene, whoever trained it. Needs PyTorch
-(``pip install "splatseed[train]"``).
+(``pip install ".[train]"``).
 """
 
 from splatseed.requirements import require

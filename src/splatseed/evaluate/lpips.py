@@ -12,7 +12,7 @@ the error says what to fetch and where to put it.
 
 from __future__ import annotations
 
-import pickle
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -188,8 +188,9 @@ def _weights_path(backbone: Backbone, given: Path | None) -> Path:
 def _read_state(path: Path) -> Mapping[str, Tensor]:
     """A file of tensors by name; nothing else that it may hold is run."""
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        with warnings.catch_warnings(action="ignore"):  # of what a foreign file might be
+            state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # noqa: BLE001  (of a damaged file, PyTorch raises what it likes)
         raise _misfit(path, f"a file that PyTorch cannot read ({type(error).__name__})") from None
     if not isinstance(state, Mapping):
         raise _misfit(path, f"a {type(state).__name__}")
@@ -217,6 +218,8 @@ def _check(path: Path, net: str, state: Mapping[str, Tensor], heads: tuple[Tenso
             shape = tuple(state[f"features.{conv.layer}.weight"].shape)
             if len(shape) != 4 or shape[1] != channels:
                 raise _misfit(path, f"features.{conv.layer}.weight of shape {list(shape)}")
+            if tuple(state[f"features.{conv.layer}.bias"].shape) != shape[:1]:
+                raise _misfit(path, f"features.{conv.layer}.bias of another size than its weight")
             channels = shape[0]
         if channels != head.shape[1]:
             raise _misfit(path, f"{channels} channels after layer {stage[-1].layer}")

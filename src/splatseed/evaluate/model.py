@@ -22,6 +22,12 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.evaluate.lpips import Lpips
 from splatseed.evaluate.metrics import Render, evaluate_views
 from splatseed.evaluate.result import NOT_ASKED, EvalResult
+from splatseed.evaluate.world import (
+    NO_TRANSFORM,
+    check_world,
+    find_transform,
+    view_in,
+)
 from splatseed.io import load_scene
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -64,6 +70,7 @@ def load_model(
     *,
     data_factor: int = 1,
     test_every: int = 8,
+    transform: str | None = None,
     device: torch.device | None = None,
     cache_dir: Path | None = None,
     progress: Progress = silent,
@@ -71,17 +78,21 @@ def load_model(
     """Read Gaussians that any trainer wrote, and the test views of the scene that they are of.
 
     Args:
-        path: The .ply, in the scene's own world frame.
+        path: The .ply.
         scene_path: The scene.
         data_factor: By how much photographs are made smaller.
         test_every: Of the images sorted by name, every so many-th is a test view.
+        transform: From the scene's world to the model's, if they differ: a file, or a word, as for
+            ``find_transform``. When left out, the model must be in the scene's own world.
         device: Where to render; the CPU when left out.
         cache_dir: Where smaller photographs are kept for the next time; nowhere when left out.
         progress: Told how far reading is.
 
     Raises:
         SceneNotFoundError: The model, the scene or its images are missing.
-        SceneFormatError: One of them is not what its format promises.
+        SceneFormatError: One of them is not what its format promises, or the model's Gaussians are not
+            where the scene's points are.
+        ParameterError: The transform cannot be computed.
     """
     gaussians = read_gaussians(path)
     scene = load_scene(scene_path, require_points=False)
@@ -100,8 +111,12 @@ def load_model(
         cache_dir=cache_dir,
         progress=progress,
     )
-    render = gaussian_renderer(gaussians, frame_of_scene(scene, test_every), device)
-    return TrainedModel(gaussians, views, render)
+    world = None if transform is None else find_transform(transform, scene)
+    if transform != NO_TRANSFORM:
+        check_world(path, scene, gaussians, world)
+    frame = training_frame([view_in(world, view) for view in poses_of(train)])
+    render = gaussian_renderer(gaussians, frame, device)
+    return TrainedModel(gaussians, views, lambda view: render(view_in(world, view)))
 
 
 def evaluate_model(

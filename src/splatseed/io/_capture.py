@@ -13,6 +13,7 @@ import numpy as np
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io._files import open_file, read_file
 
 __all__ = ["CAMERA_FILE", "check_size", "find_camera_file", "read_intrinsics", "read_text"]
 
@@ -63,7 +64,7 @@ def check_size(path: Path, intrinsics: Intrinsics) -> None:
 
     expected = (intrinsics.width, intrinsics.height)
     try:
-        with PilImage.open(path) as image:
+        with open_file(path) as file, PilImage.open(file) as image:
             size = image.size
     except (OSError, ValueError, PilImage.DecompressionBombError) as error:
         raise SceneFormatError(
@@ -85,7 +86,7 @@ def read_text(path: Path) -> str:
         SceneFormatError: It cannot be read, or is not UTF-8.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        return read_file(path).decode("utf-8")
     except FileNotFoundError as error:
         raise SceneNotFoundError(
             f"a file {path}", found="none", fix="Give the folder of an RGB-D capture."

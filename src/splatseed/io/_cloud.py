@@ -14,6 +14,10 @@ from splatseed.pointcloud import PointCloud
 
 __all__ = ["UsablePoints", "cloud_warnings", "find_usable"]
 
+_FAR_OUT = (
+    1e4  # times the inner half of the points: the sky of outdoor scenes is at some hundred times
+)
+_FEW = 0.01  # of the points at most can be so far
 _RESOLUTION = 1e-4  # float32 steps coarser than this share of the cloud's extent show in renders
 
 
@@ -39,18 +43,43 @@ def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
     warnings = []
     if num_nonfinite:
         what = "point is" if num_nonfinite == 1 else "points are"
-        warnings.append(f"{num_nonfinite:,} {what} not finite, and left out when written.")
+        which = "beyond 1e15" if np.isfinite(points.xyz).all() else "not finite"
+        warnings.append(f"{num_nonfinite:,} {what} {which}, and left out when written.")
     if num_duplicates:
         what = "point repeats" if num_duplicates == 1 else "points repeat"
         warnings.append(
             f"{num_duplicates:,} {what} the position of another, and will be left out when written."
         )
-    if _is_too_far_out(points):
+    far, distance = _far_points(points)
+    if far.any():
+        what = "point lies" if far.sum() == 1 else "points lie"
+        warnings.append(
+            f"{far.sum():,} {what} up to {distance:.3g} from the middle of the others, more than"
+            f" {_FAR_OUT:,.0f} times their extent: probably a mistake of the reconstruction; take"
+            f" {'it' if far.sum() == 1 else 'them'} out."
+        )
+    if _is_too_far_out(points.select(~far)):
         warnings.append(
             "The coordinates are so large beside the scene's extent that float32 cannot resolve"
             " it; recentre the scene (subtract an offset from points and cameras) first."
         )
     return tuple(warnings)
+
+
+def _far_points(points: PointCloud) -> tuple[Bool[np.ndarray, " N"], float]:
+    """Which few points are out of all proportion to the others, and how far the farthest is."""
+    far = np.zeros(len(points), bool)
+    finite = points.finite
+    xyz = points.xyz[finite].astype(np.float64)
+    if len(xyz) < 2:
+        return far, 0.0
+    low, middle, high = np.percentile(xyz, (25, 50, 75), axis=0)
+    distance = np.abs(xyz - middle).max(axis=1)
+    beyond = distance > _FAR_OUT * float((high - low).max())
+    if (high <= low).all() or beyond.mean() > _FEW:
+        return far, 0.0
+    far[finite] = beyond
+    return far, float(distance.max())
 
 
 def _is_too_far_out(points: PointCloud) -> bool:

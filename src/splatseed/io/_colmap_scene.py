@@ -66,7 +66,7 @@ def read_colmap_scene(model_dir: Path) -> Scene:
     image_dir = _find_image_dir(root, images)
     warnings = [
         *_model_warnings(root, model_dir),
-        *image_warnings(images, image_dir),
+        *image_warnings(images, image_dir, root),
         *lens_warnings(images),
     ]
     if not images and tracks is not None:

@@ -5,9 +5,11 @@ Promise: only the headers of a few image files are opened; nothing here raises f
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from splatseed.io._files import open_file
 from splatseed.scene import Image
 
 __all__ = ["image_warnings", "lens_warnings"]
@@ -15,28 +17,44 @@ __all__ = ["image_warnings", "lens_warnings"]
 _MAX_OPENED = 32  # files whose size is compared
 
 
-def image_warnings(images: Sequence[Image], image_dir: Path | None) -> list[str]:
-    """What the image files have against their records; only headers of a few are opened."""
+def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
+    """What the image files have against their records; only headers of a few are opened.
+
+    Args:
+        images: The images.
+        image_dir: What their names are relative to, if there is such a folder.
+        root: The scene's folder.
+    """
     if not images:
         return []
     if image_dir is None:
         return ["The images folder is missing; points can be made, but nothing can be trained."]
+    outside = [im.name for im in images if _leads_out(im.name, image_dir, root)]
     missing = {im.name: None for im in images if not (image_dir / im.name).is_file()}
     warnings = []
     if missing:
         count, first = f"{len(missing)} of {len(images)} images are", next(iter(missing))
         warnings.append(f"{count} missing in {image_dir}, the first is {first}.")
+    if outside:
+        count, first = f"{len(outside)} of {len(images)} images lie", outside[0]
+        warnings.append(f"{count} outside of {root}, the first is {first}.")
     present = [im for im in images if im.name not in missing]
     sample = present[:: -(-len(present) // _MAX_OPENED) or 1]  # the first, and every so many
     wrong = [text for im in sample if (text := _size_warning(im, image_dir))]
     return [*warnings, *wrong[:1]]
 
 
+def _leads_out(name: str, image_dir: Path, root: Path) -> bool:
+    """Whether an image's name leads out of its scene; links, which somebody made, may lead anywhere."""
+    path, around = (os.path.abspath(each) for each in (image_dir / name, root))  # noqa: PTH100
+    return os.path.commonpath([path, around]) != around
+
+
 def _size_warning(image: Image, image_dir: Path) -> str | None:
     from PIL import Image as PilImage, UnidentifiedImageError  # noqa: PLC0415  (slow to import)
 
     try:
-        with PilImage.open(image_dir / image.name) as picture:
+        with open_file(image_dir / image.name) as file, PilImage.open(file) as picture:
             size = picture.size
     except (FileNotFoundError, NotADirectoryError):
         return None
@@ -58,4 +76,4 @@ def lens_warnings(images: Sequence[Image]) -> list[str]:
         return []
     lenses = f"Cameras have lens distortion ({', '.join(models)})"
     trainers = "graphdeco's trainer and OpenSplat need PINHOLE"
-    return [f"{lenses}; {trainers}: undistort the images with colmap image_undistorter."]
+    return [f"{lenses}; {trainers}: undistort it with splatseed undistort SCENE -o OUT."]

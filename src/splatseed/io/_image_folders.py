@@ -7,12 +7,14 @@ never written to.
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePath
 
+from splatseed.io._files import open_file
 from splatseed.scene import Scene
 
 __all__ = ["bring", "frame_folders", "image_folders"]
@@ -62,7 +64,7 @@ def bring(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]
     for name, source in present.items():
         target = output / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        if copy or not _linked(source.resolve(), target):
+        if copy or not _linked(_goal(source.resolve(), target, output.resolve().parent), target):
             _copy(source, target)
     return sorted(present)
 
@@ -78,9 +80,16 @@ def _siblings(root: Path) -> dict[str, Path]:
     return {name: root / name for name in _SIBLINGS if (root / name).is_dir()}
 
 
+def _goal(source: Path, link: Path, around: Path) -> Path:
+    """What a link says: the way from here if output and source lie side by side, and can move together."""
+    if around not in source.parents or around == Path(around.anchor):
+        return source
+    return Path(os.path.relpath(source, link.parent.resolve()))
+
+
 def _linked(source: Path, target: Path) -> bool:
     with suppress(OSError, NotImplementedError):  # a file system or system without links
-        target.symlink_to(source, target_is_directory=source.is_dir())
+        target.symlink_to(source, target_is_directory=(target.parent / source).is_dir())
         return True
     return False
 
@@ -88,13 +97,25 @@ def _linked(source: Path, target: Path) -> bool:
 def _copy(source: Path, target: Path) -> None:
     """Copy contents without modes: a copy of a read-only folder could not be removed again."""
     if not source.is_dir():
-        shutil.copyfile(source, target)
+        _copy_file(source, target)
         return
     for parent, _, names in os.walk(source, followlinks=True, onerror=_raise):
         folder = target / Path(parent).relative_to(source)
+        if any(Path(parent).samefile(above) for above in _above(Path(parent), source)):
+            raise OSError(errno.ELOOP, "a link that leads back into itself", parent)
         folder.mkdir()
         for name in names:
-            shutil.copyfile(Path(parent, name), folder / name)
+            _copy_file(Path(parent, name), folder / name)
+
+
+def _copy_file(source: Path, target: Path) -> None:
+    with open_file(source) as file, target.open("xb") as copy:
+        shutil.copyfileobj(file, copy)
+
+
+def _above(folder: Path, top: Path) -> list[Path]:
+    """The folders between ``folder`` and ``top``, this one included."""
+    return [each for each in folder.parents if each == top or top in each.parents]
 
 
 def _raise(error: OSError) -> None:

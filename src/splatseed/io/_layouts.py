@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from splatseed.io._colmap_scene import read_model_cameras
 from splatseed.io._image_folders import frame_folders, image_folders
 from splatseed.io._model_ids import Renumbered, renumber
 from splatseed.io._seeds_npz import write_seeds
+from splatseed.io._split import MODEL_LISTS, ROOT_LISTS, split_fields
 from splatseed.io._transforms_json import (
     NERFSTUDIO_FROM_COLMAP,
     frame_paths,
@@ -36,7 +37,7 @@ from splatseed.scene import Scene
 __all__ = ["write_colmap", "write_json", "write_transforms"]
 
 _ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json")  # gsplat's examples read them if present
-_MODEL_EXTRAS = ("depth_params.json", "test.txt")  # graphdeco's trainer reads them if present
+_MODEL_EXTRAS = ("depth_params.json", *MODEL_LISTS)  # graphdeco's trainer reads them if present
 _RIG_FILES = ("rigs", "frames")
 
 
@@ -53,6 +54,7 @@ def write_colmap(
     write_ply(model_dir / "points3D.ply", points)
     write_seeds(folder, points)
     notes = [*_copy_extras(scene, folder, model_dir), *_model_notes(scene, model)]
+    _write_lists(scene, folder)
     return notes, image_folders(scene)
 
 
@@ -69,13 +71,15 @@ def write_transforms(
             paths += names  # a frame's own path may lack the extension
         folders = frame_folders(source.root, paths)
     else:
-        content = transforms_json(scene)
+        content = {**transforms_json(scene), **split_fields(scene)}
         folders = image_folders(scene)
         points = _in_nerfstudio_space(points)
     write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
     write_ply(folder / "sparse_pc.ply", points)
     shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
     write_seeds(folder, points)
+    if scene.source is not None:
+        _copy(scene.source.root, ROOT_LISTS, folder)
     return [], folders
 
 
@@ -109,20 +113,32 @@ def _copy_extras(scene: Scene, folder: Path, model_dir: Path) -> list[str]:
     source = scene.source
     if source is None or source.model_dir is None:
         return []
-    extras = {source.root / name: folder / name for name in _ROOT_EXTRAS}
-    extras |= {source.model_dir / name: model_dir / name for name in _MODEL_EXTRAS}
     rigs, notes = _rigs(scene, source.model_dir)
-    extras |= {path: model_dir / path.name for path in rigs}
-    for path, target in extras.items():
-        if path.is_file():
-            shutil.copyfile(path, target)
+    _copy(source.root, _ROOT_EXTRAS, folder)
+    _copy(source.model_dir, (*_MODEL_EXTRAS, *rigs), model_dir)
     return notes
 
 
-def _rigs(scene: Scene, model_dir: Path) -> tuple[list[Path], list[str]]:
+def _copy(source: Path, names: Sequence[str], target: Path) -> None:
+    for name in names:
+        if (source / name).is_file():
+            shutil.copyfile(source / name, target / name)
+
+
+def _write_lists(scene: Scene, folder: Path) -> None:
+    """The lists of the scene's split: its own, or, if a transforms.json has it, as nerfstudio reads them."""
+    if scene.source is not None:
+        _copy(scene.source.root, ROOT_LISTS, folder)
+    if scene.listed is None or any((folder / name).exists() for name in ROOT_LISTS):
+        return
+    for part, images in zip(ROOT_LISTS, scene.split(), strict=False):  # train and test
+        text = "".join(f"{image.name}\n" for image in images)
+        (folder / part).write_text(text, "utf-8")
+
+
+def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
     """The model's rigs and frames if they hold for the output too, else a note why not."""
-    there = [model_dir / f"{name}.bin" for name in _RIG_FILES]
-    there = [path for path in there if path.is_file()]
+    there = [f"{name}.bin" for name in _RIG_FILES if (model_dir / f"{name}.bin").is_file()]
     if there and _has_all_images(scene, model_dir):
         return there, []
     if there:

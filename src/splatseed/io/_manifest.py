@@ -1,19 +1,21 @@
-"""``splatseed.json``: the list of files by which an output knows its own.
+"""``splatseed.json``: which folder may be replaced, and which of its files are ours.
 
-Notation: ``files`` lists paths inside the output with forward slashes; a listed folder stands for
-all that is in it. Promise: a manifest that is missing, damaged or of another kind says nothing and
-raises nothing.
+Notation: ``command`` says what wrote a folder, its *kind*; ``files`` lists the paths inside it with
+forward slashes. An entry may name a folder that is an output of its own: then that one's manifest says
+what is ours in there. Promise: a folder may be replaced only by its own kind, and only if nothing lies
+in it that is not listed; a manifest that is missing, damaged or has no list allows nothing.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-__all__ = ["MANIFEST", "add_files", "unlisted_files"]
+__all__ = ["MANIFEST", "add_files", "seal", "unlisted_files", "why_kept"]
 
 MANIFEST = "splatseed.json"
 """The file that marks a folder as written by splatseed: only such a folder is ever replaced."""
@@ -21,37 +23,80 @@ MANIFEST = "splatseed.json"
 _PICTURES = tuple(  # made after the manifest
     f"preview{which}.png" for which in ("", "_methods", "_maps", "_cells", "_origins")
 )
-_FILE_MANAGERS = (".DS_Store", "Thumbs.db")  # made by looking at the folder
+_NOBODYS = re.compile(
+    r"(.*/)?(\.DS_Store|Thumbs\.db"  # made by looking at the folder
+    r"|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+)?"  # what a killed process of ours left
+    r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs: it makes them again
+    re.IGNORECASE,
+)
+
+
+def seal(folder: Path, kind: str) -> None:
+    """Mark a finished output with its kind and with the list of all that is in it now.
+
+    Args:
+        folder: The output; what its manifest says already is kept.
+        kind: What writes it.
+
+    Raises:
+        OSError: The folder cannot be read or written.
+    """
+    names = {*_files_outside(folder, set()), MANIFEST}
+    _write(folder, {**_read(folder), "command": kind, "files": sorted(names)})
 
 
 def add_files(folder: Path, names: Iterable[str]) -> None:
-    """List more of an output's files or folders, so that ``--overwrite`` may replace them.
+    """List more of an output's files, so that ``--overwrite`` may replace them.
 
     Args:
         folder: An output with a manifest.
-        names: Paths inside it.
+        names: Paths inside it, also of files that are yet to be written. Of a folder all files are
+            meant that are in it now; if it is an output of its own, or not there yet, its own list.
 
     Raises:
         OSError: The manifest cannot be written.
     """
     manifest = _read(folder)
-    manifest["files"] = sorted({*_files(manifest), *names})
-    text = json.dumps(manifest, indent=2) + "\n"
-    (folder / MANIFEST).write_text(text, encoding="utf-8")
+    listed = {*_files(manifest), *(each for name in names for each in _expanded(folder, name))}
+    _write(folder, {**manifest, "files": sorted(listed)})
 
 
-def unlisted_files(folder: Path) -> list[str]:
-    """Files in ``folder`` that its manifest does not list; none if the manifest has no list.
+def why_kept(folder: Path, kind: str) -> tuple[str, str] | None:
+    """Why a full folder may not be replaced, and what the user can do; None if it may be.
+
+    Args:
+        folder: The folder.
+        kind: What would write to it.
 
     Raises:
         OSError: The folder cannot be read.
     """
+    if not (folder / MANIFEST).is_file():
+        found = f"files that splatseed did not write (no {MANIFEST})"
+        return found, "Choose another folder, or empty this one yourself."
     manifest = _read(folder)
-    if "files" not in manifest:
-        return []
-    ours = {*_files(manifest), MANIFEST, *_PICTURES}
+    if manifest.get("command", kind) != kind:
+        found = f"what splatseed {manifest['command']} wrote, not {kind}"
+        return found, "Choose another folder, or remove this one yourself."
+    if "command" not in manifest or not isinstance(manifest.get("files"), list):
+        found = f"a folder whose {MANIFEST} does not say what splatseed wrote there"
+        return found, "Choose another folder, or empty this one yourself."
+    if names := unlisted_files(folder):
+        more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
+        found = f"an earlier output with files that splatseed did not write: {', '.join(names[:3])}{more}"
+        return found, "Move them elsewhere, or choose another name."
+    return None
+
+
+def unlisted_files(folder: Path) -> list[str]:
+    """Files in ``folder`` that its manifest does not list.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+    ours = {*_files(_read(folder)), MANIFEST, *_PICTURES}
     found = _files_outside(folder, ours)
-    return sorted(name for name in found if name.rpartition("/")[2] not in _FILE_MANAGERS)
+    return sorted(name for name in found if not _NOBODYS.fullmatch(name))
 
 
 def _read(folder: Path) -> dict[str, Any]:
@@ -62,19 +107,33 @@ def _read(folder: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
+def _write(folder: Path, manifest: dict[str, Any]) -> None:
+    text = json.dumps(manifest, indent=2) + "\n"
+    (folder / MANIFEST).write_text(text, encoding="utf-8")
+
+
 def _files(manifest: dict[str, Any]) -> list[str]:
     files = manifest.get("files")
     return [name for name in files if isinstance(name, str)] if isinstance(files, list) else []
 
 
+def _expanded(folder: Path, name: str) -> Iterator[str]:
+    path = folder / name
+    if path.is_dir() and not path.is_symlink() and not (path / MANIFEST).is_file():
+        yield from _files_outside(folder, set(), f"{name}/")
+    else:
+        yield name
+
+
 def _files_outside(folder: Path, ours: set[str], prefix: str = "") -> Iterator[str]:
-    """Paths of the files, links and other non-folders that are neither in ``ours`` nor below it."""
+    """Paths of the files, links and other non-folders that are not in ``ours``."""
     with os.scandir(folder / prefix) as entries:
         for entry in entries:
             name = prefix + entry.name
-            if name in ours:
-                continue
-            if entry.is_dir(follow_symlinks=False):
-                yield from _files_outside(folder, ours, name + "/")
+            if not entry.is_dir(follow_symlinks=False):
+                if name not in ours:
+                    yield name
+            elif name in ours:  # an output of its own
+                yield from (f"{name}/{each}" for each in unlisted_files(folder / name))
             else:
-                yield name
+                yield from _files_outside(folder, ours, name + "/")

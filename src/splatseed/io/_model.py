@@ -14,8 +14,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from splatseed.camera import Intrinsics
+from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
+from splatseed.io._files import read_file
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
@@ -53,7 +54,7 @@ def read_bytes(path: Path) -> bytes:
         SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
     """
     try:
-        return path.read_bytes()
+        return read_file(path)
     except (FileNotFoundError, NotADirectoryError):
         raise SceneNotFoundError(f"a file at {path}", found="none", fix="Check the path.") from None
     except OSError as error:
@@ -79,11 +80,15 @@ def make_intrinsics(
     if not all(map(math.isfinite, params)):
         raise _bad("finite camera parameters", where, str(tuple(params)))
     try:
-        return Intrinsics(camera_id, model, width, height, tuple(params))
+        camera = Intrinsics(camera_id, model, width, height, tuple(params))
     except SceneFormatError as error:
         raise SceneFormatError(
             f"{error.expected} in {where}", found=error.found, fix=error.fix
         ) from None
+    lengths = camera.params[: CAMERA_MODELS[model].num_focal]
+    if min(lengths) <= 0:
+        raise _bad("a focal length above 0", where, ", ".join(f"{each:g}" for each in lengths))
+    return camera
 
 
 def by_camera_id(intrinsics: Iterable[Intrinsics]) -> dict[int, Intrinsics]:
@@ -166,6 +171,19 @@ def check_unique(
     if len(again):
         i = int(again.min())
         raise _bad(f"each {what} id once", f"{path}, {place(i)}", f"{ids[i]} a second time")
+
+
+def check_names(images: Sequence[Image], path: Path, place: Callable[[int], str]) -> None:
+    """Check that no two records of a file are of one image: one of the poses would be wrong.
+
+    Raises:
+        SceneFormatError: Two are; the second is named.
+    """
+    first: dict[str, int] = {}
+    for i, image in enumerate(images):
+        if first.setdefault(image.name, i) != i:
+            found = f"{image.name!r} a second time, after {place(first[image.name])}"
+            raise _bad("each image name once", f"{path}, {place(i)}", found)
 
 
 def point_columns(

@@ -26,6 +26,7 @@ NERFSTUDIO_FROM_COLMAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """The ``applied_transform`` that nerfstudio gives a COLMAP model: (x, y, z) -> (x, z, -y)."""
 
 _PATH_KEYS = ("file_path", "mask_path", "depth_file_path")
+_LIST_KEYS = ("train_filenames", "val_filenames", "test_filenames")
 _OPENCV_TERMS = ("k1", "k2", "p1", "p2")  # in the order of COLMAP's parameters
 _FISHEYE_TERMS = ("k1", "k2", "k3", "k4")
 _NERFSTUDIO_MODELS = {
@@ -80,7 +81,29 @@ def kept_json(transforms: Transforms, names: Collection[str]) -> dict[str, Any]:
     root = transforms.path.parent
     pairs = zip(transforms.json["frames"], transforms.images, strict=True)
     frames = [frame for frame, image in pairs if image.name in names]
-    return {**transforms.json, "frames": [_portable(frame, root) for frame in frames]}
+    dropped = [
+        f
+        for f, image in zip(transforms.json["frames"], transforms.images, strict=True)
+        if image.name not in names
+    ]
+    lists = _kept_lists(transforms.json, dropped, root)
+    return {**transforms.json, **lists, "frames": [_portable(frame, root) for frame in frames]}
+
+
+def _kept_lists(
+    content: Mapping[str, Any], dropped: Iterable[Mapping[str, Any]], root: Path
+) -> dict[str, list[str]]:
+    """The lists of file names by which nerfstudio splits; it fails over one that is no frame's."""
+    gone = {os.path.normpath(str(frame["file_path"])) for frame in dropped}
+    return {
+        key: [
+            _portable({"file_path": name}, root)["file_path"]
+            for name in content[key]
+            if isinstance(name, str) and os.path.normpath(name) not in gone
+        ]
+        for key in _LIST_KEYS
+        if isinstance(content.get(key), list)
+    }
 
 
 def frame_paths(frames: Iterable[Mapping[str, Any]]) -> list[str]:
@@ -111,7 +134,7 @@ def _camera_fields(camera: Intrinsics) -> dict[str, Any]:
         raise OutputError(
             "cameras that transforms.json can express",
             found=f"camera {camera.camera_id} of model {camera.model}",
-            fix="Undistort the scene to PINHOLE, or write the COLMAP layout.",
+            fix="Undistort the scene first (splatseed undistort), or write the COLMAP layout.",
         )
     fisheye = camera.model.endswith("FISHEYE")
     names = _FISHEYE_TERMS if fisheye else _OPENCV_TERMS

@@ -2,7 +2,7 @@
 
 Notation: the *transforms' space* is the world of the file's poses. Promise: points come from the
 file that the JSON names, else from a PLY known to lie in that space, else from a COLMAP model whose
-cameras prove how it is brought there.
+cameras prove how it is brought there: by a known turn of the axes, or by a similarity that fits them.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ from splatseed.io.ply import read_ply
 from splatseed.io.transforms import Transforms, apply_transform, read_transforms
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
+from splatseed.similarity import fit_similarity
 
-__all__ = ["read_transforms_scene"]
+__all__ = ["find_points", "read_transforms_scene"]
 
 _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """What nerfstudio applied to a COLMAP model before it wrote ``applied_transform``."""
+_FEWEST_FITTED = 4
+"""Of three camera centres a similarity says nothing: it fits any three nearly as well."""
 _POSE_TOLERANCE = 1e-2  # of the cameras' extent, between transforms.json and its COLMAP model
 
 
@@ -43,11 +46,11 @@ def read_transforms_scene(path: Path) -> Scene:
             JSON does not fit its poses.
     """
     transforms = read_transforms(path)
-    points, points_path, notes = _find_points(transforms)
+    points, points_path, notes = find_points(transforms)
     warnings = (
         *transforms.warnings,
         *notes,
-        *image_warnings(transforms.images, transforms.image_dir),
+        *image_warnings(transforms.images, transforms.image_dir, path.parent),
         *lens_warnings(transforms.images),
     )
     source = SceneSource(
@@ -60,7 +63,7 @@ def read_transforms_scene(path: Path) -> Scene:
     return Scene(points, transforms.images, transforms.intrinsics, source=source, warnings=warnings)
 
 
-def _find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
+def find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
     """The cloud, the file it came from, and what to tell of it."""
     root, notes = transforms.path.parent, []
     named = transforms.json.get("ply_file_path")
@@ -105,6 +108,15 @@ def _transform_of_model(
         off = np.abs(apply_transform(candidate, model_centers) - centers).max(axis=1)
         if np.median(off) <= _POSE_TOLERANCE * extent:
             return candidate, []
+    fitted = fit_similarity(model_centers, centers)
+    if fitted is not None:
+        apart = np.abs(fitted.points(model_centers) - centers).max(axis=1)
+        if len(centers) >= _FEWEST_FITTED and np.median(apart) <= _POSE_TOLERANCE * extent:
+            note = (
+                f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and scaled"
+                f" by {fitted.scale:.3g}, as instant-ngp writes them; its points were brought there."
+            )
+            return fitted.matrix, [note]
     raise SceneFormatError(
         f"the cameras of {model_dir} to be those of {transforms.path} after applied_transform",
         found=f"cameras {np.median(off):.3g} apart in a scene of extent {extent:.3g}",

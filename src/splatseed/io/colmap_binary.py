@@ -21,6 +21,7 @@ from splatseed.io._binary import ByteReader
 from splatseed.io._model import (
     NO_POINT,
     by_camera_id,
+    check_names,
     check_unique,
     make_image,
     make_intrinsics,
@@ -95,6 +96,7 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
     images = tuple(_read_image(reader, cameras, i, count) for i in range(count))
     reader.finish()
     check_unique("image", np.array([im.image_id for im in images], np.int64), path, _record)
+    check_names(images, path, _record)
     return images
 
 

@@ -23,6 +23,7 @@ from splatseed.io._model import (
     MAX_ID,
     NO_POINT,
     by_camera_id,
+    check_names,
     check_unique,
     make_image,
     make_intrinsics,
@@ -98,6 +99,7 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
             numbers.append(number)
     ids = np.array([image.image_id for image in images], np.int64)
     check_unique("image", ids, path, lambda i: f"line {numbers[i]}")
+    check_names(images, path, lambda i: f"line {numbers[i]}")
     return tuple(images)
 
 

@@ -49,6 +49,10 @@ _NPY_FAILURES = (
     tokenize.TokenError,  # of headers that look like Python 2's
 )
 _ZIP_FAILURES = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
+_MOST_INFLATED = 100
+"""How many times larger than in its archive a map can be: measured values hardly shrink."""
+_SMALL = 1 << 26
+"""Bytes that do no harm, however little they are in the archive: a map can be of one value."""
 _NPZ_KEYS = ("depth", "arr_0")
 _PFM_HEADER = re.compile(rb"(P[fF])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,32})[ \t]*\r?\n")
 _BIN_HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
@@ -86,12 +90,16 @@ def read_npz(path: Path) -> StoredDepth:
         SceneNotFoundError: There is no such file.
         SceneFormatError: It holds no such array.
     """
-    arrays = _read_members(path, read_bytes(path))
-    kind = _kind_of(path, arrays.pop("kind", None))
-    wanted = [key for key in _NPZ_KEYS if key in arrays] or sorted(arrays)
-    if not wanted or (wanted[0] not in _NPZ_KEYS and len(arrays) > 1):
-        refuse(path, "one array, or one named depth", ", ".join(sorted(arrays)[:5]) or "none")
-    return StoredDepth(_as_map(path, _parse_npy(path, arrays[wanted[0]])), kind)
+    try:
+        with zipfile.ZipFile(io.BytesIO(read_bytes(path))) as archive:
+            names = {n.removesuffix(".npy") for n in archive.namelist() if n.endswith(".npy")}
+            kind = _kind_of(path, _member(path, archive, "kind") if "kind" in names else None)
+            wanted = _wanted(path, names - {"kind"})
+            return StoredDepth(
+                _as_map(path, _parse_npy(path, _member(path, archive, wanted))), kind
+            )
+    except (*_ZIP_FAILURES, NotImplementedError) as error:
+        refuse(path, "the archive of np.savez", f"{type(error).__name__}: {error}")
 
 
 def read_pfm(path: Path) -> StoredDepth:
@@ -191,16 +199,22 @@ def _as_map(path: Path, array: np.ndarray) -> np.ndarray:
     return array
 
 
-def _read_members(path: Path, data: bytes) -> dict[str, bytes]:
-    """The ``.npy`` files of an archive, by name without suffix."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = [each for each in archive.infolist() if each.filename.endswith(".npy")]
-            if sum(each.file_size for each in members) > 8 * MAX_PIXELS:
-                refuse(path, f"at most {MAX_PIXELS} values", "more")
-            return {each.filename.removesuffix(".npy"): archive.read(each) for each in members}
-    except (*_ZIP_FAILURES, NotImplementedError) as error:
-        refuse(path, "the archive of np.savez", f"{type(error).__name__}: {error}")
+def _wanted(path: Path, names: set[str]) -> str:
+    """Which of an archive's arrays is the map."""
+    wanted = [key for key in _NPZ_KEYS if key in names] or sorted(names)
+    if not wanted or (wanted[0] not in _NPZ_KEYS and len(names) > 1):
+        refuse(path, "one array, or one named depth", ", ".join(sorted(names)[:5]) or "none")
+    return wanted[0]
+
+
+def _member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
+    """A ``.npy`` file of an archive, unless it says that it is absurdly larger than it is there."""
+    info = archive.getinfo(f"{name}.npy")
+    most = max(_SMALL, _MOST_INFLATED * info.compress_size)
+    if info.file_size > min(most, 8 * MAX_PIXELS):
+        found = f"{info.compress_size:,} bytes that would become {info.file_size:,}"
+        refuse(path, "no more values than an archive of its size holds", found)
+    return archive.read(info)
 
 
 def _kind_of(path: Path, data: bytes | None) -> DepthKind | None:

@@ -161,12 +161,10 @@ def depth_folder(
     Raises:
         OutputError: ``path`` is taken or protected, or writing failed.
     """
-    with output_folder(path, overwrite=overwrite, protect=protect) as partial:
+    with output_folder(path, kind="depth", overwrite=overwrite, protect=protect) as partial:
         yield DepthWriter(partial)
         write_description(partial, kind)
-        files = (each for each in partial.rglob("*") if each.is_file())
-        names = sorted(each.relative_to(partial).as_posix() for each in files)
-        write_json(partial / MANIFEST, {**(provenance or {}), "files": [*names, MANIFEST]})
+        write_json(partial / MANIFEST, dict(provenance or {}))
 
 
 def _read_object(path: Path) -> dict[str, Any]:

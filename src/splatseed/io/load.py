@@ -11,10 +11,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io._blender import is_blender, read_blender
 from splatseed.io._cloud import cloud_warnings
 from splatseed.io._colmap_scene import find_model, read_colmap_scene, scene_root
 from splatseed.io._earlier import recall_seeds
+from splatseed.io._foreign import refuse_foreign
 from splatseed.io._manifest import MANIFEST
+from splatseed.io._split import follow_lists
 from splatseed.io._transforms_scene import read_transforms_scene
 from splatseed.io.ply import read_ply
 from splatseed.io.tum import is_tum, load_tum
@@ -31,7 +34,8 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
 
     Args:
         path: A folder with a COLMAP model (``sparse/0``, ``sparse``, ``colmap/sparse/0``, itself
-            the model, or ``0`` in it), with ``transforms.json``, or with an RGB-D capture (``traj.txt``, or
+            the model, or ``0`` in it), with ``transforms.json``, with ``transforms_train.json`` and
+            ``transforms_test.json``, or with an RGB-D capture (``traj.txt``, or
             ``rgb.txt`` and ``groundtruth.txt``); or a ``.json`` or ``.ply`` file. Where there are several, ``sparse`` goes before
             ``transforms.json``, and that before ``colmap/sparse/0``.
         require_points: Whether a scene without points is an error; else its cloud is empty.
@@ -58,7 +62,7 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     if require_points and not len(scene.points):
         fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
-    scene = recall_seeds(scene)
+    scene = follow_lists(recall_seeds(scene))
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
 
 
@@ -74,9 +78,16 @@ def _read(path: Path) -> Scene:
         return read_colmap_scene(first)
     if (path / _TRANSFORMS).is_file():
         return read_transforms_scene(path / _TRANSFORMS)
+    if is_blender(path):
+        return read_blender(path)
     nested = find_model(path / "colmap" / "sparse" / "0")
     if nested is not None:
         return read_colmap_scene(nested)
+    return _read_capture(path)
+
+
+def _read_capture(path: Path) -> Scene:
+    """An RGB-D capture."""
     if (path / "traj.txt").is_file():
         from splatseed.io.rgbd import load_rgbd  # noqa: PLC0415  (keeps splatseed.io fast)
 
@@ -91,6 +102,7 @@ def _read_file(path: Path) -> Scene:
         ".ply": _read_bare_ply,
         ".json": read_transforms_scene,
     }
+    refuse_foreign(path)
     reader = readers.get(path.suffix.lower())
     if reader is None and find_model(path.parent) is not None:
         raise SceneFormatError(
@@ -129,7 +141,7 @@ def _no_scene(path: Path) -> SceneNotFoundError:
 def _is_scene(folder: Path) -> bool:
     model_dirs = (folder / "sparse/0", folder / "sparse", folder, folder / "colmap/sparse/0")
     markers = (folder / _TRANSFORMS, folder / "traj.txt")
-    if find_model(*model_dirs) is not None or is_tum(folder):
+    if find_model(*model_dirs) is not None or is_tum(folder) or is_blender(folder):
         return True
     return any(each.is_file() for each in markers)
 

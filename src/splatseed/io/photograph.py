@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io._files import read_file
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage
@@ -24,6 +25,8 @@ _CHECK_SCALE = 8
 """JPEG is checked at an eighth of its size: all of it is read, a fraction of it is computed."""
 _WIDE_GREY = ("I", "F")
 """Pillow's modes for one channel of more than 8 bits, which it cuts off at 255 when it converts them."""
+_INKS = ("CMYK", "LAB")
+"""Pillow's modes whose colours are not light of a screen; it would convert inks by a rule of thumb."""
 _DECODER_FAILURES = (OSError, ValueError, SyntaxError)
 
 
@@ -35,7 +38,7 @@ def photograph_bytes(path: Path) -> bytes:
         SceneFormatError: It cannot be read.
     """
     try:
-        return path.read_bytes()
+        return read_file(path)
     except FileNotFoundError:
         raise SceneNotFoundError(
             f"the image {path}",
@@ -64,9 +67,16 @@ def decode_photograph(path: Path, raw: bytes) -> PilImage.Image:
     """The pixels in a file's bytes, as RGB.
 
     Raises:
-        SceneFormatError: It is no image, is cut short or damaged, or has numbers of unknown range.
+        SceneFormatError: It is no image, is cut short or damaged, is in inks (CMYK), or has numbers of
+            unknown range.
     """
     picture = open_photograph(path, raw)
+    if picture.mode in _INKS:
+        raise SceneFormatError(
+            f"{path} to be in RGB or grey",
+            found=picture.mode,
+            fix="Export it as sRGB: what its colours look like depends on a printer's profile.",
+        )
     if picture.mode.startswith(_WIDE_GREY):
         return _eight_bits(path, picture).convert("RGB")
     try:

@@ -18,6 +18,7 @@ from jaxtyping import Shaped, UInt8
 
 from splatseed.errors import SceneFormatError
 from splatseed.io._binary import ByteReader
+from splatseed.io._foreign import refuse_packed
 from splatseed.io._ply_header import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.pointcloud import PointCloud
 
@@ -88,6 +89,7 @@ def write_ply(path: Path, points: PointCloud) -> None:
 
 def _vertex_element(path: Path, header: Header) -> Element:
     vertex = next((element for element in header.elements if element.name == "vertex"), None)
+    refuse_packed(path, [prop.name for prop in vertex.properties] if vertex else ())
     if vertex is None or not _wanted_dtypes(vertex).keys() >= set(_XYZ):
         names = ", ".join(prop.name for prop in vertex.properties) if vertex else ""
         found = f"properties {names[:200] or '(none)'}" if vertex else "no element vertex"

@@ -1,7 +1,8 @@
 """Output that is there whole or not at all.
 
 Notation: the *target* is what the user named, the *partial* a hidden sibling ``.NAME.partial-XXXX``
-that is written first and renamed to the target at the end. Promise: whatever interrupts the writing
+that is written first and renamed to the target at the end; a *leftover* is the partial of a process that
+was killed, which the next one for the same target removes. Promise: whatever interrupts the writing
 (an error, a full disk, Ctrl-C), the partial is removed and an older output is still there unharmed;
 an ``OSError`` becomes an ``OutputError`` that says what to do, and what cannot be removed is named.
 """
@@ -9,17 +10,16 @@ an ``OSError`` becomes an ``OutputError`` that says what to do, and what cannot 
 from __future__ import annotations
 
 import errno
-import os
 import secrets
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatseed.errors import OutputError
-from splatseed.io._manifest import MANIFEST, add_files, unlisted_files
+from splatseed.io._leftovers import held, remove_leftovers, remove_tree
+from splatseed.io._manifest import MANIFEST, add_files, seal, why_kept
 
-__all__ = ["MANIFEST", "add_files", "atomic_file", "check_output", "output_folder"]
+__all__ = ["MANIFEST", "add_files", "atomic_file", "check_apart", "check_output", "output_folder"]
 
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
@@ -27,17 +27,18 @@ _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 @contextmanager
 def output_folder(
-    path: Path, *, overwrite: bool = False, protect: Sequence[Path] = ()
+    path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
 ) -> Iterator[Path]:
     """A folder to write into that appears at ``path`` when the block ends without an error.
 
     Missing parents are made. An empty folder at ``path`` is used up; a full one is replaced only
-    with ``overwrite`` and only if it holds ``splatseed.json``, so the block should write one. If
-    that lists ``files``, the folder may hold nothing else.
+    with ``overwrite``, and only if its ``splatseed.json`` says that the same kind wrote it and lists
+    all that is in it. That of the new one is written at the end, with what the block has put there.
 
     Args:
         path: Where the output is to be.
-        overwrite: Whether an earlier output of splatseed may be replaced.
+        kind: What writes it, a verb of the command line if it has one.
+        overwrite: Whether an earlier output of this kind may be replaced.
         protect: Files and folders that are read: the output may be neither one of them, nor inside
             one, nor around one.
 
@@ -47,28 +48,33 @@ def output_folder(
     Raises:
         OutputError: ``path`` is taken or protected, or writing failed.
     """
-    check_output(path, overwrite=overwrite, protect=protect)
-    target = Path(path).resolve()
+    check_output(path, kind=kind, overwrite=overwrite, protect=protect)
+    target = _resolved(path)
+    remove_leftovers(target)
     partial = _partial_name(target)
-    with _oserror_as_output_error(target), _parents(target.parent):
+    with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
         try:
             partial.mkdir()
+            hold()
             yield partial
-            _put_in_place(partial, target)
+            seal(partial, kind)
+            _put_in_place(partial, target, kind)
         except BaseException as error:
             _remove_after(error, partial)
             raise
 
 
-def check_output(path: Path, *, overwrite: bool = False, protect: Sequence[Path] = ()) -> None:
-    """Refuse what ``output_folder`` would refuse, before any work is done.
+def check_output(
+    path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
+) -> None:
+    """Refuse what ``output_folder`` would refuse, before any work is done; arguments as there.
 
     Raises:
         OutputError: ``path`` is taken or protected.
     """
-    target = Path(path).resolve()
-    _check_apart(target, protect)
-    _check_replaceable(target, overwrite=overwrite)
+    check_apart(path, protect)
+    target = _resolved(path)
+    _check_replaceable(target, kind, overwrite=overwrite)
 
 
 @contextmanager
@@ -85,11 +91,12 @@ def atomic_file(path: Path) -> Iterator[Path]:
         The name of the partial file, which does not exist yet.
 
     Raises:
-        OutputError: ``path`` is a folder, or writing failed.
+        OutputError: ``path`` is a folder or a device, or writing failed.
     """
-    target = Path(path).resolve()
-    if target.is_dir():
-        raise OutputError(f"a file name at {target}", found="a folder", fix="Choose another name.")
+    target = _resolved(path)
+    if target.exists() and not target.is_file():  # a device would be replaced by a file
+        found = "a folder" if target.is_dir() else "a device or a pipe"
+        raise OutputError(f"a file name at {target}", found=found, fix="Choose another name.")
     partial = _partial_name(target, target.suffix)
     with _oserror_as_output_error(target), _parents(target.parent):
         try:
@@ -100,12 +107,29 @@ def atomic_file(path: Path) -> Iterator[Path]:
             raise
 
 
+def _resolved(path: Path) -> Path:
+    try:
+        return Path(path).resolve()
+    except (OSError, RuntimeError):  # RuntimeError before Python 3.13
+        raise OutputError(
+            f"a name at {path}",
+            found="a link that leads back to itself",
+            fix="Remove the link, or choose another name.",
+        ) from None
+
+
 def _partial_name(target: Path, suffix: str = "") -> Path:
     return target.with_name(f".{target.name}.partial-{secrets.token_hex(4)}{suffix}")
 
 
-def _check_apart(target: Path, protect: Sequence[Path]) -> None:
-    for source in (Path(kept).resolve() for kept in protect):
+def check_apart(path: Path, protect: Sequence[Path]) -> None:
+    """Refuse an output that is one of ``protect``, lies inside one, or around one.
+
+    Raises:
+        OutputError: It is, or does.
+    """
+    target = _resolved(path)
+    for source in (_resolved(kept) for kept in protect):
         if target == source or source in target.parents or target in source.parents:
             raise OutputError(
                 "an output folder apart from the input",
@@ -121,31 +145,21 @@ def _check_apart(target: Path, protect: Sequence[Path]) -> None:
         )
 
 
-def _check_replaceable(target: Path, *, overwrite: bool) -> None:
+def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
     with _oserror_as_output_error(target):
         if not target.exists() or (target.is_dir() and not any(target.iterdir())):
             return
+    kept: tuple[str, str] | None
     if not target.is_dir():
-        found, fix = "a file", "Choose another name."
-    elif not (target / MANIFEST).is_file():
-        found = f"files that splatseed did not write (no {MANIFEST})"
-        fix = "Choose another folder, or empty this one yourself."
-    elif not overwrite:
-        found, fix = "an earlier output", "Pass --overwrite to replace it, or choose another name."
-    elif foreign := _foreign_files(target):
-        found = f"an earlier output with files that splatseed did not write: {foreign}"
-        fix = "Move them elsewhere, or choose another name."
+        kept = "a file", "Choose another name."
     else:
-        return
-    raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
-
-
-def _foreign_files(target: Path) -> str:
-    """Up to three files of the user's in an earlier output, and how many more there are."""
-    with _oserror_as_output_error(target):
-        names = unlisted_files(target)
-    more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more
+        with _oserror_as_output_error(target):
+            kept = why_kept(target, kind)
+        if kept is None and not overwrite:
+            kept = "an earlier output", "Pass --overwrite to replace it, or choose another name."
+    if kept is not None:
+        found, fix = kept
+        raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
 
 
 @contextmanager
@@ -162,7 +176,7 @@ def _parents(folder: Path) -> Iterator[None]:
         raise
 
 
-def _put_in_place(partial: Path, target: Path) -> None:
+def _put_in_place(partial: Path, target: Path, kind: str) -> None:
     """Rename ``partial`` to ``target``; what was there steps aside and comes back on failure."""
     if not target.exists():
         partial.rename(target)
@@ -177,7 +191,7 @@ def _put_in_place(partial: Path, target: Path) -> None:
         raise
     finally:
         if old.exists() and target.exists():
-            _discard(old, target)
+            _discard(old, target, kind)
 
 
 def _restore(old: Path, target: Path) -> None:
@@ -191,10 +205,17 @@ def _restore(old: Path, target: Path) -> None:
         ) from error
 
 
-def _discard(old: Path, target: Path) -> None:
+def _discard(old: Path, target: Path, kind: str) -> None:
     """Remove the earlier output, now that the new one is in its place."""
     try:
-        _remove_tree(old)
+        kept = why_kept(old, kind) if any(old.iterdir()) else None
+        if kept is not None:  # somebody wrote there while we worked
+            raise OutputError(
+                f"nothing but the earlier output in {target}",
+                found=kept[0],
+                fix=f"The new output is complete there; the earlier one was kept as {old}.",
+            )
+        remove_tree(old)
     except OSError as error:
         raise OutputError(
             f"the earlier output, set aside as {old}, to be removed",
@@ -206,7 +227,7 @@ def _discard(old: Path, target: Path) -> None:
 def _remove_after(failure: BaseException, partial: Path) -> None:
     """Remove what an interrupted block has written, or say where it is."""
     try:
-        _remove_tree(partial)
+        remove_tree(partial)
     except FileNotFoundError:
         return
     except OSError as error:
@@ -216,17 +237,6 @@ def _remove_after(failure: BaseException, partial: Path) -> None:
             found=_reason(error),
             fix="Remove it yourself before you try again.",
         ) from failure
-
-
-def _remove_tree(folder: Path) -> None:
-    """Remove a folder of our own, also where folders in it are read-only."""
-    folder.chmod(0o700)
-    for parent, names, _ in os.walk(folder):
-        for name in names:
-            child = Path(parent, name)
-            if not child.is_symlink():  # its target is the user's
-                child.chmod(0o700)
-    shutil.rmtree(folder)
 
 
 def _reason(error: OSError) -> str:
@@ -248,5 +258,5 @@ def _oserror_as_output_error(target: Path) -> Iterator[None]:
         raise OutputError(
             f"{target} to be written",
             found=_reason(error),
-            fix=f"{fix} Nothing was left behind.",
+            fix=f"{fix} Nothing half-written was left behind.",
         ) from error

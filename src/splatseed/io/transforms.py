@@ -24,6 +24,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError
+from splatseed.io._files import open_file
 from splatseed.io._model import MAX_ID, make_intrinsics, read_bytes
 from splatseed.scene import Image
 
@@ -197,7 +198,7 @@ def _size(where: str, values: Mapping[str, Any], file: Path) -> tuple[int, int]:
     from PIL import Image as PilImage  # noqa: PLC0415  (keeps the import of splatseed.io fast)
 
     try:
-        with PilImage.open(file) as picture:
+        with open_file(file) as opened, PilImage.open(opened) as picture:
             return picture.size
     except (OSError, ValueError, PilImage.DecompressionBombError) as error:
         raise SceneFormatError(

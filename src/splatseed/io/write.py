@@ -28,6 +28,8 @@ __all__ = ["Layout", "WriteReport", "write_scene"]
 
 Layout = Literal["colmap", "transforms"]
 
+_KIND = "write_scene"
+"""What writes an output, where the provenance names no verb."""
 _PACKAGES = ("splatseed", "numpy", "scipy", "numba")
 
 
@@ -94,7 +96,8 @@ def write_scene(
             fix="Check the cloud.",
         )
     path = Path(path)
-    with output_folder(path, overwrite=overwrite, protect=_inputs(scene)) as folder:
+    kind = str((provenance or {}).get("command", _KIND))
+    with output_folder(path, kind=kind, overwrite=overwrite, protect=_inputs(scene)) as folder:
         write_layout = write_colmap if layout == "colmap" else write_transforms
         notes, image_sources = write_layout(scene, points, usable.keep, folder)
         linked = bring(image_sources, folder, copy=copy_images)
@@ -165,7 +168,6 @@ def _manifest(
         "num_new": report.num_points - report.num_original,
         "dropped_nonfinite": report.dropped_nonfinite,
         "dropped_duplicates": report.dropped_duplicates,
-        "files": report.files,
         "notes": report.notes,
         "versions": {"python": platform.python_version(), **_versions()},
     }

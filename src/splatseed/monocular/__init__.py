@@ -52,7 +52,7 @@ def load_network(
     """
     said = preparation or Preparation()
     if Path(model).suffix.lower() == ".onnx":
-        require("onnxruntime", extra="depth")
+        require("onnxruntime")
         from splatseed.monocular.onnx_file import load_onnx  # noqa: PLC0415  (an extra)
 
         return load_onnx(Path(model), kind=kind, device=device, preparation=said)
@@ -62,7 +62,7 @@ def load_network(
             found=f"{model}, whose image processor has its own",
             fix="Leave them out, or change its preprocessor_config.json.",
         )
-    require("torch", "transformers", extra="depth")
+    require("torch", "transformers")
     from splatseed.monocular.hugging_face import load_hugging_face  # noqa: PLC0415  (an extra)
 
     return load_hugging_face(model, kind=kind, device=device)

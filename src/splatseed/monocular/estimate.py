@@ -22,12 +22,15 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io.depth_folder import depth_folder
 from splatseed.io.photograph import check_photograph, decode_photograph, photograph_bytes
 from splatseed.io.staging import check_output
+from splatseed.memory import check_memory
 from splatseed.monocular.network import DepthNetwork
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 
 __all__ = ["DepthReport", "estimate_depths"]
 
+BYTES_A_PIXEL = 3 + 4 * 3 + 4
+"""Of a photograph that goes through a network: its colours, these as floats, and its depth."""
 Size = tuple[int, int]
 """Width and height in pixels."""
 
@@ -86,8 +89,9 @@ def estimate_depths(
             raise ParameterError(f"--{name} of 1 or more", found=f"{number}", fix="Raise it.")
     folder = _image_folder(scene)
     protect = (folder,) if scene.source is None else (folder, scene.source.root)
-    check_output(output, overwrite=overwrite, protect=protect)
+    check_output(output, kind="depth", overwrite=overwrite, protect=protect)
     sizes = _check_images(scene.images, folder, max_size, progress)
+    _check_memory(sizes, batch)
     start, flat, done = time.perf_counter(), [], 0
     with depth_folder(
         output, network.meaning.kind, overwrite=overwrite, protect=protect, provenance=provenance
@@ -129,6 +133,14 @@ def _check_images(
             sizes[name] = _reduced(size, max_size)
             progress("check images", len(sizes) / len(by_name))
     return sizes
+
+
+def _check_memory(sizes: Mapping[str, Size], batch: int) -> None:
+    """Refuse a batch that the memory cannot hold, whatever the network makes of it."""
+    largest = max(width * height for width, height in sizes.values())
+    fix = "Pass --batch {most}, or a smaller --max-size."
+    what = f"photographs of {largest / 1e6:.1f} megapixels at a time"
+    check_memory(min(batch, len(sizes)), largest * BYTES_A_PIXEL, what, fix=fix)
 
 
 def _check_shape(path: Path, size: Size, image: Image) -> None:

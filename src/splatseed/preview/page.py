@@ -7,6 +7,7 @@ or not at all.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from jaxtyping import UInt8
 from PIL import Image as PillowImage, ImageDraw, ImageFont
 
 from splatseed.io.staging import atomic_file
+from splatseed.preview.fonts import font_file
 
 __all__ = [
     "GRID_SIDE",
@@ -71,6 +73,9 @@ def _centered(
     return tile
 
 
+LATIN = 0xFF
+
+
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """The font of labels."""
     return ImageFont.load_default(size=size)
@@ -79,8 +84,11 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 def _letters(label: str, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     """The font in which a label is no wider than its tile, if it is legible so."""
     size = LABEL_SIZES[0]
-    needed = font(size).getlength(label)
-    return font(max(min(size, int(size * width / max(needed, 1.0))), LABEL_SIZES[1]))
+    # Pillow's own font has Latin letters only.
+    file = font_file(label) if any(ord(each) > LATIN for each in label) else None
+    of_size = font if file is None else partial(ImageFont.truetype, file)
+    needed = of_size(size).getlength(label)
+    return of_size(max(min(size, int(size * width / max(needed, 1.0))), LABEL_SIZES[1]))
 
 
 def write_grid(

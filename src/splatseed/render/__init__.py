@@ -4,7 +4,7 @@
 go to gsplat itself; CPU tensors to this package's own rasteriser, so that code written for gsplat
 runs, trains and is tested without a GPU. ``MCMCStrategy`` is gsplat's on either device, and
 ``mcmc_on_cpu`` a block within which gsplat's own runs on the CPU. It needs PyTorch; the strategy also
-needs gsplat (``pip install "splatseed[train]"``).
+needs gsplat (``pip install ".[train]"``).
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from splatseed.errors import MissingDependencyError
+from splatseed.requirements import INSTALL, require
 
 try:
     import torch  # noqa: F401  (asked for first, so that its absence is said once and plainly)
@@ -19,12 +20,11 @@ except ModuleNotFoundError as error:
     raise MissingDependencyError(
         "PyTorch for rendering and training",
         found="no module named 'torch'",
-        fix='Install it with: pip install "splatseed[train]"',
+        fix=f"Install it with: pip install '{INSTALL['torch']}'.",
     ) from error
 
 from splatseed.render.rasterize import rasterization
 from splatseed.render.relocation import mcmc_on_cpu
-from splatseed.requirements import require
 
 if TYPE_CHECKING:
     from splatseed.render.mcmc import MCMCStrategy

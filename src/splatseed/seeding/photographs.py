@@ -201,7 +201,7 @@ def photographed(scene: Scene, hold_out: int = 0) -> tuple[Image, ...]:
     """
     folder = scene.source.image_dir if scene.source else None
     ordered = sorted(scene.images, key=lambda image: image.name)
-    used = [image for i, image in enumerate(ordered) if not hold_out or i % hold_out]
+    used = list(scene.split(hold_out)[0]) if hold_out else ordered
     if folder is not None:
         used = [image for image in used if (folder / image.name).is_file()]
     if folder is None or not used:

@@ -1,7 +1,8 @@
 """Structure-from-Motion: photographs to a scene folder, by pycolmap.
 
 ``reconstruct`` finds poses, lenses and points; ``triangulate`` finds points for poses that are
-already known (an RGB-D capture, a simulator, another tool's calibration). Both write the folder
+already known (an RGB-D capture, a simulator, another tool's calibration); ``undistort`` takes the distortion
+out of a scene. All write the folder
 that every 3DGS trainer reads: ``images/`` free of lens distortion, ``sparse/0/*.bin`` with PINHOLE
 cameras.
 
@@ -17,5 +18,6 @@ its own, and bundle adjustment can amplify that: 20 photographs gave 4095 points
 from splatseed.sfm.pipeline import reconstruct, triangulate
 from splatseed.sfm.report import SfmReport
 from splatseed.sfm.settings import DeviceName, MatcherName
+from splatseed.sfm.undistort import undistort
 
-__all__ = ["DeviceName", "MatcherName", "SfmReport", "reconstruct", "triangulate"]
+__all__ = ["DeviceName", "MatcherName", "SfmReport", "reconstruct", "triangulate", "undistort"]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from splatseed.scene import Image
 from splatseed.sfm.cameras import guess_cameras, known_cameras
@@ -19,7 +20,7 @@ from splatseed.sfm.photos import Photo
 from splatseed.sfm.settings import Settings
 from splatseed.sfm.stages import Stages
 
-__all__ = ["Found", "ReconstructJob", "TriangulateJob"]
+__all__ = ["Found", "Job", "ReconstructJob", "TriangulateJob", "UndistortJob"]
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,32 @@ class TriangulateJob:
         model_dir = triangulate_points(run, cameras, images, [image for _, image in self.pairs])
         export_scene(run, model_dir, self.staging)
         return _found(run, self.staging)
+
+
+@dataclass(frozen=True)
+class UndistortJob:
+    """A scene without distortion.
+
+    Args:
+        image_dir: The photographs.
+        staging: Where the scene is made.
+        settings: How.
+        model_dir: The COLMAP model.
+    """
+
+    image_dir: Path
+    staging: Path
+    settings: Settings
+    model_dir: Path
+
+    def run(self, stages: Stages) -> Found:
+        """Do it, in this process."""
+        run = Run(stages, self.settings, self.image_dir, self.staging / ".work")
+        export_scene(run, self.model_dir, self.staging)
+        return _found(run, self.staging)
+
+
+Job: TypeAlias = ReconstructJob | TriangulateJob | UndistortJob
 
 
 def _found(run: Run, scene: Path) -> Found:

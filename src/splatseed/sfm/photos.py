@@ -15,6 +15,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io._files import open_file
 from splatseed.scene import Image, Scene
 
 __all__ = ["Photo", "find_photos", "match_poses", "name_some"]
@@ -130,7 +131,7 @@ def _read_photo(image_dir: Path, name: str) -> Photo | None:
     """The photograph, decoded and found whole; None for a depth map."""
     path = image_dir / name
     try:
-        with PilImage.open(path) as image:
+        with open_file(path) as file, PilImage.open(file) as image:
             if image.mode.startswith(_DEPTH_MODES):
                 return None
             width, height = image.size

@@ -28,7 +28,7 @@ from splatseed.sfm.settings import (
 )
 from splatseed.sfm.worker import run_job
 
-__all__ = ["reconstruct", "triangulate"]
+__all__ = ["reconstruct", "staged", "triangulate"]
 
 
 def reconstruct(
@@ -77,7 +77,7 @@ def reconstruct(
     check_installed()
     images = Path(image_dir).absolute()
     photos = find_photos(images, at_least=2)
-    with _staged(images, Path(output), overwrite=overwrite) as staging:
+    with staged(images, Path(output), overwrite=overwrite) as staging:
         job = ReconstructJob(images, staging, settings, photos, camera_model, shared_camera)
         log = staging / ".work" / "log.txt"
         found = run_job(job, log, verbose=verbose, on_progress=on_progress)
@@ -132,7 +132,7 @@ def triangulate(
     images = Path(image_dir).absolute()
     photos = find_photos(images, at_least=2)
     pairs = match_poses(photos, poses_from, images)
-    with _staged(images, Path(output), overwrite=overwrite) as staging:
+    with staged(images, Path(output), overwrite=overwrite) as staging:
         job = TriangulateJob(images, staging, settings, pairs)
         log = staging / ".work" / "log.txt"
         found = run_job(job, log, verbose=verbose, on_progress=on_progress)
@@ -142,9 +142,9 @@ def triangulate(
 
 
 @contextmanager
-def _staged(images: Path, output: Path, *, overwrite: bool) -> Iterator[Path]:
+def staged(images: Path, output: Path, *, kind: str = "sfm", overwrite: bool) -> Iterator[Path]:
     """The folder to make the scene in, with ``.work`` for scratch files, on the output's disk."""
-    with output_folder(output, overwrite=overwrite, protect=(images,)) as staging:
+    with output_folder(output, kind=kind, overwrite=overwrite, protect=(images,)) as staging:
         work = staging / ".work"
         work.mkdir()
         yield staging.absolute()
@@ -164,10 +164,10 @@ def _report(output: Path, photos: tuple[Photo, ...], found: Found) -> SfmReport:
     )
 
 
-def _write_manifest(staging: Path, command: str, settings: Settings, report: SfmReport) -> None:
-    """Mark the folder as ours, so that ``overwrite`` may replace it, and say how it was made."""
+def _write_manifest(staging: Path, job: str, settings: Settings, report: SfmReport) -> None:
+    """Say how the scene was made."""
     manifest = {
-        "command": command,
+        "job": job,
         "version": version("splatseed"),
         "settings": asdict(settings),
         "report": {key: value for key, value in asdict(report).items() if key != "path"},

@@ -20,8 +20,9 @@ from typing import Any, BinaryIO, cast
 
 from splatseed import errors
 from splatseed.errors import ReconstructionError, SplatseedError
+from splatseed.interpreter import child_command, child_environment
 from splatseed.progress import Progress
-from splatseed.sfm.jobs import Found, ReconstructJob, TriangulateJob
+from splatseed.sfm.jobs import Found, Job
 from splatseed.sfm.settings import check_cuda, require_pycolmap
 from splatseed.sfm.stages import Stages
 
@@ -31,9 +32,7 @@ _CHILD = "from splatseed.sfm.worker import serve; serve()"
 _REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 
 
-def run_job(
-    job: ReconstructJob | TriangulateJob, log: Path, *, verbose: bool, on_progress: Progress
-) -> Found:
+def run_job(job: Job, log: Path, *, verbose: bool, on_progress: Progress) -> Found:
     """Run ``job`` in a child process and wait for it.
 
     Args:
@@ -49,11 +48,11 @@ def run_job(
     with (
         log.open("wb") as sink,
         subprocess.Popen(  # noqa: S603  (our own interpreter and module)
-            [sys.executable, "-c", _CHILD, str(int(verbose))],
+            child_command(_CHILD, str(int(verbose))),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=None if verbose else sink,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env=child_environment(),
             process_group=0,  # Ctrl-C comes to us alone, and we end the child
         ) as child,
     ):
@@ -65,9 +64,7 @@ def run_job(
             child.kill()
 
 
-def _converse(
-    child: subprocess.Popen[bytes], job: ReconstructJob | TriangulateJob, on_progress: Progress
-) -> Found:
+def _converse(child: subprocess.Popen[bytes], job: Job, on_progress: Progress) -> Found:
     commands, replies = cast("BinaryIO", child.stdin), cast("BinaryIO", child.stdout)
     pickle.dump(job, commands)
     commands.flush()

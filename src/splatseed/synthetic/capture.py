@@ -19,7 +19,7 @@ from splatseed.camera import Camera, Intrinsics, quat_from_rotation
 from splatseed.errors import ParameterError
 from splatseed.io import write_scene
 from splatseed.io.depth_folder import write_description
-from splatseed.io.staging import add_files, output_folder
+from splatseed.io.staging import output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene, Tracks
 from splatseed.synthetic.raycast import render_views, visible
@@ -132,7 +132,7 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
     Raises:
         OutputError: The folder cannot or must not be written.
     """
-    with output_folder(Path(path), overwrite=overwrite) as partial:
+    with output_folder(Path(path), kind="capture", overwrite=overwrite) as partial:
         write_scene(capture.scene, partial / "scene")
         for child in (partial / "scene").iterdir():
             child.rename(partial / child.name)
@@ -143,7 +143,6 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
             for image, array in zip(capture.scene.images, arrays, strict=True):
                 PillowImage.fromarray(array).save(partial / folder / image.name)
         write_description(partial / "depths", "z", DEPTH_SCALE)
-        add_files(partial, ("images", "depths"))
     return Path(path)
 
 

@@ -2,7 +2,7 @@
 
 ``prepare_run`` reads what a run needs and opens its folder; the ``TrainingRun`` that it returns
 trains and writes the results. ``TrainSettings`` alone can be used without PyTorch: the rest is
-imported when it is first asked for (``pip install "splatseed[train]"``).
+imported when it is first asked for (``pip install ".[train]"``).
 """
 
 from __future__ import annotations

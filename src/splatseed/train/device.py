@@ -7,22 +7,15 @@ is held at what fits.
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import torch
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.train.settings import Backend
+from splatseed.memory import free_memory
+from splatseed.train.settings import BYTES_EACH, Backend
 
 __all__ = [
-    "Capacity", "check_fits", "device_name", "free_bytes", "peak_gpu_bytes", "pick_device",
+    "BYTES_EACH", "Capacity", "check_fits", "device_name", "free_bytes", "peak_gpu_bytes", "pick_device",
 ]  # fmt: skip
-
-BYTES_EACH = 2000
-"""A Gaussian's 59 numbers, their gradients and two moments (944 bytes), and as much again for the
-rasteriser's lists and for copies while Gaussians are added."""
-CGROUP = Path("/sys/fs/cgroup")
 
 
 def pick_device(backend: Backend) -> torch.device:
@@ -98,32 +91,9 @@ def free_bytes(device: torch.device) -> int | None:
     if device.type == "cuda":
         kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + kept
-    known = [free for free in (_free_of_machine(), _free_of_container()) if free is not None]
-    return min(known, default=None)
+    return free_memory()
 
 
 def peak_gpu_bytes(device: torch.device) -> int | None:
     """Most bytes that PyTorch held on a GPU so far; None for the CPU."""
     return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None
-
-
-def _free_of_machine() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text("ascii").splitlines()
-        kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable:"))
-        return int(kilobytes) * 1024
-    except (OSError, StopIteration):
-        pass
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):  # not on Windows
-        return None
-
-
-def _free_of_container() -> int | None:
-    try:
-        limit = (CGROUP / "memory.max").read_text("ascii").strip()
-        used = (CGROUP / "memory.current").read_text("ascii").strip()
-    except OSError:
-        return None
-    return int(limit) - int(used) if limit.isdigit() else None

@@ -12,7 +12,6 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
-from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
@@ -139,6 +138,8 @@ def _squared_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N
     if len(xyz) < MIN_POINTS:
         return np.zeros(len(xyz))
     # An unbalanced tree is built several times faster and queried as fast.
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
+
     tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
     distances, _ = tree.query(xyz, k=min(NEIGHBORS, len(xyz) - 1) + 1, workers=-1)
     return np.asarray((distances[:, 1:] ** 2).mean(axis=1))

@@ -12,22 +12,34 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["Interruption", "interruption"]
+__all__ = ["Interruption", "exit_code", "interruption"]
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interruption:
-    """Whether the user asked to stop."""
+    """Whether the user asked to stop.
+
+    Attributes:
+        last: The signal that the process was last asked to stop by, whichever block heard it.
+    """
+
+    last = signal.SIGINT
 
     def __init__(self) -> None:
         self.requested = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002  (signal's)
         """Be told of a signal."""
+        Interruption.last = signal.Signals(number)
         if self.requested:
             raise KeyboardInterrupt
         self.requested = True
+
+
+def exit_code() -> int:
+    """What a process exits with that stopped as it was asked to, as shells have it."""
+    return 128 + Interruption.last
 
 
 @contextmanager

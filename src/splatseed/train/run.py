@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
@@ -17,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from splatseed.errors import OutputError
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
@@ -123,6 +125,8 @@ def prepare_run(
     if state.step:
         note(f"Going on after step {state.step:,} of {settings.max_steps:,}.")
     board = Board(folder.tensorboard, state.step) if options.tensorboard else None
+    if board:
+        folder.claim([folder.tensorboard])
     run = TrainingRun(folder, settings, frame, state, views, board)
     progress("compile", 0.0)
     run.trainer.warm_up()
@@ -156,6 +160,7 @@ class TrainingRun:
         self._frame = frame
         self._board = board
         self._saved = time.monotonic()
+        self._saved_step: int | None = None
         train, test = ([frame.view(view) for view in part] for part in views)
         self.trainer = Trainer(state, settings, train, test, self._on_record)
 
@@ -181,11 +186,11 @@ class TrainingRun:
         Raises:
             OutputError: The checkpoint or the curve cannot be written.
         """
-        done = self.trainer.run(on_step)
-        if self._board:
-            self._board.close()
-        if not done:
-            self._save()
+        with self._told_of_checkpoint():
+            done = self.trainer.run(on_step)
+            if self._board:
+                self._board.close()
+            self._save()  # also of a finished run: scoring and writing its results may fail
         return done
 
     def finish(self, score: Score, progress: Progress = silent) -> dict[str, object]:
@@ -201,6 +206,10 @@ class TrainingRun:
         Raises:
             OutputError: A result cannot be written.
         """
+        with self._told_of_checkpoint():
+            return self._finish(score, progress)
+
+    def _finish(self, score: Score, progress: Progress) -> dict[str, object]:
         progress("score", 0.0)
         scores = score(self.trainer.render, self.trainer.test_views)
         world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
@@ -239,21 +248,38 @@ class TrainingRun:
         if record.test_psnr is None:
             return
         self._write_curve()
-        if time.monotonic() - self._saved > SAVE_EVERY:
+        if self._saved_step is None or time.monotonic() - self._saved > SAVE_EVERY:
             self._save()
 
     def _save(self) -> None:
         save_checkpoint(self.folder.checkpoint, self.state)
-        self._saved = time.monotonic()
+        self._saved, self._saved_step = time.monotonic(), self.state.step
+
+    @contextmanager
+    def _told_of_checkpoint(self) -> Iterator[None]:
+        """Say of a failure to write that not all is lost, and how to go on."""
+        try:
+            yield
+        except OutputError as error:
+            if self._saved_step is None:
+                raise
+            kept = (
+                f"The run is kept as it was after step {self._saved_step:,}: go on with --resume."
+            )
+            raise OutputError(
+                error.expected, found=error.found, fix=f"{error.fix} {kept}"
+            ) from error
 
     def _write_curve(self) -> None:
         write_curve_csv(self.folder.curve_csv, self.state.records)
 
     def _write_renders(self, progress: Progress) -> None:
         views = self.trainer.test_views
-        for i, view in enumerate(views):
+        paths = [self.folder.renders / picture_name(view.name) for view in views]
+        self.folder.claim(paths)
+        for i, (view, path) in enumerate(zip(views, paths, strict=True)):
             picture = beside_truth(view.image, self.trainer.render(view).cpu().numpy())
-            write_picture(self.folder.renders / picture_name(view.name), picture)
+            write_picture(path, picture)
             progress("write", (i + 1) / len(views))
 
 

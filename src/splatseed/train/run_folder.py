@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from splatseed.errors import OutputError, SceneFormatError
-from splatseed.io.staging import MANIFEST, atomic_file, check_output
+from splatseed.io.staging import MANIFEST, add_files, atomic_file, check_apart, check_output
 
 __all__ = ["RunFolder", "write_json"]
+
+
+KIND = "train"
+"""What a run's folder is marked as."""
 
 
 @dataclass(frozen=True)
@@ -87,15 +91,15 @@ class RunFolder:
                 fix="See its metrics.json, or pass --overwrite to train again.",
             )
         if resume and self.is_run:
-            check_output(self.path, overwrite=True, protect=protect)
+            check_apart(self.path, protect)
             return
+        check_output(self.path, kind=KIND, overwrite=overwrite or self.is_run, protect=protect)
         if self.is_run and not overwrite:
             raise OutputError(
                 f"no folder, or an empty one, at {self.path}",
                 found="an earlier run",
                 fix="Pass --resume to go on with it, --overwrite to replace it, or choose another.",
             )
-        check_output(self.path, overwrite=overwrite, protect=protect)
 
     def begin(self, config: Mapping[str, object]) -> None:
         """Make the folder, empty but for the config; what ``check`` let pass is removed.
@@ -113,8 +117,27 @@ class RunFolder:
                 fix="Remove it yourself, or choose another folder.",
             ) from None
         # The mark first: a run that is cut off here can be replaced.
-        write_json(self.path / MANIFEST, {"command": "train", "version": config["splatseed"]})
+        files = [self.config, self.checkpoint, self.metrics, self.gaussians]
+        files += [self.curve_csv, self.curve_png, self.path / MANIFEST]
+        mark = {"command": KIND, "version": config["splatseed"]}
+        write_json(self.path / MANIFEST, {**mark, "files": [path.name for path in files]})
         write_json(self.config, config)
+
+    def claim(self, paths: Iterable[Path]) -> None:
+        """List files in the folder as the run's own, before or after they are written.
+
+        Raises:
+            OutputError: The list cannot be written.
+        """
+        names = [path.relative_to(self.path).as_posix() for path in paths]
+        try:
+            add_files(self.path, names)
+        except OSError as error:
+            raise OutputError(
+                f"{self.path / MANIFEST} to be written",
+                found=error.strerror or type(error).__name__,
+                fix="Check the disk and try again.",
+            ) from None
 
     def read_config(self) -> dict[str, Any]:
         """What ``begin`` wrote.

@@ -12,7 +12,7 @@ from typing import Literal, cast
 from splatseed.errors import ParameterError
 from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule
 
-__all__ = ["AS_3DGS", "BUDGET", "Backend", "StrategyName", "TrainSettings"]
+__all__ = ["AS_3DGS", "BUDGET", "BYTES_EACH", "Backend", "StrategyName", "TrainSettings"]
 
 StrategyName = Literal["default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"]
 Backend = Literal["auto", "cpu", "cuda"]
@@ -20,6 +20,10 @@ Backend = Literal["auto", "cpu", "cuda"]
 BUDGET = 1_000_000
 """Most Gaussians of the strategies that have a budget, where none is given."""
 AS_3DGS = "-3dgs"
+
+BYTES_EACH = 2000
+"""Memory of a Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes), and as
+much again for the rasteriser's lists and for copies while Gaussians are added."""
 
 
 @dataclass(frozen=True)

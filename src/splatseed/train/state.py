@@ -7,8 +7,9 @@ checkpoint appears whole or not at all, and loading one executes nothing that is
 
 from __future__ import annotations
 
-import pickle
 import time
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,13 @@ def load_checkpoint(
         SceneFormatError: The file is no checkpoint of this version.
     """
     content = _load(path, device)
+    try:
+        return _state_of(content, strategy, schedule)
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise _misfit(path, f"parts that do not fit together ({type(error).__name__})") from None
+
+
+def _state_of(content: Mapping[str, Any], strategy: Strategy, schedule: Schedule) -> TrainState:
     params = as_parameters(content["params"])
     optimizers = make_optimizers(params, schedule)
     for name, optimizer in optimizers.items():
@@ -116,21 +124,24 @@ def load_checkpoint(
     if strategy.capacity:
         strategy.capacity.held_at = content["held_at"]
     records = [Record(*row) for row in content["records"]]
-    watch = Stopwatch(content["seconds"])
-    step, losses = content["step"], content["losses"]
+    watch = Stopwatch(float(content["seconds"]))
+    step, losses = int(content["step"]), list(content["losses"])
     return TrainState(params, optimizers, strategy, step, records, watch, losses, content["mean"])
 
 
 def _load(path: Path, device: torch.device) -> dict[str, Any]:
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
-    except (OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError) as error:
-        found = f"a file that cannot be read ({type(error).__name__})"
-    else:
-        if isinstance(content, dict) and content.get("format") == FORMAT:
-            return content
-        found = "another kind or version of file"
-    raise SceneFormatError(
+        with warnings.catch_warnings(action="ignore"):  # of what a foreign file might be
+            content = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # noqa: BLE001  (of a damaged file, PyTorch raises what it likes)
+        raise _misfit(path, f"a file that cannot be read ({type(error).__name__})") from None
+    if isinstance(content, dict) and content.get("format") == FORMAT:
+        return content
+    raise _misfit(path, "another kind or version of file")
+
+
+def _misfit(path: Path, found: str) -> SceneFormatError:
+    return SceneFormatError(
         f"{path} to be a checkpoint of this version of splatseed",
         found=found,
         fix="Start the run again with --overwrite.",

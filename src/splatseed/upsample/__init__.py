@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.memory import check_memory
 from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -39,6 +40,8 @@ __all__ = [
 
 Profile = Literal["default", "paper"]
 DEFAULT_RATIO = 4.0
+BYTES_EACH = 200
+"""Of a point while it is made and written; measured as 125, from 1 to 3 million points."""
 MAX_POINTS = 1 << 32
 """More points than this are a slip of the keyboard, not a wish."""
 
@@ -159,10 +162,14 @@ def number_of_new(
     """How many points are to be made; None where the photographs say it.
 
     Raises:
-        ParameterError: A number is given though the photographs say it, or it is out of range.
+        ParameterError: A number is given though the photographs say it, it is out of range, or so
+            many points do not fit the memory.
     """
     if not chooses_number(method):
-        return planned_size(num_original, ratio, num_points) - num_original
+        total = planned_size(num_original, ratio, num_points)
+        fix = "Ask for {most} in all, with --num-points or a smaller --ratio."
+        check_memory(total, BYTES_EACH, "points", fix=fix)
+        return total - num_original
     if ratio is not None or num_points is not None:
         raise ParameterError(
             f"no number of points for the method {name}, which the photographs decide on",

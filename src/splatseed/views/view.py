@@ -17,6 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.photograph import open_photograph, photograph_bytes
+from splatseed.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.views.photographs import load_photograph
@@ -26,6 +28,8 @@ __all__ = ["View", "check_lens", "data_factor", "load_split", "load_views", "pos
 ASPECT_SLACK = 0.02
 """By how much a file may be stretched against its camera: rounding of a resized copy."""
 READERS = 4
+BYTES_A_PIXEL = 3
+"""Of a photograph that is held: three colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,12 +147,15 @@ def load_views(
         progress: Told how far reading is.
 
     Raises:
+        ParameterError: They do not fit the memory all together.
         SceneNotFoundError: An image is missing.
         SceneFormatError: A camera has distortion that is to stay, or an image cannot be used.
     """
     folder = _image_folder(scene)
     for image in images if not undistort else ():
         check_lens(image)
+    if images:
+        _check_memory(folder / images[0].name, len(images), max(data_factor, 1))
     read = partial(
         _load_view, folder=folder, data_factor=data_factor, min_side=min_side, cache_dir=cache_dir
     )
@@ -158,6 +165,18 @@ def load_views(
             views.append(view)
             progress("read images", len(views) / len(images))
     return tuple(views)
+
+
+def _check_memory(first: Path, count: int, data_factor: int) -> None:
+    """Refuse photographs that would not fit the memory all together, if all are like the first."""
+    width, height = open_photograph(first, photograph_bytes(first)).size
+    check_memory(
+        count * width * height // data_factor**2,
+        BYTES_A_PIXEL,
+        "pixels of photographs",
+        found=f"{count} of {width} x {height}, made smaller {data_factor} times",
+        fix="Make them smaller (--data-factor), take fewer, or free some memory.",
+    )
 
 
 def _image_folder(scene: Scene) -> Path:
@@ -181,7 +200,7 @@ def check_lens(image: Image) -> None:
         raise SceneFormatError(
             "cameras without lens distortion (PINHOLE), which Gaussians are drawn with",
             found=f"{image.intrinsics.model} for {image.name}",
-            fix="Undistort the scene first: colmap image_undistorter, or splatseed sfm.",
+            fix="Undistort the scene first: splatseed undistort SCENE -o OUT.",
         )
 
 

@@ -69,7 +69,7 @@ def _check_lens(image: Image, *, undistorts: bool) -> None:
         raise SceneFormatError(
             "cameras without lens distortion (PINHOLE), as COLMAP's dense tools need them",
             found=f"{image.intrinsics.model} for {image.name}",
-            fix="Undistort the scene first: colmap image_undistorter, or splatseed sfm.",
+            fix="Undistort the scene first: splatseed undistort SCENE -o OUT.",
         )
     from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 

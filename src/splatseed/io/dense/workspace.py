@@ -75,8 +75,10 @@ def write_dense_workspace(
     model = photograph_model(scene, check_dense_scene(scene, undistorts=undistort is not None))
     count, overlap = DenseCount(), OverlapPoints()
     total = length_hint(maps, len(scene.images)) or 1
-    with output_folder(Path(path), overwrite=overwrite, protect=_inputs(scene)) as folder:
-        brought = bring_photographs(scene, folder, undistort, progress, copy=copy_images)
+    with output_folder(
+        Path(path), kind="depth", overwrite=overwrite, protect=_inputs(scene)
+    ) as folder:
+        bring_photographs(scene, folder, undistort, progress, copy=copy_images)
         stereo = _Stereo(folder / "stereo", model)
         progress("write maps", 0.0)
         for dense in maps:
@@ -88,8 +90,7 @@ def write_dense_workspace(
             raise ParameterError("at least one depth map", found="none", fix="Make some first.")
         stereo.write_lists()
         model.write(folder / "sparse", overlap)
-        files = ["sparse", "stereo", *brought, MANIFEST]
-        write_json(folder / MANIFEST, {**(provenance or {}), "files": files})
+        write_json(folder / MANIFEST, dict(provenance or {}))
     return count.report(Path(path))
 
 

@@ -1,0 +1,62 @@
+"""``splatseed undistort``: a scene of distorted photographs to one that every trainer takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from splatseed.commands._options import parse_options
+from splatseed.console import print_commands, print_note, print_pairs, stage_display
+from splatseed.io import load_scene
+from splatseed.io.staging import check_output
+from splatseed.literal import quoted
+from splatseed.sfm import undistort
+
+__all__ = ["run"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Take the lens distortion out of a scene's photographs, and make its cameras PINHOLE (pycolmap)."""
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A scene with photographs, in any layout."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The scene folder to write, in COLMAP's layout."""
+    threads: int = -1
+    """Worker threads; -1 = all cores."""
+    overwrite: bool = False
+    """Replace an output folder that splatseed undistort wrote before."""
+    verbose: bool = False
+    """Show pycolmap's own log."""
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = parse_options(Options, "undistort", arguments)
+    check_output(
+        options.output, kind="undistort", overwrite=options.overwrite, protect=[options.scene]
+    )
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = load_scene(options.scene)
+        found = undistort(
+            scene,
+            options.output,
+            threads=options.threads,
+            overwrite=options.overwrite,
+            verbose=options.verbose,
+            on_progress=clock,
+        )
+    rows = [
+        ("images", f"{len(found.registered):,}"),
+        ("points", f"{found.num_points:,}"),
+        ("output", str(options.output)),
+    ]
+    print_pairs("splatseed undistort", rows)
+    if not any(image.intrinsics.has_distortion for image in scene.images):
+        print_note("No camera had distortion: the photographs are copies.")
+    print_commands("next", [("", f"splatseed upsample {quoted(options.output)} -o OUT")])

@@ -1,0 +1,246 @@
+"""The world that a trained model lies in, which need not be its scene's.
+
+Notation: ``model_from_scene`` takes the scene's world to that of the Gaussians. Some trainers normalise the
+world before they train, and write Gaussians of that world; rendered from the scene's cameras these give a
+wrong picture, and a wrong score without a warning. *Apart* is the median distance from the scene's points to
+the nearest Gaussian, in units of the median distance between neighbouring Gaussians: in the right world about
+1 (0.1 to 1.3 for seeds and trained models of five scenes), in a wrong one 4 to 700. Promise: Gaussians that lie
+apart from the scene's points are refused, with a transform that mends it if one is found.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.photograph import photograph_bytes
+from splatseed.scene import Scene
+from splatseed.similarity import Similarity, fit_similarity, similarity_of
+from splatseed.train.gaussians import Gaussians
+from splatseed.views.view import View
+
+__all__ = [
+    "GSPLAT",
+    "NO_TRANSFORM",
+    "check_world",
+    "find_transform",
+    "view_in",
+]
+
+GSPLAT, NO_TRANSFORM = "gsplat", "none"
+"""Words that stand for a transform: that of gsplat's examples, and none whatever it looks like."""
+APART = 8.0
+"""More than this is another world."""
+DOUBTFUL, CLOSER = 1.5, 3.0
+"""More than the first is, if in another world they are closer by as many times as the second."""
+SAMPLES = 3000
+"""Points and Gaussians that distances are measured for."""
+LEAST = 20
+VISIBLE = -2.2
+"""Logit of the least opacity that counts, a tenth."""
+FILES = ("dataparser_transforms.json", "cameras.json")
+"""Files of nerfstudio and graphdeco, in the model's folder or up to three above, that tell a transform."""
+_FIX = "Name another file, or a word: gsplat, none."
+
+
+def view_in(world: Similarity | None, view: View) -> View:
+    """A view of the scene, posed in the model's world."""
+    if world is None:
+        return view
+    return dataclasses.replace(view, cam_from_world=world.camera(view.cam_from_world))
+
+
+def find_transform(word: str, scene: Scene) -> Similarity | None:
+    """The transform that a user names: a file, or ``gsplat``; None for ``none``.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It holds no transform, or does not fit the scene.
+        ParameterError: gsplat's cannot be computed for the scene.
+    """
+    if word == NO_TRANSFORM:
+        return None
+    if word == GSPLAT:
+        return _of_gsplat(scene)
+    return _of_file(Path(word), scene)
+
+
+def check_world(
+    path: Path, scene: Scene, gaussians: Gaussians, given: Similarity | None = None
+) -> None:
+    """Refuse a model that is not in the world that it is taken to be in.
+
+    Args:
+        path: The model's file.
+        scene: With its points; without, nothing can be found out.
+        gaussians: The model.
+        given: The transform that the user named.
+
+    Raises:
+        SceneFormatError: It is not.
+    """
+    apart = _measure(scene, gaussians)
+    if apart is None or (found := apart(given)) <= DOUBTFUL:
+        return
+    candidates = _candidates(path, scene)
+    word = next((word for word, world in candidates if apart(world) < found / CLOSER), None)
+    if word is None and found <= APART:
+        return
+    fix = (
+        f"They fit with --transform {word}."
+        if word
+        else "Name the transform that its trainer applied with --transform FILE; to score it as it is, "
+        f"pass --transform {NO_TRANSFORM}."
+    )
+    raise SceneFormatError(
+        f"the Gaussians of {path} in the world of the scene, where its points are",
+        found=f"points {found:.0f} times as far from the nearest Gaussian as Gaussians from each other:"
+        " another frame, or another scene",
+        fix=fix,
+    )
+
+
+def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None], float] | None:
+    """A function from a transform to how far apart points and Gaussians are; None without enough."""
+    from scipy.spatial import KDTree  # noqa: PLC0415  (slow to import)
+
+    rng = np.random.default_rng(0)
+    points = scene.points.originals
+    xyz = rng.permutation(points.xyz[points.finite].astype(np.float64))[:SAMPLES]
+    means = gaussians.means[gaussians.opacities.reshape(-1) > VISIBLE].astype(np.float64)
+    means = means[np.isfinite(means).all(axis=1)]
+    if len(xyz) < LEAST or len(means) < LEAST:
+        return None
+    tree = KDTree(means)
+    near = tree.query(rng.permutation(means)[:SAMPLES], k=2)[0][:, 1]
+    gap = max(float(np.median(near)), float(np.finfo(np.float32).tiny))
+
+    def apart(world: Similarity | None) -> float:
+        moved = xyz if world is None else world.points(xyz)
+        return float(np.median(tree.query(moved)[0])) / gap
+
+    return apart
+
+
+def _candidates(path: Path, scene: Scene) -> Iterator[tuple[str, Similarity | None]]:
+    """Transforms that the model's trainer may have applied, as words for --transform."""
+    yield NO_TRANSFORM, None
+    for folder in path.resolve().parents[:4]:
+        for name in FILES:
+            if (folder / name).is_file():
+                with suppress(SceneFormatError):
+                    yield str(folder / name), _of_file(folder / name, scene)
+    with suppress(ParameterError):
+        yield GSPLAT, _of_gsplat(scene)
+
+
+def _of_file(path: Path, scene: Scene) -> Similarity:
+    """A transform from a file: a matrix, nerfstudio's ``transform`` and ``scale``, or cameras."""
+    content = _json(path)
+    if isinstance(content, list) and content and isinstance(content[0], dict):
+        return _of_cameras(path, content, scene)
+    scale = content.get("scale", 1.0) if isinstance(content, dict) else 1.0
+    rows = content.get("transform") if isinstance(content, dict) else content
+    try:
+        matrix = np.atleast_1d(np.array(rows, np.float64))
+        world = similarity_of(np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]]))
+    except (TypeError, ValueError):
+        world = None
+    if world is None:
+        raise SceneFormatError(
+            f"{path} to hold a similarity: a matrix of 3 or 4 rows of 4, by itself or as transform, with "
+            "a scale beside it",
+            found=repr(rows)[:80],
+            fix=_FIX,
+        )
+    return world
+
+
+def _json(path: Path) -> Any:
+    try:
+        return json.loads(photograph_bytes(path))
+    except SceneNotFoundError:
+        raise SceneNotFoundError(f"a file {path}", found="none", fix=_FIX) from None
+    except (SceneFormatError, ValueError, RecursionError) as error:
+        raise SceneFormatError(f"{path} to be JSON", found=str(error), fix=_FIX) from None
+
+
+def _of_cameras(path: Path, cameras: Sequence[Any], scene: Scene) -> Similarity:
+    """The similarity that takes the scene's cameras to those of graphdeco's ``cameras.json``."""
+    known = {PurePosixPath(image.name).stem: image.camera.center for image in scene.images}
+    try:
+        placed = [(PurePosixPath(str(c["img_name"])).stem, c["position"]) for c in cameras]
+        pairs = [(known[name], np.array(at, np.float64)) for name, at in placed if name in known]
+        source, target = (np.reshape(each, (-1, 3)) for each in zip(*pairs, strict=True))
+    except (KeyError, TypeError, ValueError):
+        source = target = np.empty((0, 3))
+    world = fit_similarity(source, target)
+    if world is None:
+        raise SceneFormatError(
+            f"{path} to place at least three images of the scene, not on a line",
+            found=f"{len(source)} of its {len(scene.images)} images",
+            fix=_FIX,
+        )
+    return world
+
+
+def _of_gsplat(scene: Scene) -> Similarity:
+    """How gsplat's examples (1.5, examples/datasets/normalize.py) normalise a COLMAP scene.
+
+    Cameras are turned upright, moved and scaled; then points are turned onto their principal axes,
+    and over if more of them are above than below.
+    """
+    xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
+    if len(xyz) < 3 or not scene.images:
+        raise ParameterError(
+            "a scene with points and cameras, of which gsplat computes its transform",
+            found=f"{len(xyz)} points, {len(scene.images)} cameras",
+            fix="Name a file with the transform.",
+        )
+    world_from_cam = np.stack([image.camera.world_from_cam for image in scene.images])
+    first = _upright(world_from_cam)
+    second = _principal(first @ np.vstack([xyz.T, np.ones(len(xyz))]))
+    matrix = second @ np.vstack([first, np.eye(4)[3:]])
+    z = matrix[2] @ np.vstack([xyz.T, np.ones(len(xyz))])
+    if np.median(z) > z.mean():
+        matrix = np.diag([1.0, -1.0, -1.0]) @ matrix
+    world = similarity_of(matrix)
+    assert world is not None  # noqa: S101  (rotations and one scale)
+    return world
+
+
+def _upright(world_from_cam: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray, "3 4"]:
+    """Mean up to -y, what cameras look at to 0, median camera distance to 1."""
+    up = -world_from_cam[:, :3, 1].mean(axis=0)
+    up /= np.linalg.norm(up)
+    goal = np.array([0.0, -1.0, 0.0])
+    cross = np.cross(up, goal)
+    skew = np.cross(np.eye(3), cross)
+    if up @ goal > -1:
+        rotation = np.eye(3) + skew + skew @ skew / (1 + up @ goal)
+    else:
+        rotation = np.diag([-1.0, 1.0, 1.0])
+    forward = world_from_cam[:, :3, 2] @ rotation.T
+    centers = world_from_cam[:, :3, 3] @ rotation.T
+    nearest = centers - (forward * centers).sum(axis=1, keepdims=True) * forward
+    shift = -np.median(nearest, axis=0)
+    scale = 1.0 / np.median(np.linalg.norm(centers + shift, axis=1))
+    return np.asarray(scale * np.column_stack([rotation, shift]))
+
+
+def _principal(xyz: Float64[np.ndarray, "3 N"]) -> Float64[np.ndarray, "3 4"]:
+    """The median to 0, the axis along which points spread least to z."""
+    center = np.median(xyz, axis=1)
+    _, vectors = np.linalg.eigh(np.cov(xyz - center[:, None]))
+    vectors = vectors[:, ::-1].copy()
+    if np.linalg.det(vectors) < 0:
+        vectors[:, 0] *= -1
+    return np.column_stack([vectors.T, -vectors.T @ center])

@@ -1,0 +1,35 @@
+"""Child processes that run our own code in our own interpreter.
+
+Promise: the working directory, which may hold anybody's files, has no part in what a child imports:
+a ``numpy.py`` that lies there is never executed.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping
+
+__all__ = ["child_command", "child_environment"]
+
+
+def child_command(program: str, *words: str) -> list[str]:
+    """The command that runs a short program in a new interpreter.
+
+    Args:
+        program: Python code.
+        words: What it finds in ``sys.argv[1:]``.
+    """
+    # Without -P, python -c puts the working directory before all else on sys.path.
+    return [sys.executable, "-P", "-c", program, *words]
+
+
+def child_environment(more: Mapping[str, str] | None = None) -> dict[str, str]:
+    """The environment of a child: ours, and the places that we import from.
+
+    Args:
+        more: Variables to set on top.
+    """
+    # An empty entry would stand for the working directory.
+    places = os.pathsep.join(filter(None, sys.path))
+    return {**os.environ, "PYTHONPATH": places, "PYTHONSAFEPATH": "1", **(more or {})}

@@ -1,0 +1,87 @@
+"""What killed processes leave behind: hidden partial outputs, found again and removed.
+
+Promise: what a process still writes to is never removed, as it holds a lock on it; where the system has no
+such locks nothing is.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+__all__ = ["held", "remove_leftovers", "remove_tree"]
+
+_SETTLED = 5.0
+"""Seconds after which a partial that nobody holds is a leftover: it is held right after it is made."""
+_LOG = logging.getLogger(__name__)
+
+
+@contextmanager
+def held(partial: Path) -> Iterator[Callable[[], None]]:
+    """While the block runs, a partial can be held as being written to.
+
+    Args:
+        partial: The folder.
+
+    Yields:
+        What holds it, to be called once it is there.
+    """
+    locks: list[int] = []
+    try:
+        yield lambda: locks.extend(_lock(partial))
+    finally:
+        for lock in locks:
+            os.close(lock)
+
+
+def remove_leftovers(target: Path) -> None:
+    """Remove the partials that processes left which were killed while they wrote ``target``; log it."""
+    name = re.compile(re.escape(f".{target.name}.partial-") + "[0-9a-f]{8}")
+    with suppress(OSError):
+        for path in target.parent.iterdir():
+            if name.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
+                _remove_unless_held(path)
+
+
+def _remove_unless_held(leftover: Path) -> None:
+    with suppress(OSError):
+        if time.time() - leftover.stat().st_mtime < _SETTLED:
+            return
+        for lock in _lock(leftover):
+            try:
+                remove_tree(leftover)
+                _LOG.warning("Removed %s, which a run left that was killed.", leftover)
+            finally:
+                os.close(lock)
+
+
+def _lock(folder: Path) -> list[int]:
+    """A descriptor that locks a folder until it is closed; none if another process does, or none can."""
+    try:
+        import fcntl  # noqa: PLC0415  (not on Windows)
+    except ImportError:
+        return []
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return []
+    return [descriptor]
+
+
+def remove_tree(folder: Path) -> None:
+    """Remove a folder of our own, also where folders in it are read-only."""
+    folder.chmod(0o700)
+    for parent, names, _ in os.walk(folder):
+        for name in names:
+            child = Path(parent, name)
+            if not child.is_symlink():  # its target is the user's
+                child.chmod(0o700)
+    shutil.rmtree(folder)

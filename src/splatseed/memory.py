@@ -1,0 +1,71 @@
+"""Memory that is free, and refusing what cannot fit it before any work is done.
+
+Promise: where the system does not tell how much is free, nothing is refused. An estimate counts what is
+sure to be held at once, so what is refused would not have ended well; what is let pass still may not.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from splatseed.errors import ParameterError
+
+__all__ = ["check_memory", "free_memory"]
+
+CGROUP = Path("/sys/fs/cgroup")
+
+
+def check_memory(count: int, bytes_each: int, what: str, *, found: str = "", fix: str) -> None:
+    """Refuse what the free memory cannot hold.
+
+    Args:
+        count: How many things are wanted.
+        bytes_each: What each takes.
+        what: Their name.
+        found: What was asked for, in words; the count when left out.
+        fix: What the user can do; ``{most}`` in it becomes the number that fits.
+
+    Raises:
+        ParameterError: They do not fit.
+    """
+    free = free_memory()
+    if free is None or count * bytes_each <= free:
+        return
+    most = max(free // bytes_each, 0)
+    raise ParameterError(
+        f"at most {most:,} {what}, which the {free / 1e9:.1f} GB of free memory hold",
+        found=found or f"{count:,}",
+        fix=fix.replace("{most}", str(most)),
+    )
+
+
+def free_memory() -> int | None:
+    """Bytes that this process can still take; None where the system does not tell."""
+    known = [free for free in (_of_machine(), _of_container()) if free is not None]
+    return min(known, default=None)
+
+
+def _of_machine() -> int | None:
+    try:
+        lines = Path("/proc/meminfo").read_text("ascii").splitlines()
+        kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable:"))
+        return int(kilobytes) * 1024
+    except (OSError, StopIteration):
+        pass
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):  # not on Windows
+        return None
+
+
+def _of_container() -> int | None:
+    """What a container's limit leaves; copies of files, which give way, are not counted as taken."""
+    try:
+        limit = (CGROUP / "memory.max").read_text("ascii").strip()
+        used = int((CGROUP / "memory.current").read_text("ascii"))
+        lines = (CGROUP / "memory.stat").read_text("ascii").splitlines()
+    except (OSError, ValueError):
+        return None
+    files = next((int(line.split()[1]) for line in lines if line.startswith("inactive_file ")), 0)
+    return max(int(limit) - used + files, 0) if limit.isdigit() else None

@@ -1,0 +1,81 @@
+"""Help that shows what is common first, and suggestions for what was mistyped."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from importlib.metadata import version
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["upsample", "x", "-o", "y", "--ratoi", "4"], "Did you mean --ratio?"),
+        (["upsample", "x", "-o", "y", "--mls.kk=4"], "Did you mean --mls.k?"),
+        (["upsample", "x", "-o", "y", "--method", "msl"], "Did you mean mls?"),
+        (["train", "x", "-o", "y", "--max-step", "4"], "Did you mean --max-steps?"),
+        (["train", "x", "-o", "y", "--strategy", "defalt"], "Did you mean default?"),
+        (["upsmaple"], "Did you mean upsample?"),
+        (["Info"], "Did you mean info?"),
+    ],
+)
+def test_a_slip_gets_a_suggestion(words, says, splatseed):
+    run = splatseed(*words)
+    assert (run.code, run.err.count("\n")) == (2, 1)
+    assert says in run.err
+
+
+def test_what_is_like_nothing_gets_none(splatseed):
+    assert "Did you mean" not in splatseed("upsample", "x", "-o", "y", "--zzz").err
+    assert "Did you mean" not in splatseed("qqq").err
+
+
+def test_the_short_flag_for_the_version(splatseed):
+    assert splatseed("-V").out == f"splatseed {version('splatseed')}\n"
+
+
+def test_upsamples_help_is_short_and_says_where_the_rest_is(splatseed):
+    short = splatseed("upsample", "--help")
+    assert short.code == 0
+    assert len(short.out.splitlines()) < 90
+    assert "--method" in short.out
+    assert "--mls.k" not in short.out
+    assert "--help-all" in short.out
+    one = splatseed("upsample", "--method", "mls", "--help").out
+    assert "--mls.k" in one
+    assert "--spline.k" not in one
+    every = splatseed("upsample", "--help-all").out
+    assert "--mls.k" in every
+    assert "--spline.k" in every
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs a shell")
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (["ups"], {"upsample"}),
+        (["info", "--pi"], {"--picture"}),
+        (["train", "x", "--max-s"], {"--max-steps"}),
+        (["bench", "--exec"], {"--executor"}),
+        (["train", "sc"], set()),  # files, by the shell itself
+    ],
+)
+def test_a_shell_completes_verbs_and_options(words, offered, splatseed):
+    script = splatseed("--completion", "bash")
+    assert script.code == 0
+    typed = " ".join(["splatseed", *words])
+    program = (
+        f"{script.out}\nCOMP_WORDS=({typed}); COMP_CWORD={len(words)}; _splatseed;"
+        ' printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) == offered
+    assert done.stderr == ""
+
+
+def test_another_shell_is_told_what_there_is(splatseed):
+    run = splatseed("--completion", "fish")
+    assert (run.code, "bash or zsh" in run.err) == (2, True)
+    assert splatseed("--completion", "zsh").out.startswith("autoload")

@@ -1,0 +1,123 @@
+"""Junk where a file should be, and places that cannot be written to, give one line."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+import torch
+
+from splatseed.errors import OutputError, SceneFormatError
+from splatseed.evaluate import load_lpips
+from splatseed.io.staging import atomic_file, output_folder
+from splatseed.train.schedule import Schedule
+from splatseed.train.settings import TrainSettings
+from splatseed.train.state import load_checkpoint
+from splatseed.train.strategies import make_strategy
+
+CPU = torch.device("cpu")
+
+
+def _refused(run, *says):
+    assert (run.code, run.err.count("\n")) == (2, 1), run
+    assert run.err.startswith("error: expected ")
+    assert "Traceback" not in run.err
+    for each in says:
+        assert each in run.err
+
+
+def _checkpoint(content, path):
+    torch.save(content, path)
+    settings = TrainSettings(strategy="none", backend="cpu")
+    schedule = settings.schedule
+    assert isinstance(schedule, Schedule)
+    return load_checkpoint(path, make_strategy(settings, CPU), schedule, CPU)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"format": 2},
+        {"format": 2, "params": {"means": torch.zeros(3, 3)}},
+        {"format": 2, "params": 7},
+        {"format": 1},
+        [1, 2],
+        torch.zeros(3),
+    ],
+)
+def test_a_checkpoint_of_wrong_parts(content, tmp_path):
+    with pytest.raises(SceneFormatError, match="to be a checkpoint"):
+        _checkpoint(content, tmp_path / "checkpoint.pt")
+
+
+def _spoiled(data, rng, how):
+    data = bytearray(data)
+    if how == "cut":
+        return bytes(data[: len(data) // 2])
+    for at in rng.integers(0, len(data), 40):
+        data[at] ^= int(rng.integers(1, 256))
+    return bytes(data)
+
+
+@pytest.mark.parametrize("how", ["cut", "flipped", "text", "pickle", "zip"])
+@pytest.mark.parametrize("what", ["checkpoint", "weights"])
+def test_a_damaged_file_of_pytorchs(what, how, rng, tmp_path):
+    path = tmp_path / "file"
+    torch.save({"format": 2, "params": {"means": torch.zeros(30, 3)}, "step": 3}, path)
+    whole = path.read_bytes()
+    for _ in range(20 if how == "flipped" else 1):
+        text = {"text": b"junk", "pickle": b"\x80\x04cos\nsystem\n(X\x02\x00\x00\x00lstR."}.get(how)
+        path.write_bytes(text or _spoiled(whole, rng, how))
+        if how == "zip":
+            with zipfile.ZipFile(path, "w") as archive:
+                archive.writestr("archive/data.pkl", b"(")
+        with pytest.raises(SceneFormatError), warnings.catch_warnings(action="error"):
+            _load(what, path)
+
+
+def _load(what, path):
+    if what == "weights":
+        return load_lpips("alex", path)
+    settings = TrainSettings(strategy="none", backend="cpu")
+    return load_checkpoint(path, make_strategy(settings, CPU), settings.schedule, CPU)
+
+
+def test_a_link_to_itself(room, tmp_path, splatseed):
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for verb in (["upsample", room], ["depth", room, "--stereo"], ["train", room]):
+        _refused(splatseed(*verb, "-o", tmp_path / "loop"), "leads back to itself")
+        _refused(splatseed(*verb, "-o", tmp_path / "loop/deeper"), "leads back to itself")
+    _refused(splatseed("info", tmp_path / "loop"), "loop")
+    with pytest.raises(OutputError, match="back to itself"), atomic_file(tmp_path / "loop"):
+        pass
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_output(room, splatseed, monkeypatch):
+    with pytest.raises(OutputError, match="a device"), atomic_file(Path("/dev/full")):
+        pass
+    with pytest.raises(OutputError, match="a file"), output_folder(Path("/dev/full"), kind="x"):
+        pass
+    assert Path("/dev/full").is_char_device()
+    with Path("/dev/full").open("w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        run = splatseed("info", room)
+        full.close = lambda: None  # what is left in its buffer cannot be written
+    _refused(run, "No space left on device")
+
+
+def test_numbers_are_no_weights(tmp_path):
+    state = {"features.0.weight": torch.zeros(64, 3, 11, 11), "features.0.bias": torch.zeros(3)}
+    torch.save(state, tmp_path / "weights.pth")
+    with pytest.raises(SceneFormatError, match="LPIPS"):
+        load_lpips("alex", tmp_path / "weights.pth")
+    np.save(tmp_path / "weights.npy", np.zeros(3))
+    with pytest.raises(SceneFormatError, match="LPIPS"):
+        load_lpips("alex", tmp_path / "weights.npy")

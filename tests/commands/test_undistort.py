@@ -1,0 +1,65 @@
+"""``splatseed undistort``: pinhole cameras, the same points, and a scene that can be trained."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pycolmap", reason="needs pycolmap")
+
+from splatseed.camera import Intrinsics
+from splatseed.errors import SceneFormatError
+from splatseed.io import load_scene, write_scene
+from splatseed.views.view import check_lens, load_views
+
+
+@pytest.fixture(scope="module")
+def distorted(room, tmp_path_factory):
+    """The room, its lens said to have distortion."""
+    scene = load_scene(room)
+    lens = scene.intrinsics[0]
+    bent = Intrinsics(
+        lens.camera_id, "OPENCV", lens.width, lens.height, (*lens.params, 0.06, 0.0, 0.0, 0.0)
+    )
+    images = tuple(dataclasses.replace(image, intrinsics=bent) for image in scene.images)
+    path = tmp_path_factory.mktemp("bent") / "scene"
+    write_scene(scene.replace(images=images, intrinsics=(bent,)), path)
+    names = [image.name for image in images]
+    (path / "test_list.txt").write_text("\n".join(names[:2]))
+    return path
+
+
+@pytest.mark.parametrize("layout", ["colmap", "transforms"])
+def test_a_distorted_scene_becomes_one_of_pinholes(layout, distorted, tmp_path, splatseed):
+    path, out = distorted, tmp_path / "straight"
+    if layout == "transforms":
+        path = write_scene(load_scene(distorted), tmp_path / "json", format="transforms").path
+    before = load_scene(path)
+    with pytest.raises(SceneFormatError, match="splatseed undistort"):
+        check_lens(before.images[0])
+    run = splatseed("undistort", path, "-o", out)
+    assert run.code == 0, run
+    assert f"splatseed upsample {out}" in run.out
+    after = load_scene(out)
+    assert {lens.model for lens in after.intrinsics} == {"PINHOLE"}
+    assert {image.name for image in after.images} == {image.name for image in before.images}
+    assert (after.listed.train, after.listed.test) == (before.listed.train, before.listed.test)
+    xyz = {tuple(np.round(each, 4)) for each in after.points.xyz}
+    if layout == "colmap":  # in the other the points are turned, and brought back
+        assert xyz == {tuple(np.round(each, 4)) for each in before.points.xyz}
+    assert len(load_views(after, after.images)) == len(before.images)
+    assert not any("missing" in each for each in after.warnings)
+    again = splatseed("undistort", path, "-o", out)
+    assert (again.code, "--overwrite" in again.err) == (2, True)
+    assert [each.name for each in tmp_path.iterdir() if each.name.startswith(".")] == []
+
+
+def test_a_missing_photograph_is_named(distorted, tmp_path, splatseed):
+    path = write_scene(load_scene(distorted), tmp_path / "own", copy_images=True).path
+    (path / "images/view_003.png").unlink()
+    run = splatseed("undistort", path, "-o", tmp_path / "out")
+    assert run.code == 2
+    assert "view_003.png missing" in run.err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,110 @@
+"""Files that a scene names and that are none: pipes, devices, links into themselves, archives that burst."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import socket
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatseed.errors import OutputError, SceneFormatError
+from splatseed.io import _files, colmap_binary, load_scene, write_scene
+from splatseed.io._files import open_file, read_file
+from splatseed.io.depth_arrays import read_npz
+from splatseed.io.photograph import photograph_bytes
+
+
+@pytest.fixture
+def odd(tmp_path):
+    """Things in a folder that are no files."""
+    os.mkfifo(tmp_path / "pipe")
+    with socket.socket(socket.AF_UNIX) as bound:
+        bound.bind(str(tmp_path / "socket"))
+    (tmp_path / "link").symlink_to("/dev/zero")
+    (tmp_path / "folder").mkdir()
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [("pipe", "a pipe"), ("socket", "a socket"), ("link", "a device"), ("folder", "a folder")],
+)
+def test_only_regular_files_are_opened(odd, name, says):
+    with pytest.raises(OSError, match=says):
+        open_file(odd / name)
+    with pytest.raises(SceneFormatError, match=f"{name} to be an image; found {says}"):
+        photograph_bytes(odd / name)
+
+
+def test_a_file_larger_than_the_memory_is_not_read(tmp_path, monkeypatch):
+    (tmp_path / "file").write_bytes(b"12345")
+    assert read_file(tmp_path / "file") == b"12345"
+    monkeypatch.setattr(_files, "free_memory", lambda: 4)
+    with pytest.raises(SceneFormatError, match=r"more than the .* of free memory"):
+        photograph_bytes(tmp_path / "file")
+
+
+def _rename(scene_dir, model, name):
+    images = [dataclasses.replace(model.images[0], name=name), *model.images[1:]]
+    colmap_binary.write_images(scene_dir / "sparse/0/images.bin", images)
+
+
+@pytest.mark.parametrize("name", ["../../x.jpg", "/dev/zero", "/etc/hostname"])
+def test_a_name_that_leads_out_of_the_scene_is_told(scene_dir, model, name):
+    _rename(scene_dir, model, name)
+    (told,) = [each for each in load_scene(scene_dir).warnings if "outside of" in each]
+    assert f"1 of {len(model.images)} images lie outside of {scene_dir}" in told
+    assert name in told
+
+
+def test_names_inside_are_not_told(scene_dir, model):
+    _rename(scene_dir, model, "../images/left/image000.jpg")
+    assert not [each for each in load_scene(scene_dir).warnings if "outside of" in each]
+
+
+@pytest.mark.parametrize("target", ["/dev/zero", "../images"])
+def test_copies_are_of_files_and_end(scene_dir, tmp_path, target):
+    (scene_dir / "images/odd").symlink_to(target)
+    with pytest.raises(OutputError, match=r"a device|leads back into itself"):
+        write_scene(load_scene(scene_dir), tmp_path / "out", copy_images=True)
+    assert not (tmp_path / "out").exists()
+
+
+def _archive(path: Path, shape, name="depth"):
+    """An archive of zeros whose body is written without being held."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f4", "fortran_order": False, "shape": shape}
+    )
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive,
+        archive.open(f"{name}.npy", "w") as file,
+    ):
+        file.write(header.getvalue())
+        for _ in range(shape[0]):
+            file.write(bytes(4 * shape[1]))
+
+
+def test_an_archive_that_would_burst_is_refused_by_its_header(tmp_path, little_memory):
+    _archive(tmp_path / "bomb.npz", (6000, 6000))
+    assert (tmp_path / "bomb.npz").stat().st_size < 200_000
+    with (
+        little_memory(),
+        pytest.raises(SceneFormatError, match=r"bytes that would become 144,000,"),
+    ):
+        read_npz(tmp_path / "bomb.npz")
+
+
+def test_a_map_of_one_value_and_other_arrays_are_fine(tmp_path, little_memory):
+    _archive(tmp_path / "flat.npz", (480, 640))
+    assert read_npz(tmp_path / "flat.npz").values.shape == (480, 640)
+    _archive(tmp_path / "more.npz", (48, 64))
+    with zipfile.ZipFile(tmp_path / "more.npz", "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("normals.npy", bytes(1 << 25))  # never looked at
+    with little_memory(1 << 20):
+        assert read_npz(tmp_path / "more.npz").values.shape == (48, 64)

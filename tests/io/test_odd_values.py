@@ -1,0 +1,81 @@
+"""Values that formats allow and no capture has: each gets its own true message."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from splatseed.depth.alignment import align_map
+from splatseed.depthmap import DepthMap
+from splatseed.errors import SceneFormatError
+from splatseed.io import colmap_binary, colmap_text, load_scene
+from splatseed.io._cloud import cloud_warnings, find_usable
+from splatseed.pointcloud import PointCloud
+from splatseed.upsample import upsample
+from splatseed.views.sightings import camera_points
+
+FORMATS = [(colmap_binary, "bin"), (colmap_text, "txt")]
+
+
+@pytest.mark.parametrize(("module", "suffix"), FORMATS)
+@pytest.mark.parametrize("focal", [0.0, -500.0])
+def test_a_focal_length_of_0_or_below(module, suffix, focal, model, tmp_path):
+    camera = dataclasses.replace(model.intrinsics[0], params=(500.0, focal, 320.0, 240.0))
+    module.write_cameras(tmp_path / f"cameras.{suffix}", (camera,))
+    with pytest.raises(SceneFormatError, match=rf"focal length above 0 .*found 500, {focal:g}"):
+        module.read_cameras(tmp_path / f"cameras.{suffix}")
+
+
+def test_a_focal_length_of_0_in_transforms(scene_dir):
+    frame = {"file_path": "images/left/image000.jpg", "transform_matrix": np.eye(4).tolist()}
+    content = {"fl_x": 0, "w": 640, "h": 480, "frames": [frame]}
+    (scene_dir / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(SceneFormatError, match="focal length"):
+        load_scene(scene_dir / "transforms.json")
+
+
+@pytest.mark.parametrize(("module", "suffix"), FORMATS)
+def test_one_image_name_twice(module, suffix, model, tmp_path):
+    images = (*model.images[:3], dataclasses.replace(model.images[3], name=model.images[1].name))
+    module.write_images(tmp_path / f"images.{suffix}", images)
+    with pytest.raises(SceneFormatError, match=r"name once .*image001\.jpg' a second time, after"):
+        module.read_images(tmp_path / f"images.{suffix}", model.intrinsics)
+
+
+def test_a_depth_map_of_one_value(model):
+    image = model.images[0]
+    camera = image.camera
+    uv = np.array([[x, y] for x in range(50, 600, 50) for y in range(50, 400, 50)], np.float64)
+    seen = camera_points(camera, camera.unproject(uv, np.linspace(2, 5, len(uv))))
+    depth = DepthMap(np.full((480, 640), 3.0, np.float32), "z")
+    assert "one value" in align_map(depth, camera, seen, "robust", 20).rejected
+    depth.values[0, 0] = 2.0
+    assert align_map(depth, camera, seen, "robust", 20).rejected is None
+
+
+def _cloud(rng, *far):
+    xyz = rng.normal(size=(500, 3)).astype(np.float32)
+    xyz[: len(far)] = np.reshape(far, (-1, 1))
+    return PointCloud(xyz, np.zeros((500, 3), np.uint8))
+
+
+def test_one_point_far_out_is_not_the_coordinates_fault(rng):
+    (told,) = cloud_warnings(_cloud(rng, 1e6))
+    assert told.startswith("1 point lies up to 1e+06 from the middle of the others")
+    (told,) = cloud_warnings(_cloud(rng, 1e6, -2e6))
+    assert told.startswith("2 points lie up to 2e+06")
+    told = cloud_warnings(PointCloud(_cloud(rng).xyz + 1e6, np.zeros((500, 3), np.uint8)))
+    assert "recentre" in told[-1]
+    assert cloud_warnings(_cloud(rng, 300.0)) == ()
+
+
+@pytest.mark.parametrize("method", ["mls", "linear", "spline", "voronoi", "triangle"])
+def test_a_point_beyond_all_distances_is_left_out(method, rng):
+    cloud = _cloud(rng, 1e30)
+    assert cloud_warnings(cloud) == ("1 point is beyond 1e15, and left out when written.",)
+    assert find_usable(cloud).keep.sum() == 499
+    new = upsample(cloud, method, num_points=800).xyz[500:]
+    assert np.abs(new).max() < 10
