@@ -37,6 +37,26 @@ def test_trains_and_says_what_and_where(room_path, tmp_path, capsys):
     assert "--overwrite" in capsys.readouterr().err
 
 
+def test_a_budget_is_gaussians_per_pixel_as_trained(room_path, tmp_path, capsys):
+    run = tmp_path / "run"
+    words = (room_path, "--max-steps", "40", "--data-factor", "2", "--strategy", "grow", "-o", run)
+    assert _run(*words, "--budget", "0.25rho", "--cap-max", "100") == 2
+    assert "--budget or --cap-max" in capsys.readouterr().err
+    assert _run(*words, "--budget", "0.25rho") == 0
+    assert json.loads((run / "config.json").read_text())["cap_max"] == 48 * 36 // 4
+    assert json.loads((run / "metrics.json").read_text())["num_gaussians"] <= 48 * 36 // 4
+
+
+def test_a_plain_scene_is_seeded_first_unless_it_is_to_stay(room_path, tmp_path, capsys):
+    counts = {}
+    for seeds in ("auto", "scene"):
+        words = (room_path, "--max-steps", "3", "--data-factor", "2", "-o", tmp_path / seeds)
+        assert _run(*words, *(("--seeds", "scene") if seeds == "scene" else ())) == 0
+        assert ("Seeds by method auto" in capsys.readouterr().out) == (seeds == "auto")
+        counts[seeds] = json.loads((tmp_path / seeds / "metrics.json").read_text())["num_seeds"]
+    assert counts["auto"] > counts["scene"]
+
+
 def test_interrupted_it_saves_and_says_how_to_go_on(room_path, tmp_path):
     """A process of its own, interrupted by a signal once it trains."""
     run = tmp_path / "run"

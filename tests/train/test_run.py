@@ -236,6 +236,16 @@ def test_an_earlier_run_is_neither_replaced_nor_repeated_by_accident(begin, room
         prepare_run(room, room.source.root / "run", TrainSettings())
 
 
+def test_a_run_that_was_seeded_goes_on_with_the_same_seeds(begin):
+    straight = begin("straight", seeding="auto", max_steps=20)
+    assert len(straight.state.params["means"]) > 300
+    assert straight.train()
+    assert not begin("stopped", seeding="auto", max_steps=20).train(_stop_after(5))
+    resumed = begin("stopped", RESUME, max_steps=20)
+    assert resumed.train()
+    assert _bytes(resumed) == _bytes(straight)
+
+
 def test_a_run_goes_on_with_its_own_settings_and_seeds(begin, room, tmp_path):
     run = begin(max_steps=30, strategy="none", sh_degree=1)
     run.train(_stop_after(4))

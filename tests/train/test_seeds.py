@@ -8,7 +8,8 @@ import pytest
 pytest.importorskip("torch", reason="training needs PyTorch")
 
 from splatseed.pointcloud import PointCloud
-from splatseed.train.seeds import seeds_digest, usable_seeds
+from splatseed.progress import silent
+from splatseed.train.seeds import seeded, seeds_digest, usable_seeds
 from splatseed.train.settings import TrainSettings
 
 ORIGINALS, NEW = 40, 60
@@ -27,34 +28,33 @@ def thinned(points: PointCloud, cap: int, seed: int = 0) -> tuple[PointCloud, li
     return usable_seeds(points, settings, notes.append), notes
 
 
-def test_all_originals_stay_while_they_fit(points):
+def test_more_than_the_cap_are_thinned_and_told_of(points):
     seeds, notes = thinned(points, 70)
     assert len(seeds) == 70
-    assert np.array_equal(seeds.xyz[:ORIGINALS], points.xyz[:ORIGINALS])
-    told = "100 seeds were thinned out at random to --cap-max 70, 40 of them originals."
+    assert np.isin(seeds.xyz, points.xyz).all()
+    told = f"100 seeds were thinned to --cap-max 70, {seeds.num_original} of them originals."
     assert notes == [f"{told} They leave densification no room."]
     usable_seeds(points, TrainSettings(cap_max=70, strategy="none"), notes.append)
     assert notes[1:] == [told]
 
 
-def test_a_cap_below_the_originals_keeps_nothing_else(points):
-    seeds, _ = thinned(points, 15)
-    assert (seeds.num_original, len(seeds)) == (15, 15)
+def test_what_crowds_goes_first(points):
+    """Of pairs a hair apart one stays each, the original."""
+    xyz = np.concatenate([points.xyz[:ORIGINALS], points.xyz[:ORIGINALS] + np.float32(1e-4)])
+    source = np.repeat([0, 4], ORIGINALS).astype(np.uint8)
+    pairs = PointCloud(xyz, np.zeros((2 * ORIGINALS, 3), np.uint8), source)
+    seeds, _ = thinned(pairs, ORIGINALS)
+    assert np.array_equal(seeds.xyz, points.xyz[:ORIGINALS])
 
 
-def test_which_stay_depends_on_the_seed_alone(points):
-    first, again, other = (thinned(points, 70, seed)[0].xyz for seed in (0, 0, 1))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
+def test_originals_are_asked_first_wherever_they_stand(points):
+    mixed = points.select(np.random.default_rng(0).permutation(len(points)))
+    one, other = (thinned(each, 50)[0] for each in (points, mixed))
+    assert one.num_original == other.num_original
 
 
-def test_every_new_point_is_as_likely_to_stay(points):
-    counts = np.zeros(NEW)
-    for seed in range(200):
-        seeds, _ = thinned(points, 70, seed)
-        counts += np.isin(points.xyz[ORIGINALS:, 0], seeds.xyz[:, 0])
-    assert counts.sum() == 200 * 30
-    assert 60 < counts.min() < 100 < counts.max() < 140  # binomial of 200 and 1/2, five deviations
+def test_which_stay_does_not_depend_on_the_seed(points):
+    assert np.array_equal(*(thinned(points, 70, seed)[0].xyz for seed in (0, 1)))
 
 
 def test_points_that_are_not_finite_are_left_out_and_told_of(points):
@@ -98,3 +98,27 @@ def test_asking_for_what_is_not_known_is_told(points):
     unknown = points.replace(sizes=np.full(len(points), np.nan))
     usable_seeds(unknown, TrainSettings(seed_sizes=True, seed_normals=True), notes.append)
     assert [note.split()[0] for note in notes] == ["--seed-sizes", "--seed-normals"]
+
+
+def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
+    notes: list[str] = []
+    points = seeded(room, TrainSettings(seeding="auto"), notes.append, silent).points
+    assert len(points) > len(room.points)
+    assert np.array_equal(points.originals.xyz, room.points.xyz)
+    assert "--seeds scene" in notes[-1]
+    bounded = TrainSettings(seeding="auto", strategy="none", cap_max=len(room.points) + 10)
+    assert len(seeded(room, bounded, notes.append, silent).points) == len(room.points) + 10
+
+
+@pytest.mark.parametrize(
+    "settings", [{}, {"seeding": "auto", "strategy": "default-3dgs"}, {"seeding": "auto"}]
+)
+def test_other_points_are_left_alone(settings, room):
+    """Those that are to stay, those of 3DGS's conventions, and those that splatseed has added to."""
+    touched = room.replace(
+        points=room.points.replace(source=np.full(len(room.points), 4, np.uint8))
+    )
+    scene = touched if settings == {"seeding": "auto"} else room
+    notes: list[str] = []
+    assert seeded(scene, TrainSettings(**settings), notes.append, silent) is scene
+    assert not notes

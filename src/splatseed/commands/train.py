@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -30,12 +30,15 @@ from splatseed.console import (
     print_pairs,
     stage_display,
 )
+from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.literal import quoted, visible
 from splatseed.requirements import require
+from splatseed.scene import Scene
 from splatseed.train.interruption import exit_code
-from splatseed.train.settings import Backend, StrategyName, TrainSettings
+from splatseed.train.settings import Backend, Seeding, StrategyName, TrainSettings
 from splatseed.views.photographs import user_cache_dir
+from splatseed.views.view import poses_of
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
@@ -68,10 +71,13 @@ class Options:
     cap_max: Annotated[
         int | None,
         tyro.conf.arg(
-            constructor=int, metavar="INT", help_behavior_hint="(default: 1000000 for mcmc)"
+            constructor=int, metavar="INT", help_behavior_hint="(default: 1000000 for grow, mcmc)"
         ),
     ] = None
-    """Most Gaussians; more seeds than that are thinned out."""
+    """Most Gaussians; more seeds than that are thinned."""
+    budget: Annotated[str | None, tyro.conf.arg(metavar="N|RHOrho")] = None
+    """The same, as upsample has it: a number, or Gaussians per pixel of a photograph as it is trained, such as
+    0.25rho."""
     sh_degree: int = DEFAULT.sh_degree
     """How finely colours depend on the direction, 0 to 3."""
     test_every: int = DEFAULT.test_every
@@ -82,6 +88,14 @@ class Options:
     """Begin with the sizes that the scene's seeds.npz knows, not those of the gaps between seeds."""
     seed_normals: bool = DEFAULT.seed_normals
     """Begin with flat discs where the scene's seeds.npz knows the normals."""
+    seeds: Annotated[
+        Seeding | None,
+        tyro.conf.arg(
+            help_behavior_hint="(default: auto, for points that splatseed has not added to)"
+        ),
+    ] = None
+    """Begin with what method auto makes of the scene, looking at the training photographs alone, or with the
+    scene's points as they are."""
     resume: bool = False
     """Go on with the run in the output folder, with its own settings."""
     tensorboard: bool = False
@@ -92,7 +106,15 @@ class Options:
     @property
     def settings(self) -> TrainSettings:
         """Those of the options that say how to train."""
-        return TrainSettings(**{each.name: getattr(self, each.name) for each in fields(DEFAULT)})
+        named = {
+            each.name: getattr(self, each.name)
+            for each in fields(DEFAULT)
+            if each.name != "seeding"
+        }
+        # A run that goes on says itself what it began with.
+        return TrainSettings(
+            **named, seeding=self.seeds or (DEFAULT.seeding if self.resume else "auto")
+        )
 
 
 def run(arguments: list[str]) -> None:
@@ -120,11 +142,12 @@ def _prepare(
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (imports PyTorch)
 
     clock("read", 0.0)
-    scene = load_scene(options.scene)
+    scene = load_scene(options.scene, require_points=settings.seeding == "scene")
     for warning in scene.warnings:
         note(warning)
     if scene.listed is not None:
         note(scene.listed.sentence)
+    settings = _within_budget(options, settings, scene)
     how = RunOptions(
         resume=options.resume,
         overwrite=options.overwrite,
@@ -132,6 +155,20 @@ def _prepare(
         cache_dir=user_cache_dir(),
     )
     return prepare_run(scene, options.output, settings, how, note=note, progress=clock)
+
+
+def _within_budget(options: Options, settings: TrainSettings, scene: Scene) -> TrainSettings:
+    """The settings, with the number of Gaussians that the budget is in this scene as their cap."""
+    if options.budget is None:
+        return settings
+    if options.cap_max is not None:
+        raise ParameterError("--budget or --cap-max", found="both", fix="Leave one out.")
+    from splatseed.seeding.budget import median_pixels, parse_budget  # noqa: PLC0415  (loads Numba)
+
+    views = poses_of(scene.images, options.data_factor)
+    return replace(
+        settings, cap_max=parse_budget(options.budget, median_pixels(views) if views else 0)
+    )
 
 
 def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None:

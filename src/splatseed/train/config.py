@@ -25,6 +25,8 @@ __all__ = ["check_same_seeds", "make_config", "resumed_settings"]
 
 WHERE = {"backend"}
 """Settings that may change when a run goes on."""
+OPTIONS = {"seeding": "seeds"}
+"""What the command line calls a setting, where that is not its name."""
 
 
 def make_config(
@@ -34,7 +36,7 @@ def make_config(
     return {
         "splatseed": _version("splatseed"),
         "scene": str(scene.source.root.resolve()) if scene.source else None,
-        "points": str(scene.source.points_path.resolve()) if scene.source else None,
+        "points": _points_path(scene),
         **dataclasses.asdict(settings),
         "device": device_name(device),
         "seeds": {"count": len(seeds), "digest": seeds_digest(seeds)},
@@ -89,9 +91,15 @@ def check_same_seeds(path: Path, begun: Mapping[str, Any], now: Mapping[str, Any
         )
 
 
+def _points_path(scene: Scene) -> str | None:
+    path = scene.source.points_path if scene.source else None
+    return str(path.resolve()) if path else None
+
+
 def _differs(name: str, then: object, now: object) -> ParameterError:
+    option = OPTIONS.get(name, name.replace("_", "-"))
     return ParameterError(
-        f"--{name.replace('_', '-')} {then}, with which the run began",
+        f"--{option} {then}, with which the run began",
         found=f"{now}",
         fix="Leave the option out to go on, or start again with --overwrite.",
     )

@@ -33,14 +33,14 @@ from splatseed.train.parameters import gaussians_of, make_optimizers, make_param
 from splatseed.train.pictures import beside_truth, picture_name, write_picture
 from splatseed.train.ply import write_gaussians
 from splatseed.train.run_folder import RunFolder, write_json
-from splatseed.train.seeds import usable_seeds
+from splatseed.train.seeds import seeded, usable_seeds
 from splatseed.train.settings import TrainSettings
 from splatseed.train.ssim import WINDOW
 from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
 from splatseed.train.strategies import make_strategy
 from splatseed.train.tensorboard import Board
 from splatseed.train.trainer import Trainer
-from splatseed.views.view import View, load_split
+from splatseed.views.view import View, load_split, poses_of
 
 __all__ = ["Render", "RunOptions", "Score", "TrainingRun", "prepare_run"]
 
@@ -101,7 +101,9 @@ def prepare_run(
     begun = folder.read_config() if options.resume and folder.is_run else None
     settings = resumed_settings(begun, settings)
     device = pick_device(settings.backend)
-    seeds = usable_seeds(scene.points, settings, note)
+    scene = seeded(scene, settings, note, progress)
+    trained = scene.split(settings.test_every)[0]
+    seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
     check_fits(len(seeds), device)
     config = make_config(scene, seeds, settings, device)
     if begun:

@@ -1,49 +1,110 @@
 """The points that a run starts from.
 
-Promise: points that are left out are reported; which ones are kept depends on the seed alone; of what
-is known of them they have what the run uses, and nothing else.
+Promise: points that are left out are reported; which ones are kept depends on points and cameras alone; of
+what is known of them they have what the run uses, and nothing else.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
 from splatseed.pointcloud import ORIGINAL, PointCloud
-from splatseed.train.settings import TrainSettings
+from splatseed.progress import Progress
+from splatseed.scene import Scene
+from splatseed.train.settings import AS_3DGS, TrainSettings
+from splatseed.views.view import View
 
-__all__ = ["seeds_digest", "usable_seeds"]
+__all__ = ["seeded", "seeds_digest", "usable_seeds"]
+
+ROOM: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
+"""Seeds at most, as a part of the cap, of strategies that add to what is there; of the others all of it."""
+
+
+def seeded(
+    scene: Scene, settings: TrainSettings, note: Callable[[str], None], progress: Progress
+) -> Scene:
+    """The scene with the points that method ``auto`` gives it, where the settings ask for them.
+
+    Args:
+        scene: Where no point is one that splatseed added.
+        settings: Whose cap bounds the points, and which say what photographs are not looked at.
+        note: Told what was made, and how to do without.
+        progress: Told how far it is.
+
+    Raises:
+        SceneNotFoundError: Photographs are missing.
+        SceneFormatError: One is damaged.
+    """
+    untouched = scene.points.num_original == len(scene.points)
+    if settings.seeding == "scene" or settings.strategy.endswith(AS_3DGS) or not untouched:
+        return scene
+    from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
+    from splatseed.upsample import configure  # noqa: PLC0415
+
+    start = time.perf_counter()
+    part = ROOM.get(settings.densification, 1.0)
+    cloud = upsample(
+        scene,
+        configure("auto", hold_out=settings.test_every),
+        budget=None if settings.cap is None else max(2, round(part * settings.cap)),
+        progress=progress,
+        note=note,
+    )
+    new = len(cloud) - cloud.num_original
+    note(
+        f"Seeds by method auto: {cloud.num_original:,} points of the scene and {new:,} new ones, in "
+        f"{time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as they are."
+    )
+    return scene.replace(points=cloud)
 
 
 def usable_seeds(
-    points: PointCloud, settings: TrainSettings, note: Callable[[str], None]
+    points: PointCloud,
+    settings: TrainSettings,
+    note: Callable[[str], None],
+    views: Sequence[View] = (),
 ) -> PointCloud:
-    """The finite points, thinned out at random if there are more than the cap, for a run to begin with.
+    """The finite points, thinned if there are more than the cap, for a run to begin with.
 
-    Originals stay as long as they fit: they lie where something was seen.
+    What crowds in the views goes first, new points before originals where both would do.
 
     Args:
         points: Those of the scene.
-        settings: Whose cap and seed count, and which say if sizes and normals are used.
+        settings: Whose cap counts, and which say if sizes and normals are used.
         note: Told what was left out, and what is asked for and not known.
+        views: The training views, of which only cameras and sizes are looked at; crowds are judged in space
+            when left out.
     """
-    seeds = _without_unused(points, settings, note).select(points.finite)
-    if len(seeds) < len(points):
-        note(f"{len(points) - len(seeds):,} points without finite coordinates were left out.")
-    if settings.cap is None or len(seeds) <= settings.cap:
-        return seeds
-    kept = min(seeds.num_original, settings.cap)
+    finite = points.select(points.finite)
+    if len(finite) < len(points):
+        note(f"{len(points) - len(finite):,} points without finite coordinates were left out.")
+    return _without_unused(_within_cap(finite, settings, note, views), settings, note)
+
+
+def _within_cap(
+    points: PointCloud,
+    settings: TrainSettings,
+    note: Callable[[str], None],
+    views: Sequence[View],
+) -> PointCloud:
+    cap = settings.cap
+    if cap is None or len(points) <= cap:
+        return points
+    from splatseed.seeding.budget import thin  # noqa: PLC0415  (kernels load with use)
+
+    points = points.select(np.argsort(points.source != ORIGINAL, kind="stable"))
+    first = points.num_original
+    seeds = points.select(thin(points.xyz, views, cap, first=first, priority=points.confidence))
     note(
-        f"{len(seeds):,} seeds were thinned out at random to --cap-max {settings.cap:,}, "
-        f"{kept:,} of them originals."
+        f"{len(points):,} seeds were thinned to --cap-max {cap:,}, {seeds.num_original:,} of them originals."
         + (" They leave densification no room." if settings.densification == "default" else "")
     )
-    rng = np.random.default_rng([settings.seed, settings.cap])
-    rank = rng.permutation(len(seeds))
-    rank[seeds.source == ORIGINAL] -= len(seeds)  # ahead of all others
-    return seeds.select(np.sort(np.argsort(rank)[: settings.cap]))
+    return seeds
 
 
 def _without_unused(

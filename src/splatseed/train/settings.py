@@ -12,10 +12,11 @@ from typing import Literal, cast
 from splatseed.errors import ParameterError
 from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule
 
-__all__ = ["AS_3DGS", "BUDGET", "BYTES_EACH", "Backend", "StrategyName", "TrainSettings"]
+__all__ = ["AS_3DGS", "BUDGET", "BYTES_EACH", "Backend", "Seeding", "StrategyName", "TrainSettings"]
 
 StrategyName = Literal["default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"]
 Backend = Literal["auto", "cpu", "cuda"]
+Seeding = Literal["auto", "scene"]
 
 BUDGET = 1_000_000
 """Most Gaussians of the strategies that have a budget, where none is given."""
@@ -44,7 +45,7 @@ class TrainSettings:
     seed: int = 0
     """On the CPU the same seed gives the same bytes."""
     cap_max: int | None = None
-    """Most Gaussians: more seeds are thinned out (default: 1,000,000 for grow and mcmc, else no limit)."""
+    """Most Gaussians: more seeds are thinned (default: 1,000,000 for grow and mcmc, else no limit)."""
     backend: Backend = "auto"
     """Where to train; auto takes a GPU if PyTorch sees one."""
     sh_degree: int = 3
@@ -57,6 +58,10 @@ class TrainSettings:
     """Begin with the sizes that ``seeds.npz`` knows, else with those of the gaps between seeds."""
     seed_normals: bool = False
     """Begin with flat discs where ``seeds.npz`` knows the normals, else with balls alone."""
+
+    seeding: Seeding = "scene"
+    """Begin with the scene's points as they are, or let method ``auto`` add to them what the training
+    photographs ask for. Points that splatseed has added already, and 3DGS's conventions, are left alone."""
 
     def __post_init__(self) -> None:
         for name, least in (("max_steps", 1), ("data_factor", 1), ("seed", 0), ("test_every", 2)):
