@@ -45,14 +45,17 @@ def read_blender(folder: Path) -> Scene:
         *image_warnings(images, folder, folder),
         *lens_warnings(images),
     )
-    names = [frozenset(image.name for image in part) for part in (train, test)]
     return Scene(
         points,
         images,
         tuple(cameras.values()),
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
         warnings=warnings,
-        listed=Split(*names, origin="pair of transforms_train.json and transforms_test.json"),
+        listed=Split(
+            frozenset(image.name for image in train),
+            frozenset(image.name for image in test),
+            "pair of transforms_train.json and transforms_test.json",
+        ),
     )
 
 
