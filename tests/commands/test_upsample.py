@@ -263,7 +263,7 @@ def test_odd_names_are_printed_and_quoted(name, room, tmp_path, splatseed):
     )
 
 
-@pytest.mark.parametrize("words", [["--help"], ["-h"]])
+@pytest.mark.parametrize("words", [["--help-all"], ["x", "--help-all"]])
 def test_help_lists_every_method_with_its_flags(words, splatseed):
     run = splatseed("upsample", *words)
     assert (run.code, run.err) == (0, "")

@@ -102,7 +102,7 @@ def test_bad_words_end_in_one_line(room_path, tmp_path, capsys, words, said):
 def test_missing_packages_are_named_with_the_command(monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(requirements, "find_spec", lambda name: None if name == "gsplat" else found)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'splatseed\[train\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'gsplat>=1.5.3,<1.6'"):
         requirements.require("torch", "gsplat")
 
 

@@ -45,7 +45,6 @@ def read_blender(folder: Path) -> Scene:
         *image_warnings(images, folder, folder),
         *lens_warnings(images),
     )
-    in_train, in_test = (frozenset(image.name for image in part) for part in (train, test))
     return Scene(
         points,
         images,
@@ -53,7 +52,9 @@ def read_blender(folder: Path) -> Scene:
         source=SceneSource("transforms", folder, points_path, image_dir=folder),
         warnings=warnings,
         listed=Split(
-            in_train, in_test, origin="pair of transforms_train.json and transforms_test.json"
+            frozenset(image.name for image in train),
+            frozenset(image.name for image in test),
+            "pair of transforms_train.json and transforms_test.json",
         ),
     )
 
