@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test lint format bench clean
+.PHONY: demo test coverage lint format bench clean
 .DEFAULT_GOAL := test
 
 $(READY): pyproject.toml constraints.txt
@@ -16,7 +16,11 @@ $(READY): pyproject.toml constraints.txt
 demo: $(READY)
 	$(BIN)/splatseed demo --output demo --overwrite
 
+# A file's tests share what they make, so a file goes to one process.
 test: $(READY)
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+coverage: $(READY)
 	$(BIN)/python -m pytest --cov --cov-report=term
 
 lint: $(READY)
