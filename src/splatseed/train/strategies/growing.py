@@ -92,8 +92,8 @@ class Growing(Strategy):
         ):
             return
         needless = self._needless(params)
-        if len(needless) - int(needless.sum()) < LEAST_VIEWS:
-            return  # nothing is seen: leave all of it to the user's eyes
+        if bool(needless.all()):
+            return  # the run is lost either way, and an empty scene cannot be rendered
         remove(params, optimizers, self.state, needless)
         self._grow(params, optimizers, step)
         self.state = {"first": self.state["first"]}
