@@ -54,6 +54,7 @@ ARMS: dict[str, Arm] = {
             (COST, "SIGMA_PLACE = 5.0", "SIGMA_PLACE = 1e6"),
         ]
     ),
+    "- noise of 0.5": Arm(edits=[(COST, "NOISE = 0.1", "NOISE = 0.5")]),
     "- window at every pixel": Arm(edits=[(COST, "RADIUS, STRIDE = 2, 2", "RADIUS, STRIDE = 2, 1")]),
     "- window of 7 x 7": Arm(edits=[(COST, "RADIUS, STRIDE = 2, 2", "RADIUS, STRIDE = 3, 2")]),
     "- no slopes": Arm(
