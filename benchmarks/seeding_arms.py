@@ -17,6 +17,7 @@ from splatseed.evaluate import evaluate_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.train import TrainSettings, prepare_run
+from splatseed.train.seeds import SEEDS_SHARE
 from splatseed.upsample import configure
 
 __all__ = ["ARMS", "TEST_EVERY", "train"]
@@ -30,8 +31,6 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
 }
 """How seeds are made, by what the table calls them; at ratio 1 nothing is added to SfM's points."""
 TEST_EVERY = 8
-SEEDS_SHARE: Mapping[str, float] = {"default": 0.7, "mcmc": 0.7}
-"""Seeds at most, as a part of the cap: what densification adds is the rest. All, where what is there may go."""
 
 
 def train(

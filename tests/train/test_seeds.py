@@ -7,6 +7,8 @@ import pytest
 
 pytest.importorskip("torch", reason="training needs PyTorch")
 
+from splatseed.io import load_scene, write_scene
+from splatseed.io.staging import MANIFEST
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.train.seeds import seeded, seeds_digest, usable_seeds
@@ -108,6 +110,15 @@ def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
     assert "--seeds scene" in notes[-1]
     bounded = TrainSettings(seeding="auto", strategy="none", cap_max=len(room.points) + 10)
     assert len(seeded(room, bounded, notes.append, silent).points) == len(room.points) + 10
+
+
+def test_what_upsample_only_thinned_is_left_alone(room, tmp_path):
+    write_scene(room.replace(points=room.points.select(slice(100))), tmp_path / "thin")
+    thin, asked = load_scene(tmp_path / "thin"), TrainSettings(seeding="auto")
+    (tmp_path / "thin" / MANIFEST).write_text('{"command": "upsample"}')
+    assert seeded(thin, asked, print, silent) is thin
+    (tmp_path / "thin" / MANIFEST).write_text('{"command": "sfm"}')
+    assert len(seeded(thin, asked, lambda _: None, silent).points) > len(thin.points)
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ class Options:
         ),
     ] = None
     """Most Gaussians; more seeds than that are thinned."""
-    budget: Annotated[str | None, tyro.conf.arg(metavar="N|RHOrho")] = None
+    budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
     """The same, as upsample has it: a number, or Gaussians per pixel of a photograph as it is trained, such as
     0.25rho."""
     sh_degree: int = DEFAULT.sh_degree
@@ -142,7 +142,7 @@ def _prepare(
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (imports PyTorch)
 
     clock("read", 0.0)
-    scene = load_scene(options.scene, require_points=settings.seeding == "scene")
+    scene = load_scene(options.scene, require_points=options.seeds == "scene")
     for warning in scene.warnings:
         note(warning)
     if scene.listed is not None:

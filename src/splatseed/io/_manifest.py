@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-__all__ = ["MANIFEST", "add_files", "seal", "unlisted_files", "why_kept"]
+__all__ = ["MANIFEST", "add_files", "kind_of", "seal", "unlisted_files", "why_kept"]
 
 MANIFEST = "splatseed.json"
 """The file that marks a folder as written by splatseed: only such a folder is ever replaced."""
@@ -59,6 +59,12 @@ def add_files(folder: Path, names: Iterable[str]) -> None:
     manifest = _read(folder)
     listed = {*_files(manifest), *(each for name in names for each in _expanded(folder, name))}
     _write(folder, {**manifest, "files": sorted(listed)})
+
+
+def kind_of(folder: Path) -> str | None:
+    """What wrote a folder; None if it does not say."""
+    kind = _read(folder).get("command")
+    return kind if isinstance(kind, str) else None
 
 
 def why_kept(folder: Path, kind: str) -> tuple[str, str] | None:

@@ -17,9 +17,17 @@ from pathlib import Path
 
 from splatseed.errors import OutputError
 from splatseed.io._leftovers import held, remove_leftovers, remove_tree
-from splatseed.io._manifest import MANIFEST, add_files, seal, why_kept
+from splatseed.io._manifest import MANIFEST, add_files, kind_of, seal, why_kept
 
-__all__ = ["MANIFEST", "add_files", "atomic_file", "check_apart", "check_output", "output_folder"]
+__all__ = [
+    "MANIFEST",
+    "add_files",
+    "atomic_file",
+    "check_apart",
+    "check_output",
+    "kind_of",
+    "output_folder",
+]
 
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}

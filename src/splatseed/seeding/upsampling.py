@@ -102,14 +102,15 @@ def upsample(
     most = None if budget is None else points_within(whole, budget)
     if DEFAULT_METHOD in {method, getattr(method, "name", None)}:
         method = method_for(scene, method, note)
+        originals = whole.points.originals
+        originals = originals.select(originals.distinct)
         plain = ratio is None and num_points is None and cover is None
-        enough = _originals_that_fill(whole.points, most) if plain else None
-        if enough is not None and most is not None:
+        if plain and most is not None and len(originals) >= most:  # all that thinning would leave
             note(
-                f"The budget of {most:,} is no more than the {len(enough):,} points there are: they are "
-                "thinned, and none is added."
+                f"The budget of {most:,} is no more than the {len(originals):,} points there are: "
+                "they are thinned, and none is added."
             )
-            return thin_to(whole, enough, most, CELL, 0, seed, progress)
+            return thin_to(whole, originals, most, CELL, 0, seed, progress)
     cloud = add_points(
         scene, method, ratio=ratio, num_points=num_points, seed=seed, profile=profile,
         progress=progress, note=note, **parameters,
@@ -122,14 +123,6 @@ def upsample(
         hold_out = getattr(method, "hold_out", parameters.get("hold_out", 0))
         cloud = thin_to(whole, cloud, most, cover or CELL, hold_out, seed, progress)
     return cloud
-
-
-def _originals_that_fill(points: PointCloud, budget: int | None) -> PointCloud | None:
-    """The originals, if they alone are as many as a budget: what ``thin_to`` would leave of any more."""
-    originals = points.originals
-    originals = originals.select(originals.finite)
-    originals = originals.select(originals.distinct)
-    return originals if budget is not None and len(originals) >= budget else None
 
 
 def add_cover(

@@ -13,15 +13,16 @@ from types import MappingProxyType
 
 import numpy as np
 
+from splatseed.io.staging import kind_of
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.train.settings import AS_3DGS, TrainSettings
 from splatseed.views.view import View
 
-__all__ = ["seeded", "seeds_digest", "usable_seeds"]
+__all__ = ["SEEDS_SHARE", "seeded", "seeds_digest", "usable_seeds"]
 
-ROOM: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
+SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
 """Seeds at most, as a part of the cap, of strategies that add to what is there; of the others all of it."""
 
 
@@ -40,14 +41,14 @@ def seeded(
         SceneNotFoundError: Photographs are missing.
         SceneFormatError: One is damaged.
     """
-    untouched = scene.points.num_original == len(scene.points)
-    if settings.seeding == "scene" or settings.strategy.endswith(AS_3DGS) or not untouched:
+    as_it_is = settings.seeding == "scene" or settings.strategy.endswith(AS_3DGS)
+    if as_it_is or _was_seeded(scene):
         return scene
     from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
     from splatseed.upsample import configure  # noqa: PLC0415
 
     start = time.perf_counter()
-    part = ROOM.get(settings.densification, 1.0)
+    part = SEEDS_SHARE.get(settings.densification, 1.0)
     cloud = upsample(
         scene,
         configure("auto", hold_out=settings.test_every),
@@ -61,6 +62,12 @@ def seeded(
         f"{time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as they are."
     )
     return scene.replace(points=cloud)
+
+
+def _was_seeded(scene: Scene) -> bool:
+    """Whether ``splatseed upsample`` has chosen these points, be it only by thinning them."""
+    written = scene.source is not None and kind_of(scene.source.root) == "upsample"
+    return written or scene.points.num_original < len(scene.points)
 
 
 def usable_seeds(
