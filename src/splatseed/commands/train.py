@@ -36,6 +36,7 @@ from splatseed.literal import quoted, visible
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.train.interruption import exit_code
+from splatseed.train.run_folder import RunFolder
 from splatseed.train.settings import Backend, Seeding, StrategyName, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 from splatseed.views.view import poses_of
@@ -112,8 +113,9 @@ class Options:
             if each.name != "seeding"
         }
         # A run that goes on says itself what it began with.
+        goes_on = self.resume and RunFolder(self.output).is_run
         return TrainSettings(
-            **named, seeding=self.seeds or (DEFAULT.seeding if self.resume else "auto")
+            **named, seeding=self.seeds or (DEFAULT.seeding if goes_on else "auto")
         )
 
 
