@@ -117,6 +117,7 @@ ARMS: Mapping[str, Arm] = {
     "mcmc without noise": Arm("mcmc", _set(noise=0.0)),
     "mcmc with a tenth of the penalties": Arm("mcmc", _set(penalty=0.001)),
     "mcmc that grows by 1.05": Arm("mcmc", _set(growth=1.05)),
+    "grow": Arm("grow"),
     "none-3dgs": Arm("none-3dgs"),
     "none": Arm("none"),
 }
