@@ -14,11 +14,9 @@ import numpy as np
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io._files import open_file, read_file
+from splatseed.io.depth_folder import CAMERA_FILE
 
-__all__ = ["CAMERA_FILE", "check_size", "find_camera_file", "read_intrinsics", "read_text"]
-
-CAMERA_FILE = "cam_params.json"
-"""The camera of a capture, in its folder or the one above."""
+__all__ = ["check_size", "find_camera_file", "read_intrinsics", "read_text"]
 
 
 def find_camera_file(root: Path) -> Path | None:

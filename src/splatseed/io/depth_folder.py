@@ -26,6 +26,7 @@ from splatseed.io.depth_arrays import KINDS, check_stored
 from splatseed.io.staging import MANIFEST, output_folder
 
 __all__ = [
+    "CAMERA_FILE",
     "DESCRIPTION",
     "DepthDescription",
     "DepthWriter",
@@ -36,6 +37,8 @@ __all__ = [
     "write_description",
 ]
 
+CAMERA_FILE = "cam_params.json"
+"""The camera of an RGB-D capture, and the scale of its maps, in its folder or the one above."""
 DESCRIPTION = "depths.json"
 """The file beside depth maps that says what they hold."""
 

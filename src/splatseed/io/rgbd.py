@@ -20,13 +20,13 @@ from jaxtyping import Bool, Float64
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io._capture import (
-    CAMERA_FILE,
     check_size,
     find_camera_file,
     read_intrinsics,
     read_text,
 )
-from splatseed.io.depth_find import search_depths
+from splatseed.io.depth_folder import CAMERA_FILE
+from splatseed.io.depth_matching import match_by_name
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 
@@ -75,7 +75,7 @@ def load_rgbd(path: Path) -> Scene:
         source=SceneSource("rgbd", root, root / "traj.txt", image_dir=root / "results"),
         warnings=_warnings(frames, tracked),
     )
-    return scene.replace(depths=search_depths(scene, root / "results"))
+    return scene.replace(depths=match_by_name(scene, root / "results"))
 
 
 def _find_frames(folder: Path) -> list[Path]:
