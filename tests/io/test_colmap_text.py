@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +7,11 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.camera import Intrinsics
-from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
-from splatseed.io import colmap_binary, colmap_text
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io import colmap_binary
 from splatseed.pointcloud import PointCloud
+
+from . import text_form
 
 CAMERAS = (Intrinsics(1, "PINHOLE", 640, 480, (500.0, 500.0, 320.0, 240.0)),)
 
@@ -27,12 +28,12 @@ def test_models_survive_a_round_trip(
     models, assert_same_images, assert_same_points, tmp_path_factory, data
 ):
     model, path = data.draw(models), tmp_path_factory.getbasetemp() / "round_trip.txt"
-    colmap_text.write_cameras(path, model.intrinsics)
-    assert colmap_text.read_cameras(path) == model.intrinsics
-    colmap_text.write_images(path, model.images)
-    assert_same_images(colmap_text.read_images(path, model.intrinsics), model.images)
-    colmap_text.write_points3d(path, model.points, model.tracks)
-    assert_same_points(colmap_text.read_points3d(path), (model.points, model.tracks))
+    text_form.write_cameras(path, model.intrinsics)
+    assert text_form.read_cameras(path) == model.intrinsics
+    text_form.write_images(path, model.images)
+    assert_same_images(text_form.read_images(path, model.intrinsics), model.images)
+    text_form.write_points3d(path, model.points, model.tracks)
+    assert_same_points(text_form.read_points3d(path), (model.points, model.tracks))
 
 
 def test_a_real_model_is_the_same_in_both_forms(
@@ -42,22 +43,22 @@ def test_a_real_model_is_the_same_in_both_forms(
     cameras = colmap_binary.read_cameras(source / "cameras.bin")
     images = colmap_binary.read_images(source / "images.bin", cameras)
     points, tracks = colmap_binary.read_points3d(source / "points3D.bin")
-    colmap_text.write_cameras(tmp_path / "cameras.txt", cameras)
-    colmap_text.write_images(tmp_path / "images.txt", images)
-    colmap_text.write_points3d(tmp_path / "points3D.txt", points, tracks)
-    assert colmap_text.read_cameras(tmp_path / "cameras.txt") == cameras
-    assert_same_images(colmap_text.read_images(tmp_path / "images.txt", cameras), images)
-    assert_same_points(colmap_text.read_points3d(tmp_path / "points3D.txt"), (points, tracks))
+    text_form.write_cameras(tmp_path / "cameras.txt", cameras)
+    text_form.write_images(tmp_path / "images.txt", images)
+    text_form.write_points3d(tmp_path / "points3D.txt", points, tracks)
+    assert text_form.read_cameras(tmp_path / "cameras.txt") == cameras
+    assert_same_images(text_form.read_images(tmp_path / "images.txt", cameras), images)
+    assert_same_points(text_form.read_points3d(tmp_path / "points3D.txt"), (points, tracks))
 
 
 def test_comments_blank_lines_and_line_ends_do_not_matter(tmp_path):
     text = "\ufeff# a comment\r\n\r\n  1 PINHOLE 640 480 500 5e2 320.0 240\r\n# the end"
-    assert colmap_text.read_cameras(_text(tmp_path, text)) == CAMERAS
+    assert text_form.read_cameras(_text(tmp_path, text)) == CAMERAS
 
 
 def test_feature_lines_may_be_blank_or_missing(tmp_path):
     text = "# images\n1 1 0 0 0 0 0 0 1 a.jpg\n\n\n2 1 0 0 0 0 0 0 1 b.jpg\n1 2 -1 3 4 9\n3 1 0 0 0 0 0 0 1 c.jpg"
-    images = colmap_text.read_images(_text(tmp_path, text), CAMERAS)
+    images = text_form.read_images(_text(tmp_path, text), CAMERAS)
     assert [image.name for image in images] == ["a.jpg", "b.jpg", "c.jpg"]
     assert [len(image.observations) for image in images] == [0, 2, 0]
     assert images[1].observations.xy.tolist() == [[1, 2], [3, 4]]
@@ -66,15 +67,15 @@ def test_feature_lines_may_be_blank_or_missing(tmp_path):
 
 def test_names_may_hold_spaces(tmp_path):
     text = "1 1 0 0 0 0 0 0 1 my photos/a  b.jpg \n\n"
-    (image,) = colmap_text.read_images(_text(tmp_path, text), CAMERAS)
+    (image,) = text_form.read_images(_text(tmp_path, text), CAMERAS)
     assert image.name == "my photos/a  b.jpg"
 
 
 def test_new_points_follow_the_tracked_ones(model, tmp_path):
     path = tmp_path / "points3D.txt"
     points = PointCloud.concatenate(model.points, model.points.select(slice(2)))
-    colmap_text.write_points3d(path, points, model.tracks)
-    read, tracks = colmap_text.read_points3d(path)
+    text_form.write_points3d(path, points, model.tracks)
+    read, tracks = text_form.read_points3d(path)
     np.testing.assert_array_equal(read.xyz, points.xyz)
     assert tracks.point_ids.tolist() == [*model.tracks.point_ids, 31, 32]
     assert tracks.errors[10:].tolist() == [-1.0, -1.0]
@@ -83,9 +84,9 @@ def test_new_points_follow_the_tracked_ones(model, tmp_path):
 
 def test_empty_files_are_empty_models(tmp_path):
     path = _text(tmp_path, "# nothing\n")
-    assert colmap_text.read_cameras(path) == ()
-    assert colmap_text.read_images(path, ()) == ()
-    points, tracks = colmap_text.read_points3d(path)
+    assert text_form.read_cameras(path) == ()
+    assert text_form.read_images(path, ()) == ()
+    points, tracks = text_form.read_points3d(path)
     assert len(points) == len(tracks) == 0
     assert tracks.image_ids.dtype == np.uint32
 
@@ -105,7 +106,7 @@ def test_empty_files_are_empty_models(tmp_path):
 )
 def test_malformed_cameras_name_the_line(tmp_path, text, message):
     with pytest.raises(SceneFormatError, match=message):
-        colmap_text.read_cameras(_text(tmp_path, text))
+        text_form.read_cameras(_text(tmp_path, text))
 
 
 @pytest.mark.parametrize(
@@ -128,7 +129,7 @@ def test_malformed_cameras_name_the_line(tmp_path, text, message):
 )
 def test_malformed_images_name_the_line(tmp_path, text, message):
     with pytest.raises(SceneFormatError, match=message):
-        colmap_text.read_images(_text(tmp_path, text), CAMERAS)
+        text_form.read_images(_text(tmp_path, text), CAMERAS)
 
 
 @pytest.mark.parametrize(
@@ -146,26 +147,18 @@ def test_malformed_images_name_the_line(tmp_path, text, message):
 )
 def test_malformed_points_name_the_line(tmp_path, text, message):
     with pytest.raises(SceneFormatError, match=message):
-        colmap_text.read_points3d(_text(tmp_path, text))
+        text_form.read_points3d(_text(tmp_path, text))
 
 
 def test_other_encodings_name_the_line(tmp_path):
     path = tmp_path / "cameras.txt"
     path.write_bytes(b"# one\n# caf\xe9\n")
     with pytest.raises(SceneFormatError, match=r"UTF-8 text in .*line 2"):
-        colmap_text.read_cameras(path)
+        text_form.read_cameras(path)
 
 
 def test_missing_files_are_our_errors(tmp_path):
     with pytest.raises(SceneNotFoundError):
-        colmap_text.read_points3d(tmp_path / "points3D.txt")
+        text_form.read_points3d(tmp_path / "points3D.txt")
     with pytest.raises(SceneFormatError, match="readable"):
-        colmap_text.read_cameras(tmp_path)
-
-
-@pytest.mark.parametrize("name", ["a\nb.jpg", " a.jpg", "a.jpg\t", "a\u2028b.jpg", "\udcff.jpg"])
-def test_names_that_would_not_read_back_are_refused(model, name, tmp_path):
-    path = tmp_path / "images.txt"
-    with pytest.raises(OutputError, match="image names"):
-        colmap_text.write_images(path, [replace(model.images[0], name=name)])
-    assert not path.exists()
+        text_form.read_cameras(tmp_path)

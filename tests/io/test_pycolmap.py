@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatseed.io import colmap_binary, colmap_text
+from splatseed.io import colmap_binary
 from splatseed.pointcloud import PointCloud
+
+from . import text_form
 
 pycolmap = pytest.importorskip("pycolmap")
 
 forms = pytest.mark.parametrize(
-    ("form", "suffix"), [(colmap_binary, "bin"), (colmap_text, "txt")], ids=["bin", "txt"]
+    ("form", "suffix"), [(colmap_binary, "bin"), (text_form, "txt")], ids=["bin", "txt"]
 )
 
 
@@ -117,7 +119,7 @@ def test_both_forms_of_a_real_model_agree(scenes, tmp_path, assert_same_images, 
     reconstruction.write_binary(tmp_path)
     reconstruction.write_text(tmp_path)
     cameras, images, *points = _read(colmap_binary, "bin", tmp_path)
-    text_cameras, text_images, *text_points = _read(colmap_text, "txt", tmp_path)
+    text_cameras, text_images, *text_points = _read(text_form, "txt", tmp_path)
     assert text_cameras == cameras
     assert_same_images(text_images, images)
     assert_same_points(text_points, points)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from splatseed.errors import SceneFormatError
-from splatseed.io._model import EXPORT_AGAIN, read_bytes
+from splatseed.io._files import read_bytes
 
 __all__ = ["ByteReader"]
 
@@ -38,7 +38,7 @@ class ByteReader:
         SceneFormatError: It cannot be read.
     """
 
-    def __init__(self, path: Path, fix: str = EXPORT_AGAIN) -> None:
+    def __init__(self, path: Path, fix: str) -> None:
         self.path = path
         self.fix = fix
         self.data = read_bytes(path)

@@ -2,7 +2,7 @@
 
 Promise: only regular files are opened, so that nothing is waited for or read without end (a pipe,
 ``/dev/zero``), and none that is larger than the free memory. What is refused raises an ``OSError`` whose
-``strerror`` says why, as what the system refuses does.
+``strerror`` says why, as what the system refuses does; ``read_bytes`` makes one of our errors of it.
 """
 
 from __future__ import annotations
@@ -13,9 +13,10 @@ import stat
 from pathlib import Path
 from typing import BinaryIO
 
+from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.memory import free_memory
 
-__all__ = ["open_file", "read_file"]
+__all__ = ["open_file", "read_bytes", "read_file"]
 
 _KINDS = (
     (stat.S_ISDIR, errno.EISDIR, "a folder"),
@@ -61,3 +62,22 @@ def _check(path: Path, found: os.stat_result) -> None:
         return
     number, kind = next((number, kind) for is_, number, kind in _KINDS if is_(found.st_mode))
     raise OSError(number, kind, str(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
+    """
+    try:
+        return read_file(path)
+    except (FileNotFoundError, NotADirectoryError):
+        raise SceneNotFoundError(f"a file at {path}", found="none", fix="Check the path.") from None
+    except OSError as error:
+        raise SceneFormatError(
+            f"{path} to be a readable file",
+            found=error.strerror or type(error).__name__,
+            fix="Check that it is a file and that you may read it.",
+        ) from None

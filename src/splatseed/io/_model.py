@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.errors import PointCloudError, SceneFormatError, SceneNotFoundError
-from splatseed.io._files import read_file
+from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
@@ -31,7 +30,6 @@ __all__ = [
     "make_intrinsics",
     "make_points",
     "point_columns",
-    "read_bytes",
 ]
 
 EXPORT_AGAIN = "Copy the file again, or export the model again with COLMAP."
@@ -44,25 +42,6 @@ UNKNOWN_ERROR = -1.0
 
 _MAX_SIZE = 2**31 - 1
 _NORM_RANGE = (1e-100, 1e100)  # inside it the square of a quaternion's norm is a normal float
-
-
-def read_bytes(path: Path) -> bytes:
-    """The whole file.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
-    """
-    try:
-        return read_file(path)
-    except (FileNotFoundError, NotADirectoryError):
-        raise SceneNotFoundError(f"a file at {path}", found="none", fix="Check the path.") from None
-    except OSError as error:
-        raise SceneFormatError(
-            f"{path} to be a readable file",
-            found=error.strerror or type(error).__name__,
-            fix="Check that it is a file and that you may read it.",
-        ) from None
 
 
 def make_intrinsics(

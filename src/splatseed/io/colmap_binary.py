@@ -19,6 +19,7 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
 from splatseed.io._binary import ByteReader
 from splatseed.io._model import (
+    EXPORT_AGAIN,
     NO_POINT,
     by_camera_id,
     check_names,
@@ -58,7 +59,7 @@ def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
         SceneNotFoundError: There is no such file.
         SceneFormatError: It is unreadable or malformed, or a camera model is unknown.
     """
-    reader = ByteReader(path)
+    reader = ByteReader(path, EXPORT_AGAIN)
     count = reader.count(_CAMERA.size + 3 * 8, "cameras")
     cameras = tuple(_read_camera(reader, i, count) for i in range(count))
     reader.finish()
@@ -90,7 +91,7 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
         SceneFormatError: It is unreadable or malformed, a pose is not finite, or an image names a
             camera that is not there.
     """
-    reader = ByteReader(path)
+    reader = ByteReader(path, EXPORT_AGAIN)
     cameras = by_camera_id(intrinsics)
     count = reader.count(_POSE.size + 1 + 8, "images")
     images = tuple(_read_image(reader, cameras, i, count) for i in range(count))
@@ -133,7 +134,7 @@ def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
         SceneFormatError: It is unreadable or malformed, or a point id occurs twice or exceeds
             2^63 - 1.
     """
-    reader = ByteReader(path)
+    reader = ByteReader(path, EXPORT_AGAIN)
     count = reader.count(_POINT.itemsize, "points")
     starts = _scan_points(reader, count)
     points, observations = _split_points(reader, starts)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from splatseed.io._model import read_bytes
+from splatseed.io._files import read_bytes
 from splatseed.io.depth_arrays import StoredDepth, check_stored, refuse
 from splatseed.requirements import require
 
