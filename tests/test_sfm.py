@@ -24,7 +24,7 @@ from splatseed.errors import (
     SceneFormatError,
     SceneNotFoundError,
 )
-from splatseed.io.rgbd import load_rgbd
+from splatseed.io.rgbd.replica import load_rgbd
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.sfm import reconstruct, triangulate, worker

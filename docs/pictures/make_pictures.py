@@ -27,8 +27,9 @@ import splatseed as ss
 from splatseed.commands._depth_picture import write_depth_picture
 from splatseed.depth import align
 from splatseed.geometry import spacing
-from splatseed.io import depth_folder, find_depths
-from splatseed.io.staging import atomic_file
+from splatseed.io import find_depths
+from splatseed.io.depth import folder as depth_folder
+from splatseed.io.output.staging import atomic_file
 from splatseed.preview import choose_camera, render_points
 from splatseed.scene import Image
 from splatseed.synthetic import Capture, make_capture, write_capture

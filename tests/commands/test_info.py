@@ -11,8 +11,8 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.io import load_scene, write_scene
-from splatseed.io.colmap_binary import write_cameras
-from splatseed.io.ply import write_ply
+from splatseed.io.colmap.binary import write_cameras
+from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
 
 

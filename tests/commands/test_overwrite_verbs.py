@@ -7,7 +7,7 @@ import json
 import pytest
 
 from splatseed.bench.folder import make_bench_folder
-from splatseed.io.staging import MANIFEST
+from splatseed.io.output.staging import MANIFEST
 from splatseed.train.run_folder import RunFolder
 
 

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.io import load_scene
-from splatseed.io.ply import read_ply, write_ply
+from splatseed.io.ply.points import read_ply, write_ply
 from splatseed.upsample import METHODS, chooses_number, configure
 
 METHOD_NAMES = list(METHODS)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
-from splatseed.io import _model, colmap_binary
+from splatseed.io.colmap import binary as colmap_binary, model as colmap_model
 from splatseed.pointcloud import PointCloud
 
 REAL_MODELS = [
@@ -212,7 +212,7 @@ def test_unreadable_files_are_our_errors(read, tmp_path, monkeypatch):
     def deny(_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(_model, "read_file", deny)
+    monkeypatch.setattr(colmap_model, "read_file", deny)
     with pytest.raises(SceneFormatError, match="Permission denied"):
         read(tmp_path / "model.bin")
 
@@ -230,7 +230,7 @@ def test_numba_is_imported_only_for_tracks(tmp_path):
 import sys
 from pathlib import Path
 import numpy as np
-from splatseed.io import colmap_binary
+from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
 cloud = PointCloud(np.zeros((2, 3)), np.zeros((2, 3), np.uint8))
 colmap_binary.write_points3d(Path(sys.argv[1]), cloud, None)

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io import colmap_binary
+from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
 
 from . import text_form

@@ -16,7 +16,7 @@ from splatseed.io.dense.colmap_files import (
     write_map,
 )
 from splatseed.io.dense.maps import depth_along, scaled_K
-from splatseed.io.depth_arrays import read_colmap_depth
+from splatseed.io.depth.arrays import read_colmap_depth
 from splatseed.stereo import StereoMap
 
 

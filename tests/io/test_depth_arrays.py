@@ -14,8 +14,8 @@ from PIL import Image as PilImage
 
 from splatseed import requirements
 from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
-from splatseed.io.depth_arrays import read_colmap_depth, read_npy, read_npz, read_pfm
-from splatseed.io.depth_pictures import read_exr, read_picture
+from splatseed.io.depth.arrays import read_colmap_depth, read_npy, read_npz, read_pfm
+from splatseed.io.depth.pictures import read_exr, read_picture
 
 SHAPES = hnp.array_shapes(min_dims=2, max_dims=2, max_side=9)
 FLOATS = hnp.arrays(np.float32, SHAPES)

@@ -15,7 +15,7 @@ from splatseed.camera import Intrinsics
 from splatseed.depthmap import DepthMap
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import DepthFiles, find_depths, load_scene
-from splatseed.io.depth_files import SUFFIXES
+from splatseed.io.depth.files import SUFFIXES
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 

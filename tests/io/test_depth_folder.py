@@ -12,9 +12,10 @@ from hypothesis.extra import numpy as hnp
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError, SceneFormatError
-from splatseed.io import depth_folder, find_depths
-from splatseed.io.depth_folder import DESCRIPTION, read_description, write_description
-from splatseed.io.staging import MANIFEST
+from splatseed.io import find_depths
+from splatseed.io.depth import folder as depth_folder
+from splatseed.io.depth.folder import DESCRIPTION, read_description, write_description
+from splatseed.io.output.staging import MANIFEST
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 

@@ -11,10 +11,10 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from PIL import Image as PilImage
 
 from splatseed.errors import SplatseedError
-from splatseed.io._tum_lists import read_list, read_track
-from splatseed.io.depth_arrays import read_colmap_depth, read_npy, read_npz, read_pfm
-from splatseed.io.depth_folder import read_capture_scale, read_description
-from splatseed.io.depth_pictures import read_picture
+from splatseed.io.depth.arrays import read_colmap_depth, read_npy, read_npz, read_pfm
+from splatseed.io.depth.folder import read_capture_scale, read_description
+from splatseed.io.depth.pictures import read_picture
+from splatseed.io.rgbd.tum_lists import read_list, read_track
 
 READERS: dict[str, Callable[[Path], object]] = {
     "a.bin": read_colmap_depth,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatseed import load_scene, upsample, write_scene
-from splatseed.io._seeds_npz import SEEDS
+from splatseed.io.output.seeds_npz import SEEDS
 from splatseed.pointcloud import GENERATED
 from splatseed.synthetic import make_capture
 

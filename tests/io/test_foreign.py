@@ -6,7 +6,7 @@ import pytest
 
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene
-from splatseed.io.ply import read_ply
+from splatseed.io.ply.points import read_ply
 
 PACKED = """ply
 format binary_little_endian 1.0

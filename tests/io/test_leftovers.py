@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("fcntl")
 
-from splatseed.io.staging import output_folder
+from splatseed.io.output.staging import output_folder
 
 
 @pytest.fixture

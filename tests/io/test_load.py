@@ -13,8 +13,9 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io import colmap_binary, colmap_text, load_scene
-from splatseed.io.ply import write_ply
+from splatseed.io import load_scene
+from splatseed.io.colmap import binary as colmap_binary, text as colmap_text
+from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from splatseed.errors import OutputError
 from splatseed.io import load_scene, write_scene
-from splatseed.io.staging import MANIFEST, add_files, output_folder
+from splatseed.io.output.staging import MANIFEST, add_files, output_folder
 from splatseed.synthetic import make_capture, write_capture
 
 
@@ -155,7 +155,7 @@ def test_copies_of_read_only_images_are_writable(scene_dir, tmp_path):
 READ_ONLY = """
 import sys
 from pathlib import Path
-from splatseed.io.staging import output_folder
+from splatseed.io.output.staging import output_folder
 
 out, pictures = Path(sys.argv[1]) / "out", Path(sys.argv[1]) / "pictures"
 def write():

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.ply import read_ply, write_ply
+from splatseed.io.ply.points import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 
 KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "i4": "int"}

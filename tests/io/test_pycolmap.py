@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatseed.io import colmap_binary
+from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
 
 from . import text_form

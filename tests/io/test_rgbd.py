@@ -10,7 +10,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.rgbd import load_rgbd
+from splatseed.io.rgbd.replica import load_rgbd
 
 CAMERA = {"w": 40, "h": 30, "fx": 35.0, "fy": 36.0, "cx": 19.5, "cy": 14.5, "scale": 1000.0}
 

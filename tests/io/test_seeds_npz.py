@@ -10,8 +10,8 @@ from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from splatseed import load_scene, write_scene
-from splatseed.io import colmap_binary
-from splatseed.io._seeds_npz import SEEDS, read_seeds, write_seeds
+from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io.output.seeds_npz import SEEDS, read_seeds, write_seeds
 from splatseed.pointcloud import ATTRIBUTES, PointCloud
 from splatseed.synthetic import make_capture
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from splatseed.errors import OutputError
-from splatseed.io.staging import MANIFEST, atomic_file, output_folder
+from splatseed.io.output.staging import MANIFEST, atomic_file, output_folder
 
 
 def listing(folder: Path) -> list[str]:

@@ -13,9 +13,9 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene
-from splatseed.io.depth_lens import Undistortion
-from splatseed.io.rgbd import load_rgbd
-from splatseed.io.tum import load_tum
+from splatseed.io.depth.lens import Undistortion
+from splatseed.io.rgbd.replica import load_rgbd
+from splatseed.io.rgbd.tum import load_tum
 from splatseed.lens import image_points
 from splatseed.scene import SceneSource
 

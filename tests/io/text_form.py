@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from splatseed.camera import Intrinsics
-from splatseed.io._model import point_columns
-from splatseed.io.colmap_text import read_cameras, read_images, read_points3d
+from splatseed.io.colmap.model import point_columns
+from splatseed.io.colmap.text import read_cameras, read_images, read_points3d
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Tracks
 

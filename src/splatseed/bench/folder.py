@@ -14,7 +14,7 @@ from pathlib import Path
 from splatseed.bench.ledger import LEDGER, Ledger
 from splatseed.bench.scenes import SceneFacts
 from splatseed.errors import OutputError
-from splatseed.io.staging import MANIFEST, atomic_file, check_output
+from splatseed.io.output.staging import MANIFEST, atomic_file, check_output
 
 __all__ = ["DEMO_FACTS", "check_bench_folder", "make_bench_folder", "make_demo_scene"]
 

@@ -29,7 +29,7 @@ from splatseed.bench.memory import peak_bytes
 from splatseed.bench.records import CurvePoint, ImageScore, RunResult, RunSpec
 from splatseed.bench.seeds import make_seeds, scene_of
 from splatseed.errors import SceneFormatError, SplatseedError
-from splatseed.io.staging import check_output
+from splatseed.io.output.staging import check_output
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.train.interruption import interruption

@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from splatseed.bench.records import RunResult, RunSpec
-from splatseed.io.staging import output_folder
+from splatseed.io.output.staging import output_folder
 from splatseed.train.run_folder import RunFolder
 
 __all__ = [

@@ -28,7 +28,7 @@ from splatseed.bench.local import slot_environment
 from splatseed.bench.records import RunSpec
 from splatseed.bench.watcher import Watcher
 from splatseed.errors import OutputError, ParameterError, SceneNotFoundError, SplatseedError
-from splatseed.io.staging import MANIFEST
+from splatseed.io.output.staging import MANIFEST
 from splatseed.progress import silent
 from splatseed.requirements import require
 from splatseed.train.interruption import interruption

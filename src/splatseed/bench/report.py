@@ -26,7 +26,7 @@ from splatseed.bench.study import Study, studies
 from splatseed.bench.summary import summary
 from splatseed.bench.tables import Table, write_table
 from splatseed.bench.views import ComparedView, compared_views, jpeg
-from splatseed.io.staging import atomic_file, output_folder
+from splatseed.io.output.staging import atomic_file, output_folder
 from splatseed.progress import Progress, silent
 
 __all__ = ["REPORT", "Report", "write_report"]

@@ -13,7 +13,7 @@ from pathlib import Path
 from splatseed.bench.digest import depth_digest, scene_digest
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths, find_usable, load_scene
-from splatseed.io.depth_find import search_depths
+from splatseed.io.depth_search import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from splatseed.io.staging import atomic_file
+from splatseed.io.output.staging import atomic_file
 
 __all__ = ["Cell", "Table", "cell_text", "number", "to_csv", "to_markdown", "to_tex", "words",
            "write_table"]  # fmt: skip

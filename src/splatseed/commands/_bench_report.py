@@ -30,7 +30,7 @@ from splatseed.console import (
     stage_display,
 )
 from splatseed.errors import SceneNotFoundError
-from splatseed.io.staging import check_output
+from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
 
 __all__ = ["run_compare", "run_report"]

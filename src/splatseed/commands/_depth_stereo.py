@@ -19,7 +19,7 @@ from splatseed.io.dense import (
     write_dense_maps,
     write_dense_workspace,
 )
-from splatseed.io.staging import check_output
+from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted, visible
 from splatseed.scene import Scene
 

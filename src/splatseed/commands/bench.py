@@ -23,7 +23,7 @@ from splatseed.commands._bench_prepare import Prepared, prepare
 from splatseed.commands._bench_summary import print_summary
 from splatseed.commands._options import parse_options
 from splatseed.console import OUT, print_note, stage_display
-from splatseed.io.staging import atomic_file
+from splatseed.io.output.staging import atomic_file
 from splatseed.literal import visible
 from splatseed.train.interruption import exit_code
 

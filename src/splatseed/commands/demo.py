@@ -29,7 +29,7 @@ from splatseed.console import (
 from splatseed.errors import MissingDependencyError, ParameterError
 from splatseed.geometry import GeometryScore, measure, spacing
 from splatseed.io import find_depths, load_scene, write_scene
-from splatseed.io.staging import add_files, atomic_file, output_folder
+from splatseed.io.output.staging import add_files, atomic_file, output_folder
 from splatseed.literal import quoted
 from splatseed.pointcloud import PointCloud
 from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair

@@ -17,7 +17,7 @@ from splatseed.errors import (
     ParameterError,
     SceneNotFoundError,
 )
-from splatseed.io.staging import atomic_file, check_output, output_folder
+from splatseed.io.output.staging import atomic_file, check_output, output_folder
 from splatseed.requirements import require
 from splatseed.train.run_folder import RunFolder
 from splatseed.train.settings import Backend, TrainSettings

@@ -31,7 +31,7 @@ from splatseed.io import (
     load_scene,
     write_scene,
 )
-from splatseed.io.staging import check_output
+from splatseed.io.output.staging import check_output
 from splatseed.literal import visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene

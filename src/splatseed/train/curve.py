@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from splatseed.io.staging import atomic_file
+from splatseed.io.output.staging import atomic_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

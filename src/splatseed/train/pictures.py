@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from splatseed.io.staging import atomic_file
+from splatseed.io.output.staging import atomic_file
 
 __all__ = ["FULL_ERROR", "beside_truth", "error_map", "picture_name", "write_picture"]
 

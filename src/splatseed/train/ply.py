@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.errors import SceneFormatError
-from splatseed.io._binary import ByteReader
-from splatseed.io._foreign import refuse_foreign, refuse_packed
-from splatseed.io._ply_header import EXPORT_PLY_AGAIN, Element, parse_header
-from splatseed.io.staging import atomic_file
+from splatseed.io.binary import ByteReader
+from splatseed.io.output.staging import atomic_file
+from splatseed.io.ply.foreign import refuse_foreign, refuse_packed
+from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, parse_header
 from splatseed.train.gaussians import Gaussians
 
 __all__ = ["read_gaussians", "write_gaussians"]

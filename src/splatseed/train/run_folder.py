@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseed.errors import OutputError, SceneFormatError
-from splatseed.io.staging import MANIFEST, add_files, atomic_file, check_apart, check_output
+from splatseed.io.output.staging import MANIFEST, add_files, atomic_file, check_apart, check_output
 
 __all__ = ["RunFolder", "write_json"]
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.staging import atomic_file
+from splatseed.io.output.staging import atomic_file
 from splatseed.train.curve import Record
 from splatseed.train.parameters import Optimizers, Parameters, as_parameters, make_optimizers
 from splatseed.train.schedule import Schedule

@@ -14,8 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.depth_files import SUFFIXES, DepthFiles
-from splatseed.io.depth_folder import (
+from splatseed.io.depth.files import SUFFIXES, DepthFiles
+from splatseed.io.depth.folder import (
     CAMERA_FILE,
     DESCRIPTION,
     DepthDescription,

@@ -15,9 +15,9 @@ import numpy as np
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneNotFoundError
-from splatseed.io import colmap_binary, colmap_text
-from splatseed.io._image_checks import image_warnings, lens_warnings
-from splatseed.io.ply import read_ply
+from splatseed.io.colmap import binary as colmap_binary, text as colmap_text
+from splatseed.io.image_checks import image_warnings, lens_warnings
+from splatseed.io.ply.points import read_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource, Tracks
 
@@ -35,6 +35,7 @@ _IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
 
 
 def find_model(*folders: Path) -> Path | None:
+    """The first of some folders that holds a model."""
     return next((folder for folder in folders if _is_model(folder)), None)
 
 
@@ -60,6 +61,7 @@ def scene_root(model_dir: Path) -> Path:
 
 
 def read_colmap_scene(model_dir: Path) -> Scene:
+    """The scene of a model, with its images, its points and what a user should know of them."""
     root = scene_root(model_dir)
     intrinsics, images = read_model_cameras(model_dir)
     points, tracks, points_path = read_model_points(model_dir)
@@ -85,6 +87,7 @@ def read_colmap_scene(model_dir: Path) -> Scene:
 def read_model_cameras(
     model_dir: Path,
 ) -> tuple[tuple[Intrinsics, ...], tuple[Image, ...]]:
+    """The camera and the image records of a model."""
     cameras_path, images_path = _model_file(model_dir, "cameras"), _model_file(model_dir, "images")
     if cameras_path is None:
         if images_path is not None:
@@ -101,6 +104,7 @@ def read_model_cameras(
 
 
 def read_model_points(model_dir: Path) -> tuple[PointCloud, Tracks | None, Path]:
+    """The points of a model, their tracks where they have any, and the file they are in."""
     path = _model_file(model_dir, "points3D")
     if path is None:
         return empty_cloud(), None, model_dir / "points3D.bin"
@@ -115,6 +119,7 @@ def _format_of(path: Path) -> Any:
 
 
 def empty_cloud() -> PointCloud:
+    """A cloud without points."""
     return PointCloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
 
 

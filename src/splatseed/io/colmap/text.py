@@ -16,8 +16,7 @@ import numpy as np
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
-from splatseed.io._files import read_bytes
-from splatseed.io._model import (
+from splatseed.io.colmap.model import (
     EXPORT_AGAIN,
     MAX_ID,
     NO_POINT,
@@ -28,6 +27,7 @@ from splatseed.io._model import (
     make_intrinsics,
     make_points,
 )
+from splatseed.io.files import read_bytes
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 

@@ -16,8 +16,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from splatseed.errors import OutputError
-from splatseed.io._leftovers import held, remove_leftovers, remove_tree
-from splatseed.io._manifest import MANIFEST, add_files, kind_of, seal, why_kept
+from splatseed.io.output.leftovers import held, remove_leftovers, remove_tree
+from splatseed.io.output.manifest import MANIFEST, add_files, kind_of, seal, why_kept
 
 __all__ = [
     "MANIFEST",

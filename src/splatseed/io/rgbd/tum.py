@@ -19,13 +19,13 @@ from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics, rotation_from_quat
 from splatseed.errors import SceneNotFoundError
-from splatseed.io._capture import check_size, find_camera_file, read_intrinsics
-from splatseed.io._colmap_scene import empty_cloud
-from splatseed.io._image_checks import lens_warnings
-from splatseed.io._tum_lists import TOLERANCE, nearest_in_time, poses_at, read_list, read_track
-from splatseed.io.depth_files import DepthFiles
-from splatseed.io.depth_folder import read_capture_scale, safe_parts
-from splatseed.io.depth_lens import Undistortion
+from splatseed.io.colmap.scene import empty_cloud
+from splatseed.io.depth.files import DepthFiles
+from splatseed.io.depth.folder import read_capture_scale, safe_parts
+from splatseed.io.depth.lens import Undistortion
+from splatseed.io.image_checks import lens_warnings
+from splatseed.io.rgbd.capture import check_size, find_camera_file, read_intrinsics
+from splatseed.io.rgbd.tum_lists import TOLERANCE, nearest_in_time, poses_at, read_list, read_track
 from splatseed.scene import Image, Scene, SceneSource
 
 __all__ = ["find_tum_depths", "is_tum", "load_tum"]

@@ -1,6 +1,6 @@
 """The content of a ``transforms.json`` to be written.
 
-Notation: as in ``splatseed.io.transforms``. Promise: a file that was read keeps all its fields; a
+Notation: as in ``splatseed.io.nerfstudio.transforms``. Promise: a file that was read keeps all its fields; a
 new one has those that nerfstudio's own conversion of a COLMAP model writes, which OpenSplat,
 Brush and LichtFeld Studio read too.
 """
@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
-from splatseed.io.transforms import OPENCV_FROM_OPENGL, Transforms
+from splatseed.io.nerfstudio.transforms import OPENCV_FROM_OPENGL, Transforms
 from splatseed.scene import Image, Scene
 
 __all__ = ["NERFSTUDIO_FROM_COLMAP", "frame_paths", "kept_json", "transforms_json"]

@@ -24,8 +24,8 @@ from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError
-from splatseed.io._files import open_file, read_bytes
-from splatseed.io._model import MAX_ID, make_intrinsics
+from splatseed.io.colmap.model import MAX_ID, make_intrinsics
+from splatseed.io.files import open_file, read_bytes
 from splatseed.scene import Image
 
 __all__ = ["OPENCV_FROM_OPENGL", "Transforms", "apply_transform", "read_transforms"]

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from splatseed.errors import PointCloudError
-from splatseed.io._model import NO_POINT
+from splatseed.io.colmap.model import NO_POINT
 from splatseed.scene import Image, Observations, Scene, Tracks
 
 __all__ = ["Renumbered", "renumber"]

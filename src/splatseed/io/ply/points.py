@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Shaped, UInt8
 
 from splatseed.errors import SceneFormatError
-from splatseed.io._binary import ByteReader
-from splatseed.io._foreign import refuse_packed
-from splatseed.io._ply_header import EXPORT_PLY_AGAIN, Element, Header, parse_header
+from splatseed.io.binary import ByteReader
+from splatseed.io.ply.foreign import refuse_packed
+from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.pointcloud import PointCloud
 
 __all__ = ["read_ply", "write_ply"]

@@ -21,7 +21,7 @@ from numpy.lib import format as npy_format
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import SceneFormatError
-from splatseed.io._files import read_bytes
+from splatseed.io.files import read_bytes
 
 __all__ = [
     "KINDS",

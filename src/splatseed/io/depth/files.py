@@ -16,15 +16,15 @@ from jaxtyping import Float32
 
 from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import SceneNotFoundError
-from splatseed.io.depth_arrays import (
+from splatseed.io.depth.arrays import (
     StoredDepth,
     read_colmap_depth,
     read_npy,
     read_npz,
     read_pfm,
 )
-from splatseed.io.depth_lens import Undistortion
-from splatseed.io.depth_pictures import read_exr, read_picture
+from splatseed.io.depth.lens import Undistortion
+from splatseed.io.depth.pictures import read_exr, read_picture
 
 __all__ = ["FAR", "INTEGER_SCALE", "SUFFIXES", "DepthFiles"]
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io._files import open_file, read_file
-from splatseed.io.depth_folder import CAMERA_FILE
+from splatseed.io.depth.folder import CAMERA_FILE
+from splatseed.io.files import open_file, read_file
 
 __all__ = ["check_size", "find_camera_file", "read_intrinsics", "read_text"]
 

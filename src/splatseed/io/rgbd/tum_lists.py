@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from splatseed.errors import SceneFormatError
-from splatseed.io._capture import read_text
+from splatseed.io.rgbd.capture import read_text
 
 __all__ = ["TOLERANCE", "Track", "nearest_in_time", "poses_at", "read_list", "read_track"]
 

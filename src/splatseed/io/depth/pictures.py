@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from splatseed.io._files import read_bytes
-from splatseed.io.depth_arrays import StoredDepth, check_stored, refuse
+from splatseed.io.depth.arrays import StoredDepth, check_stored, refuse
+from splatseed.io.files import read_bytes
 from splatseed.requirements import require
 
 __all__ = ["read_exr", "read_picture"]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from splatseed.errors import SceneFormatError
-from splatseed.io._files import read_bytes
+from splatseed.io.files import read_bytes
 
 __all__ = ["ByteReader"]
 

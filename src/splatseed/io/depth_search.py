@@ -8,11 +8,11 @@ from pathlib import Path, PurePosixPath
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneNotFoundError
-from splatseed.io.depth_arrays import KINDS
-from splatseed.io.depth_files import SUFFIXES, DepthFiles
-from splatseed.io.depth_folder import safe_parts
-from splatseed.io.depth_matching import match_by_name
-from splatseed.io.tum import find_tum_depths, is_tum
+from splatseed.io.depth.arrays import KINDS
+from splatseed.io.depth.files import SUFFIXES, DepthFiles
+from splatseed.io.depth.folder import safe_parts
+from splatseed.io.depth.matching import match_by_name
+from splatseed.io.rgbd.tum import find_tum_depths, is_tum
 from splatseed.scene import Scene
 
 __all__ = ["find_depths", "search_depths"]

@@ -20,10 +20,10 @@ from jaxtyping import Float32
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import OutputError, SceneFormatError
-from splatseed.io._files import read_bytes
-from splatseed.io._layouts import write_json
-from splatseed.io.depth_arrays import KINDS, check_stored
-from splatseed.io.staging import MANIFEST, output_folder
+from splatseed.io.depth.arrays import KINDS, check_stored
+from splatseed.io.files import read_bytes
+from splatseed.io.output.layouts import write_json
+from splatseed.io.output.staging import MANIFEST, output_folder
 
 __all__ = [
     "CAMERA_FILE",

@@ -17,8 +17,8 @@ from jaxtyping import Int64, UInt8
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
-from splatseed.io._binary import ByteReader
-from splatseed.io._model import (
+from splatseed.io.binary import ByteReader
+from splatseed.io.colmap.model import (
     EXPORT_AGAIN,
     NO_POINT,
     by_camera_id,
@@ -151,7 +151,7 @@ def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
 
 def _scan_points(reader: ByteReader, count: int) -> Int64[np.ndarray, " N+1"]:
     """The byte offset of each point record, then the end of the last; consumes the file."""
-    from splatseed.io._records import scan_records  # noqa: PLC0415  (imports Numba)
+    from splatseed.io.colmap.records import scan_records  # noqa: PLC0415  (imports Numba)
 
     starts = np.empty(count + 1, np.int64)
     complete = scan_records(np.frombuffer(reader.data, np.uint8), reader.offset, starts)
@@ -167,7 +167,7 @@ def _split_points(
     reader: ByteReader, starts: Int64[np.ndarray, " N+1"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The heads [N] as ``_POINT`` and the track elements [T] as ``_OBSERVATION``."""
-    from splatseed.io._records import split_records  # noqa: PLC0415  (imports Numba)
+    from splatseed.io.colmap.records import split_records  # noqa: PLC0415  (imports Numba)
 
     points = np.empty(len(starts) - 1, _POINT)
     observations = np.empty(_track_offsets(starts)[-1], _OBSERVATION)
@@ -283,7 +283,7 @@ def _joined_records(
     heads: np.ndarray, tracks: Tracks, start: int, stop: int
 ) -> UInt8[np.ndarray, " B"]:
     """The bytes of the records of points ``start`` to ``stop``, which have tracks."""
-    from splatseed.io._records import join_records  # noqa: PLC0415  (imports Numba)
+    from splatseed.io.colmap.records import join_records  # noqa: PLC0415  (imports Numba)
 
     first, last = tracks.offsets[start], tracks.offsets[stop]
     observations = np.empty(last - first, _OBSERVATION)

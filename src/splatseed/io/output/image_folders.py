@@ -14,7 +14,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path, PurePath
 
-from splatseed.io._files import open_file
+from splatseed.io.files import open_file
 from splatseed.scene import Scene
 
 __all__ = ["bring", "frame_folders", "image_folders"]

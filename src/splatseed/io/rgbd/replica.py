@@ -19,14 +19,14 @@ from jaxtyping import Bool, Float64
 
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io._capture import (
+from splatseed.io.depth.folder import CAMERA_FILE
+from splatseed.io.depth.matching import match_by_name
+from splatseed.io.rgbd.capture import (
     check_size,
     find_camera_file,
     read_intrinsics,
     read_text,
 )
-from splatseed.io.depth_folder import CAMERA_FILE
-from splatseed.io.depth_matching import match_by_name
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 

@@ -9,7 +9,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatseed.io._files import open_file
+from splatseed.io.files import open_file
 from splatseed.scene import Image
 
 __all__ = ["image_warnings", "lens_warnings"]

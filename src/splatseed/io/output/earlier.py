@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
-from splatseed.io._seeds_npz import read_seeds
-from splatseed.io.staging import MANIFEST
+from splatseed.io.output.seeds_npz import read_seeds
+from splatseed.io.output.staging import MANIFEST
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.scene import Scene, Tracks
 

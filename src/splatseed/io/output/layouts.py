@@ -17,20 +17,20 @@ import numpy as np
 from jaxtyping import Bool
 
 from splatseed.camera import Intrinsics
-from splatseed.io import colmap_binary
-from splatseed.io._colmap_scene import read_model_cameras
-from splatseed.io._image_folders import frame_folders, image_folders
-from splatseed.io._model_ids import Renumbered, renumber
-from splatseed.io._seeds_npz import write_seeds
-from splatseed.io._split import MODEL_LISTS, ROOT_LISTS, split_fields
-from splatseed.io._transforms_json import (
+from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io.colmap.ids import Renumbered, renumber
+from splatseed.io.colmap.scene import read_model_cameras
+from splatseed.io.nerfstudio.content import (
     NERFSTUDIO_FROM_COLMAP,
     frame_paths,
     kept_json,
     transforms_json,
 )
-from splatseed.io.ply import write_ply
-from splatseed.io.transforms import apply_transform, read_transforms
+from splatseed.io.nerfstudio.transforms import apply_transform, read_transforms
+from splatseed.io.output.image_folders import frame_folders, image_folders
+from splatseed.io.output.seeds_npz import write_seeds
+from splatseed.io.ply.points import write_ply
+from splatseed.io.split import MODEL_LISTS, ROOT_LISTS, split_fields
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 

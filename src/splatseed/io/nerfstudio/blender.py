@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from splatseed.camera import Intrinsics
-from splatseed.io._image_checks import image_warnings, lens_warnings
-from splatseed.io._transforms_scene import find_points
-from splatseed.io.transforms import Transforms, read_transforms
+from splatseed.io.image_checks import image_warnings, lens_warnings
+from splatseed.io.nerfstudio.scene import find_points
+from splatseed.io.nerfstudio.transforms import Transforms, read_transforms
 from splatseed.scene import Image, Scene, SceneSource, Split
 
 __all__ = ["is_blender", "read_blender"]

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-from splatseed.io._files import read_bytes
+from splatseed.io.files import read_bytes
 from splatseed.scene import Scene, Split
 
 __all__ = ["MODEL_LISTS", "ROOT_LISTS", "follow_lists", "split_fields"]

@@ -14,15 +14,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import SceneFormatError
-from splatseed.io._colmap_scene import (
+from splatseed.io.colmap.scene import (
     empty_cloud,
     find_model,
     read_model_cameras,
     read_model_points,
 )
-from splatseed.io._image_checks import image_warnings, lens_warnings
-from splatseed.io.ply import read_ply
-from splatseed.io.transforms import Transforms, apply_transform, read_transforms
+from splatseed.io.image_checks import image_warnings, lens_warnings
+from splatseed.io.nerfstudio.transforms import Transforms, apply_transform, read_transforms
+from splatseed.io.ply.points import read_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.similarity import fit_similarity
