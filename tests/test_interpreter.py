@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import splatseed
-from splatseed.bench import child
-from splatseed.bench.job import JobOptions
+from splatseed.bench.running import child
+from splatseed.bench.running.job import JobOptions
 from splatseed.errors import ReconstructionError
 from splatseed.sfm import worker
 

@@ -10,6 +10,8 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import Counter
+from graphlib import TopologicalSorter
 from importlib.metadata import version
 from pathlib import Path
 
@@ -116,6 +118,26 @@ def test_imports_run_one_way(part):
         ours = {name[1] for name in names if name[0] == "splatseed" and len(name) > 1}
         assert ours <= allowed, path.name
         assert ["splatseed"] not in names, f"{path.name} imports the whole package"
+
+
+@pytest.mark.parametrize("part", ["io", "bench"])
+def test_rooms_of_a_part_import_each_other_in_no_circle(part):
+    """A room is a folder of the part, or a file that stands in none."""
+    rooms = {}
+    for path in _files(part):
+        place = path.relative_to(SOURCE / part)
+        if place.name != "__init__.py" or len(place.parts) > 1:  # a part's door opens on all rooms
+            names = [name.split(".") for name in _imports(path)]
+            ours = {name[2] for name in names if name[:2] == ["splatseed", part] and len(name) > 2}
+            room = place.parts[0].removesuffix(".py")
+            rooms[room] = rooms.get(room, set()) | ours - {room}
+    TopologicalSorter(rooms).prepare()  # raises CycleError, which names the circle
+
+
+@pytest.mark.parametrize("top", ["src/splatseed/bench", "src/splatseed/io"])
+def test_no_folder_holds_many_files(top):
+    counts = Counter(path.parent for path in _tracked() if path.is_relative_to(ROOT / top))
+    assert not {str(folder): count for folder, count in counts.items() if count > 15}
 
 
 @pytest.mark.parametrize("part", ["views", "depth", "stereo", "upsample", "seeding"])

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from splatseed.bench.compare import change_table, compare, only_table, settings_table
-from splatseed.bench.ledger import LEDGER, Ledger
-from splatseed.bench.records import SFM
-from splatseed.bench.study import BASELINE, Variant
+from splatseed.bench.analysis.compare import change_table, compare, only_table, settings_table
+from splatseed.bench.analysis.study import BASELINE, Variant
+from splatseed.bench.planning.records import SFM
+from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.cli import main
 
 from .planted import GAINS, rows

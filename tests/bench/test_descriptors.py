@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from splatseed.bench.descriptors import (
+from splatseed.bench.analysis.descriptors import (
     Descriptors,
     describe,
     read_descriptors,

@@ -6,9 +6,9 @@ import dataclasses
 
 import pytest
 
-from splatseed.bench.estimate import Estimator
-from splatseed.bench.records import SFM, Arm, ImageScore, RunResult, RunRow, RunSpec
-from splatseed.bench.scenes import SceneFacts
+from splatseed.bench.planning.estimate import Estimator
+from splatseed.bench.planning.records import SFM, Arm, ImageScore, RunResult, RunRow, RunSpec
+from splatseed.bench.planning.scenes import SceneFacts
 
 FACTS = SceneFacts("room", "", "ab12", num_points=10_000, num_images=80, pixels=800 * 600)
 SPEC = RunSpec("room", "ab12", Arm("mls", "default", 8, "none"), repeat=0, max_steps=1000)

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatseed.bench.figures import (
+from splatseed.bench.analysis.study import Variant, studies
+from splatseed.bench.planning.records import SFM
+from splatseed.bench.report.figures import (
     curve_figure,
     ratio_figure,
     scene_figure,
     shown_variants,
     strategy_figure,
 )
-from splatseed.bench.records import SFM
-from splatseed.bench.study import Variant, studies
 
 from .planted import rows
 

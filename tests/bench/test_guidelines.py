@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from splatseed.bench.descriptors import Descriptors
-from splatseed.bench.gains import gains
-from splatseed.bench.guidelines import (
+from splatseed.bench.analysis.descriptors import Descriptors
+from splatseed.bench.analysis.gains import gains
+from splatseed.bench.analysis.guidelines import (
     Guideline,
     fewest_scenes,
     guideline_table,
@@ -20,9 +20,9 @@ from splatseed.bench.guidelines import (
     verdict,
     winner_table,
 )
-from splatseed.bench.records import SFM
-from splatseed.bench.study import studies
-from splatseed.bench.tables import to_markdown
+from splatseed.bench.analysis.study import studies
+from splatseed.bench.analysis.tables import to_markdown
+from splatseed.bench.planning.records import SFM
 
 from .planted import rows
 

@@ -14,13 +14,13 @@ from PIL import Image as PilImage
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
-from splatseed.bench import job
-from splatseed.bench.job import JobOptions, run_job
-from splatseed.bench.kept import read_result
-from splatseed.bench.memory import peak_bytes
-from splatseed.bench.plan import plan_runs
-from splatseed.bench.scenes import survey
-from splatseed.bench.seeds import make_seeds, scene_of
+from splatseed.bench.planning.plan import plan_runs
+from splatseed.bench.planning.scenes import survey
+from splatseed.bench.running import job
+from splatseed.bench.running.job import JobOptions, run_job
+from splatseed.bench.running.kept import read_result
+from splatseed.bench.running.memory import peak_bytes
+from splatseed.bench.running.seeds import make_seeds, scene_of
 from splatseed.cli import main
 from splatseed.io import load_scene, write_scene
 from splatseed.train.seeds import seeds_digest

@@ -14,10 +14,10 @@ import time
 
 import pytest
 
-from splatseed.bench import ledger as ledger_module, worker as worker_module
-from splatseed.bench.ledger import Ledger
-from splatseed.bench.records import Arm, ImageScore, RunResult, RunSpec
-from splatseed.bench.worker import STALE_SECONDS, worker_name
+from splatseed.bench.planning.records import Arm, ImageScore, RunResult, RunSpec
+from splatseed.bench.running import ledger as ledger_module, worker as worker_module
+from splatseed.bench.running.ledger import Ledger
+from splatseed.bench.running.worker import STALE_SECONDS, worker_name
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 
 ARM = Arm("mls", "default", 8, "none")
@@ -101,8 +101,8 @@ def test_a_run_is_handed_on_when_its_worker_is_silent(ledger, monkeypatch):
 def test_a_run_of_a_killed_process_is_handed_on_at_once(ledger):
     code = (
         "import sys, time; from pathlib import Path\n"
-        "from splatseed.bench.ledger import Ledger\n"
-        "from splatseed.bench.worker import worker_name\n"
+        "from splatseed.bench.running.ledger import Ledger\n"
+        "from splatseed.bench.running.worker import worker_name\n"
         "Ledger.open(Path(sys.argv[1])).claim(worker_name()); print('claimed', flush=True)\n"
         "time.sleep(60)\n"
     )

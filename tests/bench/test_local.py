@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from splatseed.bench import child
-from splatseed.bench.ledger import Ledger
-from splatseed.bench.local import LocalExecutor, slot_environment
-from splatseed.bench.records import Arm, ImageScore, RunResult, RunSpec
-from splatseed.bench.watcher import Watcher
+from splatseed.bench.planning.records import Arm, ImageScore, RunResult, RunSpec
+from splatseed.bench.running import child
+from splatseed.bench.running.ledger import Ledger
+from splatseed.bench.running.local import LocalExecutor, slot_environment
+from splatseed.bench.running.watcher import Watcher
 from splatseed.errors import OutputError
 
 ARM = Arm("mls", "default", 8, "none")
@@ -193,12 +193,12 @@ def test_a_process_ends_with_its_parent(tmp_path):
     code = f"""
 import sys
 from pathlib import Path
-from splatseed.bench import child
-from splatseed.bench.job import JobOptions
-from splatseed.bench.records import Arm, RunSpec
+from splatseed.bench.running import child
+from splatseed.bench.running.job import JobOptions
+from splatseed.bench.planning.records import Arm, RunSpec
 child.PROGRAM = '''
 import os, sys, time
-from splatseed.bench import job
+from splatseed.bench.running import job
 def wait(spec):
     print(os.getpid(), file=sys.stderr, flush=True)
     time.sleep(60)

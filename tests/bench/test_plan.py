@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.bench.plan import DEMO, Plan, PlannedScene, plan_runs
-from splatseed.bench.plan_file import KINDS, plan_text, read_plan
-from splatseed.bench.records import SFM, Arm
-from splatseed.bench.scenes import survey
+from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene, plan_runs
+from splatseed.bench.planning.plan_file import KINDS, plan_text, read_plan
+from splatseed.bench.planning.records import SFM, Arm
+from splatseed.bench.planning.scenes import survey
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.train.settings import StrategyName

@@ -17,15 +17,15 @@ pytest.importorskip("ray", reason="Ray is an extra: pip install 'splatseed[clust
 
 from ray.cluster_utils import Cluster
 
-from splatseed.bench import ray_cluster as module
-from splatseed.bench.child import Child, Killed
-from splatseed.bench.environment import package_version
-from splatseed.bench.kept import kept_folder
-from splatseed.bench.ledger import Ledger
-from splatseed.bench.plan import plan_runs
-from splatseed.bench.plan_file import plan_text
-from splatseed.bench.ray_cluster import Share, run_on_node
-from splatseed.bench.scenes import survey
+from splatseed.bench.planning.plan import plan_runs
+from splatseed.bench.planning.plan_file import plan_text
+from splatseed.bench.planning.scenes import survey
+from splatseed.bench.running import ray_cluster as module
+from splatseed.bench.running.child import Child, Killed
+from splatseed.bench.running.environment import package_version
+from splatseed.bench.running.kept import kept_folder
+from splatseed.bench.running.ledger import Ledger
+from splatseed.bench.running.ray_cluster import Share, run_on_node
 from splatseed.errors import MissingDependencyError, ParameterError
 
 COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()", "bench")

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from splatseed.bench.records import SFM, Arm, CurvePoint, ImageScore, RunResult, RunSpec
+from splatseed.bench.planning.records import SFM, Arm, CurvePoint, ImageScore, RunResult, RunSpec
 
 ARM = Arm("mls", "default", 8, "none")
 SPEC = RunSpec("room", "ab12", ARM, repeat=0, max_steps=100, parameters={"k": 12}, version="1")

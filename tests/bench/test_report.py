@@ -11,19 +11,18 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from splatseed.bench import report_pictures
-from splatseed.bench.digest import scene_digest
-from splatseed.bench.gains import gains
-from splatseed.bench.html import slider, table
-from splatseed.bench.kept import kept_folder
-from splatseed.bench.ledger import LEDGER, Ledger
-from splatseed.bench.records import SFM, RunRow
-from splatseed.bench.report import REPORT, write_report
-from splatseed.bench.report_pictures import safe_name
-from splatseed.bench.study import studies
-from splatseed.bench.summary import summary
-from splatseed.bench.tables import Cell, Table, words
-from splatseed.bench.views import compared_views
+from splatseed.bench.analysis.gains import gains
+from splatseed.bench.analysis.study import studies
+from splatseed.bench.analysis.summary import summary
+from splatseed.bench.analysis.tables import Cell, Table, words
+from splatseed.bench.planning.digest import scene_digest
+from splatseed.bench.planning.records import SFM, RunRow
+from splatseed.bench.report.html import slider, table
+from splatseed.bench.report.pictures import safe_name
+from splatseed.bench.report.views import compared_views
+from splatseed.bench.report.write import REPORT, pictures as report_pictures, write_report
+from splatseed.bench.running.kept import kept_folder
+from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.cli import main
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from splatseed.bench.statistics import (
+from splatseed.bench.analysis.statistics import (
     Difference,
     adjusted,
     difference,

@@ -12,15 +12,23 @@ import re
 import numpy as np
 import pytest
 
-from splatseed.bench.comparisons import equal_count_table, ratio_table, strategy_table
-from splatseed.bench.convergence import convergence_table, reach
-from splatseed.bench.costs import cost_table, quality_table
-from splatseed.bench.gains import clear_best, gains, mean_gains
-from splatseed.bench.paper import DATASETS, dataset_of, paper_dataset
-from splatseed.bench.psnr_tables import gain_table, mean_gain_table, psnr_tables
-from splatseed.bench.records import SFM, RunRow
-from splatseed.bench.study import BASELINE, Variant, studies
-from splatseed.bench.tables import Cell, Table, to_csv, to_markdown, to_tex, words, write_table
+from splatseed.bench.analysis.comparisons import equal_count_table, ratio_table, strategy_table
+from splatseed.bench.analysis.convergence import convergence_table, reach
+from splatseed.bench.analysis.costs import cost_table, quality_table
+from splatseed.bench.analysis.gains import clear_best, gains, mean_gains
+from splatseed.bench.analysis.paper import DATASETS, dataset_of, paper_dataset
+from splatseed.bench.analysis.psnr_tables import gain_table, mean_gain_table, psnr_tables
+from splatseed.bench.analysis.study import BASELINE, Variant, studies
+from splatseed.bench.analysis.tables import (
+    Cell,
+    Table,
+    to_csv,
+    to_markdown,
+    to_tex,
+    words,
+    write_table,
+)
+from splatseed.bench.planning.records import SFM, RunRow
 
 from .planted import GAINS, SCENES, result, rows, spec
 

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from splatseed.bench.folder import make_bench_folder
+from splatseed.bench.running.folder import make_bench_folder
 from splatseed.io.output.staging import MANIFEST
 from splatseed.train.run_folder import RunFolder
 

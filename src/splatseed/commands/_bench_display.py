@@ -10,8 +10,8 @@ from contextlib import contextmanager
 
 from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn
 
-from splatseed.bench.records import RunResult, RunSpec
-from splatseed.bench.watcher import Watcher
+from splatseed.bench.planning.records import RunResult, RunSpec
+from splatseed.bench.running.watcher import Watcher
 from splatseed.console import ERR, OUT
 from splatseed.literal import visible
 

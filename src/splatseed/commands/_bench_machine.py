@@ -10,17 +10,17 @@ from pathlib import Path
 from shutil import which
 from typing import TYPE_CHECKING, TypeAlias
 
-from splatseed.bench.job import JobOptions
-from splatseed.bench.ledger import Ledger
-from splatseed.bench.local import LocalExecutor, cores, slot_environment
-from splatseed.bench.watcher import Watcher
+from splatseed.bench.running.job import JobOptions
+from splatseed.bench.running.ledger import Ledger
+from splatseed.bench.running.local import LocalExecutor, cores, slot_environment
+from splatseed.bench.running.watcher import Watcher
 from splatseed.commands._bench_options import Options
 from splatseed.memory import check_memory
 from splatseed.requirements import require
 from splatseed.train.settings import BYTES_EACH, Backend
 
 if TYPE_CHECKING:
-    from splatseed.bench.ray_cluster import Cluster
+    from splatseed.bench.running.ray_cluster import Cluster
 
 __all__ = ["Machine", "check_machine", "open_machine"]
 
@@ -69,7 +69,7 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
     """
     require("torch", "gsplat")
     if options.executor == "ray":
-        from splatseed.bench.ray_cluster import ray_cluster  # noqa: PLC0415  (an extra)
+        from splatseed.bench.running.ray_cluster import ray_cluster  # noqa: PLC0415  (an extra)
 
         with ray_cluster(options.address) as cluster:
             yield _ray_machine(options, backend, cluster)
@@ -140,7 +140,7 @@ def _gpu_of(slot: int, gpus: Sequence[str]) -> str:
 
 
 def _ray_machine(options: Options, backend: Backend, cluster: Cluster) -> Machine:
-    from splatseed.bench.ray_cluster import RayExecutor  # noqa: PLC0415  (an extra)
+    from splatseed.bench.running.ray_cluster import RayExecutor  # noqa: PLC0415  (an extra)
 
     found: Backend = "cuda" if backend == "cuda" or cluster.has_gpus else "cpu"
     found = "cpu" if backend == "cpu" else found

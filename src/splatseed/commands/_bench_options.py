@@ -15,9 +15,9 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from splatseed.bench.plan import DEMO, Plan, PlannedScene
-from splatseed.bench.plan_file import read_plan
-from splatseed.bench.presets import PresetName, preset_plan
+from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
+from splatseed.bench.planning.plan_file import read_plan
+from splatseed.bench.planning.presets import PresetName, preset_plan
 from splatseed.errors import ParameterError
 from splatseed.train.settings import Backend, StrategyName
 from splatseed.upsample import Profile

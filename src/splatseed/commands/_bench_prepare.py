@@ -7,11 +7,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatseed.bench.environment import package_version
-from splatseed.bench.folder import DEMO_FACTS, make_demo_scene
-from splatseed.bench.plan import DEPTH, Plan, PlannedScene, plan_runs
-from splatseed.bench.records import SFM, RunSpec
-from splatseed.bench.scenes import SceneFacts, survey
+from splatseed.bench.planning.plan import DEPTH, Plan, PlannedScene, plan_runs
+from splatseed.bench.planning.records import SFM, RunSpec
+from splatseed.bench.planning.scenes import SceneFacts, survey
+from splatseed.bench.running.environment import package_version
+from splatseed.bench.running.folder import DEMO_FACTS, make_demo_scene
 from splatseed.commands._bench_options import Asked
 from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress

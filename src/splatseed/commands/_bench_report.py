@@ -9,17 +9,17 @@ from typing import Annotated
 
 import tyro
 
-from splatseed.bench.compare import (
+from splatseed.bench.analysis.compare import (
     Comparison,
     change_table,
     compare,
     only_table,
     settings_table,
 )
-from splatseed.bench.ledger import LEDGER, Ledger
-from splatseed.bench.records import RunRow
-from splatseed.bench.report import Report, write_report
-from splatseed.bench.tables import Table, cell_text, write_table
+from splatseed.bench.analysis.tables import Table, cell_text, write_table
+from splatseed.bench.planning.records import RunRow
+from splatseed.bench.report.write import Report, write_report
+from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.commands._options import parse_options
 from splatseed.console import (
     OUT,

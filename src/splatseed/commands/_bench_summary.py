@@ -7,8 +7,8 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 from statistics import fmean
 
-from splatseed.bench.kept import ERROR, kept_folder
-from splatseed.bench.records import SFM, Arm, RunRow
+from splatseed.bench.planning.records import SFM, Arm, RunRow
+from splatseed.bench.running.kept import ERROR, kept_folder
 from splatseed.commands._bench_display import describe
 from splatseed.console import print_commands, print_note, print_pairs, print_table
 from splatseed.literal import quoted

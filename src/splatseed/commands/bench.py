@@ -8,14 +8,14 @@ from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
-from splatseed.bench.environment import describe_environment
-from splatseed.bench.estimate import Estimator
-from splatseed.bench.folder import check_bench_folder, make_bench_folder
-from splatseed.bench.job import JobOptions
-from splatseed.bench.ledger import LEDGER, Ledger
-from splatseed.bench.plan import Plan
-from splatseed.bench.plan_file import plan_text
-from splatseed.bench.records import RunRow, RunSpec
+from splatseed.bench.planning.estimate import Estimator
+from splatseed.bench.planning.plan import Plan
+from splatseed.bench.planning.plan_file import plan_text
+from splatseed.bench.planning.records import RunRow, RunSpec
+from splatseed.bench.running.environment import describe_environment
+from splatseed.bench.running.folder import check_bench_folder, make_bench_folder
+from splatseed.bench.running.job import JobOptions
+from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.commands._bench_display import run_display, spoken_time
 from splatseed.commands._bench_machine import Machine, check_machine, open_machine
 from splatseed.commands._bench_options import PLAN, Asked, Options, asked_plan
