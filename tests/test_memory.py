@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatseed import memory
-from splatseed.commands._bench_machine import Machine, check_machine
+from splatseed.commands.bench.machine import Machine, check_machine
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.monocular import estimate

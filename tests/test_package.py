@@ -53,7 +53,6 @@ ORDER = (
     "sfm",
     "monocular",
     "diagnostics",
-    "trainers",
     "render",
     "train",
     "evaluate",

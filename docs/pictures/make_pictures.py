@@ -24,11 +24,11 @@ from scipy.ndimage import gaussian_filter
 from splatseed.depth.sightings import find_sightings
 
 import splatseed as ss
-from splatseed.commands._depth_picture import write_depth_picture
+from splatseed.commands.info.depth_picture import write_depth_picture
 from splatseed.depth import align
 from splatseed.geometry import spacing
 from splatseed.io import find_depths
-from splatseed.io.depth import folder as depth_folder
+from splatseed.io.depth.folder import depth_folder
 from splatseed.io.output.staging import atomic_file
 from splatseed.preview import choose_camera, render_points
 from splatseed.scene import Image

@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _print_completion(words: list[str]) -> None:
-    from splatseed.commands._completion import completion_script  # noqa: PLC0415  (loads every verb)
+    from splatseed.commands.completion import completion_script  # noqa: PLC0415  (loads every verb)
 
     try:
         OUT.print(completion_script(words, list(VERBS)), end="", soft_wrap=True)

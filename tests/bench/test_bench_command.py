@@ -283,7 +283,7 @@ def test_bad_words_end_in_one_line(bench, room_path, tmp_path, monkeypatch, word
 
 def test_help_does_not_wait_for_pytorch():
     code = (
-        "import sys, splatseed.commands.bench\n"
+        "import sys, splatseed.commands.bench.command\n"
         "assert 'torch' not in sys.modules and 'gsplat' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

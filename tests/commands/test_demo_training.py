@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from splatseed.commands import demo
+from splatseed.commands.demo import command as demo
 from splatseed.errors import MissingDependencyError
 
 WORDS = ("demo", "--views", "4", "--ratio", "2", "--no-preview")

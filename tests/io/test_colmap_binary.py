@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import OutputError, PointCloudError, SceneFormatError, SceneNotFoundError
-from splatseed.io.colmap import binary as colmap_binary, model as colmap_model
+from splatseed.io import files
+from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
 
 REAL_MODELS = [
@@ -212,7 +213,7 @@ def test_unreadable_files_are_our_errors(read, tmp_path, monkeypatch):
     def deny(_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(colmap_model, "read_file", deny)
+    monkeypatch.setattr(files, "read_file", deny)
     with pytest.raises(SceneFormatError, match="Permission denied"):
         read(tmp_path / "model.bin")
 

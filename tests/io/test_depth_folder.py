@@ -13,8 +13,7 @@ from hypothesis.extra import numpy as hnp
 from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io import find_depths
-from splatseed.io.depth import folder as depth_folder
-from splatseed.io.depth.folder import DESCRIPTION, read_description, write_description
+from splatseed.io.depth.folder import DESCRIPTION, depth_folder, read_description, write_description
 from splatseed.io.output.staging import MANIFEST
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene

@@ -8,7 +8,8 @@ import signal
 import pytest
 
 from splatseed.cli import main
-from splatseed.commands import bench, train
+from splatseed.commands import train
+from splatseed.commands.bench import command as bench
 from splatseed.train.interruption import exit_code, interruption
 
 

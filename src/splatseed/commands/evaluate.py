@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from splatseed.commands._options import parse_options
+from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import (
     MissingDependencyError,

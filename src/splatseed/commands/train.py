@@ -20,7 +20,7 @@ from rich.progress import (
 )
 from rich.table import Column
 
-from splatseed.commands._options import parse_options
+from splatseed.commands.options import parse_options
 from splatseed.console import (
     ERR,
     OUT,

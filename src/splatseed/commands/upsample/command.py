@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from splatseed.commands._options import parse_options
-from splatseed.commands._upsample_output import summarise, write_map_preview, write_previews
+from splatseed.commands.options import parse_options
+from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
 from splatseed.console import (
     OUT,
     StageClock,
@@ -46,7 +46,7 @@ from splatseed.upsample import (
     planned_size,
 )
 
-__all__ = ["parse", "run"]
+__all__ = ["Options", "parse", "run"]
 
 HELP_ALL = "--help-all"
 

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-from splatseed.commands._depth_options import Options
+from splatseed.commands.depth.options import Options
 from splatseed.console import OUT, StageClock, print_commands, print_note, stage_display
 from splatseed.io import load_scene
 from splatseed.io.dense import (

@@ -10,9 +10,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseed.commands._depth_numbers import print_depth
-from splatseed.commands._depth_picture import write_depth_picture
-from splatseed.commands._options import parse_options
+from splatseed.commands.info.depth_numbers import print_depth
+from splatseed.commands.info.depth_picture import write_depth_picture
+from splatseed.commands.options import parse_options
 from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
 from splatseed.depth import Alignment, align
 from splatseed.depthmap import DepthKind
@@ -30,7 +30,7 @@ from splatseed.io import find_depths, load_scene
 from splatseed.literal import quoted
 from splatseed.scene import Scene
 
-__all__ = ["run"]
+__all__ = ["Options", "run"]
 
 KINDS_SHOWN = 3
 """Kinds of cameras listed; collections of photographs from the web have one a photograph."""

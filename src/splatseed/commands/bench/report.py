@@ -20,7 +20,7 @@ from splatseed.bench.analysis.tables import Table, cell_text, write_table
 from splatseed.bench.planning.records import RunRow
 from splatseed.bench.report.write import Report, write_report
 from splatseed.bench.running.ledger import LEDGER, Ledger
-from splatseed.commands._options import parse_options
+from splatseed.commands.options import parse_options
 from splatseed.console import (
     OUT,
     print_commands,

@@ -12,7 +12,7 @@ from splatseed.bench.planning.records import SFM, RunSpec
 from splatseed.bench.planning.scenes import SceneFacts, survey
 from splatseed.bench.running.environment import package_version
 from splatseed.bench.running.folder import DEMO_FACTS, make_demo_scene
-from splatseed.commands._bench_options import Asked
+from splatseed.commands.bench.options import Asked
 from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress
 from splatseed.train.settings import Backend

@@ -16,12 +16,12 @@ from splatseed.bench.running.environment import describe_environment
 from splatseed.bench.running.folder import check_bench_folder, make_bench_folder
 from splatseed.bench.running.job import JobOptions
 from splatseed.bench.running.ledger import LEDGER, Ledger
-from splatseed.commands._bench_display import run_display, spoken_time
-from splatseed.commands._bench_machine import Machine, check_machine, open_machine
-from splatseed.commands._bench_options import PLAN, Asked, Options, asked_plan
-from splatseed.commands._bench_prepare import Prepared, prepare
-from splatseed.commands._bench_summary import print_summary
-from splatseed.commands._options import parse_options
+from splatseed.commands.bench.display import run_display, spoken_time
+from splatseed.commands.bench.machine import Machine, check_machine, open_machine
+from splatseed.commands.bench.options import PLAN, Asked, Options, asked_plan
+from splatseed.commands.bench.prepare import Prepared, prepare
+from splatseed.commands.bench.summary import print_summary
+from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_note, stage_display
 from splatseed.io.output.staging import atomic_file
 from splatseed.literal import visible
@@ -36,7 +36,7 @@ REPORTING = {"report": "run_report", "compare": "run_compare"}
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
     if arguments and arguments[0] in REPORTING:
-        reporting = import_module("splatseed.commands._bench_report")
+        reporting = import_module("splatseed.commands.bench.report")
         getattr(reporting, REPORTING[arguments[0]])(arguments[1:])
         return
     options = parse_options(Options, "bench", arguments)

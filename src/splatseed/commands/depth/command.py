@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from splatseed.commands._depth_options import Options, check_together
-from splatseed.commands._depth_stereo import provenance, run_stereo
-from splatseed.commands._options import parse_options
+from splatseed.commands.depth.options import Options, check_together
+from splatseed.commands.depth.stereo import provenance, run_stereo
+from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.output.staging import check_output

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from splatseed.commands.upsample.trainers import training_commands
 from splatseed.console import StageClock, print_commands, print_note, print_pairs
 from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.io import WriteReport
@@ -16,7 +17,6 @@ from splatseed.progress import silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views
 from splatseed.seeding.upsampling import CELL
-from splatseed.trainers import training_commands
 from splatseed.upsample import Upsampler, chooses_number, methods_for, upsample
 from splatseed.upsample.registry import origin_name
 

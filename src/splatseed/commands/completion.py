@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 
-from splatseed.commands._options import known_options
+from splatseed.commands.options import known_options
 from splatseed.errors import ParameterError
 
 __all__ = ["completion_script"]

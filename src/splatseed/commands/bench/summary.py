@@ -9,7 +9,7 @@ from statistics import fmean
 
 from splatseed.bench.planning.records import SFM, Arm, RunRow
 from splatseed.bench.running.kept import ERROR, kept_folder
-from splatseed.commands._bench_display import describe
+from splatseed.commands.bench.display import describe
 from splatseed.console import print_commands, print_note, print_pairs, print_table
 from splatseed.literal import quoted
 

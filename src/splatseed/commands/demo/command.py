@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
-from splatseed.commands._options import parse_options
+from splatseed.commands.options import parse_options
 from splatseed.console import (
     StageClock,
     print_commands,
@@ -46,9 +46,9 @@ from splatseed.upsample import (
 )
 
 if TYPE_CHECKING:  # importing PyTorch takes a while, and it may be absent
-    from splatseed.commands._demo_training import TrainedArm
+    from splatseed.commands.demo.training import TrainedArm
 
-__all__ = ["run"]
+__all__ = ["Options", "run"]
 
 SHOWN = "auto"
 TEST_EVERY = 8
@@ -216,7 +216,7 @@ def _train(options: Options) -> bool:
         print_note(f"not trained: {error.found} installed. {error.fix}")
         return False
     # These import PyTorch.
-    from splatseed.commands._demo_training import Arm, train_arm, write_comparison  # noqa: PLC0415
+    from splatseed.commands.demo.training import Arm, train_arm, write_comparison  # noqa: PLC0415
     from splatseed.train.settings import TrainSettings  # noqa: PLC0415
 
     folder = options.output
@@ -262,7 +262,7 @@ def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None
 
 
 def _row(each: TrainedArm, goal: float) -> tuple[str, ...]:
-    from splatseed.commands._demo_training import when_reached  # noqa: PLC0415  (as above)
+    from splatseed.commands.demo.training import when_reached  # noqa: PLC0415  (as above)
 
     metrics, reached = each.metrics, when_reached(goal, each.metrics)
     return (

@@ -14,7 +14,7 @@ from splatseed.bench.running.job import JobOptions
 from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.local import LocalExecutor, cores, slot_environment
 from splatseed.bench.running.watcher import Watcher
-from splatseed.commands._bench_options import Options
+from splatseed.commands.bench.options import Options
 from splatseed.memory import check_memory
 from splatseed.requirements import require
 from splatseed.train.settings import BYTES_EACH, Backend
