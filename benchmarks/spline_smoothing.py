@@ -14,8 +14,8 @@ from scipy.interpolate import SmoothBivariateSpline
 
 from clouds import room
 from markdown import table
-from splatseed.upsample.frames import local_frames
 from splatseed.upsample.neighbors import prepare
+from splatseed.upsample.surfaces.frames import local_frames
 
 __all__ = ["smoothing_table"]
 

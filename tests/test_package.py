@@ -119,7 +119,7 @@ def test_imports_run_one_way(part):
         assert ["splatseed"] not in names, f"{path.name} imports the whole package"
 
 
-@pytest.mark.parametrize("part", ["io", "bench"])
+@pytest.mark.parametrize("part", ["io", "upsample", "bench"])
 def test_rooms_of_a_part_import_each_other_in_no_circle(part):
     """A room is a folder of the part, or a file that stands in none."""
     rooms = {}
@@ -133,9 +133,9 @@ def test_rooms_of_a_part_import_each_other_in_no_circle(part):
     TopologicalSorter(rooms).prepare()  # raises CycleError, which names the circle
 
 
-@pytest.mark.parametrize("top", ["src/splatseed/bench", "src/splatseed/io"])
+@pytest.mark.parametrize("top", ["bench", "commands", "io", "upsample"])
 def test_no_folder_holds_many_files(top):
-    counts = Counter(path.parent for path in _tracked() if path.is_relative_to(ROOT / top))
+    counts = Counter(path.parent for path in _tracked() if path.is_relative_to(SOURCE / top))
     assert not {str(folder): count for folder, count in counts.items() if count > 15}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatseed.upsample.frames import local_frames, world_frames
+from splatseed.upsample.surfaces.frames import local_frames, world_frames
 
 from . import references as slow
 

@@ -9,11 +9,11 @@ from scipy.spatial import QhullError
 from splatseed import PointCloud
 from splatseed.errors import PointCloudError
 from splatseed.progress import silent
-from splatseed.upsample import voronoi_box
-from splatseed.upsample.frames import local_frames
+from splatseed.upsample.cells import box as voronoi_box
+from splatseed.upsample.cells.box import box_cells
+from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
 from splatseed.upsample.neighbors import prepare
-from splatseed.upsample.voronoi_box import box_cells
-from splatseed.upsample.voronoi_cells import MAX_NEIGHBORS, Cells, build_cells
+from splatseed.upsample.surfaces.frames import local_frames
 
 from . import references_voronoi as slow
 

@@ -21,12 +21,12 @@ from jaxtyping import Float64
 
 from splatseed.jit import kernel, parallel_range
 from splatseed.progress import Progress, blocks
+from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
 from splatseed.upsample.colors import interpolate_colors
-from splatseed.upsample.frames import local_frames
 from splatseed.upsample.method import NewPoints, require
 from splatseed.upsample.nearest import NearestMethod
 from splatseed.upsample.neighbors import Neighbors, PreparedCloud, draw_bases
-from splatseed.upsample.voronoi_cells import MAX_NEIGHBORS, Cells, build_cells
+from splatseed.upsample.surfaces.frames import local_frames
 
 __all__ = ["Voronoi"]
 
@@ -78,7 +78,7 @@ class Voronoi(NearestMethod):
         neighbors = neighbors.nearest(self.k)
         frames, _ = local_frames(cloud.xyz, neighbors.idx)
         if self.cells == "box":
-            from splatseed.upsample.voronoi_box import box_cells  # noqa: PLC0415  (SciPy's Qhull)
+            from splatseed.upsample.cells.box import box_cells  # noqa: PLC0415  (SciPy's Qhull)
 
             center, radius, volume = box_cells(cloud, progress)
             weight = weight * volume

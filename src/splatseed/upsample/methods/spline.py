@@ -20,9 +20,15 @@ from jaxtyping import Float32, Float64
 
 from splatseed.jit import inline, kernel, parallel_range
 from splatseed.upsample.method import require
-from splatseed.upsample.patch_method import PatchMethod
-from splatseed.upsample.patches import Patches
-from splatseed.upsample.spline_basis import CONTROL, PatchBasis, evaluate, patch_basis, penalty
+from splatseed.upsample.surfaces.patch_method import PatchMethod
+from splatseed.upsample.surfaces.patches import Patches
+from splatseed.upsample.surfaces.spline_basis import (
+    CONTROL,
+    PatchBasis,
+    evaluate,
+    patch_basis,
+    penalty,
+)
 
 __all__ = ["Spline"]
 
@@ -75,7 +81,7 @@ class Spline(PatchMethod):
     ) -> None:
         """Fit rows ``first:last`` and write S(u, v) of all their outputs into ``out`` [M]."""
         if self.basis == "bicubic":
-            from splatseed.upsample.spline_bicubic import bicubic_heights  # noqa: PLC0415  (LAPACK)
+            from splatseed.upsample.surfaces.spline_bicubic import bicubic_heights  # noqa: PLC0415  (LAPACK)
 
             bicubic_heights(patches, first, last, out)
             return
@@ -87,7 +93,7 @@ class Spline(PatchMethod):
     def _smoothing(self, basis: PatchBasis, count: np.ndarray) -> Float64[np.ndarray, " rows"]:
         """The penalty's weight for each row."""
         if isinstance(self.smoothing, str):
-            from splatseed.upsample.spline_gcv import cross_validate  # noqa: PLC0415  (compiles)
+            from splatseed.upsample.surfaces.spline_gcv import cross_validate  # noqa: PLC0415  (compiles)
 
             return cross_validate(basis, count)
         return np.full(len(basis.z), float(self.smoothing))

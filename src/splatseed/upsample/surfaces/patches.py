@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from splatseed.jit import inline, kernel, parallel_range
-from splatseed.upsample.frames import coordinate
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
+from splatseed.upsample.surfaces.frames import coordinate
 
 __all__ = ["Patches", "lift"]
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.jit import inline, kernel, parallel_range
-from splatseed.upsample.spline_basis import CONTROL, PatchBasis, penalty
+from splatseed.upsample.surfaces.spline_basis import CONTROL, PatchBasis, penalty
 
 __all__ = ["LAMBDAS", "cross_validate"]
 

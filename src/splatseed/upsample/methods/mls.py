@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.jit import inline, kernel, parallel_range
-from splatseed.upsample.patch_method import PatchMethod
-from splatseed.upsample.patches import Patches
+from splatseed.upsample.surfaces.patch_method import PatchMethod
+from splatseed.upsample.surfaces.patches import Patches
 
 __all__ = ["Mls"]
 

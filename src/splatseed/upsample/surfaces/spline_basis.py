@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int8
 
 from splatseed.jit import inline, kernel, parallel_range
-from splatseed.upsample.patches import Patches
+from splatseed.upsample.surfaces.patches import Patches
 
 __all__ = ["CONTROL", "PatchBasis", "evaluate", "patch_basis", "penalty"]
 

@@ -11,12 +11,12 @@ from jaxtyping import Float32
 
 from splatseed.progress import Progress, blocks
 from splatseed.upsample.colors import interpolate_colors
-from splatseed.upsample.frames import local_frames, world_frames
 from splatseed.upsample.method import NewPoints, require
 from splatseed.upsample.nearest import NearestMethod
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud, draw_bases
-from splatseed.upsample.patches import Patches, lift
-from splatseed.upsample.placement import place_in_box, place_in_triangle, place_on_disc
+from splatseed.upsample.surfaces.frames import local_frames, world_frames
+from splatseed.upsample.surfaces.patches import Patches, lift
+from splatseed.upsample.surfaces.placement import place_in_box, place_in_triangle, place_on_disc
 
 __all__ = ["PatchMethod"]
 

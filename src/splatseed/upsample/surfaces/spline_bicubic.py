@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.jit import inline, kernel, parallel_range
-from splatseed.upsample.patches import Patches
+from splatseed.upsample.surfaces.patches import Patches
 
 __all__ = ["bicubic_heights"]
 
