@@ -1,7 +1,7 @@
 """How close new points come to known surfaces, and how well they fill them.
 
 Notation: h is the spacing of a case's originals (mean distance to the 6 nearest); error, p95 and
-coverage are in units of h and mean what ``splatseed.geometry`` says, sum = error + coverage. A *case*
+coverage are in units of h and mean what ``splatseed.diagnostics.geometry`` says, sum = error + coverage. A *case*
 is a shape, a noise level and a seed; an *arm* is a method with its parameters. Promise: nothing here
 depends on the clock; the same code gives the same tables.
 """
@@ -22,7 +22,7 @@ import splatseed as ss
 from clouds import sample_unevenly
 from markdown import table
 from outliers import outlier_table
-from splatseed.geometry import GeometryScore, far_share, measure, spacing
+from splatseed.diagnostics.geometry import GeometryScore, far_share, measure, spacing
 from splatseed.synthetic import SHAPES, Surface
 from splatseed.synthetic.shapes import plane, sine_sheet
 from splatseed.synthetic.wavy import SineSheet

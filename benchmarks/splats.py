@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from clouds import sample_unevenly
 from splatseed.camera import Camera
-from splatseed.jit import kernel, parallel_range
+from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.render.binning import RECORD, TILE, depth_order, list_tiles
 from splatseed.render.layout import gather
 from splatseed.synthetic.raycast import render_views, visible

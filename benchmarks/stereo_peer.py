@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.stereo.cost import (
     LEAST,
     NOISE,

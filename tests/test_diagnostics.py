@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatseed.camera import Intrinsics
-from splatseed.diagnostics import (
+from splatseed.diagnostics.scene import (
     CloudStatistics,
     EmptyRegions,
     cloud_statistics,

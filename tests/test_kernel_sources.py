@@ -11,14 +11,14 @@ from pathlib import Path
 import pytest
 
 import splatseed
-from splatseed.kernel_sources import reached_files, source_digest
+from splatseed.kernels.sources import reached_files, source_digest
 
 SOURCE = Path(splatseed.__file__).parent
 
 FILES = {
     "__init__": "",
     "kernels": """
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 
 from tiny.middle import (
     halved,
@@ -30,7 +30,7 @@ def twice_shifted(x):
     return shifted(2.0 * x) + halved(0.0)
 """,
     "middle": """
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from . import numbers
 from .numbers import SHIFT
 
@@ -97,13 +97,13 @@ def test_a_file_reaches_what_it_imports_directly_and_by_way_of_others(tiny):
     found = reached_files(tiny / "kernels.py", "tiny.kernels")
     ours = {path.stem for path in found if path.parent == tiny}
     assert ours == {"kernels", "middle", "__init__", "numbers"}
-    assert found - set(tiny.iterdir()) == {SOURCE / "jit.py", SOURCE / "kernel_sources.py"}
+    assert found - set(tiny.iterdir()) == {SOURCE / "kernels/jit.py", SOURCE / "kernels/sources.py"}
 
 
 def test_kernels_reach_the_files_whose_functions_they_call():
     found = reached_files(SOURCE / "render" / "harmonics.py", "splatseed.render.harmonics")
     names = {path.relative_to(SOURCE).as_posix() for path in found}
-    assert {"simd.py", "render/shuffles.py", "jit.py"} <= names
+    assert {"kernels/simd.py", "kernels/shuffles.py", "kernels/jit.py"} <= names
     assert "cli.py" not in names
 
 
@@ -117,6 +117,6 @@ def test_the_digest_is_of_contents_alone(tiny, tmp_path):
 
 def test_a_script_reaches_splatseed_only(tmp_path):
     script = tmp_path / "script.py"
-    script.write_text("import numpy\nimport splatseed.simd as simd\nfrom . import gone\n")
+    script.write_text("import numpy\nimport splatseed.kernels.simd as simd\nfrom . import gone\n")
     names = {path.name for path in reached_files(script, "__main__")}
-    assert names == {"script.py", "simd.py", "jit.py", "kernel_sources.py"}
+    assert names == {"script.py", "simd.py", "jit.py", "sources.py"}

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed import memory
 from splatseed.commands.bench.machine import Machine, check_machine
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.monocular import estimate
 from splatseed.pointcloud import PointCloud
+from splatseed.process import memory
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.device import BYTES_EACH as BYTES_TRAINED
 from splatseed.upsample import BYTES_EACH, number_of_new, upsample

@@ -19,10 +19,10 @@ from splatseed.bench.planning.scenes import survey
 from splatseed.bench.running import job
 from splatseed.bench.running.job import JobOptions, run_job
 from splatseed.bench.running.kept import read_result
-from splatseed.bench.running.memory import peak_bytes
 from splatseed.bench.running.seeds import make_seeds, scene_of
 from splatseed.cli import main
 from splatseed.io import load_scene, write_scene
+from splatseed.process.peak import peak_bytes
 from splatseed.train.seeds import seeds_digest
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.memory import free_memory
+from splatseed.process.memory import free_memory
 
 __all__ = ["open_file", "read_bytes", "read_file"]
 

@@ -26,8 +26,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from splatseed.jit import always_inline, inline, kernel, parallel_range
-from splatseed.simd import (
+from splatseed.kernels.jit import always_inline, inline, kernel, parallel_range
+from splatseed.kernels.simd import (
     LANES,
     add,
     divide,

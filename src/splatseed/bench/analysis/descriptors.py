@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from splatseed.diagnostics import empty_regions
+from splatseed.diagnostics.scene import empty_regions
 from splatseed.errors import PointCloudError, SplatseedError
 from splatseed.io.output.staging import atomic_file
 from splatseed.io.photograph import decode_photograph, photograph_bytes

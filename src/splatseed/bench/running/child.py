@@ -23,7 +23,7 @@ from typing import IO, Any
 
 from splatseed.bench.planning.records import RunResult, RunSpec
 from splatseed.bench.running.job import JobOptions, Outcome, run_job
-from splatseed.interpreter import child_command, child_environment
+from splatseed.process.interpreter import child_command, child_environment
 from splatseed.progress import Progress
 
 __all__ = ["Child", "Killed", "serve"]

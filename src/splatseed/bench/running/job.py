@@ -26,10 +26,10 @@ from splatseed.bench.running.kept import (
     result_bytes,
     write_kept,
 )
-from splatseed.bench.running.memory import peak_bytes
 from splatseed.bench.running.seeds import make_seeds, scene_of
 from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.output.staging import check_output
+from splatseed.process.peak import peak_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.train.interruption import interruption

@@ -15,7 +15,7 @@ from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.local import LocalExecutor, cores, slot_environment
 from splatseed.bench.running.watcher import Watcher
 from splatseed.commands.bench.options import Options
-from splatseed.memory import check_memory
+from splatseed.process.memory import check_memory
 from splatseed.requirements import require
 from splatseed.train.settings import BYTES_EACH, Backend
 

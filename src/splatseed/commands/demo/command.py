@@ -26,8 +26,8 @@ from splatseed.console import (
     print_table,
     stage_display,
 )
+from splatseed.diagnostics.geometry import GeometryScore, measure, spacing
 from splatseed.errors import MissingDependencyError, ParameterError
-from splatseed.geometry import GeometryScore, measure, spacing
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.output.staging import add_files, atomic_file, output_folder
 from splatseed.literal import quoted

@@ -16,7 +16,7 @@ from splatseed.commands.options import parse_options
 from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
 from splatseed.depth import Alignment, align
 from splatseed.depthmap import DepthKind
-from splatseed.diagnostics import (
+from splatseed.diagnostics.scene import (
     CloudStatistics,
     EmptyRegions,
     TrackStatistics,

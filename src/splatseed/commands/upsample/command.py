@@ -21,8 +21,8 @@ from splatseed.console import (
     stage_display,
 )
 from splatseed.depthmap import DepthKind
+from splatseed.diagnostics.geometry import far_share
 from splatseed.errors import ParameterError
-from splatseed.geometry import far_share
 from splatseed.io import (
     UsablePoints,
     WriteReport,

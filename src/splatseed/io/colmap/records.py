@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 
 __all__ = ["HEAD_BYTES", "PAIR_BYTES", "join_records", "scan_records", "split_records"]
 

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError
 
 from splatseed.errors import PointCloudError
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.progress import Progress
 from splatseed.upsample.neighbors import PreparedCloud
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 
 __all__ = ["Cells", "build_cells"]
 

@@ -15,7 +15,7 @@ from typing import ClassVar, Self
 import numpy as np
 from jaxtyping import Float32
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.surfaces.patch_method import PatchMethod
 from splatseed.upsample.surfaces.patches import Patches
 

@@ -18,7 +18,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.method import require
 from splatseed.upsample.surfaces.patch_method import PatchMethod
 from splatseed.upsample.surfaces.patches import Patches

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from splatseed.jit import kernel, parallel_range
+from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress
 from splatseed.upsample.method import NewPoints
 from splatseed.upsample.nearest import NearestMethod

@@ -19,7 +19,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.jit import kernel, parallel_range
+from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress, blocks
 from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
 from splatseed.upsample.colors import interpolate_colors

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float64, Int32
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 
 __all__ = ["coordinate", "local_frames", "world_frames"]
 

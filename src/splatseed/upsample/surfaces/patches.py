@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.surfaces.frames import coordinate
 

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from splatseed.jit import kernel, parallel_range
+from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.surfaces.frames import coordinate
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int8
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.surfaces.patches import Patches
 
 __all__ = ["CONTROL", "PatchBasis", "evaluate", "patch_basis", "penalty"]

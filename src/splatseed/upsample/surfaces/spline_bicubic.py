@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.surfaces.patches import Patches
 
 __all__ = ["bicubic_heights"]

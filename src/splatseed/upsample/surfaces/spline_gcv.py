@@ -13,7 +13,7 @@ import math
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.surfaces.spline_basis import CONTROL, PatchBasis, penalty
 
 __all__ = ["LAMBDAS", "cross_validate"]

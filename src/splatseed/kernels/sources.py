@@ -20,7 +20,7 @@ __all__ = ["reached_files", "source_digest"]
 Packages: TypeAlias = tuple[tuple[str, Path], ...]
 """Names and folders of the packages whose files count."""
 
-SPLATSEED = ("splatseed", Path(__file__).parent)
+SPLATSEED = ("splatseed", Path(__file__).parents[1])
 IMPORT = re.compile(
     rb"^(?:from (?P<dots>\.*)(?P<module>[\w.]*) import (?P<names>\([^)]*\)|.*)"
     rb"|import (?P<whole>[\w.]+))",

@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from splatseed.simd import INDEX, LANES, VECTOR, f32x16
+from splatseed.kernels.simd import INDEX, LANES, VECTOR, f32x16
 
 __all__ = ["lane", "permutation", "three_sums", "triple"]
 

@@ -21,7 +21,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 
 __all__ = [
     "LANES",

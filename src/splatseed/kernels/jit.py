@@ -5,7 +5,7 @@ a SystemError inside ``prange``), releases the GIL, is cached on disk, and never
 floating-point sums, so its bytes do not depend on the number of threads or on the cache.
 
 A cached kernel is keyed on what its own file says and on every file that this one reaches by its imports
-(``splatseed.kernel_sources``): kernels call functions and use constants of any file.
+(``splatseed.kernels.sources``): kernels call functions and use constants of any file.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core import config
 
-from splatseed.kernel_sources import source_digest
+from splatseed.kernels.sources import source_digest
 
 __all__ = ["always_inline", "inline", "kernel", "parallel_range"]
 
