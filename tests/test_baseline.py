@@ -17,14 +17,16 @@ from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import TrainSettings
 from splatseed.train.schedule import make_schedule
 
-FOLDER = Path(__file__).parents[1] / "benchmarks"
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
 def bench():
-    sys.path.insert(0, str(FOLDER))
-    yield SimpleNamespace(**{n: import_module(n) for n in ("baseline", "baseline_arms")})
-    sys.path.remove(str(FOLDER))
+    sys.path.insert(0, str(ROOT))
+    yield SimpleNamespace(
+        **{n: import_module(f"benchmarks.training.{n}") for n in ("baseline", "baseline_arms")}
+    )
+    sys.path.remove(str(ROOT))
 
 
 @pytest.fixture(scope="module")

@@ -17,25 +17,27 @@ from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
 from splatseed.train.ply import read_gaussians
 
-FOLDER = Path(__file__).parents[1] / "benchmarks"
+ROOT = Path(__file__).parents[1]
 MODULES = (
-    "splats",
-    "children",
-    "clocks",
-    "stopwatch",
-    "torch_rasterizer",
-    "opensplat",
-    "render",
-    "train_step",
+    "rendering.splats",
+    "common.children",
+    "common.clocks",
+    "rendering.stopwatch",
+    "rendering.torch_rasterizer",
+    "rendering.opensplat",
+    "rendering.render",
+    "rendering.train_step",
 )
 
 
 @pytest.fixture(scope="module")
 def bench():
-    """The modules by name; they import each other from their folder."""
-    sys.path.insert(0, str(FOLDER))
-    yield SimpleNamespace(**{name: import_module(name) for name in MODULES})
-    sys.path.remove(str(FOLDER))
+    """The modules by name; they import each other from the checkout."""
+    sys.path.insert(0, str(ROOT))
+    yield SimpleNamespace(
+        **{name.split(".")[1]: import_module(f"benchmarks.{name}") for name in MODULES}
+    )
+    sys.path.remove(str(ROOT))
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,13 @@ from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.losses import ssim
 from splatseed.views.view import load_split
 
-FOLDER = Path(__file__).parents[1] / "benchmarks"
-MODULES = ("children", "peer_trainer", "peer_runs", "peer_stand_ins")
+ROOT = Path(__file__).parents[1]
+MODULES = (
+    "common.children",
+    "training.peer_trainer",
+    "training.peer_runs",
+    "training.peer_stand_ins",
+)
 
 # In place of gsplat's files: they import what it imports and train, in as few lines as that takes.
 TRAINER = """
@@ -184,10 +189,12 @@ def distances(points):
 
 @pytest.fixture(scope="module")
 def bench():
-    """The modules by name; they import each other from their folder."""
-    sys.path.insert(0, str(FOLDER))
-    yield SimpleNamespace(**{name: import_module(name) for name in MODULES})
-    sys.path.remove(str(FOLDER))
+    """The modules by name; they import each other from the checkout."""
+    sys.path.insert(0, str(ROOT))
+    yield SimpleNamespace(
+        **{name.split(".")[1]: import_module(f"benchmarks.{name}") for name in MODULES}
+    )
+    sys.path.remove(str(ROOT))
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +217,7 @@ def _train(bench, room, examples, steps, **more):
     settings = {"strategy": "default", "max_steps": steps, "data_factor": 2, "seed": 1, **more}
     capped = settings["strategy"] == "default" and "cap_max" in settings
     return bench.children.call(
-        "peer_runs:train_peer", threads=1, scene=str(room), split="validation",
+        "benchmarks.training.peer_runs:train_peer", threads=1, scene=str(room), split="validation",
         settings=settings, examples=str(examples), capped=capped,
     )  # fmt: skip
 
@@ -340,8 +347,8 @@ def test_options_that_make_no_sense_are_refused(bench, wrong, says):
 
 def test_the_script_says_what_is_missing_without_a_traceback(room):
     done = subprocess.run(
-        [sys.executable, FOLDER / "peer_trainer.py", "--scene", room, "--gsplat-examples", "none"],
-        capture_output=True, check=False, text=True,
+        [sys.executable, "-m", "benchmarks.training.peer_trainer", "--scene", room, "--gsplat-examples", "none"],
+        cwd=ROOT, capture_output=True, check=False, text=True,
     )  # fmt: skip
     assert done.returncode == 1
     assert done.stderr.startswith("expected the folder examples of gsplat v1.5.3")

@@ -12,10 +12,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from benchmarks.common.clouds import find_scenes
+from benchmarks.common.markdown import table
 from scipy.spatial import Delaunay, QhullError
 
-from clouds import find_scenes
-from markdown import table
 from splatseed.io import load_scene
 from splatseed.progress import silent
 from splatseed.scene import Image, Scene

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.seeds.depth import CAPTURES, FAR, HELD_OUT, Truth, query, triangulated
 from scipy.spatial import cKDTree
 
 import splatseed as ss
-from depth import CAPTURES, FAR, HELD_OUT, Truth, query, triangulated
 from splatseed.io import find_depths
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene

@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from benchmarks.common.children import call
+from benchmarks.common.clouds import find_scenes
+from benchmarks.common.machine import describe
+from benchmarks.common.markdown import table
+from benchmarks.training.baseline import read_ledger, say, write_line
+from benchmarks.training.baseline_arms import CAPS
+from benchmarks.training.seeding_arms import ARMS
 
-from baseline import read_ledger, say, write_line
-from baseline_arms import CAPS
-from children import call
-from clouds import find_scenes
-from machine import describe
-from markdown import table
-from seeding_arms import ARMS
 from splatseed.errors import SplatseedError
 
 __all__: list[str] = []
@@ -62,7 +62,7 @@ def run(key: Key, scenes: Path, ledger: Path) -> None:
     scene, arm, strategy, rho, max_steps, data_factor, seed = key
     say(f"{scene}, {arm}, {strategy}, rho {rho:g}, seed {seed} ...")
     result = call(
-        "seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm, strategy=strategy,
+        "benchmarks.training.seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm, strategy=strategy,
         rho=rho, max_steps=max_steps, data_factor=data_factor, seed=seed,
     )  # fmt: skip
     write_line(ledger, key, result)

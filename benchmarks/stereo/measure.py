@@ -14,19 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from benchmarks.common.children import avx2_environment, call
+from benchmarks.common.clocks import Clock
+from benchmarks.common.clouds import find_scenes
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
+from benchmarks.seeds.depth import at_hand
+from benchmarks.stereo.arms import ARMS, FOLIAGE, scores_of
+from benchmarks.stereo.points import PointScore
+from benchmarks.stereo.speed import NUM_VIEWS, prepare_views
+from benchmarks.stereo.truth import TRUE_SCENES, Score, prepare
 
-from children import avx2_environment, call
-from clocks import Clock
-from clouds import find_scenes
-from depth import at_hand
-from machine import describe, warn_if_busy
-from markdown import table
 from splatseed.errors import ParameterError, SplatseedError
 from splatseed.views.photographs import user_cache_dir
-from stereo_arms import ARMS, FOLIAGE, scores_of
-from stereo_points import PointScore
-from stereo_speed import NUM_VIEWS, prepare_views
-from stereo_truth import TRUE_SCENES, Score, prepare
 
 __all__: list[str] = []
 
@@ -79,7 +79,7 @@ def print_speed(_: Settings) -> None:
         for code, environment in codes.items():
             variables = {**(environment or {}), "NUMBA_CACHE_DIR": folder}
             found[code] = call(
-                "stereo_speed:hypothesis_seconds",
+                "benchmarks.stereo.speed:hypothesis_seconds",
                 threads=1,
                 environment=variables,
                 peer_rows=PEER_ROWS,
@@ -101,7 +101,7 @@ def print_whole(settings: Settings) -> None:
     """A hundred views, stage by stage."""
     folder = prepare_views(settings.cache)
     found = call(
-        "stereo_speed:whole_run",
+        "benchmarks.stereo.speed:whole_run",
         threads=THREADS,
         folder=str(folder),
         clock=settings.clock,
@@ -125,7 +125,7 @@ def print_truth(settings: Settings) -> None:
     prepare(names, settings.cache)
     arguments = {"cache": str(settings.cache), "limit": settings.limit}
     header = ["kept", "within 1%", "within 5%", "reached", "CPU s"]
-    _print_arms("stereo_truth:score_all", Score, names, settings.arms, header, arguments)
+    _print_arms("benchmarks.stereo.truth:score_all", Score, names, settings.arms, header, arguments)
 
 
 def print_points(settings: Settings) -> None:
@@ -142,7 +142,7 @@ def _print_against_points(settings: Settings, names: Sequence[str], arms: Sequen
     find_scenes()
     header = ["kept", "points known", "within 1%", "within 5%", "CPU s"]
     arguments = {"limit": settings.limit // 2}
-    _print_arms("stereo_points:score_points", PointScore, names, arms, header, arguments)
+    _print_arms("benchmarks.stereo.points:score_points", PointScore, names, arms, header, arguments)
 
 
 def print_bare(settings: Settings) -> None:
@@ -152,7 +152,9 @@ def print_bare(settings: Settings) -> None:
     arguments = {"names": names, "cache": str(settings.cache), "limit": settings.limit}
     for_each = {"SfM's points": "", "no points": "depths", "depth maps": "points"}
     found = {
-        label: scores_of(ARMS["stereo"], "stereo_truth:score_all", without=without, **arguments)
+        label: scores_of(
+            ARMS["stereo"], "benchmarks.stereo.truth:score_all", without=without, **arguments
+        )
         for label, without in for_each.items()
     }
     header = ["begun from", "kept", "within 1%", "within 5%", "reached", "CPU s"]

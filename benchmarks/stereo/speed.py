@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarks.common.clocks import Clock
+from benchmarks.common.memory import status_bytes
+from benchmarks.stereo.peer import costs_of_planes
 
 import splatseed as ss
-from clocks import Clock
-from memory import status_bytes
 from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.fusion import fuse
 from splatseed.stereo.patchmatch import Pictures, begin, sweep
@@ -26,7 +27,6 @@ from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.texture import value_noise
 from splatseed.views.sightings import find_sightings
 from splatseed.views.view import load_views
-from stereo_peer import costs_of_planes
 
 __all__ = ["hypothesis_seconds", "prepare_views", "whole_run"]
 

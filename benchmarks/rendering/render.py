@@ -17,17 +17,17 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from benchmarks.common.children import avx2_environment, call, thread_settings
+from benchmarks.common.clocks import Clock
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
+from benchmarks.rendering.splats import Workload, make_workload, useful_pairs
+from benchmarks.rendering.stopwatch import RENDER_STAGES, Stopwatch, timed
+from benchmarks.rendering.torch_rasterizer import rasterize
 from torch import Tensor
 
-from children import avx2_environment, call, thread_settings
-from clocks import Clock
-from machine import describe, warn_if_busy
-from markdown import table
-from splats import Workload, make_workload, useful_pairs
 from splatseed.errors import SplatseedError
 from splatseed.render import rasterization
-from stopwatch import RENDER_STAGES, Stopwatch, timed
-from torch_rasterizer import rasterize
 
 __all__: list[str] = []
 
@@ -168,7 +168,7 @@ def measured_runs(path: Path, settings: Settings) -> list[Run]:
         for code, environment in codes.items():
             for threads in THREADS:
                 found = call(
-                    "render:measure", threads=threads, environment=environment,
+                    "benchmarks.rendering.render:measure", threads=threads, environment=environment,
                     path=str(path), repeats=settings.repeats, clock=settings.clock,
                 )  # fmt: skip
                 runs.append(Run(code, threads, found["pairs"], found["seconds"]))
@@ -228,7 +228,7 @@ def print_peer(settings: Settings) -> None:
     with tempfile.TemporaryDirectory() as folder:
         workload.save(Path(folder) / "scene.npz")
         found = call(
-            "render:measure_peer",
+            "benchmarks.rendering.render:measure_peer",
             threads=THREADS[-1],
             environment=thread_settings(THREADS[-1], awake=True),  # PyTorch's many small loops
             path=str(Path(folder) / "scene.npz"),

@@ -18,13 +18,13 @@ from typing import Any, get_args
 
 import torch
 import tyro
+from benchmarks.common.children import call
+from benchmarks.common.clouds import REAL_SCENES, find_scenes
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
+from benchmarks.training.peer_runs import Split, read_scene
+from benchmarks.training.peer_stand_ins import check_examples
 
-from children import call
-from clouds import REAL_SCENES, find_scenes
-from machine import describe, warn_if_busy
-from markdown import table
-from peer_runs import Split, read_scene
-from peer_stand_ins import check_examples
 from splatseed.errors import ParameterError, SplatseedError
 from splatseed.train import TrainSettings
 from splatseed.train.settings import BUDGET, StrategyName
@@ -89,9 +89,9 @@ def run_arm(arm: str, seed: int, scene: Path, settings: Settings) -> dict[str, f
     common: dict[str, Any] = {"scene": str(scene), "split": settings.split}
     common["settings"] = train_settings(arm, seed, settings)
     if arm in OURS:
-        return call("peer_runs:train_ours", threads=settings.threads, **common)
+        return call("benchmarks.training.peer_runs:train_ours", threads=settings.threads, **common)
     return call(
-        "peer_runs:train_peer", threads=settings.threads, **common,
+        "benchmarks.training.peer_runs:train_peer", threads=settings.threads, **common,
         examples=str(settings.gsplat_examples), capped=settings.cap_default,
     )  # fmt: skip
 

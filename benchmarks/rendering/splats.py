@@ -14,10 +14,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
+from benchmarks.common.clouds import sample_unevenly
 from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
-from clouds import sample_unevenly
 from splatseed.camera import Camera
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.render.binning import RECORD, TILE, depth_order, list_tiles

@@ -17,15 +17,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
+from benchmarks.common.clouds import REAL_SCENES, find_scenes, load_cloud, room
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
+from benchmarks.common.memory import peak_bytes_per_output
+from benchmarks.upsampling.end_to_end import cli_seconds, interpreter_seconds
+from benchmarks.upsampling.naive import seconds_per_point
+from benchmarks.upsampling.peer_pcl import MODES, build, run as run_peer
 
 import splatseed as ss
-from clouds import REAL_SCENES, find_scenes, load_cloud, room
-from end_to_end import cli_seconds, interpreter_seconds
-from machine import describe, warn_if_busy
-from markdown import table
-from memory import peak_bytes_per_output
-from naive import seconds_per_point
-from peer_pcl import MODES, build, run as run_peer
 from splatseed.errors import SplatseedError
 
 __all__: list[str] = []

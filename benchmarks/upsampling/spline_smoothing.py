@@ -10,10 +10,10 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
+from benchmarks.common.clouds import room
+from benchmarks.common.markdown import table
 from scipy.interpolate import SmoothBivariateSpline
 
-from clouds import room
-from markdown import table
 from splatseed.upsample.neighbors import prepare
 from splatseed.upsample.surfaces.frames import local_frames
 

@@ -14,7 +14,8 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
-from clocks import Clock, start_clock
+from benchmarks.common.clocks import Clock, start_clock
+
 from splatseed.render import blending, blending_vjp, functions
 from splatseed.render.functions import Blend, Harmonics, Project
 

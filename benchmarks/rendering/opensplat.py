@@ -16,11 +16,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from benchmarks.common.children import seconds_of, thread_settings
+from benchmarks.common.clocks import Clock
+from benchmarks.rendering.splats import Workload
 from PIL import Image as PillowImage
 
-from children import seconds_of, thread_settings
-from clocks import Clock
-from splats import Workload
 from splatseed import PointCloud, Scene
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import MissingDependencyError

@@ -19,14 +19,15 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
+from benchmarks.common.children import call, seconds_of
+from benchmarks.common.clocks import Clock
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
+from benchmarks.common.memory import status_bytes
+from benchmarks.rendering.opensplat import seconds_per_step
+from benchmarks.rendering.splats import Workload, make_workload, useful_pairs
+from benchmarks.rendering.stopwatch import RENDER_STAGES, Place, Stopwatch, timed
 
-from children import call, seconds_of
-from clocks import Clock
-from machine import describe, warn_if_busy
-from markdown import table
-from memory import status_bytes
-from opensplat import seconds_per_step
-from splats import Workload, make_workload, useful_pairs
 from splatseed import load_scene
 from splatseed.errors import SplatseedError
 from splatseed.train import losses, trainer as loop
@@ -40,7 +41,6 @@ from splatseed.train.state import TrainState
 from splatseed.train.strategies import make_strategy
 from splatseed.train.trainer import Trainer
 from splatseed.views.view import load_split
-from stopwatch import RENDER_STAGES, Place, Stopwatch, timed
 
 __all__: list[str] = []
 
@@ -222,7 +222,7 @@ def measured_runs(
         workload.save(path)
         return [
             Run(name, threads, target, **call(
-                "train_step:measure", threads=threads, path=str(path), steps=settings.steps,
+                "benchmarks.rendering.train_step:measure", threads=threads, path=str(path), steps=settings.steps,
  clock=settings.clock
             ))
             for threads in THREADS
@@ -266,7 +266,7 @@ def print_start_up(clock: Clock) -> None:
         make_workload(*SMALL).save(path)
         for name in ("nothing on disk, so compiling", "compiled kernels on disk"):
             seconds = call(
-                "train_step:first_step", threads=THREADS[-1], environment=cache,
+                "benchmarks.rendering.train_step:first_step", threads=THREADS[-1], environment=cache,
                 path=str(path), clock=clock,
             )  # fmt: skip
             rows.append([f"first step of a process, {name}", f"{seconds:.2f}", ""])

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from benchmarks.common.clouds import REAL_SCENES, load_cloud, room
+from benchmarks.common.markdown import table
 
-from clouds import REAL_SCENES, load_cloud, room
-from markdown import table
 from splatseed import PointCloud
 from splatseed.errors import SplatseedError
 from splatseed.synthetic.surfaces import Sphere

@@ -13,9 +13,9 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from benchmarks.common.clouds import find_scenes
 
 import splatseed as ss
-from clouds import find_scenes
 from splatseed.camera import Camera
 from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.result import Stereo

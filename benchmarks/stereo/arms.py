@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks.common.children import call
+
 import splatseed
-from children import call
 
 __all__ = ["ARMS", "FOLIAGE", "Arm", "apply_edits", "scores_of"]
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import tyro
+from benchmarks.common.clouds import room
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
+from benchmarks.seeds.cover_rules import rule_table
 
-from clouds import room
-from cover_rules import rule_table
-from machine import describe, warn_if_busy
-from markdown import table
 from splatseed.errors import SplatseedError
 from splatseed.seeding.budget import thin
 from splatseed.seeding.cover import cover

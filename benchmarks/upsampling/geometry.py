@@ -16,17 +16,17 @@ from typing import Any
 
 import numpy as np
 import tyro
+from benchmarks.common.clouds import sample_unevenly
+from benchmarks.common.markdown import table
+from benchmarks.upsampling import naive
+from benchmarks.upsampling.outliers import outlier_table
+from benchmarks.upsampling.spline_smoothing import smoothing_table
 
-import naive
 import splatseed as ss
-from clouds import sample_unevenly
-from markdown import table
-from outliers import outlier_table
 from splatseed.diagnostics.geometry import GeometryScore, far_share, measure, spacing
 from splatseed.synthetic import SHAPES, Surface
 from splatseed.synthetic.shapes import plane, sine_sheet
 from splatseed.synthetic.wavy import SineSheet
-from spline_smoothing import smoothing_table
 
 __all__: list[str] = []
 

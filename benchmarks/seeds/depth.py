@@ -8,7 +8,7 @@ share of them over 5 cm away; *gap* is the distance from these surfaces to the n
 *bare* their share with no point within 5 cm. Promise: the captures are only read; without them the
 script says so and ends.
 
-Run it as ``python benchmarks/depth.py`` (some minutes, and one more for each capture the first time:
+Run it as ``python -m benchmarks.seeds.depth`` (some minutes, and one more for each capture the first time:
 SfM points are triangulated and kept under ``--cache``); ``--speed`` measures time alone.
 """
 
@@ -26,13 +26,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from benchmarks.common.clouds import find_scenes
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
 from PIL import Image as PilImage
 from scipy.spatial import cKDTree
 
 import splatseed as ss
-from clouds import find_scenes
-from machine import describe, warn_if_busy
-from markdown import table
 from splatseed.depth.planar import map_camera
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths
@@ -44,7 +44,7 @@ from splatseed.views.photographs import user_cache_dir
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does
 
-SCENES = Path(os.environ.get("SPLATSEED_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
+SCENES = Path(os.environ.get("SPLATSEED_SCENES", Path(__file__).parents[3] / "shared" / "scenes"))
 CAPTURES = {"replica/room0": 2, "7scenes_redkitchen": 2}
 """Captures, and the step in pixels at which their held-out surfaces are sampled."""
 HELD_OUT = 8

@@ -14,13 +14,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-from clocks import Clock
+from benchmarks.common.clocks import Clock
+
 from splatseed.errors import SplatseedError
 
 __all__ = ["avx2_environment", "call", "seconds_of", "thread_settings"]
 
+ROOT = Path(__file__).parents[2]
 THREADS = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 AVX2 = {"NUMBA_CPU_NAME": "x86-64-v3", "ATEN_CPU_CAPABILITY": "avx2"}
 
@@ -32,10 +35,10 @@ class ChildError(SplatseedError):
 def call(
     function: str, *, threads: int, environment: Mapping[str, str] | None = None, **arguments: Any
 ) -> Any:
-    """What a function of a module beside this file returns in a fresh process.
+    """What a function of these benchmarks returns in a fresh process.
 
     Args:
-        function: ``module:name``; it takes and returns what JSON can hold.
+        function: ``package.module:name``; it takes and returns what JSON can hold.
         threads: How many it may use.
         environment: Further variables.
         arguments: Its arguments.
@@ -44,8 +47,8 @@ def call(
         ChildError: It failed; what it wrote to stderr is in the message.
     """
     done = subprocess.run(
-        [sys.executable, __file__, function, json.dumps(arguments)],
-        env={**os.environ, **thread_settings(threads), **(environment or {})},
+        [sys.executable, "-m", __name__, function, json.dumps(arguments)],
+        env=_importing({**os.environ, **thread_settings(threads), **(environment or {})}),
         capture_output=True, check=False, text=True,
     )  # fmt: skip
     if done.returncode:
@@ -53,6 +56,12 @@ def call(
             f"{function} to run on {threads} threads", found=done.stderr[-2000:], fix="See there."
         )
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def _importing(environment: Mapping[str, str]) -> dict[str, str]:
+    """An environment in which the benchmarks are found, wherever the child is started."""
+    places = filter(None, [environment.get("PYTHONPATH"), str(ROOT)])
+    return {**environment, "PYTHONPATH": os.pathsep.join(places)}
 
 
 def thread_settings(threads: int, *, awake: bool = False) -> dict[str, str]:

@@ -20,12 +20,12 @@ from threading import Lock
 from typing import Any
 
 import tyro
+from benchmarks.common.children import call
+from benchmarks.common.clouds import find_scenes
+from benchmarks.common.machine import describe
+from benchmarks.common.markdown import table
+from benchmarks.training.baseline_arms import ARMS, CAPS, fingerprint
 
-from baseline_arms import ARMS, CAPS, fingerprint
-from children import call
-from clouds import find_scenes
-from machine import describe
-from markdown import table
 from splatseed.errors import ParameterError, SplatseedError
 
 __all__ = ["read_ledger", "say", "write_line"]
@@ -70,7 +70,7 @@ def run(key: Key, scenes: Path, ledger: Path) -> None:
     scene, arm, max_steps, data_factor, seed, _ = key
     say(f"{scene}, {arm}, {max_steps:,} steps, seed {seed} ...")
     result = call(
-        "baseline_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
+        "benchmarks.training.baseline_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
         max_steps=max_steps, data_factor=data_factor, seed=seed, cap_max=CAPS[scene],
     )  # fmt: skip
     write_line(ledger, key, result)

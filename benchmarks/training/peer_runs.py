@@ -17,9 +17,9 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from benchmarks.training.peer_stand_ins import Capture, Peer, fused_ssim, load_peer
 from torch import Tensor
 
-from peer_stand_ins import Capture, Peer, fused_ssim, load_peer
 from splatseed import Scene, load_scene
 from splatseed.errors import SceneFormatError
 from splatseed.evaluate import Render, evaluate_views

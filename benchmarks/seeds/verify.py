@@ -19,13 +19,14 @@ from unittest.mock import patch
 
 import numpy as np
 import tyro
+from benchmarks.common.children import call
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
+from benchmarks.common.memory import status_bytes
+from benchmarks.seeds.depth import CAPTURES, FAR, HELD_OUT, RATIO, Truth, at_hand, triangulated
+from benchmarks.stereo.speed import prepare_views
 
 import splatseed as ss
-from children import call
-from depth import CAPTURES, FAR, HELD_OUT, RATIO, Truth, at_hand, triangulated
-from machine import describe, warn_if_busy
-from markdown import table
-from memory import status_bytes
 from splatseed.errors import SplatseedError
 from splatseed.scene import Scene
 from splatseed.seeding import verify as module
@@ -34,7 +35,6 @@ from splatseed.synthetic.room import build_room
 from splatseed.upsample.method import NewPoints
 from splatseed.views.photographs import user_cache_dir
 from splatseed.views.sightings import find_sightings
-from stereo_speed import prepare_views
 
 __all__ = ["whole_run"]
 
@@ -179,7 +179,7 @@ def thresholds(truth: Truth | Room, held: Held) -> list[list[str]]:
 def print_speed(settings: Settings) -> None:
     """A hundred views, stage by stage."""
     found = call(
-        "verify:whole_run",
+        "benchmarks.seeds.verify:whole_run",
         threads=THREADS,
         folder=str(prepare_views(settings.cache)),
         points=settings.points,

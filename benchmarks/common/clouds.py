@@ -91,7 +91,7 @@ def find_scenes() -> Path:
     Raises:
         SceneNotFoundError: There is none on this machine.
     """
-    beside = Path(__file__).parents[2] / "shared" / "scenes"
+    beside = Path(__file__).parents[3] / "shared" / "scenes"
     folder = Path(os.environ.get("SPLATSEED_SCENES", beside))
     if not folder.is_dir():
         raise SceneNotFoundError(
