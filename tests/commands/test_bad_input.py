@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatseed.commands.info import command as info
+from splatseed.commands import info
 from splatseed.io import load_scene
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.io.ply.points import write_ply

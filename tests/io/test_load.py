@@ -18,7 +18,7 @@ from splatseed.io.colmap import binary as colmap_binary
 from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
 
-from . import text_form
+from .colmap import text_form
 
 
 def rewrite_points(scene_dir, xyz):

@@ -18,7 +18,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.upsample import upsample
 from splatseed.views.sightings import camera_points
 
-from . import text_form
+from .colmap import text_form
 
 FORMATS = [(colmap_binary, "bin"), (text_form, "txt")]
 

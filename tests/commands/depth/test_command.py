@@ -9,7 +9,7 @@ import pytest
 
 from splatseed.io import find_depths, load_scene
 
-from ..networks import onnx_sum, save_network  # noqa: TID252
+from ...networks import onnx_sum, save_network
 
 pytest.importorskip("onnxruntime", reason="needs splatseed[depth]")
 

@@ -208,7 +208,7 @@ def test_what_would_fail_every_run_is_found_before(own_room):
 
 
 def test_the_plan_of_the_published_results_is_the_one_they_tell_of():
-    folder = Path(__file__).parents[2] / "docs" / "results"
+    folder = Path(__file__).parents[3] / "docs" / "results"
     plan = read_plan(folder / "plan.toml")
     told = (folder / "README.md").read_text("utf-8")
     assert [each.label for each in plan.scenes] == ["bonsai", "fox", "fern", "treehill", "demo"]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from splatseed.upsample.surfaces.frames import local_frames, world_frames
 
-from . import references as slow
+from .. import references as slow
 
 STRETCHES = {
     "blob": (1.0, 0.7, 0.4),

@@ -17,7 +17,7 @@ from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import TrainSettings
 from splatseed.train.schedule import make_schedule
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
 from splatseed.train.ply import read_gaussians
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 MODULES = (
     "rendering.splats",
     "common.children",

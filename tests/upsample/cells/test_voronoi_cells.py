@@ -15,7 +15,7 @@ from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
 from splatseed.upsample.neighbors import prepare
 from splatseed.upsample.surfaces.frames import local_frames
 
-from . import references_voronoi as slow
+from .. import references_voronoi as slow
 
 
 def prepared(xyz):

@@ -11,7 +11,7 @@ pytest.importorskip("torch", reason="training and scoring need PyTorch")
 
 from splatseed.synthetic import make_capture, write_capture
 
-TEXT = (Path(__file__).parents[1] / "docs" / "training.md").read_text("utf-8")
+TEXT = (Path(__file__).parents[2] / "docs" / "training.md").read_text("utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 

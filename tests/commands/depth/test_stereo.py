@@ -17,8 +17,8 @@ import splatseed.stereo
 from splatseed.io import find_depths, load_scene
 from splatseed.synthetic import make_capture, write_capture
 
-from ..bent import bend  # noqa: TID252
-from ..stereo_maps import true_maps  # noqa: TID252
+from ...bent import bend
+from ...stereo_maps import true_maps
 
 
 @pytest.fixture(scope="session")

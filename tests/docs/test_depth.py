@@ -10,7 +10,7 @@ import pytest
 
 from splatseed.cli import VERBS, main
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 TEXT = "".join((DOCS / name).read_text("utf-8") for name in ("depth.md", "stereo.md"))
 LINES = [
     shlex.split(line, comments=True)

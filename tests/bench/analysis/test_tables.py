@@ -30,7 +30,7 @@ from splatseed.bench.analysis.tables import (
 )
 from splatseed.bench.planning.records import SFM, RunRow
 
-from .planted import GAINS, SCENES, result, rows, spec
+from ..planted import GAINS, SCENES, result, rows, spec
 
 MLS8 = Variant("mls", ratio=8.0)
 

@@ -17,10 +17,11 @@ from splatseed.bench.analysis.summary import summary
 from splatseed.bench.analysis.tables import Cell, Table, words
 from splatseed.bench.planning.digest import scene_digest
 from splatseed.bench.planning.records import SFM, RunRow
+from splatseed.bench.report import pictures as report_pictures
 from splatseed.bench.report.html import slider, table
 from splatseed.bench.report.pictures import safe_name
 from splatseed.bench.report.views import compared_views
-from splatseed.bench.report.write import REPORT, pictures as report_pictures, write_report
+from splatseed.bench.report.write import REPORT, write_report
 from splatseed.bench.running.kept import kept_folder
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.cli import main
@@ -29,8 +30,8 @@ from splatseed.io import load_scene
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.pictures import beside_truth, write_picture
 
-from .browser import CHROMIUM, chromium
-from .planted import GAINS, result, rows, spec
+from ..browser import CHROMIUM, chromium
+from ..planted import GAINS, result, rows, spec
 
 GONE = {"scene_path": "gone"}
 

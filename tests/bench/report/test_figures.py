@@ -19,7 +19,7 @@ from splatseed.bench.report.figures import (
     strategy_figure,
 )
 
-from .planted import rows
+from ..planted import rows
 
 ORANGE = (0xD5, 0x5E, 0x00)
 """The colour of mls."""

@@ -24,7 +24,7 @@ from splatseed.bench.analysis.study import studies
 from splatseed.bench.analysis.tables import to_markdown
 from splatseed.bench.planning.records import SFM
 
-from .planted import rows
+from ..planted import rows
 
 METHODS = {(SFM, 1): 0.0, ("linear", 8): 0.0, ("mls", 8): 0.0}
 

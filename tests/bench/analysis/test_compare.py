@@ -15,7 +15,7 @@ from splatseed.bench.planning.records import SFM
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.cli import main
 
-from .planted import GAINS, rows
+from ..planted import GAINS, rows
 
 MLS8 = Variant("mls", ratio=8.0)
 BETTER = {**GAINS, ("mls", 8): 0.8}

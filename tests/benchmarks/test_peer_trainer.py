@@ -18,7 +18,7 @@ from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.losses import ssim
 from splatseed.views.view import load_split
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 MODULES = (
     "common.children",
     "training.peer_trainer",

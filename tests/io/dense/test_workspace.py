@@ -25,8 +25,8 @@ from splatseed.io.ply.points import read_ply
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.undistortion import undistort
 
-from ..bent import bend  # noqa: TID252
-from ..stereo_maps import true_maps  # noqa: TID252
+from ...bent import bend
+from ...stereo_maps import true_maps
 
 ON_SURFACE = 1e-5
 """Metres: float32 of depths of some metres."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatseed.render import MCMCStrategy, mcmc_on_cpu, rasterization
 
-from .scenes import random_scene
+from ..scenes import random_scene
 
 
 def splats(scene: dict[str, Any]) -> tuple[torch.nn.ParameterDict, dict[str, torch.optim.Adam]]:

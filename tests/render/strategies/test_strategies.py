@@ -12,7 +12,7 @@ from torch import Tensor
 
 from splatseed.render import rasterization
 
-from .scenes import random_scene
+from ..scenes import random_scene
 
 
 def parameters(scene: dict[str, Any]) -> torch.nn.ParameterDict:

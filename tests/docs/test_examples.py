@@ -13,7 +13,7 @@ from PIL import Image as PillowImage
 from splatseed.io import load_scene
 from splatseed.upsample import METHODS
 
-FOLDER = Path(__file__).parents[1] / "examples"
+FOLDER = Path(__file__).parents[2] / "examples"
 EXAMPLES = sorted(FOLDER.glob("*.py"))
 
 
