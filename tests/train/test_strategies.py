@@ -52,6 +52,15 @@ def test_enough_photographs_are_seen_between_densifications(steps, default, mcmc
     assert make_schedule("mcmc", steps, as_3dgs=False).refine_every == mcmc
 
 
+@pytest.mark.parametrize(
+    ("steps", "every"), [(10, 20), (40, 20), (300, 20), (1500, 100), (30_000, 2000)]
+)
+def test_halves_have_time_to_learn_before_they_are_split_again(steps, every):
+    """Rounds of two steps lost ten decibels in a run of forty."""
+    schedule = make_schedule("grow", steps, as_3dgs=False)
+    assert schedule.refine_every == schedule.refine_start == every
+
+
 @pytest.mark.parametrize("steps", [30, 1500, 4000])
 def test_mcmc_may_grow_as_far_in_a_short_run(steps):
     """By 1.05 each of 245 times in a full one."""

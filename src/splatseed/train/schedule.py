@@ -49,6 +49,9 @@ opacities, Gaussians die that are needed later."""
 GROW_EVERY = FULL_RUN // 15
 """Steps of a full run from one round of ``grow`` to the next, and to the first: each round looks at
 contributions for as many photographs as it can."""
+LEAST_ROUND = 20
+"""Steps of a round of ``grow`` in the shortest run: halves that are split again before they have
+found their places are noise."""
 MEAN_FROM = 0.8
 """Part of a run from which on the mean of the Gaussians is taken."""
 LARGEST = 0.05
@@ -152,7 +155,7 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
     every = max(1, round(shrunk), min(100, stop // LEAST_ROUNDS[densification]))
     start = _scaled(500, max_steps)
     if densification == "grow":
-        every = start = _scaled(GROW_EVERY, max_steps)
+        every = start = max(LEAST_ROUND, _scaled(GROW_EVERY, max_steps))
     return Schedule(
         max_steps=max_steps,
         near_depths=True,
