@@ -26,8 +26,8 @@ from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import MissingDependencyError
 from splatseed.io import write_scene
 from splatseed.scene import Image
-from splatseed.train.gaussians import SH_C0
-from splatseed.train.ply import write_gaussians
+from splatseed.splat.gaussians import SH_C0
+from splatseed.splat.ply import write_gaussians
 from splatseed.views.view import View
 
 __all__ = ["seconds_per_step"]

@@ -30,11 +30,12 @@ from benchmarks.rendering.stopwatch import RENDER_STAGES, Place, Stopwatch, time
 
 from splatseed import load_scene
 from splatseed.errors import SplatseedError
+from splatseed.splat.frame import TrainingFrame, training_frame
+from splatseed.splat.gaussians import Gaussians, initial_gaussians
+from splatseed.splat.rendering import render_view
 from splatseed.train import losses, trainer as loop
-from splatseed.train.frame import TrainingFrame, training_frame
-from splatseed.train.gaussians import Gaussians, initial_gaussians
 from splatseed.train.near_depths import near_depths
-from splatseed.train.parameters import make_optimizers, make_parameters, render_view
+from splatseed.train.parameters import make_optimizers, make_parameters
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState

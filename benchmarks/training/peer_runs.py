@@ -23,9 +23,9 @@ from torch import Tensor
 from splatseed import Scene, load_scene
 from splatseed.errors import SceneFormatError
 from splatseed.evaluate import Render, evaluate_views
+from splatseed.process.allocator import keep_freed_memory
 from splatseed.render import mcmc_on_cpu
 from splatseed.train import TrainSettings, prepare_run
-from splatseed.train.allocator import keep_freed_memory
 from splatseed.train.device import Capacity
 from splatseed.train.schedule import FULL_RUN
 from splatseed.train.seeds import usable_seeds

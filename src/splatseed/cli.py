@@ -95,7 +95,7 @@ def _run(verb: str, words: list[str]) -> None:
         )
     except KeyboardInterrupt as stop:
         ERR.print("\ninterrupted; nothing was left half-written")
-        from splatseed.train.interruption import exit_code  # noqa: PLC0415  (as late as can be)
+        from splatseed.process.interruption import exit_code  # noqa: PLC0415  (as late as can be)
 
         sys.exit(TERMINATED if isinstance(stop, _Termination) else exit_code())
 

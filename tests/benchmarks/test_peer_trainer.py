@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
+from splatseed.evaluate.images import ssim
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train.losses import ssim
 from splatseed.views.view import load_split
 
 ROOT = Path(__file__).parents[2]

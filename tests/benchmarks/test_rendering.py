@@ -15,7 +15,7 @@ import torch
 
 from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
-from splatseed.train.ply import read_gaussians
+from splatseed.splat.ply import read_gaussians
 
 ROOT = Path(__file__).parents[2]
 MODULES = (

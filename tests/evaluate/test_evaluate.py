@@ -26,9 +26,9 @@ from splatseed.evaluate import (  # noqa: E402
 from splatseed.evaluate.lpips import LPIPS_NETS  # noqa: E402
 from splatseed.evaluate.model import frame_of_scene, gaussian_renderer  # noqa: E402
 from splatseed.io import load_scene  # noqa: E402
+from splatseed.splat.gaussians import initial_gaussians  # noqa: E402
+from splatseed.splat.ply import write_gaussians  # noqa: E402
 from splatseed.synthetic import make_capture, write_capture  # noqa: E402
-from splatseed.train.gaussians import initial_gaussians  # noqa: E402
-from splatseed.train.ply import write_gaussians  # noqa: E402
 from splatseed.views.view import View  # noqa: E402
 
 

@@ -16,9 +16,9 @@ from splatseed.evaluate import evaluate_model, load_model
 from splatseed.evaluate.world import find_transform
 from splatseed.io import load_scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
+from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.ply import write_gaussians
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train.gaussians import initial_gaussians
-from splatseed.train.ply import write_gaussians
 
 
 @pytest.fixture(scope="module")

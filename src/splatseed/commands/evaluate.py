@@ -19,7 +19,7 @@ from splatseed.errors import (
 )
 from splatseed.io.output.staging import atomic_file, check_output, output_folder
 from splatseed.requirements import require
-from splatseed.train.run_folder import RunFolder
+from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Backend, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 

@@ -19,8 +19,8 @@ from torch import Tensor
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.output.staging import atomic_file
-from splatseed.train.curve import Record
 from splatseed.train.parameters import Optimizers, Parameters, as_parameters, make_optimizers
+from splatseed.train.record.curve import Record
 from splatseed.train.schedule import Schedule
 from splatseed.train.strategies import Strategy
 

@@ -27,8 +27,8 @@ from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.cli import main
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
+from splatseed.splat.pictures import beside_truth, write_picture
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train.pictures import beside_truth, write_picture
 
 from ..browser import CHROMIUM, chromium
 from ..planted import GAINS, result, rows, spec

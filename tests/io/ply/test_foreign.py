@@ -35,7 +35,7 @@ def test_a_compressed_ply_is_named(tmp_path):
 
 
 def test_evaluate_names_them_too(tmp_path):
-    ply = pytest.importorskip("splatseed.train.ply")
+    ply = pytest.importorskip("splatseed.splat.ply")
     for name, content in (("a.splat", b""), ("a.ply", PACKED.encode())):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(SceneFormatError, match=r"found Gaussians .*does not read"):

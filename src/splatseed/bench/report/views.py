@@ -1,7 +1,7 @@
 """Test views: the photograph, what the baseline and the best variant make of it, and their errors.
 
 Notation: runs keep a few test views as pictures, with photograph, render and error map in a row (see
-``splatseed.train.pictures``). Promise: both renders are of the same repeat; what is called best was chosen
+``splatseed.splat.pictures``). Promise: both renders are of the same repeat; what is called best was chosen
 by mean gain on the scene, not by the view that is shown.
 """
 
@@ -20,7 +20,7 @@ from splatseed.bench.analysis.study import BASELINE, Study, Variant
 from splatseed.bench.running.kept import kept_folder
 from splatseed.errors import SplatseedError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
-from splatseed.train.pictures import GAP
+from splatseed.splat.pictures import GAP
 from splatseed.train.settings import StrategyName
 
 __all__ = ["ComparedView", "compared_views", "jpeg"]

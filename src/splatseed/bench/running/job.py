@@ -29,10 +29,10 @@ from splatseed.bench.running.kept import (
 from splatseed.bench.running.seeds import make_seeds, scene_of
 from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.output.staging import check_output
+from splatseed.process.interruption import interruption
 from splatseed.process.peak import peak_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.train.interruption import interruption
 from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from splatseed.bench.planning.records import RunResult, RunSpec
 from splatseed.io.output.staging import output_folder
-from splatseed.train.run_folder import RunFolder
+from splatseed.train.record.folder import RunFolder
 
 __all__ = [
     "ERROR",

@@ -19,7 +19,7 @@ from splatseed.bench.running.job import JobOptions, Outcome
 from splatseed.bench.running.kept import kept_folder, work_folder
 from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.watcher import Watcher
-from splatseed.train.interruption import Interruption, interruption
+from splatseed.process.interruption import Interruption, interruption
 
 __all__ = ["LocalExecutor", "cores", "slot_environment"]
 

@@ -29,9 +29,9 @@ from splatseed.bench.running.local import slot_environment
 from splatseed.bench.running.watcher import Watcher
 from splatseed.errors import OutputError, ParameterError, SceneNotFoundError, SplatseedError
 from splatseed.io.output.staging import MANIFEST
+from splatseed.process.interruption import interruption
 from splatseed.progress import silent
 from splatseed.requirements import require
-from splatseed.train.interruption import interruption
 
 __all__ = ["Cluster", "RayExecutor", "Share", "ray_cluster", "run_on_node"]
 

@@ -25,7 +25,7 @@ from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_note, stage_display
 from splatseed.io.output.staging import atomic_file
 from splatseed.literal import visible
-from splatseed.train.interruption import exit_code
+from splatseed.process.interruption import exit_code
 
 __all__ = ["run"]
 

@@ -18,7 +18,7 @@ from splatseed.console import StageClock
 from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene
 from splatseed.preview import Tile, write_grid
-from splatseed.train.pictures import FULL_ERROR, error_map
+from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
 

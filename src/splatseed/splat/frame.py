@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
 from splatseed.pointcloud import PointCloud
-from splatseed.train.gaussians import Gaussians
+from splatseed.splat.gaussians import Gaussians
 from splatseed.views.view import View
 
 __all__ = ["SCENE_SCALE", "TrainingFrame", "stray_note", "stray_views", "training_frame"]

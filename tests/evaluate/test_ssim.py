@@ -5,11 +5,15 @@ from __future__ import annotations
 import numba
 import numpy as np
 import pytest
+
+pytest.importorskip("torch", reason="training needs PyTorch")
+
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from splatseed.train.losses import photometric_loss, psnr, ssim
-from splatseed.train.ssim import l1_and_ssim
+from splatseed.evaluate.images import psnr, ssim
+from splatseed.evaluate.ssim import l1_and_ssim
+from splatseed.train.losses import photometric_loss
 
 
 def _pair(rng, height, width):

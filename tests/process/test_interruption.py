@@ -10,7 +10,7 @@ import pytest
 from splatseed.cli import main
 from splatseed.commands import train
 from splatseed.commands.bench import command as bench
-from splatseed.train.interruption import exit_code, interruption
+from splatseed.process.interruption import exit_code, interruption
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

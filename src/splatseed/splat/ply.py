@@ -19,7 +19,7 @@ from splatseed.io.binary import ByteReader
 from splatseed.io.output.staging import atomic_file
 from splatseed.io.ply.foreign import refuse_foreign, refuse_packed
 from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, parse_header
-from splatseed.train.gaussians import Gaussians
+from splatseed.splat.gaussians import Gaussians
 
 __all__ = ["read_gaussians", "write_gaussians"]
 

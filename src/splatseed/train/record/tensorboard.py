@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatseed.requirements import require
-from splatseed.train.curve import Record
+from splatseed.train.record.curve import Record
 
 __all__ = ["Board"]
 

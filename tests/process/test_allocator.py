@@ -10,7 +10,7 @@ import pytest
 
 FAULTS = """
 import resource
-from splatseed.train.allocator import keep_freed_memory
+from splatseed.process.allocator import keep_freed_memory
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
