@@ -44,7 +44,7 @@ def test_an_arm_is_a_strategy_with_one_choice_changed(bench):
         changed = arm.change(settings.schedule)
         if arm.opacity_reset:
             continue
-        plain = name in {"default", "mcmc", "none"} or name.endswith("-3dgs")
+        plain = name in {"default", "grow", "mcmc", "none"} or name.endswith("-3dgs")
         assert (changed == settings.schedule) == plain, name
         if arm.strategy == "default" and not plain:
             different = [k for k in vars(own) if getattr(own, k) != getattr(changed, k)]
@@ -84,7 +84,9 @@ def test_what_is_in_the_ledger_is_not_run_again(bench, captures, monkeypatch, tm
     monkeypatch.setattr(bench.baseline, "find_scenes", lambda: captures)
     settings = bench.baseline.Settings(("fern",), ("none",), seeds=2, ledger=tmp_path / "l.jsonl")
     bench.baseline.main(settings)
-    assert sorted(asked) == [("baseline_arms:train", 1, "none", seed) for seed in (0, 1)]
+    assert sorted(asked) == [
+        ("benchmarks.training.baseline_arms:train", 1, "none", seed) for seed in (0, 1)
+    ]
     bench.baseline.main(settings)
     assert len(asked) == 2
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| none")]
