@@ -103,6 +103,7 @@ ARMS: Mapping[str, Arm] = {
     "- pruning by size": Arm("default", _set(prune_size=UNBOUNDED)),
     "- faster positions": Arm("default", _times(means=1.0)),
     "- faster scales, rotations, colours": Arm("default", _times(**OTHERS)),
+    "- faster forgetting of gradients": Arm("default", _set(beta2=0.999)),
     "+ faster opacities": Arm("default", _times(opacities=4.0)),
     "+ all rates fall to 0.3": Arm("default", _falling(0.3)),
     "- bound on first sizes": Arm("default", _set(largest=UNBOUNDED)),
@@ -118,6 +119,7 @@ ARMS: Mapping[str, Arm] = {
     "mcmc with a tenth of the penalties": Arm("mcmc", _set(penalty=0.001)),
     "mcmc that grows by 1.05": Arm("mcmc", _set(growth=1.05)),
     "grow": Arm("grow"),
+    "grow - faster forgetting of gradients": Arm("grow", _set(beta2=0.999)),
     "none-3dgs": Arm("none-3dgs"),
     "none": Arm("none"),
 }

@@ -8,6 +8,7 @@ from gsplat.strategy import DefaultStrategy
 
 from splatseed.errors import ParameterError
 from splatseed.render import rasterization
+from splatseed.train.parameters import as_parameters, make_optimizers
 from splatseed.train.schedule import LEARNING_RATES, make_schedule
 from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies import make_strategy
@@ -81,6 +82,17 @@ def test_short_runs_learn_faster_up_to_a_bound():
     assert short["sh0"] == pytest.approx(4 * full["sh0"])
     assert half["opacities"] == short["opacities"] == full["opacities"]
     assert make_schedule("none", 90_000, as_3dgs=False).learning_rates == full
+
+
+@pytest.mark.parametrize(
+    ("steps", "as_3dgs", "beta2"),
+    [(30_000, False, 0.999), (10_000, False, 0.997), (1500, False, 0.99), (1500, True, 0.999)],
+)
+def test_short_runs_forget_gradients_faster_up_to_a_bound(steps, as_3dgs, beta2):
+    schedule = make_schedule("grow", steps, as_3dgs=as_3dgs)
+    assert schedule.beta2 == pytest.approx(beta2)
+    optimizers = make_optimizers(as_parameters({"means": torch.zeros((1, 3))}), schedule)
+    assert optimizers["means"].defaults["betas"] == (0.9, schedule.beta2)
 
 
 @pytest.mark.parametrize(

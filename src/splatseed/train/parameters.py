@@ -35,6 +35,7 @@ __all__ = [
 Parameters = torch.nn.ParameterDict
 Optimizers = dict[str, torch.optim.Optimizer]
 
+ADAM_BETA1 = 0.9
 ADAM_EPSILON = 1e-15
 NEAR_DEPTHS = "near_depths"
 
@@ -84,9 +85,14 @@ def yardsticks(params: Parameters) -> Float[Tensor, "#N"]:
 
 def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
     """One Adam a parameter, with the schedule's learning rates."""
+    betas = (ADAM_BETA1, schedule.beta2)
     return {
         name: torch.optim.Adam(
-            [{"params": [value]}], lr=schedule.learning_rates[name], eps=ADAM_EPSILON, fused=True
+            [{"params": [value]}],
+            lr=schedule.learning_rates[name],
+            betas=betas,
+            eps=ADAM_EPSILON,
+            fused=True,
         )
         for name, value in params.items()
         if value.requires_grad

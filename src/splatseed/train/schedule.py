@@ -46,6 +46,11 @@ MOST_SPEEDUP: Mapping[str, float] = MappingProxyType(
 """Learning rates of a short run are multiplied by how many times shorter it is than a full one, but by
 no more than this. Positions have as far to go in a short run as in a long one; with a higher rate of
 opacities, Gaussians die that are needed later."""
+FORGETTING = 1e-3
+"""1 - beta2 of Adam, what it forgets of the squared gradients in a step, as in 3DGS."""
+MOST_FORGETTING = 1e-2
+"""A short run forgets so many times faster as it is shorter than a full one, but no faster than this:
+its gradients shrink within some hundred steps, and steps are divided by what is remembered."""
 GROW_EVERY = FULL_RUN // 15
 """Steps of a full run from one round of ``grow`` to the next, and to the first: each round looks at
 contributions for as many photographs as it can."""
@@ -68,6 +73,7 @@ class Schedule:
         near_depths: Whether each Gaussian's near depth is its yardstick, else the cameras' extent.
         learning_rates: Of each parameter at the first step; positions' in yardsticks.
         decays: What some of them fall to by the end, as a part of the first.
+        beta2: Adam's: what it keeps of its mean of squared gradients at each step.
         sh_every: Steps from one degree of the spherical harmonics to the next.
         refine_start: Densification begins after this step.
         refine_stop: And ends before this one.
@@ -90,6 +96,7 @@ class Schedule:
     near_depths: bool
     learning_rates: Mapping[str, float]
     decays: Mapping[str, float]
+    beta2: float
     sh_every: int
     refine_start: int
     refine_stop: int
@@ -137,6 +144,7 @@ def _as_3dgs(densification: Densification, max_steps: int) -> Schedule:
         near_depths=False,
         learning_rates=LEARNING_RATES,
         decays=DECAYS,
+        beta2=1 - FORGETTING,
         sh_every=_scaled(1000, max_steps),
         refine_start=_scaled(500, max_steps),
         refine_stop=_scaled(25_000 if mcmc else 15_000, max_steps),
@@ -163,6 +171,7 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
             n: rate * min(speedup, MOST_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()
         },
         decays=DECAYS,
+        beta2=1 - min(FORGETTING * speedup, MOST_FORGETTING),
         sh_every=_scaled(1000, max_steps),
         refine_start=start,
         refine_stop=stop,
