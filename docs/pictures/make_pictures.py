@@ -21,7 +21,6 @@ from jaxtyping import Float32, Float64, UInt8
 from matplotlib import colormaps
 from PIL import Image as PillowImage, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
-from splatseed.depth.sightings import find_sightings
 
 import splatseed as ss
 from splatseed.commands.info.depth_picture import write_depth_picture
@@ -34,6 +33,7 @@ from splatseed.preview import choose_camera, render_points
 from splatseed.scene import Image
 from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.upsample import methods_for
+from splatseed.views.sightings import find_sightings
 from splatseed.views.viewpoint import choose_image, look_at
 
 HERE = Path(__file__).parent
