@@ -33,10 +33,10 @@ format: $(READY)
 	$(BIN)/ruff check --fix .
 
 bench: $(READY)
-	$(BIN)/python benchmarks/speed.py
-	$(BIN)/python benchmarks/geometry.py
-	$(BIN)/python benchmarks/render.py
-	$(BIN)/python benchmarks/train_step.py
+	$(BIN)/python -m benchmarks.upsampling.speed
+	$(BIN)/python -m benchmarks.upsampling.geometry
+	$(BIN)/python -m benchmarks.rendering.render
+	$(BIN)/python -m benchmarks.rendering.train_step
 
 clean:
 	rm -rf $(VENV) demo .mypy_cache .pytest_cache .ruff_cache .hypothesis .coverage

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from splatseed.cli import VERBS, main
-from splatseed.io.ply import write_ply
+from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
 
 COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()")
@@ -91,7 +91,7 @@ SLOW_WRITER = """
 import signal, sys, time
 from pathlib import Path
 from splatseed.cli import main
-from splatseed.io import colmap_binary
+from splatseed.io.colmap import binary as colmap_binary
 
 def write(path, points, tracks=None):
     Path(path).write_bytes(b"half")

@@ -10,6 +10,8 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import Counter
+from graphlib import TopologicalSorter
 from importlib.metadata import version
 from pathlib import Path
 
@@ -24,14 +26,11 @@ MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__pat
 
 ORDER = (
     "errors",
-    "interpreter",
     "literal",
-    "memory",
     "requirements",
     "progress",
-    "kernel_sources",
-    "jit",
-    "simd",
+    "process",
+    "kernels",
     "camera",
     "similarity",
     "lens",
@@ -44,17 +43,15 @@ ORDER = (
     "stereo",
     "upsample",
     "seeding",
-    "geometry",
-    "viewpoint",
+    "diagnostics",
     "preview",
     "synthetic",
     "sfm",
     "monocular",
-    "diagnostics",
-    "trainers",
     "render",
-    "train",
+    "splat",
     "evaluate",
+    "train",
     "bench",
     "console",
     "commands",
@@ -116,6 +113,26 @@ def test_imports_run_one_way(part):
         ours = {name[1] for name in names if name[0] == "splatseed" and len(name) > 1}
         assert ours <= allowed, path.name
         assert ["splatseed"] not in names, f"{path.name} imports the whole package"
+
+
+@pytest.mark.parametrize("part", [part for part in ORDER if (SOURCE / part).is_dir()])
+def test_rooms_of_a_part_import_each_other_in_no_circle(part):
+    """A room is a folder of the part, or a file that stands in none."""
+    rooms = {}
+    for path in _files(part):
+        place = path.relative_to(SOURCE / part)
+        if place.name != "__init__.py" or len(place.parts) > 1:  # a part's door opens on all rooms
+            names = [name.split(".") for name in _imports(path)]
+            ours = {name[2] for name in names if name[:2] == ["splatseed", part] and len(name) > 2}
+            room = place.parts[0].removesuffix(".py")
+            rooms[room] = rooms.get(room, set()) | ours - {room}
+    TopologicalSorter(rooms).prepare()  # raises CycleError, which names the circle
+
+
+@pytest.mark.parametrize("top", ["src", "tests", "benchmarks", "examples"])
+def test_no_folder_holds_many_files(top):
+    counts = Counter(path.parent for path in _tracked() if path.is_relative_to(ROOT / top))
+    assert not {str(folder): count for folder, count in counts.items() if count > 15}
 
 
 @pytest.mark.parametrize("part", ["views", "depth", "stereo", "upsample", "seeding"])
@@ -237,10 +254,11 @@ def test_dependencies_are_those_that_are_imported():
     for path in SOURCE.rglob("*.py"):
         imported = {name.split(".")[0] for name in _imports(path)}
         needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
-        trains = {"render", "train", "evaluate", "commands"} & set(path.parts)
+        part = path.relative_to(SOURCE).parts[0]
+        trains = part in {"render", "splat", "evaluate", "train", "commands"}
         allowed = base | more if trains else base
-        allowed = base | names["depth"] if "monocular" in path.parts else allowed
-        allowed = base | names["cluster"] if "bench" in path.parts else allowed
+        allowed = base | names["depth"] if part == "monocular" else allowed
+        allowed = base | names["cluster"] if part == "bench" else allowed
         assert {"pillow" if name == "PIL" else name for name in needed} <= allowed, path.name
 
 

@@ -21,19 +21,20 @@ from jaxtyping import Float32, Float64, UInt8
 from matplotlib import colormaps
 from PIL import Image as PillowImage, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
-from splatseed.depth.sightings import find_sightings
 
 import splatseed as ss
-from splatseed.commands._depth_picture import write_depth_picture
+from splatseed.commands.info.depth_picture import write_depth_picture
 from splatseed.depth import align
-from splatseed.geometry import spacing
-from splatseed.io import depth_folder, find_depths
-from splatseed.io.staging import atomic_file
+from splatseed.diagnostics.geometry import spacing
+from splatseed.io import find_depths
+from splatseed.io.depth.folder import depth_folder
+from splatseed.io.output.staging import atomic_file
 from splatseed.preview import choose_camera, render_points
 from splatseed.scene import Image
 from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.upsample import methods_for
-from splatseed.viewpoint import choose_image, look_at
+from splatseed.views.sightings import find_sightings
+from splatseed.views.viewpoint import choose_image, look_at
 
 HERE = Path(__file__).parent
 RATIO = 8

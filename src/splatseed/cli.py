@@ -66,7 +66,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _print_completion(words: list[str]) -> None:
-    from splatseed.commands._completion import completion_script  # noqa: PLC0415  (loads every verb)
+    from splatseed.commands.completion import completion_script  # noqa: PLC0415  (loads every verb)
 
     try:
         OUT.print(completion_script(words, list(VERBS)), end="", soft_wrap=True)
@@ -95,7 +95,7 @@ def _run(verb: str, words: list[str]) -> None:
         )
     except KeyboardInterrupt as stop:
         ERR.print("\ninterrupted; nothing was left half-written")
-        from splatseed.train.interruption import exit_code  # noqa: PLC0415  (as late as can be)
+        from splatseed.process.interruption import exit_code  # noqa: PLC0415  (as late as can be)
 
         sys.exit(TERMINATED if isinstance(stop, _Termination) else exit_code())
 

@@ -6,7 +6,15 @@ import math
 
 import numpy as np
 
-from splatseed.bench.records import SFM, Arm, CurvePoint, ImageScore, RunResult, RunRow, RunSpec
+from splatseed.bench.planning.records import (
+    SFM,
+    Arm,
+    CurvePoint,
+    ImageScore,
+    RunResult,
+    RunRow,
+    RunSpec,
+)
 
 SCENES = ("bonsai", "fox", "room0", "treehill")
 GAINS = {(SFM, 1): 0.0, ("linear", 8): 0.3, ("mls", 4): 0.2, ("mls", 8): 0.5, ("random", 8): -0.4}

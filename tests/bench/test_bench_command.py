@@ -18,10 +18,10 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed import synthetic
-from splatseed.bench import folder as folder_module
-from splatseed.bench.ledger import Ledger
-from splatseed.bench.plan import PlannedScene
-from splatseed.bench.plan_file import plan_text, read_plan
+from splatseed.bench.planning.plan import PlannedScene
+from splatseed.bench.planning.plan_file import plan_text, read_plan
+from splatseed.bench.running import folder as folder_module
+from splatseed.bench.running.ledger import Ledger
 from splatseed.cli import main
 from splatseed.io import load_scene
 from splatseed.synthetic import make_capture
@@ -283,7 +283,7 @@ def test_bad_words_end_in_one_line(bench, room_path, tmp_path, monkeypatch, word
 
 def test_help_does_not_wait_for_pytorch():
     code = (
-        "import sys, splatseed.commands.bench\n"
+        "import sys, splatseed.commands.bench.command\n"
         "assert 'torch' not in sys.modules and 'gsplat' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

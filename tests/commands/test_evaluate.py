@@ -12,9 +12,9 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.evaluate import evaluate_views  # noqa: E402
 from splatseed.io import load_scene  # noqa: E402
-from splatseed.io.ply import write_ply  # noqa: E402
-from splatseed.train.gaussians import initial_gaussians  # noqa: E402
-from splatseed.train.ply import write_gaussians  # noqa: E402
+from splatseed.io.ply.points import write_ply  # noqa: E402
+from splatseed.splat.gaussians import initial_gaussians  # noqa: E402
+from splatseed.splat.ply import write_gaussians  # noqa: E402
 from splatseed.train.run import prepare_run  # noqa: E402
 from splatseed.train.settings import TrainSettings  # noqa: E402
 

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from splatseed.bench.folder import make_bench_folder
-from splatseed.io.staging import MANIFEST
-from splatseed.train.run_folder import RunFolder
+from splatseed.bench.running.folder import make_bench_folder
+from splatseed.io.output.staging import MANIFEST
+from splatseed.train.record.folder import RunFolder
 
 
 def _run_folder(path):

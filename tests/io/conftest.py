@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image as PilImage
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
-from splatseed.io import colmap_binary
+from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 

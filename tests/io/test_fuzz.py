@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SplatseedError
-from splatseed.io import colmap_binary, colmap_text
-from splatseed.io.ply import read_ply, write_ply
+from splatseed.io.colmap import binary as colmap_binary, text as colmap_text
+from splatseed.io.ply.points import read_ply, write_ply
 
 CAMERAS = (Intrinsics(7, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0)),)
 READERS: dict[str, Callable[[Path], object]] = {

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from splatseed.errors import OutputError, SceneFormatError
-from splatseed.io import _files, colmap_binary, load_scene, write_scene
-from splatseed.io._files import open_file, read_file
-from splatseed.io.depth_arrays import read_npz
+from splatseed.io import files, load_scene, write_scene
+from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io.depth.arrays import read_npz
+from splatseed.io.files import open_file, read_file
 from splatseed.io.photograph import photograph_bytes
 
 
@@ -44,7 +45,7 @@ def test_only_regular_files_are_opened(odd, name, says):
 def test_a_file_larger_than_the_memory_is_not_read(tmp_path, monkeypatch):
     (tmp_path / "file").write_bytes(b"12345")
     assert read_file(tmp_path / "file") == b"12345"
-    monkeypatch.setattr(_files, "free_memory", lambda: 4)
+    monkeypatch.setattr(files, "free_memory", lambda: 4)
     with pytest.raises(SceneFormatError, match=r"more than the .* of free memory"):
         photograph_bytes(tmp_path / "file")
 

@@ -13,9 +13,12 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io import colmap_binary, colmap_text, load_scene
-from splatseed.io.ply import write_ply
+from splatseed.io import load_scene
+from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
+
+from .colmap import text_form
 
 
 def rewrite_points(scene_dir, xyz):
@@ -59,7 +62,7 @@ def test_model_named_relatively_finds_its_images(scene_dir, monkeypatch):
 def test_binary_goes_before_text_and_text_before_ply(scene_dir, model):
     folder = scene_dir / "sparse/0"
     text_points = model.points.replace(rgb=np.full((10, 3), 7, np.uint8))
-    colmap_text.write_points3d(folder / "points3D.txt", text_points, model.tracks)
+    text_form.write_points3d(folder / "points3D.txt", text_points, model.tracks)
     write_ply(folder / "points3D.ply", model.points.replace(rgb=np.full((10, 3), 9, np.uint8)))
     assert load_scene(scene_dir).source.points_path.suffix == ".bin"
     (folder / "points3D.bin").unlink()
@@ -74,9 +77,9 @@ def test_binary_goes_before_text_and_text_before_ply(scene_dir, model):
 def test_text_model_equals_binary_model(scene_dir, model, assert_same_images):
     folder = scene_dir / "sparse/0"
     expected = load_scene(scene_dir)
-    colmap_text.write_cameras(folder / "cameras.txt", model.intrinsics)
-    colmap_text.write_images(folder / "images.txt", model.images)
-    colmap_text.write_points3d(folder / "points3D.txt", model.points, model.tracks)
+    text_form.write_cameras(folder / "cameras.txt", model.intrinsics)
+    text_form.write_images(folder / "images.txt", model.images)
+    text_form.write_points3d(folder / "points3D.txt", model.points, model.tracks)
     for path in folder.glob("*.bin"):
         path.unlink()
     assert_same_images(load_scene(scene_dir).images, expected.images)

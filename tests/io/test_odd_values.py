@@ -11,13 +11,16 @@ import pytest
 from splatseed.depth.alignment import align_map
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError
-from splatseed.io import colmap_binary, colmap_text, load_scene
-from splatseed.io._cloud import cloud_warnings, find_usable
+from splatseed.io import load_scene
+from splatseed.io.cloud import cloud_warnings, find_usable
+from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
 from splatseed.upsample import upsample
 from splatseed.views.sightings import camera_points
 
-FORMATS = [(colmap_binary, "bin"), (colmap_text, "txt")]
+from .colmap import text_form
+
+FORMATS = [(colmap_binary, "bin"), (text_form, "txt")]
 
 
 @pytest.mark.parametrize(("module", "suffix"), FORMATS)

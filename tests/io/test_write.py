@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from splatseed.errors import OutputError, PointCloudError
-from splatseed.io import _layouts, colmap_binary, load_scene, write_scene
-from splatseed.io.ply import read_ply, write_ply
+from splatseed.io import load_scene, write_scene
+from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io.output import layouts
+from splatseed.io.ply.points import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Observations, Scene, Tracks
 
@@ -269,7 +271,7 @@ def test_an_interrupted_or_full_disk_leaves_nothing(
         path.write_bytes(b"half")
         raise failure
 
-    monkeypatch.setattr(_layouts, function, fail)
+    monkeypatch.setattr(layouts, function, fail)
     form = "transforms" if function == "write_json" else "colmap"
     expected = OutputError if isinstance(failure, OSError) else KeyboardInterrupt
     scene = load_scene(scene_dir)

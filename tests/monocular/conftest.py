@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ..networks import save_network  # noqa: TID252  (tests are no package)
+from ..networks import save_network
 
 
 @pytest.fixture(scope="session")

@@ -30,7 +30,7 @@ from splatseed.monocular import Preparation, load_network
 from splatseed.monocular.hugging_face import HuggingFaceNetwork
 from splatseed.monocular.network import Meaning
 
-from ..networks import SAVED  # noqa: TID252
+from ..networks import SAVED
 
 KINDS = {
     "depth_anything": "inverse",

@@ -17,7 +17,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.monocular import Preparation, load_network
 from splatseed.monocular.preparation import InputForm
 
-from ..networks import onnx_sum  # noqa: TID252
+from ..networks import onnx_sum
 
 IDENTITY = Preparation(1, 1, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from splatseed.kernels.simd import LANES
 from splatseed.render import layout
 from splatseed.render.binning import RECORD, TILE
 from splatseed.render.blending import BLOCKS, CHANNELS
-from splatseed.simd import LANES
 
 
 def _records(conics: np.ndarray) -> np.ndarray:

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from splatseed.viewpoint import look_at
 from splatseed.views.view import View
+from splatseed.views.viewpoint import look_at
 
 NEARER, HIDING, WITNESSES = 0.1, 5, 12
 

@@ -10,7 +10,7 @@ from splatseed.seeding.verify import TEXTURE
 from splatseed.stereo.patchmatch import Pictures
 from splatseed.stereo.quads import make_quads
 
-from ..stereo.references import (  # noqa: TID252  (tests are no package)
+from ..stereo.references import (
     OFFSETS as WINDOW,
     best_of,
     bilinear,

@@ -26,7 +26,7 @@ from splatseed.seeding.verify import (
     _Trials,
 )
 
-from ..stereo.made import WIDTH  # noqa: TID252  (tests are no package)
+from ..stereo.made import WIDTH
 from .planted import (
     NORMAL,
     constant,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.simd import LANES
+from splatseed.kernels.simd import LANES
 from splatseed.stereo.cost import NOISE, SAMPLES, UNSEEN, best_cost, prepare_window
 from splatseed.stereo.quads import make_quads
 

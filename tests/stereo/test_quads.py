@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numba import njit
 
-from splatseed.simd import LANES, load, store
+from splatseed.kernels.simd import LANES, load, store
 from splatseed.stereo.quads import grey_image, make_quads, sample, square_root
 
 from .references import bilinear

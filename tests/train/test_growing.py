@@ -7,8 +7,9 @@ import pytest
 import torch
 from hypothesis import given, strategies as st
 
-from splatseed.train.gaussians import Gaussians
-from splatseed.train.parameters import make_optimizers, make_parameters, render_features
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.rendering import render_features
+from splatseed.train.parameters import make_optimizers, make_parameters
 from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies import make_strategy
 from splatseed.train.strategies.contributions import contributions

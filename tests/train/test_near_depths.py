@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings, strategies as st
 
-from splatseed.train.gaussians import initial_gaussians
+from splatseed.splat.gaussians import initial_gaussians
 from splatseed.train.near_depths import LEAST, MARGIN, near_depths
 from splatseed.train.parameters import make_optimizers, make_parameters, optimize, yardsticks
 from splatseed.train.schedule import make_schedule

@@ -16,10 +16,10 @@ import torch
 from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
+from splatseed.splat.ply import read_gaussians
 from splatseed.train import device, trainer
 from splatseed.train.averaging import add_to_mean
 from splatseed.train.parameters import gaussians_of
-from splatseed.train.ply import read_gaussians
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
 

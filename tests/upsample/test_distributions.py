@@ -12,7 +12,7 @@ from scipy import stats
 
 import splatseed as ss
 from splatseed.upsample.neighbors import Bases, Neighbors, draw_bases, prepare
-from splatseed.upsample.placement import place_in_box, place_in_triangle, place_on_disc
+from splatseed.upsample.surfaces.placement import place_in_box, place_in_triangle, place_on_disc
 
 NUM = 20_000
 

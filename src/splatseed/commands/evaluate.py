@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from splatseed.commands._options import parse_options
+from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import (
     MissingDependencyError,
     ParameterError,
     SceneNotFoundError,
 )
-from splatseed.io.staging import atomic_file, check_output, output_folder
+from splatseed.io.output.staging import atomic_file, check_output, output_folder
 from splatseed.requirements import require
-from splatseed.train.run_folder import RunFolder
+from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Backend, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 

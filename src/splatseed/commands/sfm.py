@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseed.commands._options import parse_options
+from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.literal import quoted

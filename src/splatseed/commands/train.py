@@ -20,7 +20,7 @@ from rich.progress import (
 )
 from rich.table import Column
 
-from splatseed.commands._options import parse_options
+from splatseed.commands.options import parse_options
 from splatseed.console import (
     ERR,
     OUT,
@@ -33,10 +33,10 @@ from splatseed.console import (
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.literal import quoted, visible
+from splatseed.process.interruption import exit_code
 from splatseed.requirements import require
 from splatseed.scene import Scene
-from splatseed.train.interruption import exit_code
-from splatseed.train.run_folder import RunFolder
+from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Backend, Seeding, StrategyName, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 from splatseed.views.view import poses_of

@@ -8,10 +8,10 @@ from typing import Annotated
 
 import tyro
 
-from splatseed.commands._options import parse_options
+from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
-from splatseed.io.staging import check_output
+from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
 from splatseed.sfm import undistort
 

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from splatseed.depth.settings import Settings
 from splatseed.depth.views import Reduced
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.views.projection import place
 
 __all__ = ["Support", "find_support"]

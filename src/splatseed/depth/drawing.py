@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatseed.depth.settings import Settings
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 
 __all__ = ["Drawn", "draw_pixels"]
 

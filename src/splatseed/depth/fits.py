@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 
 __all__ = [
     "SIGMA_OF_MEDIAN",

@@ -25,7 +25,7 @@ from scipy.sparse.linalg import spsolve
 
 from splatseed.depth.fits import SIGMA_OF_MEDIAN
 from splatseed.depth.views import View
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, in_threads
 from splatseed.views.projection import place
 

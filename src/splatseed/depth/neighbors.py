@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatseed.depth.views import View
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.progress import Progress, in_threads
 from splatseed.views.parallax import cosine_between
 from splatseed.views.projection import place

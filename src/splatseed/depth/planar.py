@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64, Int, Int64
 from splatseed.camera import Camera
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.scene import Image
 
 __all__ = ["PlanarDepth", "lift_pixels", "map_camera", "ray_length"]

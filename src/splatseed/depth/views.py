@@ -23,7 +23,7 @@ from splatseed.depth.settings import Settings
 from splatseed.depthmap import ASPECT_SLACK, DepthMap, DepthMaps
 from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.scene import Image
 from splatseed.views.sightings import SeenPoints, Sightings, camera_points
 

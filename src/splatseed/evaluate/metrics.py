@@ -18,12 +18,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from splatseed.errors import ParameterError
+from splatseed.evaluate.images import psnr, ssim as ssim_inside
 from splatseed.evaluate.lpips import Lpips
 from splatseed.evaluate.result import NOT_ASKED, EvalResult, ViewScore
+from splatseed.evaluate.ssim import WINDOW
 from splatseed.progress import Progress, silent
-from splatseed.train.losses import psnr, ssim as ssim_inside
-from splatseed.train.parameters import photograph
-from splatseed.train.ssim import WINDOW
+from splatseed.splat.rendering import photograph
 from splatseed.views.view import View
 
 __all__ = ["Render", "evaluate_views"]

@@ -1,6 +1,6 @@
 """A trained model beside the test views of its scene, in the world of that scene.
 
-Notation: the training frame is that of the scene's training cameras (``train.frame``). Promise: a
+Notation: the training frame is that of the scene's training cameras (``splat.frame``). Promise: a
 model is rendered in that frame whoever trained it, so that the near plane lies at the same place as
 in training and single precision suffices for a far-off world; what is behind all is black.
 """
@@ -22,6 +22,7 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.evaluate.lpips import Lpips
 from splatseed.evaluate.metrics import Render, evaluate_views
 from splatseed.evaluate.result import NOT_ASKED, EvalResult
+from splatseed.evaluate.ssim import WINDOW
 from splatseed.evaluate.world import (
     NO_TRANSFORM,
     check_world,
@@ -31,12 +32,11 @@ from splatseed.evaluate.world import (
 from splatseed.io import load_scene
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.train.frame import TrainingFrame, training_frame
-from splatseed.train.gaussians import Gaussians
-from splatseed.train.parameters import render_view
-from splatseed.train.pictures import beside_truth, picture_name, write_picture
-from splatseed.train.ply import read_gaussians
-from splatseed.train.ssim import WINDOW
+from splatseed.splat.frame import TrainingFrame, training_frame
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.pictures import beside_truth, picture_name, write_picture
+from splatseed.splat.ply import read_gaussians
+from splatseed.splat.rendering import render_view
 from splatseed.views.view import View, load_views, poses_of
 
 __all__ = [

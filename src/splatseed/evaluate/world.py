@@ -24,7 +24,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io.photograph import photograph_bytes
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
-from splatseed.train.gaussians import Gaussians
+from splatseed.splat.gaussians import Gaussians
 from splatseed.views.view import View
 
 __all__ = [

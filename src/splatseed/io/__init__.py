@@ -5,10 +5,10 @@ Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a sce
 ``splatseed.errors``; importing this package loads neither Numba nor SciPy.
 """
 
-from splatseed.io._cloud import UsablePoints, find_usable
-from splatseed.io.depth_files import DepthFiles
-from splatseed.io.depth_find import find_depths
-from splatseed.io.depth_folder import DepthWriter, depth_folder
+from splatseed.io.cloud import UsablePoints, find_usable
+from splatseed.io.depth.files import DepthFiles
+from splatseed.io.depth.folder import DepthWriter, depth_folder
+from splatseed.io.depth_search import find_depths
 from splatseed.io.load import load_scene
 from splatseed.io.write import WriteReport, write_scene
 

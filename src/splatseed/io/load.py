@@ -11,16 +11,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io._blender import is_blender, read_blender
-from splatseed.io._cloud import cloud_warnings
-from splatseed.io._colmap_scene import find_model, read_colmap_scene, scene_root
-from splatseed.io._earlier import recall_seeds
-from splatseed.io._foreign import refuse_foreign
-from splatseed.io._manifest import MANIFEST
-from splatseed.io._split import follow_lists
-from splatseed.io._transforms_scene import read_transforms_scene
-from splatseed.io.ply import read_ply
-from splatseed.io.tum import is_tum, load_tum
+from splatseed.io.cloud import cloud_warnings
+from splatseed.io.colmap.scene import find_model, read_colmap_scene, scene_root
+from splatseed.io.nerfstudio.blender import is_blender, read_blender
+from splatseed.io.nerfstudio.scene import read_transforms_scene
+from splatseed.io.output.earlier import recall_seeds
+from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.ply.foreign import refuse_foreign
+from splatseed.io.ply.points import read_ply
+from splatseed.io.rgbd.tum import is_tum, load_tum
+from splatseed.io.split import follow_lists
 from splatseed.scene import Scene, SceneSource
 
 __all__ = ["load_scene"]
@@ -89,7 +89,7 @@ def _read(path: Path) -> Scene:
 def _read_capture(path: Path) -> Scene:
     """An RGB-D capture."""
     if (path / "traj.txt").is_file():
-        from splatseed.io.rgbd import load_rgbd  # noqa: PLC0415  (keeps splatseed.io fast)
+        from splatseed.io.rgbd.replica import load_rgbd  # noqa: PLC0415  (keeps splatseed.io fast)
 
         return load_rgbd(path)
     if is_tum(path):

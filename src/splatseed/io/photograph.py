@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io._files import read_file
+from splatseed.io.files import read_file
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage

@@ -18,10 +18,10 @@ from pathlib import Path, PurePath
 from typing import Literal
 
 from splatseed.errors import OutputError, PointCloudError
-from splatseed.io._cloud import find_usable
-from splatseed.io._image_folders import bring
-from splatseed.io._layouts import write_colmap, write_json, write_transforms
-from splatseed.io.staging import MANIFEST, output_folder
+from splatseed.io.cloud import find_usable
+from splatseed.io.output.image_folders import bring
+from splatseed.io.output.layouts import write_colmap, write_json, write_transforms
+from splatseed.io.output.staging import MANIFEST, output_folder
 from splatseed.scene import Scene
 
 __all__ = ["Layout", "WriteReport", "write_scene"]

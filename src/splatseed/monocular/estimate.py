@@ -19,11 +19,11 @@ from PIL import Image as PilImage
 
 from splatseed.depthmap import ASPECT_SLACK
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.depth_folder import depth_folder
+from splatseed.io.depth.folder import depth_folder
+from splatseed.io.output.staging import check_output
 from splatseed.io.photograph import check_photograph, decode_photograph, photograph_bytes
-from splatseed.io.staging import check_output
-from splatseed.memory import check_memory
 from splatseed.monocular.network import DepthNetwork
+from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 

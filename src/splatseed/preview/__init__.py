@@ -12,7 +12,7 @@ from splatseed.preview.maps import map_tiles, preview_maps
 from splatseed.preview.origins import origin_legend, origin_picture, preview_origins
 from splatseed.preview.page import Tile, write_grid
 from splatseed.preview.points import render_points
-from splatseed.viewpoint import choose_camera, choose_image
+from splatseed.views.viewpoint import choose_camera, choose_image
 
 __all__ = [
     "CoveredView",

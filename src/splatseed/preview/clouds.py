@@ -20,7 +20,7 @@ from splatseed.preview.page import GRID_SIDE, Tile, columns_for, write_grid
 from splatseed.preview.photographs import photograph_at
 from splatseed.preview.points import render_points
 from splatseed.scene import Scene
-from splatseed.viewpoint import choose_camera, choose_image
+from splatseed.views.viewpoint import choose_camera, choose_image
 
 __all__ = ["preview_errors", "preview_methods", "preview_pair"]
 

@@ -21,7 +21,7 @@ from splatseed.preview.photographs import photograph_at
 from splatseed.preview.points import render_points
 from splatseed.scene import Scene
 from splatseed.upsample.registry import SOURCE_CODES, origin_name
-from splatseed.viewpoint import choose_camera, choose_image
+from splatseed.views.viewpoint import choose_camera, choose_image
 
 __all__ = ["origin_colors", "origin_legend", "origin_picture", "preview_origins"]
 

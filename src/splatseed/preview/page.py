@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image as PillowImage, ImageDraw, ImageFont
 
-from splatseed.io.staging import atomic_file
+from splatseed.io.output.staging import atomic_file
 from splatseed.preview.fonts import font_file
 
 __all__ = [

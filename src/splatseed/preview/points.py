@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
 from splatseed.camera import Camera
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.pointcloud import PointCloud
 from splatseed.preview.page import PAPER
 

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt32
 
-from splatseed.jit import always_inline, inline, kernel, parallel_range
+from splatseed.kernels.jit import always_inline, inline, kernel, parallel_range
 
 __all__ = ["LOWEST", "RECORD", "TILE", "TileLists", "depth_order", "list_tiles", "row_order"]
 

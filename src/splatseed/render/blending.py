@@ -27,9 +27,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.jit import always_inline, kernel, parallel_range
-from splatseed.render.binning import LOWEST, RECORD, TILE
-from splatseed.simd import (
+from splatseed.kernels.jit import always_inline, kernel, parallel_range
+from splatseed.kernels.simd import (
     LANES,
     add,
     aligned,
@@ -49,6 +48,7 @@ from splatseed.simd import (
     store,
     subtract,
 )
+from splatseed.render.binning import LOWEST, RECORD, TILE
 
 __all__ = ["BLOCKS", "CHANNELS", "MAX_ALPHA", "STOP", "forward"]
 

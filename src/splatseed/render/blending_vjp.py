@@ -21,10 +21,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.jit import always_inline, kernel, parallel_range
-from splatseed.render.binning import LOWEST, RECORD, TILE
-from splatseed.render.blending import BLOCKS, CHANNELS, MAX_ALPHA, STOP
-from splatseed.simd import (
+from splatseed.kernels.jit import always_inline, kernel, parallel_range
+from splatseed.kernels.simd import (
     LANES,
     add,
     aligned,
@@ -47,6 +45,8 @@ from splatseed.simd import (
     store_transposed,
     subtract,
 )
+from splatseed.render.binning import LOWEST, RECORD, TILE
+from splatseed.render.blending import BLOCKS, CHANNELS, MAX_ALPHA, STOP
 
 __all__ = ["SUMS", "backward", "sum_spans"]
 

@@ -18,9 +18,9 @@ import math
 
 import numpy as np
 
-from splatseed.jit import always_inline, kernel, parallel_range
-from splatseed.render.shuffles import lane, permutation, three_sums, triple
-from splatseed.simd import (
+from splatseed.kernels.jit import always_inline, kernel, parallel_range
+from splatseed.kernels.shuffles import lane, permutation, three_sums, triple
+from splatseed.kernels.simd import (
     LANES,
     add,
     fma,

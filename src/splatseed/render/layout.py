@@ -15,10 +15,10 @@ import math
 
 import numpy as np
 
-from splatseed.jit import always_inline, kernel, parallel_range
+from splatseed.kernels.jit import always_inline, kernel, parallel_range
+from splatseed.kernels.simd import LANES
 from splatseed.render.binning import RECORD, TILE
 from splatseed.render.blending import BLOCKS, CHANNELS
-from splatseed.simd import LANES
 
 __all__ = ["from_blocks", "gather", "mark_visible", "scatter", "to_blocks"]
 

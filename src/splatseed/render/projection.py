@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from splatseed.jit import always_inline, kernel, parallel_range
+from splatseed.kernels.jit import always_inline, kernel, parallel_range
 
 __all__ = ["CHUNKS", "MIN_ALPHA", "project", "project_vjp"]
 

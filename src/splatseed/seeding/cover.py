@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, silent
 from splatseed.seeding.coverage import cell_depths, check_points, grid_of
 from splatseed.seeding.guess import (

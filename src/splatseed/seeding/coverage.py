@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, silent
 from splatseed.views.projection import place
 from splatseed.views.view import View

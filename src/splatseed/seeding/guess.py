@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.progress import Progress
 from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world
 from splatseed.views.projection import place

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.jit import always_inline, inline
-from splatseed.simd import LANES
+from splatseed.kernels.jit import always_inline, inline
+from splatseed.kernels.simd import LANES
 from splatseed.stereo.cost import NOISE, SAMPLES, best_cost, prepare_window
 
 __all__ = ["REACH", "slide"]

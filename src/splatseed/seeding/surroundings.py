@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
-from splatseed.upsample.frames import local_frames
 from splatseed.upsample.neighbors import Neighbors, PreparedCloud, prepare
+from splatseed.upsample.surfaces.frames import local_frames
 
 __all__ = ["Surroundings", "survey"]
 

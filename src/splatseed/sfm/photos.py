@@ -15,7 +15,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io._files import open_file
+from splatseed.io.files import open_file
 from splatseed.scene import Image, Scene
 
 __all__ = ["Photo", "find_photos", "match_poses", "name_some"]

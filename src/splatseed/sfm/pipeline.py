@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from shutil import rmtree
 
-from splatseed.io.staging import MANIFEST, output_folder
+from splatseed.io.output.staging import MANIFEST, output_folder
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.sfm.jobs import Found, ReconstructJob, TriangulateJob

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import write_scene
-from splatseed.io._split import ROOT_LISTS
+from splatseed.io.split import ROOT_LISTS
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.sfm.jobs import Found, UndistortJob

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, cast
 
 from splatseed import errors
 from splatseed.errors import ReconstructionError, SplatseedError
-from splatseed.interpreter import child_command, child_environment
+from splatseed.process.interpreter import child_command, child_environment
 from splatseed.progress import Progress
 from splatseed.sfm.jobs import Found, Job
 from splatseed.sfm.settings import check_cuda, require_pycolmap

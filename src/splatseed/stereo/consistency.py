@@ -10,7 +10,7 @@ in one direction only, so the order of views does not show.
 
 from __future__ import annotations
 
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 
 __all__ = ["confirm"]
 

@@ -22,8 +22,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.jit import always_inline, inline
-from splatseed.simd import (
+from splatseed.kernels.jit import always_inline, inline
+from splatseed.kernels.simd import (
     LANES,
     add,
     divide,

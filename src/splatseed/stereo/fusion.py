@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.camera import Camera
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, silent
 from splatseed.stereo.matching import other_from_view
 from splatseed.stereo.result import Stereo

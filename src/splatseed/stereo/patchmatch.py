@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from splatseed.jit import always_inline, inline
-from splatseed.simd import LANES
+from splatseed.kernels.jit import always_inline, inline
+from splatseed.kernels.simd import LANES
 from splatseed.stereo.cost import SAMPLES, best_cost, prepare_window
 
 __all__ = ["Pictures", "begin", "sweep"]

@@ -17,8 +17,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from splatseed.jit import inline
-from splatseed.simd import INDEX, LANES, VECTOR, f32x16
+from splatseed.kernels.jit import inline
+from splatseed.kernels.simd import INDEX, LANES, VECTOR, f32x16
 
 __all__ = ["grey_image", "make_quads", "sample", "square_root"]
 

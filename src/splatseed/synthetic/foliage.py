@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Float64
 
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.synthetic.surfaces import Sphere
 
 __all__ = ["Discs"]

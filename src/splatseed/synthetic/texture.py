@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Float, Float64
 
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 
 __all__ = ["Mottled", "Plain", "Texture", "Tiles", "value_noise"]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.memory import free_memory
+from splatseed.process.memory import free_memory
 from splatseed.train.settings import BYTES_EACH, Backend
 
 __all__ = [

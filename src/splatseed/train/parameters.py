@@ -1,28 +1,24 @@
-"""The trained parameters in PyTorch, their optimisers, and what they look like from a view.
+"""The trained parameters in PyTorch, and their optimisers.
 
 Notation: gsplat's parameter dict: ``means``, ``scales`` (logarithms), ``quats``, ``opacities``
 (logits), ``sh0``, ``shN``; one Adam each, as gsplat's strategies need them. Beside them stand, in
 splatseed's conventions, ``near_depths`` [N], which are not learnt: whatever adds, moves or removes
-Gaussians hands them on with the rest. Promise: one rasteriser call serves training and scoring on
-CPU and CUDA alike.
+Gaussians hands them on with the rest.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from splatseed.render import rasterization
-from splatseed.train.frame import SCENE_SCALE
-from splatseed.train.gaussians import Gaussians
+from splatseed.splat.frame import SCENE_SCALE
+from splatseed.splat.gaussians import Gaussians
 from splatseed.train.schedule import Schedule
-from splatseed.views.view import View
 
 __all__ = [
     "NEAR_DEPTHS",
@@ -33,9 +29,6 @@ __all__ = [
     "make_optimizers",
     "make_parameters",
     "optimize",
-    "photograph",
-    "render_features",
-    "render_view",
     "yardsticks",
 ]
 
@@ -126,64 +119,3 @@ def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, flo
     for axis in range(3):
         positions[:, axis].addcmul_(means.data[:, axis], lengths)
     means.data = positions
-
-
-def render_view(
-    params: Parameters | Mapping[str, Tensor], view: View, sh_degree: int
-) -> tuple[Float[Tensor, "H W 3"], dict[str, Any]]:
-    """What the Gaussians look like from a view, and the rasteriser's ``info``.
-
-    Args:
-        params: The parameter dict, in the frame of the view's camera.
-        view: Whose camera is used.
-        sh_degree: Degree of spherical harmonics in use; coefficients beyond it are left out.
-    """
-    images, info = _rasterize(params, view, _harmonics(params, sh_degree), sh_degree)
-    return images, info
-
-
-def render_features(
-    params: Parameters | Mapping[str, Tensor], view: View, features: Float[Tensor, "N D"]
-) -> Float[Tensor, "H W D"]:
-    """What the Gaussians look like from a view if these numbers, whatever they mean, are their colours."""
-    return _rasterize(params, view, features, None)[0]
-
-
-def _rasterize(
-    params: Parameters | Mapping[str, Tensor],
-    view: View,
-    colors: Tensor | tuple[Tensor, Tensor],
-    sh_degree: int | None,
-) -> tuple[Float[Tensor, "H W D"], dict[str, Any]]:
-    means = params["means"]
-    images, _, info = rasterization(
-        means=means,
-        quats=params["quats"],
-        scales=torch.exp(params["scales"]),
-        opacities=torch.sigmoid(params["opacities"]),
-        colors=colors,
-        viewmats=_on_device(view.cam_from_world, means)[None],
-        Ks=_on_device(view.K, means)[None],
-        width=view.width,
-        height=view.height,
-        sh_degree=sh_degree,
-        packed=False,
-    )
-    return images.squeeze(0), info  # unlike an index, backward makes no image of zeros of it
-
-
-def photograph(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
-    """The view's pixels as float32 from 0 to 1."""
-    # A copy: PyTorch warns on stderr of arrays that are read-only, as a view's may be.
-    return torch.tensor(view.image, device=device).to(torch.float32).div_(255.0)
-
-
-def _harmonics(
-    params: Parameters | Mapping[str, Tensor], sh_degree: int
-) -> Tensor | tuple[Tensor, Tensor]:
-    """The coefficients in use: idle ones would be copied and optimised all the same."""
-    return params["sh0"] if sh_degree == 0 else (params["sh0"], params["shN"])
-
-
-def _on_device(matrix: np.ndarray, like: Tensor) -> Tensor:
-    return torch.from_numpy(np.asarray(matrix, np.float32)).to(like.device)

@@ -19,26 +19,26 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseed.errors import OutputError
+from splatseed.evaluate.ssim import WINDOW
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
-from splatseed.train.config import check_same_seeds, make_config, resumed_settings
-from splatseed.train.curve import Record, write_curve_csv, write_curve_png
+from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, training_frame
+from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.pictures import beside_truth, picture_name, write_picture
+from splatseed.splat.ply import write_gaussians
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
-from splatseed.train.frame import TrainingFrame, stray_note, stray_views, training_frame
-from splatseed.train.gaussians import initial_gaussians
 from splatseed.train.near_depths import near_depths
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
-from splatseed.train.pictures import beside_truth, picture_name, write_picture
-from splatseed.train.ply import write_gaussians
-from splatseed.train.run_folder import RunFolder, write_json
+from splatseed.train.record.config import check_same_seeds, make_config, resumed_settings
+from splatseed.train.record.curve import Record, write_curve_csv, write_curve_png
+from splatseed.train.record.folder import RunFolder, write_json
+from splatseed.train.record.tensorboard import Board
 from splatseed.train.seeds import seeded, usable_seeds
 from splatseed.train.settings import TrainSettings
-from splatseed.train.ssim import WINDOW
 from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
 from splatseed.train.strategies import make_strategy
-from splatseed.train.tensorboard import Board
 from splatseed.train.trainer import Trainer
 from splatseed.views.view import View, load_split, poses_of
 

@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from splatseed.io.staging import kind_of
+from splatseed.io.output.staging import kind_of
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene

@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.staging import atomic_file
-from splatseed.train.curve import Record
+from splatseed.io.output.staging import atomic_file
 from splatseed.train.parameters import Optimizers, Parameters, as_parameters, make_optimizers
+from splatseed.train.record.curve import Record
 from splatseed.train.schedule import Schedule
 from splatseed.train.strategies import Strategy
 

@@ -16,12 +16,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseed.train.allocator import keep_freed_memory
+from splatseed.evaluate.images import psnr
+from splatseed.process.allocator import keep_freed_memory
+from splatseed.process.interruption import interruption
+from splatseed.splat.rendering import photograph, render_view
 from splatseed.train.averaging import add_to_mean, take_mean
-from splatseed.train.curve import Record
-from splatseed.train.interruption import interruption
-from splatseed.train.losses import photometric_loss, psnr
-from splatseed.train.parameters import optimize, photograph, render_view
+from splatseed.train.losses import photometric_loss
+from splatseed.train.parameters import optimize
+from splatseed.train.record.curve import Record
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
 from splatseed.views.view import View

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.memory import check_memory
 from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
+from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints, Upsampler

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
 from splatseed.io import find_usable
-from splatseed.jit import inline, kernel, parallel_range
+from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene

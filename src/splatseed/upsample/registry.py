@@ -1,6 +1,6 @@
 """METHODS: every upsampling method by name, imported when first looked up.
 
-Built-in methods come first: this folder's, and those that parts of the package above it add when they are imported,
+Built-in methods come first: those of ``methods/``, and those that parts of the package above it add when they are imported,
 as all are with the package (``add_built_in``). Then come what installed packages register under the entry-point group
 ``splatseed.methods`` (``name = "package.module:Class"``). A built-in name cannot be taken over.
 """
@@ -22,13 +22,13 @@ __all__ = ["METHODS", "SOURCE_CODES", "add_built_in", "origin_name", "source_cod
 GROUP = "splatseed.methods"
 
 BUILT_IN = {
-    "linear": "splatseed.upsample.linear:Linear",
-    "triangle": "splatseed.upsample.triangle:Triangle",
-    "spline": "splatseed.upsample.spline:Spline",
-    "mls": "splatseed.upsample.mls:Mls",
-    "voronoi": "splatseed.upsample.voronoi:Voronoi",
-    "depth": "splatseed.upsample.depth:Depth",
-    "random": "splatseed.upsample.bounding_box:BoundingBox",
+    "linear": "splatseed.upsample.methods.linear:Linear",
+    "triangle": "splatseed.upsample.methods.triangle:Triangle",
+    "spline": "splatseed.upsample.methods.spline:Spline",
+    "mls": "splatseed.upsample.methods.mls:Mls",
+    "voronoi": "splatseed.upsample.methods.voronoi:Voronoi",
+    "depth": "splatseed.upsample.methods.depth:Depth",
+    "random": "splatseed.upsample.methods.bounding_box:BoundingBox",
 }
 
 SOURCE_CODES = {

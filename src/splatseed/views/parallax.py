@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.jit import always_inline
+from splatseed.kernels.jit import always_inline
 
 __all__ = ["cosine_between"]
 

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from splatseed.errors import OutputError, ParameterError, SceneFormatError
+from splatseed.io.output.staging import atomic_file
 from splatseed.io.photograph import decode_photograph, open_photograph, photograph_bytes
-from splatseed.io.staging import atomic_file
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage

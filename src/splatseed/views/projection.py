@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 
 __all__ = ["place"]
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.camera import Intrinsics
-from splatseed.jit import inline
+from splatseed.kernels.jit import inline
 from splatseed.lens import distort, fold_radius
 
 __all__ = ["undistort"]

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import open_photograph, photograph_bytes
-from splatseed.memory import check_memory
+from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.views.photographs import load_photograph

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatseed.camera import Camera
-from splatseed.io._model_ids import Renumbered
+from splatseed.io.colmap.ids import Renumbered
 from splatseed.io.dense.maps import DenseMap
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks

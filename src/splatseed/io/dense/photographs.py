@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError, SceneFormatError
-from splatseed.io._image_folders import bring, image_folders
 from splatseed.io.dense.maps import scaled_K
-from splatseed.io.depth_folder import safe_parts
+from splatseed.io.depth.folder import safe_parts
+from splatseed.io.output.image_folders import bring, image_folders
 from splatseed.io.photograph import decode_photograph, open_photograph, photograph_bytes
 from splatseed.progress import Progress, in_threads
 from splatseed.scene import Image, Scene

@@ -16,7 +16,7 @@ import numpy as np
 from splatseed.errors import ParameterError
 from splatseed.io.dense.maps import DenseMap, check_map, depth_along, scaled_K
 from splatseed.io.dense.report import DenseCount, DenseReport
-from splatseed.io.depth_folder import depth_folder, safe_parts
+from splatseed.io.depth.folder import depth_folder, safe_parts
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import Camera, Intrinsics
-from splatseed.io import colmap_binary
-from splatseed.io._cloud import find_usable
-from splatseed.io._model_ids import Renumbered, renumber
+from splatseed.io.cloud import find_usable
+from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io.colmap.ids import Renumbered, renumber
 from splatseed.io.dense.maps import scaled_K
 from splatseed.io.dense.overlap import OverlapPoints
 from splatseed.lens import rays_through

@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from splatseed.errors import ParameterError, SceneNotFoundError
-from splatseed.io._layouts import write_json
 from splatseed.io.dense.colmap_files import write_consistency_graph, write_map
 from splatseed.io.dense.maps import DenseMap, check_map, depth_along, scaled_K
 from splatseed.io.dense.overlap import OverlapPoints
 from splatseed.io.dense.photographs import Undistort, bring_photographs, check_image
 from splatseed.io.dense.report import DenseCount, DenseReport
 from splatseed.io.dense.sparse_model import Size, SparseModel, photograph_model
-from splatseed.io.staging import MANIFEST, output_folder
+from splatseed.io.output.layouts import write_json
+from splatseed.io.output.staging import MANIFEST, output_folder
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 

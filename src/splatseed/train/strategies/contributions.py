@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseed.train.parameters import Parameters, render_features
+from splatseed.splat.rendering import render_features
+from splatseed.train.parameters import Parameters
 from splatseed.views.view import View
 
 __all__ = ["contributions"]

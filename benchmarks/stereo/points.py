@@ -1,0 +1,113 @@
+"""Stereo on captures without true depth, against SfM's points of which it was not told.
+
+Notation: of a capture's training photographs (the test views are taken out) some neighbours by name; of its points every
+second is *held out*. A held-out point that an image sees is *known* if its pixel has a depth; its error is that of
+the plane there, relative. Promise: captures are only read. Points are no truth: they lie on texture, and are
+themselves off by a part of a percent.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from benchmarks.common.clouds import find_scenes
+
+import splatseed as ss
+from splatseed.camera import Camera
+from splatseed.stereo.depths import find_stereo
+from splatseed.stereo.result import Stereo
+from splatseed.stereo.settings import StereoSettings
+from splatseed.views.sightings import Sightings, find_sightings
+from splatseed.views.view import data_factor, load_views
+
+__all__ = ["PointScore", "score_points"]
+
+
+@dataclass(frozen=True)
+class PointScore:
+    """What stereo makes of one capture.
+
+    Args:
+        kept: Share of the maps' pixels that have a depth.
+        known: Share of the held-out points, once for each image that sees them, whose pixel has one.
+        within_1: Share of these that are within 1% of it.
+        within_5: Likewise 5%.
+        seconds: Processor time.
+    """
+
+    kept: float
+    known: float
+    within_1: float
+    within_5: float
+    seconds: float
+
+    def cells(self) -> list[str]:
+        """As a row of a table."""
+        shares = (self.kept, self.known, self.within_1, self.within_5)
+        return [*(f"{share:.1%}" for share in shares), f"{self.seconds:.1f}"]
+
+
+def score_points(
+    names: list[str], settings: dict[str, Any], limit: int
+) -> dict[str, dict[str, float]]:
+    """The score on each capture, as JSON can hold it.
+
+    Args:
+        names: Folders of captures.
+        settings: Fields of ``StereoSettings``.
+        limit: Photographs at most.
+    """
+    return {name: asdict(_score(name, StereoSettings(**settings), limit)) for name in names}
+
+
+def _score(name: str, settings: StereoSettings, limit: int) -> PointScore:
+    scene = ss.load_scene(find_scenes() / name)
+    images = scene.split()[0][:limit]
+    views = load_views(scene, images, data_factor=data_factor(images, settings.max_size))
+    sightings = find_sightings(scene)
+    told = _every_second(sightings, 0)
+    find_stereo(views[:2], images[:2], told, settings)  # compiled
+    started = time.process_time()
+    stereo = find_stereo(views, images, told, settings)
+    seconds = time.process_time() - started
+    held_out = _every_second(sightings, 1)
+    errors = [_errors(stereo, i, held_out.of(image)) for i, image in enumerate(images)]
+    error = np.concatenate(errors)
+    known = np.isfinite(error)
+    kept = np.concatenate([stereo.kept(i).ravel() for i in range(len(views))]).mean()
+    return PointScore(
+        float(kept),
+        float(known.mean()),
+        float((error[known] < 0.01).mean()),
+        float((error[known] < 0.05).mean()),
+        seconds,
+    )
+
+
+def _every_second(sightings: Sightings, first: int) -> Sightings:
+    """Half of the points; who sees them stays known."""
+    mine = sightings.point_idx % 2 == first
+    before = np.concatenate([[0], np.cumsum(mine)])
+    start = {key: int(before[at]) for key, at in sightings.start.items()}
+    count = {
+        key: int(before[at + sightings.count[key]] - before[at])
+        for key, at in sightings.start.items()
+    }
+    return Sightings(sightings.xyz, sightings.point_idx[mine], start, count)
+
+
+def _errors(stereo: Stereo, i: int, xyz: np.ndarray) -> np.ndarray:
+    """Relative error at the pixels of points, [M]; NaN where there is no depth."""
+    view, grid = stereo.views[i], stereo.settings.grid
+    uv, z = Camera(view.K, view.width, view.height, view.cam_from_world).project(xyz)
+    rows, columns = stereo.costs[i].shape
+    inside = (z > 0) & ((uv >= 0) & (uv < [columns * grid, rows * grid])).all(axis=1)
+    uv, z = uv[inside], z[inside]
+    column, row = (uv // grid).astype(int).T
+    w, gx, gy = stereo.planes[i][:, row, column]
+    across, down = (uv - (np.stack([column, row], axis=1) + 0.5) * grid).T
+    error = np.abs(1 / (z * (w + gx * across + gy * down)) - 1)
+    return np.where(stereo.kept(i)[row, column], error, np.nan)

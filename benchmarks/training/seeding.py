@@ -1,0 +1,139 @@
+"""What seeds are worth: trained from, on held-out training views, at equal numbers of Gaussians.
+
+The test views (names sorted, every 8th) are taken out of a capture first; of the rest every 8th is held out and
+scored. Runs have a process of their own each; those that are in the ledger are not run again. Prints Markdown; see
+README.md.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import tyro
+from benchmarks.common.children import call
+from benchmarks.common.clouds import find_scenes
+from benchmarks.common.machine import describe
+from benchmarks.common.markdown import table
+from benchmarks.training.baseline import read_ledger, say, write_line
+from benchmarks.training.baseline_arms import CAPS
+from benchmarks.training.seeding_arms import ARMS
+
+from splatseed.errors import SplatseedError
+
+__all__: list[str] = []
+
+Key = tuple[str, str, str, float, int, int, int]
+"""Capture, arm, strategy, rho, steps, data factor, seed."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to run."""
+
+    scenes: tuple[str, ...] = tuple(CAPS)
+    """Captures, by their names in the folder of captures."""
+    arms: tuple[str, ...] = tuple(ARMS)
+    """Which seeds."""
+    strategies: tuple[str, ...] = ("default", "none")
+    """Densification."""
+    rho: tuple[float, ...] = (0.25,)
+    """Most Gaussians, per pixel of a photograph at the size that is trained."""
+    max_steps: int = 1500
+    """Training steps."""
+    seeds: int = 1
+    """Runs of each arm on each capture, with seeds 0, 1, ..."""
+    data_factor: int = 2
+    """By how much photographs are made smaller."""
+    jobs: int = os.cpu_count() or 1
+    """Runs at a time, on one thread each."""
+    ledger: Path = Path("seeding.jsonl")
+    """Where results are kept, a line a run."""
+
+
+def run(key: Key, scenes: Path, ledger: Path) -> None:
+    """One run, and its line in the ledger."""
+    scene, arm, strategy, rho, max_steps, data_factor, seed = key
+    say(f"{scene}, {arm}, {strategy}, rho {rho:g}, seed {seed} ...")
+    result = call(
+        "benchmarks.training.seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm, strategy=strategy,
+        rho=rho, max_steps=max_steps, data_factor=data_factor, seed=seed,
+    )  # fmt: skip
+    write_line(ledger, key, result)
+    say(f"  {scene}, {arm}, {strategy}: {result['psnr']:.2f} dB")
+
+
+def wanted(settings: Settings) -> Iterable[Key]:
+    """All runs that are asked for: each arm of each capture once before any is repeated."""
+    for seed in range(settings.seeds):
+        for rho in settings.rho:
+            for strategy in settings.strategies:
+                for arm in settings.arms:
+                    for scene in settings.scenes:
+                        steps, factor = settings.max_steps, settings.data_factor
+                        yield scene, arm, strategy, rho, steps, factor, seed
+
+
+def rows(results: Mapping[Any, Mapping[str, Any]], settings: Settings) -> Iterable[list[str]]:
+    """Strategy, rho and arm each: PSNR / SSIM (Gaussians, of them seeds) by capture, and the mean."""
+    for strategy in settings.strategies:
+        for rho in settings.rho:
+            for arm in settings.arms:
+                means = [
+                    _means(results, (s, arm, strategy, rho), settings) for s in settings.scenes
+                ]
+                if any(means):
+                    every = [each for each in means if each]
+                    mean = [statistics.mean(v) for v in zip(*every, strict=True)]
+                    whole = _scores(mean) if len(every) == len(means) else ""
+                    yield [strategy, f"{rho:g}", arm, *(map(_cell, means)), whole]
+
+
+def _means(
+    results: Mapping[Any, Mapping[str, Any]], arm: tuple[str, str, str, float], settings: Settings
+) -> list[float]:
+    """The means over the seeds; empty until all have been run."""
+    rest = (settings.max_steps, settings.data_factor)
+    runs = [results.get((*arm, *rest, seed)) for seed in range(settings.seeds)]
+    names = ("psnr", "ssim", "gaussians", "seeds", "seeding", "seconds")
+    known = [each for each in runs if each]
+    if len(known) < len(runs):
+        return []
+    return [statistics.mean(each[name] for each in known) for name in names]
+
+
+def _cell(means: list[float]) -> str:
+    if not means:
+        return ""
+    _, _, count, seeds, seeding, seconds = means
+    numbers = f"{count / 1000:.1f}k, {seeds / 1000:.1f}k seeds"
+    return f"{_scores(means)} ({numbers}, {seeding:.0f} + {seconds:.0f} s)"
+
+
+def _scores(means: list[float]) -> str:
+    return f"{means[0]:.2f} / {means[1]:.4f}"
+
+
+def main(settings: Settings) -> None:
+    """Run what is not there yet, and print the table."""
+    scenes = find_scenes()
+    done = read_ledger(settings.ledger)
+    missing = [key for key in wanted(settings) if key not in done]
+    with ThreadPoolExecutor(settings.jobs) as pool:
+        list(pool.map(partial(run, scenes=scenes, ledger=settings.ledger), missing))
+    header = ["strategy", "rho", "seeds", *settings.scenes, "mean"]
+    print(f"{describe()}\n\n### {settings.max_steps:,} steps, {settings.seeds} run(s) of each\n")
+    print(table(header, rows(read_ledger(settings.ledger), settings)))
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Settings, description=__doc__))
+    except SplatseedError as error:
+        raise SystemExit(str(error)) from None

@@ -1,0 +1,1 @@
+"""What the finished runs say: studies, statistics, gains, and the tables made of them."""

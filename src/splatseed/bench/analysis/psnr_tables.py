@@ -1,0 +1,246 @@
+"""The paper's tables 1 and 2 beside ours: PSNR of every scene and variant, and what it gains.
+
+Notation: marks are as in ``MARKS``. Promise: our numbers carry their standard error over repeats, the
+paper's stand in a row of their own where the scene's name is one of its scenes; nothing is marked as
+best that could be noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from splatseed.bench.analysis.gains import Gains, MeanGains, clear_best, gains, mean_gains
+from splatseed.bench.analysis.paper import (
+    DATASETS,
+    PAPER_STEPS,
+    PaperDataset,
+    dataset_of,
+    paper_dataset,
+)
+from splatseed.bench.analysis.statistics import Difference
+from splatseed.bench.analysis.study import BASELINE, Cell as Runs, Study, Variant
+from splatseed.bench.analysis.tables import Cell, Table, number, words
+from splatseed.train.settings import StrategyName
+
+__all__ = ["MARKS", "gain_cell", "gain_table", "mean_gain_table", "psnr_tables"]
+
+NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
+
+MARKS = (
+    "PSNR in dB, mean ± standard error over repeats. Bold: the best of its row, where its gain over sfm"
+    " is significant (paired by scene and repeat, Holm-corrected over all gains on scenes in this"
+    " strategy, 5%), or sfm where all are significantly worse; † where it is also better than the second best. ~: within noise of sfm."
+    " (1 run): a single repeat, which has no standard error of its own."
+)
+PAPER_NOTE = (
+    "Rows '(paper)' are the numbers printed there: 30,000 steps, a quarter (outdoors) or half (indoors) of"
+    " the size of Mip-NeRF360's photographs."
+)
+GAIN_NOTE = (
+    "dB ± standard error. On a scene and on these scenes, the noise is that of training again; on scenes"
+    " like these, it is the spread of gains from scene to scene, repeats averaged first. Means are over"
+    " the scenes that a column has. ~: within noise (Holm-corrected over all cells of scenes, and over"
+    " each row of means). (1 run): a single pair, of whose noise nothing is known."
+)
+MEAN_NOTE = (
+    "dB over sfm. All variants together: what a variant picked blindly gives. Best single variant: a"
+    " little flattering, as it is chosen by the scores that it is of. Best of each scene: chosen on the"
+    " very test views that it is scored on, so that noise counts as gain; not a gain that anybody can"
+    " have. Variants that some scene lacks are left out."
+)
+TABLE_NAMES = {"mipnerf360": "table1", "replica": "table2", "": "table_scenes"}
+
+
+def psnr_tables(study: Study, strategy: StrategyName) -> tuple[Table, ...]:
+    """PSNR by scene and variant: a table for each dataset of the paper, and one for other scenes.
+
+    Args:
+        study: The study.
+        strategy: One of its strategies.
+    """
+    found = gains(study, strategy)
+    groups: dict[str, list[str]] = {}
+    for scene in study.scenes_of(strategy):
+        dataset = dataset_of(scene)
+        groups.setdefault("" if dataset is None else dataset.key, []).append(scene)
+    return tuple(
+        _psnr_table(study, found, key, groups[key]) for key in (*DATASETS, "") if key in groups
+    )
+
+
+def _psnr_table(study: Study, found: Gains, key: str, scenes: Sequence[str]) -> Table:
+    variants = study.variants_of(found.strategy)
+    rows: list[tuple[Cell, ...]] = []
+    for scene in scenes:
+        rows.append(_our_row(study, found, scene, variants))
+        dataset = dataset_of(scene)
+        if dataset is not None:
+            rows.append(_paper_row(dataset, scene, variants))
+    known = paper_dataset(key).title if key else "other scenes"
+    return Table(
+        f"{TABLE_NAMES[key]}_{found.strategy}",
+        f"PSNR, {known}, strategy {found.strategy}",
+        ("scene", BASELINE.label, *(each.label for each in variants)),
+        tuple(rows),
+        (MARKS, f"Ours: {study.description}.", *_paper_notes(study, key)),
+    )
+
+
+def _paper_notes(study: Study, key: str) -> tuple[str, ...]:
+    if not key:
+        return ()
+    steps = study.settings["max_steps"]
+    short = (
+        "" if steps == PAPER_STEPS else f" Ours are of {steps:,} steps: compare gains, not levels."
+    )
+    return (PAPER_NOTE + short,)
+
+
+def _our_row(
+    study: Study, found: Gains, scene: str, variants: Sequence[Variant]
+) -> tuple[Cell, ...]:
+    best = found.best(scene)
+    clear = clear_best(study, found.strategy, scene)
+
+    def cell(variant: Variant) -> Cell:
+        gain = found.on_scene.get((scene, variant))
+        verdict = "unknown" if gain is None else gain.verdict
+        bold = variant == best and verdict == "better"
+        mark = NOISE if verdict == "within noise" else CLEAR if bold and clear else ""
+        return _runs_cell(study.cell(found.strategy, scene, variant), mark=mark, bold=bold)
+
+    known = [found.on_scene[scene, v].verdict for v in variants if (scene, v) in found.on_scene]
+    as_it_is = bool(known) and set(known) == {"worse"}
+    base = _runs_cell(study.cell(found.strategy, scene, BASELINE), bold=as_it_is)
+    return (words(scene), base, *map(cell, variants))
+
+
+def _runs_cell(runs: Runs, *, mark: str = "", bold: bool = False) -> Cell:
+    """Mean and standard error of a cell's PSNR over its repeats."""
+    values = np.array([result.psnr for result in runs.values()])
+    if not len(values):
+        return Cell()
+    if len(values) == 1:
+        return Cell(float(values[0]), math.nan, text=ONE_RUN, mark=mark, bold=bold)
+    se = float(values.std(ddof=1)) / math.sqrt(len(values))
+    return Cell(float(values.mean()), se, mark=mark, bold=bold)
+
+
+def _paper_row(dataset: PaperDataset, scene: str, variants: Sequence[Variant]) -> tuple[Cell, ...]:
+    scores = dataset.psnr[scene]
+    arms = (BASELINE, *variants)
+    printed = (scores.get((arm.method, arm.ratio)) for arm in arms)
+    return _soft((words(f"{scene} (paper)"), *(number(value) for value in printed)))
+
+
+def _soft(row: Iterable[Cell]) -> tuple[Cell, ...]:
+    return tuple(replace(cell, soft=True) for cell in row)
+
+
+def gain_cell(gain: Difference | None) -> Cell:
+    """A gain with its standard error, and whether it is within noise."""
+    if gain is None:
+        return Cell()
+    mark = NOISE if gain.verdict == "within noise" else ""
+    text = ONE_RUN if math.isnan(gain.se) and gain.n == 1 else ""
+    return Cell(gain.mean, gain.se, 3, signed=True, mark=mark, text=text)
+
+
+def gain_table(study: Study, strategy: StrategyName) -> Table:
+    """What each variant gains: on each scene, on these scenes, on scenes like these; and the paper's.
+
+    Args:
+        study: The study.
+        strategy: One of its strategies.
+    """
+    found = gains(study, strategy)
+
+    def row(name: str, gain: Callable[[Variant], Cell]) -> tuple[Cell, ...]:
+        return (words(name), *(gain(each) for each in found.variants))
+
+    rows = [
+        row(scene, lambda v, scene=scene: gain_cell(found.on_scene.get((scene, v))))  # type: ignore[misc]
+        for scene in found.scenes
+    ]
+    rows.append(row("mean, these scenes", lambda v: gain_cell(found.on_these[v])))
+    if len(found.scenes) > 1:
+        rows.append(row("mean, scenes like these", lambda v: gain_cell(found.on_like[v])))
+    rows += [_soft(row(name, cells)) for name, cells in _paper_gains(found)]
+    return Table(
+        f"gains_{strategy}",
+        f"Gain over sfm in PSNR, strategy {strategy}",
+        ("scene", *(each.label for each in found.variants)),
+        tuple(rows),
+        (GAIN_NOTE, f"{study.description}."),
+    )
+
+
+def _paper_gains(found: Gains) -> list[tuple[str, Callable[[Variant], Cell]]]:
+    """The paper's mean gains over the scenes that ours are of, for each dataset."""
+    rows: list[tuple[str, Callable[[Variant], Cell]]] = []
+    for key in DATASETS:
+        dataset = paper_dataset(key)
+        scenes = [scene for scene in found.scenes if scene in dataset.psnr]
+        if not scenes:
+            continue
+
+        def cell(v: Variant, dataset: PaperDataset = dataset, scenes: list[str] = scenes) -> Cell:
+            return number(_paper_mean(dataset, scenes, v), 3, signed=True)
+
+        if any(cell(variant).value is not None for variant in found.variants):
+            name = f"paper, {len(scenes)} of {len(dataset.psnr)} {dataset.title} scenes"
+            rows.append((name, cell))
+    return rows
+
+
+def _paper_mean(dataset: PaperDataset, scenes: Sequence[str], variant: Variant) -> float | None:
+    known = [dataset.gain(scene, (variant.method, variant.ratio)) for scene in scenes]
+    told = [each for each in known if each is not None]
+    return sum(told) / len(told) if told else None
+
+
+def mean_gain_table(study: Study) -> Table:
+    """The three kinds of mean gain, ours by strategy and the paper's.
+
+    Args:
+        study: The study.
+    """
+    rows = []
+    for strategy in study.strategies:
+        ours = mean_gains(gains(study, strategy).means())
+        if ours is not None:
+            rows.append(_mean_row(f"ours, {strategy}", ours))
+    for key in DATASETS:
+        theirs = mean_gains(_paper_means(paper_dataset(key)))
+        if theirs is not None:
+            rows.append(_soft(_mean_row(f"paper, {DATASETS[key]}", theirs)))
+    return Table(
+        "mean_gains",
+        "Three mean gains that are easily mistaken for one another",
+        ("", "all variants together", "best single variant", "which", "best of each scene (unfair)",
+         "scenes", "variants"),
+        tuple(rows),
+        (MEAN_NOTE,),
+    )  # fmt: skip
+
+
+def _paper_means(dataset: PaperDataset) -> dict[str, dict[Variant, float]]:
+    return {
+        scene: {
+            Variant(method, ratio=ratio): psnr - entries["sfm", 1.0]
+            for (method, ratio), psnr in entries.items()
+            if method != BASELINE.method
+        }
+        for scene, entries in dataset.psnr.items()
+    }
+
+
+def _mean_row(name: str, means: MeanGains) -> tuple[Cell, ...]:
+    kinds = (means.over_all, means.over_best, means.per_scene)
+    first, second, third = (number(value, 3, signed=True) for value in kinds)
+    sizes = (number(float(each), 0) for each in (means.num_scenes, means.num_variants))
+    return (words(name), first, second, words(means.best), third, *sizes)

@@ -1,0 +1,148 @@
+"""The answer in a few sentences: does upsampling help on these scenes, by which method, at what cost?
+
+Promise: a gain is called one only where it is more than noise after adjusting for the number of variants;
+where a single run was made of each, the sentences say that nothing is known of the noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from statistics import fmean
+
+from splatseed.bench.analysis.convergence import speed
+from splatseed.bench.analysis.gains import Gains, gains
+from splatseed.bench.analysis.statistics import LEVEL, Difference, Verdict
+from splatseed.bench.analysis.study import BASELINE, Study, Variant
+from splatseed.bench.planning.records import RunResult
+from splatseed.train.settings import StrategyName
+
+__all__ = ["decibels", "summary"]
+
+
+def summary(study: Study, strategy: StrategyName) -> tuple[str, ...]:
+    """What the runs under a strategy say, a sentence or two each.
+
+    Args:
+        study: The study.
+        strategy: One of its strategies.
+    """
+    found = gains(study, strategy)
+    if not found.variants:
+        return (f"Strategy {strategy}: nothing can be compared with {BASELINE.label} yet.",)
+    best = max(found.variants, key=lambda each: found.on_these[each].mean)
+    said = [_answer(found, best), _by_scene(found, best), _elsewhere(found, best)]
+    return tuple(each for each in (*said, _cost(study, strategy, best)) if each)
+
+
+def decibels(gain: Difference) -> str:
+    """A gain with its standard error, in words."""
+    spread = "" if math.isnan(gain.se) else f" ± {gain.se:.2f}"
+    return f"{gain.mean:+.2f}{spread} dB"
+
+
+def _answer(found: Gains, best: Variant) -> str:
+    """Whether any variant gains, and which gains most."""
+    scenes = _count(len(found.scenes), "scene")
+    lead = f"Strategy {found.strategy}, {scenes}:"
+    top = found.on_these[best]
+    if top.verdict == "unknown":
+        return (
+            f"{lead} with one run of each nothing is known of the noise, so no gain can be claimed."
+            f" The highest is that of {best.label}, {decibels(top)}."
+        )
+    better, worse = (_those(found, verdict) for verdict in ("better", "worse"))
+    of = f"of {_count(len(found.variants), 'variant')}"
+    if better:
+        text = f"{lead} yes, {len(better)} {of} gain more than noise, {best.label} most ({decibels(top)})."
+    else:
+        text = (
+            f"{lead} no gain beyond noise was found among {_count(len(found.variants), 'variant')}; the"
+            f" highest is that of {best.label}, {decibels(top)}."
+        )
+    loses = (
+        f" Beyond noise, {_listed(worse)} {'lose' if len(worse) > 1 else 'loses'}." if worse else ""
+    )
+    return text + loses
+
+
+def _those(found: Gains, verdict: Verdict) -> list[str]:
+    return [each.label for each in found.variants if found.on_these[each].verdict == verdict]
+
+
+def _by_scene(found: Gains, best: Variant) -> str:
+    """On how many scenes the best variant gains and loses."""
+    known = [d for s in found.scenes if (d := found.on_scene.get((s, best))) is not None]
+    if len(known) < 2 or all(each.verdict == "unknown" for each in known):
+        return ""
+    kinds: tuple[Verdict, ...] = ("better", "worse", "within noise")
+    counts = {kind: sum(each.verdict == kind for each in known) for kind in kinds}
+    return (
+        f"On single scenes {best.label} is better on {counts['better']}, worse on {counts['worse']} and"
+        f" within noise on {counts['within noise']} of {len(known)}."
+    )
+
+
+def _elsewhere(found: Gains, best: Variant) -> str:
+    """Whether the gain can be expected of other scenes."""
+    like = found.on_like[best]
+    if like.verdict == "unknown":
+        return "One scene says nothing of others."
+    low, high = like.interval()
+    span = f"95% interval {low:+.2f} to {high:+.2f} dB"
+    if like.verdict == "within noise":
+        return f"For scenes like these it is not shown to gain: {span} before adjusting for the choice."
+    gain = "a gain" if like.mean > 0 else "a loss"
+    return f"For scenes like these {gain} is shown too: {span}."
+
+
+def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
+    """What the best variant costs beside the baseline, and how soon it is as good."""
+    seconds = fmean(own.upsample_seconds for _, own in _pairs(study, strategy, best))
+    longer = _times(study, strategy, best, lambda r: r.train_seconds)
+    larger = _times(study, strategy, best, lambda r: float(r.num_gaussians))
+    text = (
+        f"{best.label} costs {seconds:.1f} s of upsampling a scene, {longer:.2f} times {BASELINE.label}'s"
+        f" training time and {larger:.2f} times its Gaussians."
+    )
+    sooner = speed(study, strategy, best)
+    if sooner is None:
+        return text
+    if sooner.log_steps is None or sooner.log_seconds is None:
+        part = f"{sooner.reached} of {sooner.pairs} runs"
+        return f"{text} {part} reach {BASELINE.label}'s last PSNR."
+    steps, clock = (_ratio(each) for each in (sooner.log_steps, sooner.log_seconds))
+    return (
+        f"{text} It is as good as {BASELINE.label} in the end after {steps} the steps and {clock} the"
+        f" seconds that {BASELINE.label} itself takes."
+    )
+
+
+def _ratio(log: Difference) -> str:
+    """How many times, and whether that could be once."""
+    sure = log.p <= LEVEL  # NaN of a single pair is not
+    return f"{math.exp(log.mean):.2f} times{'' if sure else ' (within noise)'}"
+
+
+def _pairs(
+    study: Study, strategy: StrategyName, variant: Variant
+) -> list[tuple[RunResult, RunResult]]:
+    scenes = study.scenes_of(strategy)
+    return [pair for scene in scenes for pair in study.pairs(strategy, scene, variant)]
+
+
+def _times(
+    study: Study, strategy: StrategyName, variant: Variant, measure: Callable[[RunResult], float]
+) -> float:
+    """Geometric mean over pairs of runs of how many times the baseline's measure it is."""
+    pairs = _pairs(study, strategy, variant)
+    logs = [math.log(max(measure(own), 1e-9) / max(measure(base), 1e-9)) for base, own in pairs]
+    return math.exp(fmean(logs))
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " and ".join([*([", ".join(names[:-1])] if names[:-1] else []), names[-1]])

@@ -1,0 +1,241 @@
+"""A plan: which scenes, which arms, how often, and how each run is trained.
+
+Notation: see ``records``. Promise: a plan that exists is valid; the runs of a plan come in an order in
+which all arms of all scenes have been run once before any is repeated, so that a benchmark which is
+stopped early still compares all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, get_args
+
+from splatseed.bench.planning.records import ANY_RATIO, SFM, Arm, RunSpec
+from splatseed.bench.planning.scenes import SceneFacts
+from splatseed.errors import ParameterError
+from splatseed.train.schedule import FULL_RUN
+from splatseed.train.settings import Backend, StrategyName, TrainSettings
+from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, configure
+
+__all__ = ["DEMO", "Plan", "PlannedScene", "plan_runs"]
+
+DEMO = "demo:"
+"""The path of the made-up room, which is made in the benchmark's folder when it is needed."""
+DEPTH = "depth"
+
+
+@dataclass(frozen=True)
+class PlannedScene:
+    """A scene of a plan.
+
+    Args:
+        path: Where it lies; ``DEMO`` for the made-up room.
+        name: What it is called in tables; its folder's name when left empty.
+        images: The folder of photographs within it, such as ``images_4``; found when left empty.
+        depth: The folder of its depth maps; looked for in the scene when left out.
+    """
+
+    path: str
+    name: str = ""
+    images: str = ""
+    depth: str = ""
+
+    @property
+    def is_demo(self) -> bool:
+        """Whether it is the made-up room."""
+        return self.path == DEMO
+
+    @property
+    def label(self) -> str:
+        """Its name, or its folder's."""
+        return self.name or ("demo" if self.is_demo else Path(self.path).resolve().name)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a benchmark is to run.
+
+    Raises:
+        ParameterError: A value is out of its range, or given twice.
+    """
+
+    scenes: tuple[PlannedScene, ...] = ()
+    """The scenes."""
+    methods: tuple[str, ...] = (SFM, "linear", "mls")
+    """How new points are made; ``sfm`` for none, with which all others are compared."""
+    ratios: tuple[float, ...] = (8.0,)
+    """Points in all, per original."""
+    strategies: tuple[StrategyName, ...] = ("default",)
+    """Densification strategies."""
+    profiles: tuple[Profile, ...] = ("default",)
+    """Parameters of the methods: improved ones, and those of the paper's text."""
+    repeats: int = 3
+    """How often each is run, with another seed each time."""
+    max_steps: int = FULL_RUN
+    """Training steps."""
+    data_factor: int = 1
+    """By how much photographs are made smaller."""
+    test_every: int = 8
+    """Every so many-th image is kept for the test."""
+    cap_max: int | None = None
+    """Most Gaussians; None for the strategy's own."""
+    sh_degree: int = 3
+    """Degree of spherical harmonics."""
+    backend: Backend = "auto"
+    """Where to train."""
+    opacity_reset: bool = False
+    """Whether strategy default resets opacities."""
+    keep_models: bool = False
+    """Whether trained models are kept."""
+    lpips: bool = False
+    """Whether LPIPS is measured; its weights must be there."""
+    parameters: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Parameters that differ from the profile's, by method."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "ratios", tuple(float(ratio) for ratio in self.ratios))
+        _check_choices("methods", self.methods, (SFM, *METHODS))
+        _check_choices("strategies", self.strategies, get_args(StrategyName))
+        _check_choices("profiles", self.profiles, get_args(Profile))
+        _check_distinct("ratios", self.ratios)
+        for ratio in self.ratios:
+            if not 1 < ratio < math.inf:
+                raise _out_of_range("ratios", "above 1 (points in all, per original)", ratio)
+        if self.repeats < 1:
+            raise _out_of_range("repeats", "of 1 or more", self.repeats)
+        if self.backend not in get_args(Backend):
+            raise _out_of_range("backend", f"of {', '.join(get_args(Backend))}", self.backend)
+        _check_distinct("scenes", [each.label for each in self.scenes])
+        for scene in self.scenes:
+            _check_text(scene)
+        for method in self.parameters:
+            _check_choices("parameters", (method,), tuple(METHODS))
+            configure(method, **self.parameters[method])
+        self._settings()
+
+    def _settings(self) -> TrainSettings:
+        """Whose making checks what training depends on."""
+        return TrainSettings(
+            max_steps=self.max_steps,
+            data_factor=self.data_factor,
+            test_every=self.test_every,
+            cap_max=self.cap_max,
+            sh_degree=self.sh_degree,
+        )
+
+    def parameters_of(self, method: str) -> Mapping[str, Any]:
+        """What differs from the profile's; no method sees the photographs kept for the test."""
+        looks = hasattr(METHODS[method], "hold_out")
+        held = {"hold_out": self.test_every} if looks else {}
+        return MappingProxyType({**held, **self.parameters.get(method, {})})
+
+    def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:
+        """The arms of one strategy: the original cloud first.
+
+        A method whose profiles are one and the same has one arm, of the first of them; one that makes
+        as many seeds as the photographs need has no ratio.
+        """
+        arms = [Arm(SFM, "default", 1, strategy)] if SFM in self.methods else []
+        for method in self.methods:
+            if method != SFM:
+                arms += [
+                    Arm(method, profile, ratio, strategy)
+                    for profile in self._profiles_of(method)
+                    for ratio in ((ANY_RATIO,) if chooses_number(method) else self.ratios)
+                ]
+        return tuple(arms)
+
+    def _profiles_of(self, method: str) -> list[Profile]:
+        seen: list[Upsampler] = []
+        chosen = []
+        for profile in self.profiles:
+            configured = configure(method, profile, **self.parameters_of(method))
+            if configured not in seen:
+                seen.append(configured)
+                chosen.append(profile)
+        return chosen
+
+
+def plan_runs(
+    plan: Plan, scenes: Sequence[SceneFacts], backend: Backend, version: str
+) -> list[RunSpec]:
+    """The runs of a plan, in the order in which they are to be run.
+
+    Arms of the method depth are left out for scenes without depth maps.
+
+    Args:
+        plan: The plan.
+        scenes: What was found where its scenes lie.
+        backend: Where they will be trained: not "auto".
+        version: The package's.
+    """
+    return [
+        RunSpec(
+            scene=scene.name,
+            scene_digest=scene.digest,
+            arm=arm,
+            repeat=repeat,
+            parameters={} if arm.method == SFM else dict(plan.parameters_of(arm.method)),
+            depth_digest=scene.depth_digest if arm.method == DEPTH else "",
+            depth_path=scene.depth_path if arm.method == DEPTH else "",
+            scene_path=scene.path,
+            images=scene.images,
+            backend=backend,
+            version=version,
+            max_steps=plan.max_steps,
+            data_factor=plan.data_factor,
+            test_every=plan.test_every,
+            cap_max=plan.cap_max,
+            sh_degree=plan.sh_degree,
+            opacity_reset=plan.opacity_reset,
+        )
+        for repeat in range(plan.repeats)
+        for scene, arm in _scene_arms(plan, scenes)
+    ]
+
+
+def _scene_arms(plan: Plan, scenes: Sequence[SceneFacts]) -> Iterator[tuple[SceneFacts, Arm]]:
+    for scene in scenes:
+        for strategy in plan.strategies:
+            for arm in plan.arms(strategy):
+                if arm.method != DEPTH or scene.depth_digest:
+                    yield scene, arm
+
+
+def _check_choices(name: str, given: Sequence[str], known: Sequence[str]) -> None:
+    _check_distinct(name, given)
+    for each in given:
+        if each not in known:
+            raise _out_of_range(name, f"among {', '.join(known)}", each)
+
+
+def _check_distinct(name: str, given: Sequence[object]) -> None:
+    if name not in {"scenes", "parameters"} and not given:
+        raise _out_of_range(name, "of at least one", "none")
+    twice = next((each for i, each in enumerate(given) if each in given[:i]), None)
+    if twice is not None:
+        raise ParameterError(
+            f"{name} that differ",
+            found=f"{twice} twice",
+            fix="Give names to scenes in a plan (see --dry-run)."
+            if name == "scenes"
+            else "Drop one.",
+        )
+
+
+def _check_text(scene: PlannedScene) -> None:
+    """A plan is a text file: names of files that are no text cannot stand in it."""
+    try:
+        f"{scene.path}{scene.name}{scene.images}{scene.depth}".encode()
+    except UnicodeEncodeError:
+        raise ParameterError(
+            "scenes whose paths are valid text", found=ascii(scene.path), fix="Rename the folder."
+        ) from None
+
+
+def _out_of_range(name: str, expected: str, found: object) -> ParameterError:
+    return ParameterError(f"{name} {expected}", found=f"{found}", fix="See splatseed bench --help.")

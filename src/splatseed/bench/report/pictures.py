@@ -1,0 +1,138 @@
+"""What a report needs of the scenes themselves: descriptors, and pictures of the seeds.
+
+Notation: what is kept lies in ``BENCH/descriptors.json`` and ``BENCH/figures``; ``clouds.json`` there says
+which picture is of which seeds. Promise: a scene is opened only for what is not kept yet; one that is gone
+or has changed costs its pictures and not the report.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from splatseed.bench.analysis.descriptors import (
+    Descriptors,
+    describe,
+    read_descriptors,
+    write_descriptors,
+)
+from splatseed.bench.analysis.study import Study, Variant
+from splatseed.bench.planning.records import RunSpec
+from splatseed.bench.report.clouds import cloud_picture, open_unchanged, seed_specs
+from splatseed.errors import SplatseedError
+from splatseed.progress import Progress, silent
+
+__all__ = ["CLOUDS", "FIGURES", "KEPT_DESCRIPTORS", "Pictures", "safe_name", "scene_pictures"]
+
+FIGURES = "figures"
+CLOUDS = "clouds.json"
+KEPT_DESCRIPTORS = "descriptors.json"
+
+
+@dataclass
+class Pictures:
+    """What was found out of a study's scenes.
+
+    Args:
+        described: Descriptors by scene.
+        clouds: PNG by scene.
+        files: The name of each scene's PNG, without suffix.
+        keys: What each PNG is of, by file name.
+        notes: What could not be shown, one sentence each.
+    """
+
+    described: dict[str, Descriptors] = field(default_factory=dict)
+    clouds: dict[str, bytes] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+    keys: dict[str, str] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def scene_pictures(
+    bench: Path, study: Study, *, from_scenes: bool = True, progress: Progress = silent
+) -> Pictures:
+    """Descriptors and pictures of a study's scenes, kept ones or new.
+
+    Args:
+        bench: The benchmark's folder.
+        study: The study.
+        from_scenes: Whether scenes may be opened; else only what is kept is used.
+        progress: Told the stages.
+
+    Raises:
+        OutputError: Descriptors cannot be kept.
+    """
+    found = Pictures()
+    kept = read_descriptors(bench / KEPT_DESCRIPTORS)
+    drawn = _drawn(bench)
+    for scene in study.scenes:
+        specs = seed_specs(study, scene)
+        anyone = study.rows[scene][0].spec
+        key = _key(anyone, specs)
+        if anyone.scene_digest in kept:
+            found.described[scene] = kept[anyone.scene_digest]
+        if key in drawn:
+            found.clouds[scene] = drawn[key]
+        if from_scenes and (scene not in found.described or (specs and scene not in found.clouds)):
+            _look(found, scene, anyone, specs, progress)
+        if scene in found.clouds:
+            found.files[scene] = f"clouds_{safe_name(scene)}_{key[:6]}"
+            found.keys[found.files[scene]] = key
+        if scene in found.described:
+            kept[anyone.scene_digest] = found.described[scene]
+    if kept:
+        write_descriptors(bench / KEPT_DESCRIPTORS, kept)
+    return found
+
+
+def _look(
+    found: Pictures,
+    scene: str,
+    anyone: RunSpec,
+    specs: Mapping[Variant, RunSpec],
+    progress: Progress,
+) -> None:
+    """Open a scene for what is not known of it."""
+    try:
+        opened = open_unchanged([*specs.values(), anyone])
+        if scene not in found.described:
+            found.described[scene] = describe(opened, progress)
+        if specs and scene not in found.clouds:
+            found.clouds[scene] = cloud_picture(opened, specs, progress)
+    except SplatseedError as error:
+        found.notes.append(f"{scene}: its points are not shown or described: {error}")
+
+
+def _key(anyone: RunSpec, specs: Mapping[Variant, RunSpec]) -> str:
+    """What a picture of seeds depends on."""
+    told = [
+        (variant.label, spec.repeat, spec.depth_digest, spec.version)
+        for variant, spec in specs.items()
+    ]
+    text = json.dumps([anyone.scene_digest, told])
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _drawn(bench: Path) -> dict[str, bytes]:
+    """Pictures of an earlier report by what they are of."""
+    pictures = {}
+    with suppress(OSError, ValueError, AttributeError):
+        names = json.loads((bench / FIGURES / CLOUDS).read_text("utf-8"))
+        for name, key in names.items():
+            pictures[key] = (bench / FIGURES / f"{Path(name).name}.png").read_bytes()
+    return pictures
+
+
+def safe_name(text: str) -> str:
+    """A name as a part of a file's: letters, digits, dots, hyphens and underscores.
+
+    Example:
+        >>> safe_name("my kitchen/(ab12)")
+        'my_kitchen_ab12_'
+    """
+    return re.sub(r"[^\w.-]+", "_", text)

@@ -1,0 +1,138 @@
+"""A study's part of the report: its tables, its figures, and where on the page they stand.
+
+Promise: what stands on the page is what is written as a table or a figure, no more and no less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+
+from splatseed.bench.analysis.comparisons import equal_count_table, ratio_table, strategy_table
+from splatseed.bench.analysis.convergence import convergence_table
+from splatseed.bench.analysis.costs import cost_table, quality_table
+from splatseed.bench.analysis.descriptors import Descriptors
+from splatseed.bench.analysis.gains import gains
+from splatseed.bench.analysis.guidelines import (
+    guideline_table,
+    guidelines,
+    scene_table,
+    verdict,
+    winner_table,
+)
+from splatseed.bench.analysis.psnr_tables import gain_table, mean_gain_table, psnr_tables
+from splatseed.bench.analysis.study import Study
+from splatseed.bench.analysis.tables import Table
+from splatseed.bench.report.figures import (
+    Plot,
+    curve_figure,
+    ratio_figure,
+    scene_figure,
+    strategy_figure,
+)
+from splatseed.bench.report.html import Section, figure, paragraphs, table
+
+__all__ = ["StudyReport", "study_report"]
+
+NO_GAINS = "There is nothing to compare with yet: runs of sfm are missing, or all others."
+
+
+@dataclass
+class StudyReport:
+    """What is reported of a study, in the order of the page.
+
+    Args:
+        prefix: Before the names of files and links; empty for the first study.
+        title: Before the headings.
+        tables: All tables.
+        plots: All figures.
+        sections: Where they stand.
+    """
+
+    prefix: str = ""
+    title: str = ""
+    tables: list[Table] = field(default_factory=list)
+    plots: list[Plot] = field(default_factory=list)
+    sections: list[Section] = field(default_factory=list)
+
+    def add(self, key: str, title: str, parts: Iterable[Table | Plot | str | None]) -> None:
+        """Add a section of tables, figures and paragraphs; None is passed over."""
+        blocks = [self._block(part) for part in parts if part is not None]
+        self.sections.append(Section(self.prefix + key, self.title + title, blocks))
+
+    def _block(self, part: Table | Plot | str) -> str:
+        if isinstance(part, str):
+            return paragraphs([part])
+        if isinstance(part, Table):
+            self.tables.append(replace(part, name=self.prefix + part.name))
+            return table(self.tables[-1])
+        self.plots.append(part._replace(name=self.prefix + part.name))
+        return figure(part.png, part.caption)
+
+
+def study_report(
+    study: Study, described: Mapping[str, Descriptors], prefix: str = "", title: str = ""
+) -> StudyReport:
+    """The tables and figures of a study.
+
+    Args:
+        study: The study.
+        described: Descriptors of its scenes, as far as they are known.
+        prefix: Before the names of files and links.
+        title: Before the headings.
+    """
+    report = StudyReport(prefix, title)
+    strategies = study.strategies
+    report.add("scores", "Scores", _scores(study))
+    if not study.variants:
+        report.add("gains", "Gains", [NO_GAINS])
+    else:
+        _add_gains(report, study)
+    report.add("convergence", "Convergence", _convergence(study))
+    report.add("cost", "Cost", (cost_table(study, each) for each in strategies))
+    report.add("guidelines", "Guidelines", _guidelines(study, described))
+    return report
+
+
+def _scores(study: Study) -> Iterable[Table]:
+    for strategy in study.strategies:
+        yield from psnr_tables(study, strategy)
+        yield quality_table(study, strategy)
+
+
+def _add_gains(report: StudyReport, study: Study) -> None:
+    parts: list[Table | Plot | str | None] = []
+    for strategy in study.strategies:
+        parts += [gain_table(study, strategy), scene_figure(study, strategy)]
+    report.add("gains", "Gains", [*parts, mean_gain_table(study)])
+    report.add(
+        "ratios",
+        "By ratio, strategy and count",
+        [
+            ratio_figure(study),
+            ratio_table(study),
+            strategy_figure(study),
+            strategy_table(study),
+            equal_count_table(study),
+        ],
+    )
+
+
+def _convergence(study: Study) -> Iterable[Table | Plot | None]:
+    for strategy in study.strategies:
+        yield curve_figure(study, strategy, "steps")
+        yield curve_figure(study, strategy, "seconds")
+        if study.variants_of(strategy):
+            yield convergence_table(study, strategy)
+
+
+def _guidelines(study: Study, described: Mapping[str, Descriptors]) -> Iterable[Table | str]:
+    for strategy in study.strategies if study.variants else ():
+        found = gains(study, strategy)
+        derived = guidelines(found, described)
+        yield f"Strategy {strategy}: {verdict(derived)}"
+        yield winner_table(found, described)
+        if derived:
+            yield guideline_table(derived, strategy)
+    if described:
+        yield scene_table(described)

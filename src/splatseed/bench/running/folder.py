@@ -1,0 +1,99 @@
+"""The folder of a benchmark: who may write there, and the made-up room in it.
+
+Notation: ``BENCH`` holds ``ledger.sqlite``, ``plan.toml``, ``runs/`` with what is kept of each run,
+``work/`` with runs that go on, and ``scenes/demo`` if a plan asks for it. Promise: a folder that is
+neither empty nor a benchmark's is never written to.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatseed.bench.planning.scenes import SceneFacts
+from splatseed.bench.running.ledger import LEDGER, Ledger
+from splatseed.errors import OutputError
+from splatseed.io.output.staging import MANIFEST, atomic_file, check_output
+
+__all__ = ["DEMO_FACTS", "check_bench_folder", "make_bench_folder", "make_demo_scene"]
+
+DEMO_FACTS = SceneFacts(
+    "demo", "demo:", "not made yet", 11_364, 40, 400 * 300, depth_digest="not made yet"
+)
+"""What is known of the made-up room before it is made; the number of points nearly."""
+
+
+def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
+    """Refuse a folder that is not a benchmark's, before any work is done.
+
+    Args:
+        folder: The folder, which need not be there.
+        protect: Scenes, which the folder must lie apart from.
+
+    Raises:
+        OutputError: It is another's, or lies in a scene or around one.
+        SceneFormatError: Its ledger is none that this version knows.
+    """
+    ledger = folder / LEDGER
+    if ledger.is_file() and ledger.stat().st_size:  # else another process is about to write it
+        Ledger.open(ledger, read_only=True)
+    marked = (folder / MANIFEST).is_file() and not (folder / LEDGER).exists()
+    if marked and _command(folder) != "bench":
+        raise OutputError(
+            f"the folder of a benchmark, or a new one, at {folder}",
+            found=f"what splatseed {_command(folder)} wrote",
+            fix="Choose another folder.",
+        )
+    if not marked and not (folder / LEDGER).is_file():
+        check_output(folder, kind="bench", protect=protect)
+        return
+    for scene in protect:
+        within = folder.resolve() in scene.resolve().parents
+        if within and scene.resolve() != (folder / "scenes" / "demo").resolve():
+            check_output(folder, kind="bench", overwrite=True, protect=[scene])
+
+
+def make_bench_folder(folder: Path) -> None:
+    """Make the folder and mark it as a benchmark's, unless it is there.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    if not (folder / MANIFEST).is_file():
+        with atomic_file(folder / MANIFEST) as partial:
+            partial.write_text(json.dumps({"command": "bench"}) + "\n", "utf-8")
+
+
+def make_demo_scene(folder: Path) -> Path:
+    """The made-up room that ``splatseed demo`` makes, in a folder; made unless it is there.
+
+    Args:
+        folder: Where to.
+
+    Returns:
+        Its place.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    path = folder / "demo"
+    if path.is_dir():
+        return path
+    from splatseed.synthetic import make_capture, write_capture  # noqa: PLC0415  (Numba)
+
+    try:
+        return write_capture(make_capture(), path)
+    except OutputError:
+        if path.is_dir():  # another process was faster
+            return path
+        raise
+
+
+def _command(folder: Path) -> str:
+    """What wrote a folder, by its manifest."""
+    try:
+        content = json.loads((folder / MANIFEST).read_text("utf-8"))
+    except (OSError, ValueError):
+        return "something else"
+    return str(content.get("command")) if isinstance(content, dict) else "something else"

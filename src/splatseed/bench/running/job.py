@@ -1,0 +1,223 @@
+"""One run of the benchmark, from its specification to its result.
+
+Promise: a run that was interrupted goes on from its checkpoint, if there is one, and else begins anew;
+a run on files other than those that were planned is an error; whatever goes wrong comes back as an
+``Outcome`` and never as an exception, so that one bad run does not end the others.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+import sys
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from splatseed.bench.planning.digest import depth_digest, scene_digest
+from splatseed.bench.planning.records import CurvePoint, ImageScore, RunResult, RunSpec
+from splatseed.bench.running.kept import (
+    ERROR,
+    RESULT,
+    kept_files,
+    read_result,
+    result_bytes,
+    write_kept,
+)
+from splatseed.bench.running.seeds import make_seeds, scene_of
+from splatseed.errors import SceneFormatError, SplatseedError
+from splatseed.io.output.staging import check_output
+from splatseed.process.interruption import interruption
+from splatseed.process.peak import peak_bytes
+from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
+from splatseed.views.photographs import user_cache_dir
+
+if TYPE_CHECKING:  # PyTorch, which takes a while
+    from splatseed.evaluate import Lpips
+    from splatseed.train.run import TrainingRun
+
+__all__ = ["JobOptions", "Outcome", "run_job"]
+
+TRAIN = "train"
+
+
+@dataclass(frozen=True)
+class JobOptions:
+    """What is done beside what determines the result.
+
+    Args:
+        keep_models: Keep the trained Gaussians.
+        lpips: Measure LPIPS.
+    """
+
+    keep_models: bool = False
+    lpips: bool = False
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a run ended.
+
+    Args:
+        status: Done; failed, for the reason in ``error``; or interrupted, to be taken up again.
+        result: What it gave, if it is done.
+        error: One line, if it failed.
+    """
+
+    status: Literal["done", "failed", "interrupted"]
+    result: RunResult | None = None
+    error: str = ""
+
+
+def run_job(
+    spec: RunSpec,
+    work: Path,
+    target: Path,
+    options: JobOptions | None = None,
+    progress: Progress = silent,
+) -> Outcome:
+    """Do a run, unless what is kept shows that it is done.
+
+    The first SIGINT or SIGTERM during training leaves a checkpoint; while results are written it is
+    not heeded, as that takes seconds.
+
+    Args:
+        spec: The run.
+        work: The folder it works in, which is removed when it is done.
+        target: The folder for what is kept.
+        options: What else to do.
+        progress: Told the stages, training among them.
+    """
+    try:
+        kept = read_result(target, spec.key)
+        if kept is not None:
+            return Outcome("done", kept)
+        _remove_leftovers(target)
+        check_output(target, kind="bench", overwrite=True)
+        result = _train(spec, work, target, options or JobOptions(), progress)
+    except KeyboardInterrupt:
+        return Outcome("interrupted")
+    except Exception as error:  # noqa: BLE001  (whatever it is, the other runs go on)
+        return Outcome("failed", error=_keep_error(target, error))
+    if result is None:
+        return Outcome("interrupted")
+    shutil.rmtree(work, ignore_errors=True)
+    return Outcome("done", result)
+
+
+def _remove_leftovers(target: Path) -> None:
+    """Remove what an attempt left that was killed while it wrote; nobody else has this run now."""
+    for partial in target.parent.glob(f".{target.name}.partial-*"):
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _train(
+    spec: RunSpec, work: Path, target: Path, options: JobOptions, progress: Progress
+) -> RunResult | None:
+    """The result, once it is kept; None if the run was interrupted and left a checkpoint."""
+    progress("read", 0.0)
+    scene = scene_of(spec)
+    _check_unchanged(scene, spec)
+    lpips = _load_lpips() if options.lpips else None
+    seeds, seconds = make_seeds(scene, spec, progress)
+    run = _prepare(scene.replace(points=seeds), work, spec, progress)
+    if not run.train(lambda step: progress(TRAIN, step / spec.max_steps)):
+        return None
+    with interruption():
+        metrics = _finish(run, lpips, progress)
+        result = _result(metrics, run, seconds)
+        files = kept_files(work, models=options.keep_models)
+        write_kept(target, {**files, RESULT: result_bytes(spec, result)})
+    return result
+
+
+def _check_unchanged(scene: Scene, spec: RunSpec) -> None:
+    """Hold the scene to what was planned: it may have been changed since, or be another elsewhere."""
+    folder = scene.source.image_dir if scene.source else None
+    same = folder is not None and scene_digest(scene, folder) == spec.scene_digest
+    if same and spec.depth_digest and scene.depths is not None:
+        same = depth_digest(scene.depths) == spec.depth_digest
+    if not same:
+        raise SceneFormatError(
+            f"the files of {spec.scene_path} as they were when the benchmark was planned",
+            found="other points, cameras, photographs or depth maps",
+            fix="Start the benchmark again: it plans anew.",
+        )
+
+
+def _prepare(scene: Scene, work: Path, spec: RunSpec, progress: Progress) -> TrainingRun:
+    """A run that goes on where it stopped; if it cannot, one that begins."""
+    from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (PyTorch)
+
+    cache = user_cache_dir()
+    try:
+        resume = RunOptions(resume=True, cache_dir=cache)
+        return prepare_run(scene, work, spec.settings, resume, progress=progress)
+    except SplatseedError:
+        if not work.exists():
+            raise
+    anew = RunOptions(overwrite=True, cache_dir=cache)
+    return prepare_run(scene, work, spec.settings, anew, progress=progress)
+
+
+def _load_lpips() -> Lpips:
+    from splatseed.evaluate import load_lpips  # noqa: PLC0415  (PyTorch)
+
+    return load_lpips()
+
+
+def _finish(run: TrainingRun, lpips: Lpips | None, progress: Progress) -> Mapping[str, Any]:
+    from splatseed.evaluate import evaluate_views  # noqa: PLC0415  (PyTorch)
+
+    return run.finish(
+        lambda render, views: evaluate_views(
+            render, views, lpips=lpips, progress=progress
+        ).to_dict(),
+        progress,
+    )
+
+
+def _result(metrics: Mapping[str, Any], run: TrainingRun, upsample_seconds: float) -> RunResult:
+    from splatseed.train.parameters import gaussians_of  # noqa: PLC0415  (PyTorch)
+
+    scores = tuple(
+        ImageScore(each["name"], _number(each["psnr"]), each["ssim"], each["lpips"])
+        for each in metrics["per_image"]
+    )
+    curve = tuple(CurvePoint(**each) for each in metrics["tests"] if each["psnr"] is not None)
+    return RunResult(
+        psnr=_number(metrics["psnr"]),
+        ssim=metrics["ssim"],
+        lpips=metrics["lpips"],
+        per_image=scores,
+        curve=curve,
+        num_seeds=metrics["num_seeds"],
+        num_gaussians=metrics["num_gaussians"],
+        model_bytes=gaussians_of(run.state.params).num_bytes,
+        upsample_seconds=upsample_seconds,
+        train_seconds=metrics["train_seconds"],
+        render_seconds=metrics["render_seconds"],
+        peak_bytes=peak_bytes(),
+        device=run.device,
+        peak_gpu_bytes=run.peak_gpu_bytes,
+    )
+
+
+def _number(psnr: float | None) -> float:
+    """JSON has no infinity, which the PSNR of equal images is."""
+    return math.inf if psnr is None else psnr
+
+
+def _keep_error(target: Path, error: Exception) -> str:
+    """The error in one line; its traceback is kept if there is anywhere to keep it."""
+    text = "".join(traceback.format_exception(error))
+    try:
+        write_kept(target, {ERROR: text.encode("utf-8", "backslashreplace")})
+    except SplatseedError as another:
+        print(f"{text}\n{another}", file=sys.stderr)  # noqa: T201  (the log of the run)
+    ours = isinstance(error, SplatseedError)
+    said = str(error) if ours else traceback.format_exception_only(error)[-1]
+    return " ".join(said.split())

@@ -1,0 +1,29 @@
+"""Watcher: who is told what happens while a benchmark runs. This one listens to nothing."""
+
+from __future__ import annotations
+
+from splatseed.bench.planning.records import RunResult, RunSpec
+
+__all__ = ["Watcher"]
+
+
+class Watcher:
+    """Told of runs by their executor; may be called from several threads at once."""
+
+    def begun(self, spec: RunSpec) -> None:
+        """A run has been begun."""
+
+    def progress(self, spec: RunSpec, stage: str, fraction: float) -> None:
+        """So much of a stage of a run is done, 0 to 1."""
+
+    def done(self, spec: RunSpec, result: RunResult) -> None:
+        """A run is done and recorded."""
+
+    def failed(self, spec: RunSpec, error: str) -> None:
+        """A run has failed."""
+
+    def handed_back(self, spec: RunSpec, reason: str) -> None:
+        """A run has been stopped, and will be taken up again."""
+
+    def stopping(self, words: str) -> None:
+        """The user asked to stop; the words say what becomes of the runs."""

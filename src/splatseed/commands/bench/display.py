@@ -1,0 +1,158 @@
+"""The display of a benchmark that runs: bars on stderr, one line a finished run on stdout."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn
+
+from splatseed.bench.planning.records import RunResult, RunSpec
+from splatseed.bench.running.watcher import Watcher
+from splatseed.console import ERR, OUT
+from splatseed.literal import visible
+
+__all__ = ["RunDisplay", "describe", "run_display", "spoken_time"]
+
+TRAIN = "train"
+MINUTE = 60.0
+
+
+class RunDisplay(Watcher):
+    """Shows how far a benchmark is; what it is told comes from several threads.
+
+    Args:
+        seconds: What each run that is to be done is expected to take, by its key.
+        done: How many runs of the benchmark are done already.
+        jobs: How many run at a time.
+        bar: Where to draw; None where there is no terminal.
+    """
+
+    def __init__(
+        self, seconds: Mapping[str, float], done: int, jobs: int, bar: Bar | None = None
+    ) -> None:
+        self._expected = dict(seconds)
+        self._ended, self._total, self._failed = done, done + len(seconds), 0
+        self._jobs, self._bar = jobs, bar
+        self._tasks: dict[str, TaskID] = {}
+        self._parts: dict[str, float] = {}
+        self._begun: dict[str, float] = {}
+        self._pace = (0.0, 0.0)
+        self._lock = threading.RLock()
+        self._whole = bar.add_task("", total=self._total) if bar else None
+        self._draw()
+
+    def begun(self, spec: RunSpec) -> None:
+        """Show a run."""
+        with self._lock:
+            self._begun[spec.key], self._parts[spec.key] = time.monotonic(), 0.0
+            if self._bar:
+                self._tasks[spec.key] = self._bar.add_task(f"  {describe(spec)}", total=1.0)
+            self._draw()
+
+    def progress(self, spec: RunSpec, stage: str, fraction: float) -> None:
+        """Show how far a run is."""
+        with self._lock:
+            if stage == TRAIN:
+                self._parts[spec.key] = fraction
+            if self._bar and spec.key in self._tasks:
+                label = f"  {describe(spec)}: {stage}"
+                self._bar.update(self._tasks[spec.key], completed=fraction, description=label)
+            self._draw()
+
+    def done(self, spec: RunSpec, result: RunResult) -> None:
+        """Say what a run gave."""
+        with self._lock:
+            seconds = self._end(spec)
+            expected, actual = self._pace
+            self._pace = (expected + self._expected.pop(spec.key, 0.0), actual + seconds)
+            self._say(
+                f"{describe(spec)}: {result.psnr:.2f} dB, {result.num_gaussians:,} Gaussians,"
+                f" {seconds:.0f} s"
+            )
+
+    def failed(self, spec: RunSpec, error: str) -> None:
+        """Say why a run failed."""
+        with self._lock:
+            self._end(spec)
+            self._failed += 1
+            self._expected.pop(spec.key, None)
+            self._say(f"{describe(spec)} failed: {error}")
+
+    def handed_back(self, spec: RunSpec, reason: str) -> None:
+        """Say why a run is not done."""
+        with self._lock:
+            self._end(spec)
+            self._ended -= 1
+            self._say(f"{describe(spec)}: {reason}; to be taken up again", count=False)
+
+    def stopping(self, words: str) -> None:
+        """Say what the user waits for."""
+        ERR.print(f"stopping: {words}")
+
+    def _end(self, spec: RunSpec) -> float:
+        """Take a run off the display; returns the seconds it took."""
+        self._ended += 1
+        self._parts.pop(spec.key, None)
+        task = self._tasks.pop(spec.key, None)
+        if self._bar and task is not None:
+            self._bar.remove_task(task)
+        return time.monotonic() - self._begun.pop(spec.key, time.monotonic())
+
+    def _say(self, text: str, *, count: bool = True) -> None:
+        number = f"[{self._ended}/{self._total}] " if count else ""
+        OUT.print(f"{number}{text}", soft_wrap=True)
+        self._draw()
+
+    def _draw(self) -> None:
+        if self._bar is None or self._whole is None:
+            return
+        failed = f", {self._failed} failed" if self._failed else ""
+        label = (
+            f"{self._ended - self._failed} of {self._total} done, {len(self._begun)} running"
+            f"{failed}, {spoken_time(self.seconds_left())} left"
+        )
+        self._bar.update(self._whole, completed=self._ended, description=label)
+
+    def seconds_left(self) -> float:
+        """An estimate, made better by what runs have taken so far."""
+        expected, actual = self._pace
+        left = sum(self._expected.values())
+        left -= sum(part * self._expected.get(key, 0.0) for key, part in self._parts.items())
+        return left / self._jobs * (actual / expected if expected else 1.0)
+
+
+@contextmanager
+def run_display(seconds: Mapping[str, float], done: int, jobs: int) -> Iterator[RunDisplay]:
+    """A display while the block runs; bars only where stderr is a terminal.
+
+    Args:
+        seconds: What each run that is to be done is expected to take, by its key.
+        done: How many runs of the benchmark are done already.
+        jobs: How many run at a time.
+    """
+    if not ERR.is_terminal:
+        yield RunDisplay(seconds, done, jobs)
+        return
+    columns = (BarColumn(20), TextColumn("{task.description}", markup=False))
+    # What goes into a file on stdout must not end up on the terminal.
+    shared = sys.stdout.isatty()
+    with Bar(*columns, console=ERR, transient=True, redirect_stdout=shared) as bar:
+        yield RunDisplay(seconds, done, jobs, bar)
+
+
+def describe(spec: RunSpec) -> str:
+    """A run in a few words."""
+    return f"{visible(spec.scene)}, {spec.arm.label}, {spec.arm.strategy}, repeat {spec.repeat + 1}"
+
+
+def spoken_time(seconds: float) -> str:
+    """A length of time in words, as roughly as an estimate deserves."""
+    if seconds < 1.5 * MINUTE:
+        return f"{seconds:.0f} s"
+    if seconds < 90 * MINUTE:
+        return f"{seconds / MINUTE:.0f} min"
+    return f"{seconds / MINUTE / MINUTE:.1f} h"

@@ -1,0 +1,225 @@
+"""The options of ``splatseed bench``, and the plan that they make.
+
+Notation: an option that is not given leaves the plan as it is: that of a preset, of a file, of the
+folder to go on with, or the default one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
+from splatseed.bench.planning.plan_file import read_plan
+from splatseed.bench.planning.presets import PresetName, preset_plan
+from splatseed.errors import ParameterError
+from splatseed.train.settings import Backend, StrategyName
+from splatseed.upsample import Profile
+
+__all__ = ["PLAN", "Asked", "Options", "asked_plan"]
+
+PLAN = "plan.toml"
+"""The name of the plan in the folder of a benchmark."""
+DEFAULT = Plan()
+
+
+def _hint(default: str) -> Any:
+    """An option that is empty or None when it is not given, with what stands in for it."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {default})")
+
+
+def _one(kind: type, default: str) -> Any:
+    """A number, text or path that is None when it is not given."""
+    return tyro.conf.arg(
+        constructor=kind,
+        metavar=kind.__name__.upper(),
+        help_behavior_hint=f"(default: {default})",
+    )
+
+
+def _listed(values: Sequence[object]) -> str:
+    return " ".join(f"{x:g}" if isinstance(x, float) else f"{x}" for x in values)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Train from every method's seeds, several times each, on one machine or many, and compare.
+
+    Stop it when you like: the same command, or ``splatseed bench -o BENCH`` alone, goes on. Then see
+    ``splatseed bench report BENCH``, and ``splatseed bench compare A B`` for two benchmarks.
+    """
+
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], constructor=Path, metavar="DIR", help_behavior_hint="")] = None  # fmt: skip
+    """The folder of the benchmark, new or to go on with."""
+    scenes: Annotated[tuple[str, ...], _hint("the plan's")] = ()
+    """Scenes with photographs; demo: is a made-up room."""
+    methods: Annotated[tuple[str, ...], _hint(_listed(DEFAULT.methods))] = ()
+    """Methods of upsampling; sfm is the cloud as it is, with which the others are compared."""
+    ratios: Annotated[tuple[float, ...], _hint(_listed(DEFAULT.ratios))] = ()
+    """Points in all, per original."""
+    strategies: Annotated[tuple[StrategyName, ...], _hint(_listed(DEFAULT.strategies))] = ()
+    """Densification strategies; -3dgs: in 3DGS's own conventions of rates and schedules."""
+    profiles: Annotated[tuple[Profile, ...], _hint(_listed(DEFAULT.profiles))] = ()
+    """Improved parameters of the methods, and those of the paper's text."""
+    repeats: Annotated[int | None, _one(int, f"{DEFAULT.repeats}")] = None
+    """How often, with another seed each time; error bars need at least 3."""
+    max_steps: Annotated[int | None, _one(int, f"{DEFAULT.max_steps}")] = None
+    """Training steps; schedules and learning rates are adapted to them."""
+    data_factor: Annotated[int | None, _one(int, f"{DEFAULT.data_factor}")] = None
+    """By how much the photographs are made smaller."""
+    test_every: Annotated[int | None, _one(int, f"{DEFAULT.test_every}")] = None
+    """Of the images sorted by name, every so many-th is kept for the test."""
+    cap_max: Annotated[int | None, _one(int, "1000000 for mcmc")] = None
+    """Most Gaussians, which makes arms equal in number with mcmc."""
+    sh_degree: Annotated[int | None, _one(int, f"{DEFAULT.sh_degree}")] = None
+    """How finely colours depend on the direction, 0 to 3."""
+    backend: Annotated[Backend | None, _hint(DEFAULT.backend)] = None
+    """Where to train; auto takes a GPU if there is one."""
+    opacity_reset: bool = False
+    """Lower all opacities at times, as 3DGS does (strategy default)."""
+    depth: Annotated[tuple[Path, ...], _hint("the scene's")] = ()
+    """For method depth: a folder of maps a scene, or one folder with a subfolder of each one's name."""
+    preset: Annotated[PresetName | None, _hint("none")] = None
+    """A plan made before: the paper's data sets (with --data), or quick, for a laptop."""
+    data: Annotated[Path | None, _one(Path, "none")] = None
+    """The folder of a preset's scenes."""
+    plan: Annotated[Path | None, _one(Path, "none")] = None
+    """A plan as --dry-run prints it; other options change it."""
+    dry_run: bool = False
+    """Print the plan, how many runs it is, and an estimate of hours and disk; run nothing."""
+    executor: Literal["local", "ray"] = "local"
+    """Processes on this machine, or tasks on a Ray cluster (extra cluster)."""
+    jobs: Annotated[int | None, _one(int, "one a GPU, else 1; ray: what fits")] = None
+    """Runs at a time."""
+    threads: Annotated[int | None, _one(int, "the cores shared out")] = None
+    """Threads of each run on the CPU."""
+    address: Annotated[str | None, _one(str, "a cluster on this machine alone")] = None
+    """The Ray cluster's, such as auto on its head node."""
+    retry_failed: bool = False
+    """Run again what has failed."""
+    keep_models: bool = False
+    """Keep trained models: some 236 bytes a Gaussian."""
+    lpips: bool = False
+    """Measure LPIPS too; its weights must be there (see splatseed evaluate)."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the options ask for.
+
+    Args:
+        plan: The plan.
+        missing: Scenes of a preset that are not there.
+        lenient: Whether a scene that is not fit to be run is passed over.
+    """
+
+    plan: Plan
+    missing: tuple[str, ...] = ()
+    lenient: bool = False
+
+
+def asked_plan(options: Options) -> Asked:
+    """The plan that the options ask for.
+
+    Raises:
+        ParameterError: Options contradict each other, or a value is out of its range.
+        SceneNotFoundError: A plan or a preset's scenes are not there.
+        SceneFormatError: The plan's file is not one.
+    """
+    _check(options)
+    asked = _base(options)
+    plan = dataclasses.replace(asked.plan, **_changes(options))
+    if options.depth:
+        plan = dataclasses.replace(plan, scenes=_with_depth(plan.scenes, options.depth))
+    if not plan.scenes:
+        raise ParameterError(
+            "--scenes DIR..., --preset or --plan",
+            found="none of them",
+            fix="splatseed bench --preset quick -o BENCH tries it on a made-up room.",
+        )
+    return dataclasses.replace(asked, plan=plan)
+
+
+def _check(options: Options) -> None:
+    if options.output is None and not options.dry_run:
+        raise ParameterError(
+            "-o BENCH, the folder of the benchmark", found="none", fix="Name one, or --dry-run."
+        )
+    if options.plan is not None and options.preset is not None:
+        raise ParameterError("--plan or --preset", found="both", fix="Leave one of them out.")
+    if options.preset is None and options.data is not None:
+        raise ParameterError("--preset with --data", found="none", fix="Name the preset.")
+    if options.preset not in {None, "quick"} and options.scenes:
+        raise ParameterError(
+            f"the scenes of the preset {options.preset}",
+            found="--scenes",
+            fix="Leave --scenes out, or take --plan: --dry-run prints the preset's.",
+        )
+    for name in ("jobs", "threads"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise ParameterError(f"--{name} of 1 or more", found=f"{value}", fix="Leave it out.")
+    if options.address is not None and options.executor != "ray":
+        raise ParameterError("--executor ray with --address", found="local", fix="Add it.")
+
+
+def _base(options: Options) -> Asked:
+    """The plan that options change."""
+    if options.preset is not None:
+        plan, missing = preset_plan(options.preset, options.data)
+        return Asked(plan, missing, lenient=options.preset != "quick")
+    if options.plan is not None:
+        return Asked(read_plan(options.plan))
+    if options.output is not None and not options.scenes:
+        earlier = options.output / PLAN
+        if earlier.is_file():
+            return Asked(read_plan(earlier))
+    return Asked(DEFAULT)
+
+
+def _changes(options: Options) -> dict[str, Any]:
+    """The fields of the plan that are given as options."""
+    names = {each.name for each in dataclasses.fields(Plan)} - {"scenes", "parameters"}
+    given = {name: getattr(options, name) for name in names}
+    changes = {name: value for name, value in given.items() if value not in (None, (), False)}
+    if options.scenes:
+        changes["scenes"] = _scenes(options.scenes)
+    return changes
+
+
+def _scenes(paths: Sequence[str]) -> tuple[PlannedScene, ...]:
+    """The scenes at some paths; folders of one name are told apart by those that they are in."""
+    scenes = [PlannedScene(path) for path in paths]
+    count = Counter(scene.label for scene in scenes)
+    return tuple(
+        scene
+        if count[scene.label] == 1 or scene.path == DEMO
+        else PlannedScene(scene.path, "_".join(Path(scene.path).resolve().parts[-2:]))
+        for scene in scenes
+    )
+
+
+def _with_depth(
+    scenes: Sequence[PlannedScene], folders: Sequence[Path]
+) -> tuple[PlannedScene, ...]:
+    """The scenes with their folders of depth maps."""
+    if len(folders) == 1 and any((folders[0] / scene.label).is_dir() for scene in scenes):
+        below = [folders[0] / scene.label for scene in scenes]
+        found = [str(folder) if folder.is_dir() else "" for folder in below]
+    elif len(folders) == len(scenes):
+        found = [str(folder) for folder in folders]
+    else:
+        raise ParameterError(
+            f"--depth with a folder for each of {len(scenes)} scenes, or one with subfolders of their names",
+            found=f"{len(folders)} folders",
+            fix="See --dry-run for the scenes and their order.",
+        )
+    return tuple(
+        dataclasses.replace(scene, depth=depth) for scene, depth in zip(scenes, found, strict=True)
+    )

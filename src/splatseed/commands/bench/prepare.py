@@ -1,0 +1,102 @@
+"""From a plan to its runs: looking at every scene before any is run."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatseed.bench.planning.plan import DEPTH, Plan, PlannedScene, plan_runs
+from splatseed.bench.planning.records import SFM, RunSpec
+from splatseed.bench.planning.scenes import SceneFacts, survey
+from splatseed.bench.running.environment import package_version
+from splatseed.bench.running.folder import DEMO_FACTS, make_demo_scene
+from splatseed.commands.bench.options import Asked
+from splatseed.errors import SceneNotFoundError
+from splatseed.progress import Progress
+from splatseed.train.settings import Backend
+
+__all__ = ["Prepared", "prepare"]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A benchmark that can be run.
+
+    Args:
+        plan: Its plan, with the scenes that are there.
+        scenes: What was found of them.
+        runs: Its runs, in order.
+        notes: What the user should know, one sentence each.
+    """
+
+    plan: Plan
+    scenes: Sequence[SceneFacts]
+    runs: Sequence[RunSpec]
+    notes: Sequence[str]
+
+    @property
+    def keys(self) -> frozenset[str]:
+        """The keys of its runs."""
+        return frozenset(spec.key for spec in self.runs)
+
+
+def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progress) -> Prepared:
+    """Look at all scenes of a plan, and list its runs.
+
+    Args:
+        asked: What the user asks for.
+        backend: Where runs are trained: not "auto".
+        made: Where a made-up scene is put; None to do with what is known of it, without making it.
+        progress: Told how far this is.
+
+    Raises:
+        SceneNotFoundError: A scene is not there; for a preset, none is.
+        SceneFormatError: A file of one is not what its format promises.
+    """
+    notes = [f"not there: {', '.join(asked.missing)}"] if asked.missing else []
+    found: list[tuple[PlannedScene, SceneFacts]] = []
+    for scene in asked.plan.scenes:
+        try:
+            found.append((scene, _survey(scene, asked.plan, made, progress)))
+        except SceneNotFoundError as error:
+            if not asked.lenient:
+                raise
+            notes.append(f"{scene.label} is left out: {error}")
+    if not found:
+        raise SceneNotFoundError("scenes to run", found="; ".join(notes), fix="See above.")
+    plan = dataclasses.replace(asked.plan, scenes=tuple(scene for scene, _ in found))
+    scenes = [facts for _, facts in found]
+    runs = plan_runs(plan, scenes, backend, package_version("splatseed"))
+    return Prepared(plan, scenes, runs, [*notes, *_notes(plan, scenes)])
+
+
+def _survey(scene: PlannedScene, plan: Plan, made: Path | None, progress: Progress) -> SceneFacts:
+    if scene.is_demo and made is None:
+        return dataclasses.replace(DEMO_FACTS, name=scene.label)
+    if scene.is_demo:
+        progress("make the demo scene", 0.0)
+    return survey(
+        make_demo_scene(made) if made and scene.is_demo else Path(scene.path),
+        scene.label,
+        images=scene.images,
+        depth=Path(scene.depth) if scene.depth else None,
+        with_depth=DEPTH in plan.methods,
+        progress=progress,
+    )
+
+
+def _notes(plan: Plan, scenes: Sequence[SceneFacts]) -> Iterator[str]:
+    for scene in scenes:
+        yield from (f"{scene.name}: {warning}" for warning in scene.warnings)
+    bare = [scene.name for scene in scenes if not scene.depth_digest]
+    if DEPTH in plan.methods and bare:
+        yield f"without depth maps, and so without the method depth: {', '.join(bare)} (--depth DIR)"
+    if SFM not in plan.methods:
+        yield "Without sfm among the methods there is nothing to compare with."
+    if len(plan.profiles) > 1:
+        labels = [arm for arm in plan.arms(plan.strategies[0]) if arm.method != SFM]
+        same = [m for m in plan.methods if len({a.profile for a in labels if a.method == m}) == 1]
+        if same:
+            yield f"run once, as both profiles are the same: {', '.join(same)}"

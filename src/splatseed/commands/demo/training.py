@@ -1,0 +1,110 @@
+"""The demo's training: the same few steps from the SfM seeds and from the upsampled ones.
+
+Promise: the two runs differ in their seeds alone. Gaussians are neither added nor removed, so that
+what is seen is the worth of the seeds; the view that is shown is chosen before any is rendered.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from splatseed.console import StageClock
+from splatseed.evaluate import evaluate_views
+from splatseed.io import load_scene
+from splatseed.preview import Tile, write_grid
+from splatseed.splat.pictures import FULL_ERROR, error_map
+from splatseed.train.run import RunOptions, prepare_run
+from splatseed.train.settings import TrainSettings
+
+__all__ = ["Arm", "TrainedArm", "train_arm", "when_reached", "write_comparison"]
+
+
+@dataclass(frozen=True)
+class Arm:
+    """One of the runs.
+
+    Args:
+        label: What its seeds are.
+        scene: The folder of the scene that holds them.
+        output: The folder of the run.
+    """
+
+    label: str
+    scene: Path
+    output: Path
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedArm:
+    """A run that is done.
+
+    Args:
+        arm: Which.
+        metrics: What its metrics.json holds.
+        truth: The photograph of the view that is shown.
+        render: That view as rendered, 0 to 1.
+    """
+
+    arm: Arm
+    metrics: Mapping[str, Any]
+    truth: UInt8[np.ndarray, "H W 3"]
+    render: Float32[np.ndarray, "H W 3"]
+
+
+def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedArm:
+    """Train from an arm's seeds, and score.
+
+    Raises:
+        KeyboardInterrupt: The user does not want to wait; a checkpoint is there to go on with.
+        SplatseedError: As ``prepare_run``.
+    """
+    stage = f"train {arm.label}"
+    run = prepare_run(
+        load_scene(arm.scene), arm.output, settings, RunOptions(overwrite=True), progress=clock
+    )
+    clock(stage, 0.0)
+    if not run.train(lambda step: clock(stage, step / settings.max_steps)):
+        raise KeyboardInterrupt
+    metrics = run.finish(lambda render, views: evaluate_views(render, views).to_dict(), clock)
+    shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
+    render = np.asarray(run.trainer.render(shown).cpu().numpy(), np.float32)
+    return TrainedArm(arm, metrics, shown.image, render)
+
+
+def when_reached(psnr: float, metrics: Mapping[str, Any]) -> tuple[int, float] | None:
+    """Step and training seconds at which a run's test PSNR first was ``psnr``; None if never."""
+    tests = (test for test in metrics["tests"] if test["psnr"] >= psnr)
+    return next(((test["step"], test["seconds"]) for test in tests), None)
+
+
+def write_comparison(arms: Sequence[TrainedArm], path: Path) -> None:
+    """Write the photograph and each arm's render, with its error map below.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    truth = arms[0].truth
+    blank = np.full_like(truth, 255)
+    renders = [
+        Tile(
+            f"{each.arm.label}: {each.metrics['psnr']:.2f} dB over all test views",
+            _bytes(each.render),
+        )
+        for each in arms
+    ]
+    errors = [
+        Tile(f"error: black 0, bright {FULL_ERROR:g} or more", error_map(truth, each.render))
+        for each in arms
+    ]
+    tiles = [Tile("photograph, not trained on", truth), *renders, Tile("", blank), *errors]
+    write_grid(tiles, path, columns=1 + len(arms))
+
+
+def _bytes(render: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    return np.asarray(np.round(np.clip(render, 0.0, 1.0) * 255), np.uint8)

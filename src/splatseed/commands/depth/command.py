@@ -1,0 +1,100 @@
+"""``splatseed depth``: a depth map for every photograph, by a network or from the photographs alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from splatseed.commands.depth.options import Options, check_together
+from splatseed.commands.depth.stereo import provenance, run_stereo
+from splatseed.commands.options import parse_options
+from splatseed.console import print_commands, print_note, print_pairs, stage_display
+from splatseed.io import load_scene
+from splatseed.io.output.staging import check_output
+from splatseed.literal import quoted
+from splatseed.monocular import (
+    DepthNetwork,
+    DepthReport,
+    Preparation,
+    estimate_depths,
+    load_network,
+)
+
+__all__ = ["run"]
+
+NAMES_SHOWN = 5
+MAX_SIZE = 1600
+PACKAGES = ("splatseed", "transformers", "torch", "onnxruntime", "numpy", "pillow")
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = parse_options(Options, "depth", arguments)
+    check_together(options)
+    if options.stereo:
+        run_stereo(options)
+    else:
+        _run_network(options)
+
+
+def _run_network(options: Options) -> None:
+    max_size = MAX_SIZE if options.max_size is None else options.max_size
+    options = replace(options, max_size=max_size)
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = load_scene(options.scene, require_points=False)
+        check_output(
+            options.output, kind="depth", overwrite=options.overwrite, protect=[options.scene]
+        )
+        clock("load network", 0.0)
+        network = _network(options)
+        report = estimate_depths(
+            scene,
+            network,
+            options.output,
+            batch=options.batch,
+            max_size=max_size,
+            overwrite=options.overwrite,
+            provenance={**provenance(options, PACKAGES), **_said_by(network)},
+            progress=clock,
+        )
+    _summarise(options, network, report)
+
+
+def _network(options: Options) -> DepthNetwork:
+    preparation = Preparation(options.input_size, options.input_multiple, options.mean, options.std)
+    return load_network(
+        str(options.model), kind=options.depth_kind, device=options.device, preparation=preparation
+    )
+
+
+def _said_by(network: DepthNetwork) -> dict[str, object]:
+    meaning = network.meaning
+    return {"kind": meaning.kind, "kind_because": meaning.reason, "device": network.device}
+
+
+def _summarise(options: Options, network: DepthNetwork, report: DepthReport) -> None:
+    small, large = (f"{width} x {height}" for width, height in report.sizes)
+    each = report.seconds / report.num_images
+    rows = [
+        ("network", str(options.model)),
+        ("run by", network.device),
+        ("predicts", f"{network.meaning.kind} ({network.meaning.reason})"),
+        ("maps", f"{report.num_images:,} of {large if small == large else f'{small} to {large}'}"),
+        ("seconds", f"{report.seconds:.1f}, {each:.2f} an image"),
+        ("output", str(report.path)),
+    ]
+    print_pairs("splatseed depth", rows)
+    if report.flat:
+        shown = ", ".join(report.flat[:NAMES_SHOWN])
+        more = len(report.flat) - NAMES_SHOWN
+        print_note(
+            "the network saw no depth (one value all over, or none) in: "
+            + shown
+            + (f" and {more} more" if more > 0 else "")
+        )
+    scene, maps = (quoted(path) for path in (options.scene, report.path))
+    commands = [
+        ("look", f"splatseed info {scene} --depth {maps} --picture depth.png"),
+        ("use", f"splatseed upsample {scene} --method depth --depth {maps} --ratio 16 -o OUT"),
+    ]
+    print_commands("next", commands)

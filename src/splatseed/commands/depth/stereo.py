@@ -1,0 +1,152 @@
+"""``splatseed depth --stereo``: maps from the photographs alone, plain or as a COLMAP workspace."""
+
+from __future__ import annotations
+
+import math
+import platform
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+from splatseed.commands.depth.options import Options
+from splatseed.console import OUT, StageClock, print_commands, print_note, stage_display
+from splatseed.io import load_scene
+from splatseed.io.dense import (
+    DenseReport,
+    check_dense_scene,
+    write_dense_maps,
+    write_dense_workspace,
+)
+from splatseed.io.output.staging import check_output
+from splatseed.literal import quoted, visible
+from splatseed.scene import Scene
+
+if TYPE_CHECKING:
+    from splatseed.stereo import StereoMap
+
+__all__ = ["provenance", "run_stereo"]
+
+NAMES_SHOWN = 5
+PICTURE = "preview_maps.png"
+PACKAGES = ("splatseed", "numba", "numpy", "pillow", "scipy")
+MIN_PIXELS = 3
+"""What COLMAP is told to want of a fused point. Its own 5 suit maps that nothing has confirmed yet;
+a pixel of ours has been, and few views see the borders."""
+
+
+def run_stereo(options: Options) -> None:
+    """Do what the options ask for."""
+    start = time.perf_counter()
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = load_scene(options.scene, require_points=False)
+        check_output(
+            options.output,
+            kind="depth",
+            overwrite=options.overwrite,
+            protect=[options.scene],
+        )
+        if options.colmap:
+            check_dense_scene(scene, undistorts=True)
+        maps = _maps(scene, options, clock)
+        report = _write(scene, maps, options, clock)
+        if options.preview:
+            _draw(options, scene, maps, clock)
+    bent = any(image.intrinsics.has_distortion for image in scene.images)
+    _summarise(options, maps, report, time.perf_counter() - start, bent=bent)
+
+
+def provenance(options: Options, packages: Sequence[str]) -> dict[str, object]:
+    """How maps came about, for ``splatseed.json``."""
+    versions = {"python": platform.python_version()}
+    for package in packages:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    given = {name: value for name, value in asdict(options).items() if value is not None}
+    return {"command": "depth", "options": given, "versions": versions}
+
+
+def _maps(scene: Scene, options: Options, clock: StageClock) -> tuple[StereoMap, ...]:
+    """The maps, by stereo's own defaults where an option is left out."""
+    from splatseed.stereo import stereo_depths  # noqa: PLC0415  (as little loads as can be)
+
+    names = ("max_size", "grid", "seed")
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    return stereo_depths(scene, progress=clock, **given)
+
+
+def _write(
+    scene: Scene, maps: Sequence[StereoMap], options: Options, clock: StageClock
+) -> DenseReport:
+    how: dict[str, Any] = {
+        "overwrite": options.overwrite,
+        "provenance": provenance(options, PACKAGES),
+        "progress": clock,
+    }
+    if not options.colmap:
+        return write_dense_maps(scene, maps, options.output, **how)
+    from splatseed.views.undistortion import undistort  # noqa: PLC0415  (Numba)
+
+    return write_dense_workspace(scene, maps, options.output, undistort=undistort, **how)
+
+
+def _draw(options: Options, scene: Scene, maps: Sequence[StereoMap], clock: StageClock) -> None:
+    from splatseed.preview import preview_maps  # noqa: PLC0415  (Pillow)
+
+    clock("preview", 0.0)
+    preview_maps(scene, maps, options.output / PICTURE)
+    clock("preview", 1.0)
+
+
+def _summarise(
+    options: Options,
+    maps: Sequence[StereoMap],
+    report: DenseReport,
+    seconds: float,
+    *,
+    bent: bool,
+) -> None:
+    OUT.print(
+        f"{report.num_maps:,} depth maps of {_sizes(maps)}: {report.share_known:.0%} of their pixels"
+        f" confirmed by other views, in {seconds:.1f} s, written to {visible(report.path)}",
+        soft_wrap=True,
+    )
+    if options.preview:
+        OUT.print(f"pictures: {visible(options.output / PICTURE)}", soft_wrap=True)
+    if report.empty:
+        more = len(report.empty) - NAMES_SHOWN
+        shown = ", ".join(report.empty[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+        print_note(f"no other view confirms any pixel of: {shown}")
+    if bent and not options.colmap:
+        print_note(
+            "the cameras have lens distortion, and these maps are of the photographs without it: "
+            "--colmap writes both, as a scene to go on with"
+        )
+    print_commands("next", _next(options, report, bent=bent))
+
+
+def _sizes(maps: Sequence[StereoMap]) -> str:
+    """Of the smallest and the largest map, if they differ."""
+    ordered = sorted((each.depth.shape for each in maps), key=math.prod)
+    ends = dict.fromkeys((ordered[0], ordered[-1]))
+    return " to ".join(f"{width} x {height}" for height, width in ends)
+
+
+def _next(options: Options, report: DenseReport, *, bent: bool) -> list[tuple[str, str]]:
+    # The workspace is a scene itself, without distortion.
+    shown = report.path if options.colmap else options.scene
+    scene, maps = (quoted(path) for path in (shown, report.path))
+    look = ("look", f"splatseed info {scene} --depth {maps} --picture depth.png")
+    if not options.colmap:
+        seeds = f"splatseed upsample {scene} --method depth --depth {maps} --ratio 16 -o OUT"
+        return [look] if bent else [look, ("use", seeds)]
+    fused = quoted(report.path / "fused.ply")
+    fuse = (
+        f"colmap stereo_fusion --workspace_path {maps} --output_path {fused}"
+        f" --StereoFusion.min_num_pixels {MIN_PIXELS}"
+    )
+    return [look, ("fuse", fuse)]

@@ -1,0 +1,199 @@
+"""``splatseed info``: what is in a scene, and what is wrong with it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from splatseed.commands.info.depth_numbers import print_depth
+from splatseed.commands.info.depth_picture import write_depth_picture
+from splatseed.commands.options import parse_options
+from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
+from splatseed.depth import Alignment, align
+from splatseed.depthmap import DepthKind
+from splatseed.diagnostics.scene import (
+    CloudStatistics,
+    EmptyRegions,
+    TrackStatistics,
+    cloud_statistics,
+    empty_regions,
+    find_problems,
+    track_statistics,
+)
+from splatseed.errors import ParameterError
+from splatseed.io import find_depths, load_scene
+from splatseed.literal import quoted
+from splatseed.scene import Scene
+
+__all__ = ["Options", "run"]
+
+KINDS_SHOWN = 3
+"""Kinds of cameras listed; collections of photographs from the web have one a photograph."""
+
+
+def _path(metavar: str) -> Any:
+    """How an optional path shows in the help."""
+    return tyro.conf.arg(constructor=Path, metavar=metavar, help_behavior_hint="")
+
+
+def _default(stands_in: str) -> Any:
+    """How an option that may be left out shows in the help: with what stands in for it."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Show what is in a scene: cameras, images, points, tracks, depth maps, and problems."""
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A COLMAP scene folder, a folder with transforms.json, an RGB-D capture, or a .ply."""
+    depth: Annotated[Path | None, _path("DIR")] = None
+    """Also hold a folder of depth maps, in any layout of docs/formats.md, against the SfM points."""
+    depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
+    """What their values are: planar depth, distance along the ray, or inverse depth."""
+    depth_scale: Annotated[float | None, _default("what the folder says")] = None
+    """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
+    picture: Annotated[Path | None, _path("FILE")] = None
+    """Write a PNG of depth beside photographs, and of where the two disagree."""
+    list_all: Annotated[bool, tyro.conf.arg(name="all")] = False
+    """List the depth of all images, not of the worst alone."""
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = parse_options(Options, "info", arguments)
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = _read(options)
+        cloud = cloud_statistics(scene, clock)
+        tracks = track_statistics(scene)
+        regions = empty_regions(scene, clock)
+        alignments = _alignments(options, scene, clock)
+    rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
+    rows += _method_rows(options, scene)
+    print_pairs(str(options.scene), rows)
+    if alignments is not None:
+        print_depth(str(options.depth or "depth"), scene, alignments, list_all=options.list_all)
+    problems = find_problems(scene, cloud, regions)
+    OUT.print("\nproblems" if problems else "\nno problems found", style="bold" if problems else "")
+    for problem in problems:
+        OUT.print(f"  - {problem}", soft_wrap=True)
+    if options.picture is not None:
+        print_pairs("picture", [("of depth", str(options.picture))])
+    if len(scene.points) or scene.images:
+        print_commands("next", [("", _next_command(options, scene))])
+
+
+def _read(options: Options) -> Scene:
+    """The scene, with the depth maps that the user names, or else its own."""
+    scene = load_scene(options.scene, require_points=False)
+    if options.depth is not None:
+        maps = find_depths(scene, options.depth, kind=options.depth_kind, scale=options.depth_scale)
+        return scene.replace(depths=maps)
+    if options.depth_kind is not None or options.depth_scale is not None or options.picture:
+        raise ParameterError(
+            "--depth DIR, whose maps --depth-kind, --depth-scale and --picture speak of",
+            found="none",
+            fix="Name the folder.",
+        )
+    return scene
+
+
+def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment] | None:
+    """How each map fits the SfM points, drawn if so asked; None where no maps were named."""
+    if options.depth is None:
+        return None
+    alignments = align(scene, progress=clock)
+    if options.picture is not None:
+        clock("draw picture", 0.0)
+        write_depth_picture(scene, alignments, options.picture)
+    return alignments
+
+
+def _next_command(options: Options, scene: Scene) -> str:
+    """What to run on the scene: points can be upsampled once there are some."""
+    scene_dir = quoted(options.scene)
+    if options.depth is not None and len(scene.points):
+        maps = quoted(options.depth)
+        return f"splatseed upsample {scene_dir} --method depth --depth {maps} --ratio 16 -o OUT"
+    if len(scene.points) and scene.has_photographs:
+        return f"splatseed upsample {scene_dir} -o OUT"
+    if len(scene.points):
+        return f"splatseed upsample {scene_dir} --method mls --ratio 8 -o OUT"
+    images = scene.source.image_dir if scene.source else None
+    photographs = "IMAGES" if images is None else quoted(images)
+    return f"splatseed sfm {photographs} --poses-from {scene_dir} -o OUT"
+
+
+def _source_rows(scene: Scene) -> list[tuple[str, str]]:
+    sizes = Counter(f"{c.model} {c.width}x{c.height}" for c in scene.intrinsics)
+    cameras = [f"{count:,} {kind}" for kind, count in sizes.most_common(KINDS_SHOWN)]
+    if len(sizes) > KINDS_SHOWN:
+        cameras.append(f"{len(sizes) - KINDS_SHOWN:,} kinds more")
+    train, test = scene.split()
+    by = f", by its {scene.listed.origin}" if scene.listed else ""
+    images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
+    maps = [] if scene.depths is None else [("depth maps", f"{len(scene.depths):,}")]
+    return [
+        ("format", scene.source.format if scene.source else "memory"),
+        ("cameras", ", ".join(cameras) or "none"),
+        ("images", images if scene.images else "none"),
+        *maps,
+    ]
+
+
+def _cloud_rows(cloud: CloudStatistics) -> list[tuple[str, str]]:
+    rows = [("points", f"{cloud.num_points:,}"), ("not finite", f"{cloud.non_finite:,}")]
+    if cloud.num_points == cloud.non_finite:  # nothing to measure
+        return rows if cloud.num_points else [("points", "none")]
+    low, high = (" ".join(f"{x:.4g}" for x in corner) for corner in (cloud.low, cloud.high))
+    spacing = " ".join(f"{x:.4g}" for x in cloud.spacing if not math.isnan(x))
+    return [
+        *rows,
+        ("duplicates", f"{cloud.duplicates:,}"),
+        ("isolated", f"{cloud.isolated:,}"),
+        ("spacing 5/25/50/75/95%", spacing or "none"),
+        ("bounding box", f"{low}  to  {high}"),
+        ("float32 step there", f"{cloud.resolution:.2g}"),
+    ]
+
+
+def _track_rows(tracks: TrackStatistics | None) -> list[tuple[str, str]]:
+    if tracks is None:
+        return [("tracks", "none")]
+    return [
+        ("track length, images", _spread(tracks.mean_length, tracks.length, ".3g")),
+        ("reprojection error, px", _spread(tracks.mean_error, tracks.error, ".3f")),
+    ]
+
+
+def _spread(mean: float, percentiles: tuple[float, ...], style: str) -> str:
+    spread = " ".join(f"{x:{style}}" for x in percentiles)
+    return f"mean {mean:{style}}, 5/25/50/75/95% {spread}"
+
+
+def _method_rows(options: Options, scene: Scene) -> list[tuple[str, str]]:
+    """What would make the best points of this scene, and why."""
+    if not len(scene.points):
+        return []
+    if options.depth is not None:
+        return [("method", "depth: there are depth maps")]
+    if not scene.has_photographs:
+        return [("method", "mls: there are no photographs to look at")]
+    return [("method", "auto: stereo between the photographs, and a seed where no point is seen")]
+
+
+def _region_rows(regions: EmptyRegions | None) -> list[tuple[str, str]]:
+    if regions is None:
+        return []
+    return [
+        (
+            "image area without points",
+            f"{regions.mean:.0%} on average, {regions.worst:.0%} in {regions.worst_name}",
+        )
+    ]

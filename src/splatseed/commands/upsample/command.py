@@ -1,0 +1,330 @@
+"""``splatseed upsample``: read a scene, add points, write a scene that trainers load unchanged."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import tyro
+
+from splatseed.commands.options import parse_options
+from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
+from splatseed.console import (
+    OUT,
+    StageClock,
+    print_note,
+    stage_display,
+)
+from splatseed.depthmap import DepthKind
+from splatseed.diagnostics.geometry import far_share
+from splatseed.errors import ParameterError
+from splatseed.io import (
+    UsablePoints,
+    WriteReport,
+    find_depths,
+    find_usable,
+    load_scene,
+    write_scene,
+)
+from splatseed.io.output.staging import check_output
+from splatseed.literal import visible
+from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.scene import Scene
+from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
+from splatseed.upsample import (
+    METHODS,
+    Profile,
+    Upsampler,
+    chooses_number,
+    configure,
+    number_of_new,
+    planned_size,
+)
+
+__all__ = ["Options", "parse", "run"]
+
+HELP_ALL = "--help-all"
+
+
+def _number(kind: type, default: str) -> Any:
+    """How an optional number shows in the help: as a number, with what stands in for it."""
+    return tyro.conf.arg(
+        constructor=kind,
+        metavar=kind.__name__.upper(),
+        help_behavior_hint=f"(default: {default})",
+    )
+
+
+def _cover() -> Any:
+    """The flag --cover; its field has another name, since the method cover has that one."""
+    return tyro.conf.arg(
+        name="cover",
+        constructor=int,
+        metavar="INT",
+        help_behavior_hint="(default: none; auto and cover do so anyway)",
+    )
+
+
+def _budget() -> Any:
+    """How a budget shows in the help."""
+    return tyro.conf.arg(
+        constructor=str, metavar="N|Xrho", help_behavior_hint="(default: as many as there are)"
+    )
+
+
+def _default(stands_in: str) -> Any:
+    """How an optional choice shows in the help: with what stands in for it."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
+
+
+def _depth_folder() -> Any:
+    """The flag --depth; its field has another name, since the method depth has that one."""
+    return tyro.conf.arg(
+        name="depth", constructor=Path, metavar="DIR", help_behavior_hint="(default: the scene's)"
+    )
+
+
+@dataclass(frozen=True)
+class Options:
+    """Upsample the points of a scene, ready for any 3DGS trainer."""
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A COLMAP scene folder, a folder with transforms.json, or a .ply."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The scene folder to write."""
+    method: str = DEFAULT_METHOD
+    """How new points are made; the flags of each method are below. auto looks at the photographs."""
+    ratio: Annotated[float | None, _number(float, "4, unless --num-points is given")] = None
+    """Points in all, as a multiple of the originals, for methods that interpolate."""
+    num_points: Annotated[int | None, _number(int, "by the ratio")] = None
+    """Points in all, instead of a ratio."""
+    budget: Annotated[str | None, _budget()] = None
+    """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph."""
+    cover_cell: Annotated[int | None, _cover()] = None
+    """Give each part of the photographs, of so many pixels a side, that no point falls in a seed."""
+    verify: bool = False
+    """Hold interpolated points against the photographs: slide them onto surfaces, drop what fits none."""
+    seed: int = 0
+    """The same seed gives the same bytes."""
+    profile: Profile = "default"
+    """Defaults of the method flags below: improved ones, or those of the paper's text."""
+    depth_maps: Annotated[Path | None, _depth_folder()] = None
+    """For --method depth: a folder of depth maps, in any layout that docs/formats.md lists."""
+    depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
+    """What their values are: planar depth, distance along the ray, or inverse depth."""
+    depth_scale: Annotated[float | None, _number(float, "what the folder says")] = None
+    """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
+    align: bool = True
+    """For --method depth: --no-align takes metric depth and poses as they are (--depth.no-align)."""
+    preview: bool = False
+    """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's maps."""
+    format: Literal["auto", "colmap", "transforms"] = "auto"
+    """Layout to write; auto keeps the input's."""
+    copy_images: bool = False
+    """Copy the images instead of linking to them."""
+    overwrite: bool = False
+    """Replace an output folder that splatseed wrote before."""
+
+
+def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
+    """The options, and every method with its parameters, from the command line's words."""
+    if {"-h", "--help"} & set(arguments):
+        _help(arguments)
+    arguments = ["--help" if word == HELP_ALL else word for word in arguments]
+    options = _parse_with({name: METHODS[name]() for name in METHODS}, arguments)
+    if options.profile == "paper":
+        # The profile sets the defaults of other flags, so it must be known before they are read.
+        options = _parse_with({name: METHODS[name].paper() for name in METHODS}, arguments)
+    methods = {name: getattr(options, name) for name in METHODS}
+    if not options.align:
+        methods["depth"] = dataclasses.replace(methods["depth"], align=False)
+    return options, methods
+
+
+def _help(arguments: list[str]) -> None:
+    """Show the common options, those of the method that is named too, and how to see all."""
+    named = [name for name in METHODS if name in arguments or f"--method={name}" in arguments]
+    with suppress(SystemExit):
+        _parse_with({name: METHODS[name]() for name in named}, ["--help"])
+    OUT.print(
+        f"\nsplatseed upsample {HELP_ALL} shows the flags of all methods,"
+        " --method mls --help those of one."
+    )
+    raise SystemExit(0)
+
+
+def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
+    """Options with one more field a method, whose default is the method given."""
+    names = tuple(METHODS)
+    fields: list[Any] = [
+        (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
+    ]
+    full = dataclasses.make_dataclass(
+        "UpsampleOptions",
+        [("method", Literal[names], dataclasses.field(default=DEFAULT_METHOD)), *fields],
+        bases=(Options,),
+        frozen=True,
+    )
+    full.__doc__ = Options.__doc__
+    return parse_options(full, "upsample", arguments)
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options, methods = parse(arguments)
+    planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
+    inputs = [path for path in (options.scene, options.depth_maps) if path is not None]
+    check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=inputs)
+    notes: list[str] = []
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = _read(options, methods[options.method])
+        options = _settle(options, scene, notes)
+        method = methods[options.method]
+        usable = find_usable(scene.points)
+        total = _planned(options, method, usable)
+    _announce(options, scene, method, total, _idle(options, methods))
+    with stage_display(clock):
+        seeds = _make(options, scene, method, total, usable, clock, notes)
+        clock("check", 0.0)
+        found = _check(scene, seeds, method, usable)
+        clock("write", 0.0)
+        report = _write(options, scene.replace(points=seeds), method)
+        if options.preview:
+            shown = scene.replace(points=scene.points.select(usable.keep), tracks=None)
+            write_previews(
+                shown, seeds, total, methods, options.method, options.seed, options.output, clock
+            )
+            write_map_preview(scene, method, options.seed, options.output, clock)
+        seconds = clock.seconds()
+    summarise(scene, seeds, report, seconds, found, options.output, options.preview)
+    for sentence in notes:
+        print_note(sentence)
+
+
+def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
+    """The options with the method that is taken: the default needs photographs."""
+    if options.method != DEFAULT_METHOD:
+        return options
+    method = method_for(scene, options.method, notes.append)
+    return dataclasses.replace(options, method=str(method))
+
+
+def _planned(options: Options, method: Upsampler, usable: UsablePoints) -> int | None:
+    """Points in all; None where the photographs say how many."""
+    count = int(usable.keep.sum())
+    new = number_of_new(method, options.method, count, options.ratio, options.num_points)
+    return None if new is None else count + new
+
+
+def _make(
+    options: Options,
+    scene: Scene,
+    method: Upsampler,
+    total: int | None,
+    usable: UsablePoints,
+    clock: StageClock,
+    notes: list[str],
+) -> PointCloud:
+    """The originals and the new points."""
+    # Points that writing leaves out are asked for on top, so that the output has ``total``.
+    asked = None if total is None else total + int((~usable.keep).sum())
+    return upsample(
+        scene, method, num_points=asked, budget=options.budget, cover=options.cover_cell, verify=options.verify, seed=options.seed,
+        progress=clock, note=notes.append,
+    )  # fmt: skip
+
+
+def _check(
+    scene: Scene, seeds: PointCloud, method: Upsampler, usable: UsablePoints
+) -> dict[str, float]:
+    """What can be said of the points: how far off they are, or how much of the pictures they cover."""
+    found = {}
+    new = seeds.xyz[seeds.source != ORIGINAL]
+    if usable.keep.any() and not chooses_number(method):
+        found["far"] = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
+    if scene.images:
+        found["before"] = share_covered(scene, scene.points)
+        found["after"] = share_covered(scene, seeds)
+    return found
+
+
+def _read(options: Options, method: Upsampler) -> Scene:
+    """The scene's originals, and its depth maps if their folder is named."""
+    scene = load_scene(options.scene, require_points=getattr(method, "needs_points", True))
+    scene = scene.replace(points=scene.points.originals)
+    if options.depth_maps is not None:
+        maps = find_depths(
+            scene, options.depth_maps, kind=options.depth_kind, scale=options.depth_scale
+        )
+        return scene.replace(depths=maps)
+    if options.depth_kind is not None or options.depth_scale is not None:
+        raise ParameterError(
+            "--depth DIR, whose maps --depth-kind and --depth-scale speak of",
+            found="none",
+            fix="Name the folder.",
+        )
+    return scene
+
+
+def _announce(
+    options: Options, scene: Scene, method: Upsampler, total: int | None, idle: Sequence[str]
+) -> None:
+    """Say what will be done, before it is done, and which flags have no part in it."""
+    for warning in scene.warnings:
+        print_note(warning)
+    for name in idle:
+        print_note(f"The flags of {name} change nothing with --method {options.method}.")
+    kind = scene.source.format if scene.source else "memory"
+    parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]
+    number = "as many as the photographs need" if total is None else f"{total:,} points"
+    OUT.print(
+        f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} points)\n"
+        f"  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n"
+        f"  -> {visible(options.output)} ({number}, seed {options.seed})",
+        soft_wrap=True,
+    )
+
+
+def _idle(options: Options, methods: dict[str, Upsampler]) -> list[str]:
+    """Methods whose flags were changed though they are not used."""
+    if options.preview:  # draws them all
+        return []
+    plain = {name: configure(name, options.profile) for name in methods}
+    changed = {name for name in methods if methods[name] != plain[name]}
+    if options.depth_maps is not None:
+        changed.add("depth")
+    return [name for name in methods if name in changed - {options.method}]
+
+
+def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
+    return write_scene(
+        scene,
+        options.output,
+        format=options.format,
+        overwrite=options.overwrite,
+        copy_images=options.copy_images,
+        provenance=_provenance(options, method),
+    )
+
+
+def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
+    """What made the output, for ``splatseed.json``."""
+    return {
+        "command": "upsample",
+        "method": options.method,
+        "profile": options.profile,
+        "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]
+        "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
+        "ratio": options.ratio,
+        "num_points_asked": options.num_points,
+        "budget": options.budget,
+        "cover": options.cover_cell,
+        "verify": options.verify,
+        "seed": options.seed,
+    }

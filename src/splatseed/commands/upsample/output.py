@@ -1,0 +1,199 @@
+"""What ``splatseed upsample`` says and draws at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from splatseed.commands.upsample.trainers import training_commands
+from splatseed.console import StageClock, print_commands, print_note, print_pairs
+from splatseed.errors import PointCloudError, SceneFormatError
+from splatseed.io import WriteReport
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import silent
+from splatseed.scene import Image, Scene
+from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views
+from splatseed.seeding.upsampling import CELL
+from splatseed.upsample import Upsampler, chooses_number, methods_for, upsample
+from splatseed.upsample.registry import origin_name
+
+__all__ = ["summarise", "write_map_preview", "write_previews"]
+
+MAPS = "preview_maps.png"
+PICTURES = (
+    "preview.png",
+    "preview_methods.png",
+    "preview_origins.png",
+    "preview_cells.png",
+    MAPS,
+)
+PHOTOGRAPHS_SHOWN = 4
+"""Those whose cells and maps are drawn."""
+
+
+def write_previews(
+    scene: Scene,
+    seeds: PointCloud,
+    total: int | None,
+    methods: Mapping[str, Upsampler],
+    method: str,
+    seed: int,
+    folder: Path,
+    clock: StageClock,
+) -> None:
+    """Before and after, every method, and, with photographs, seeds by origin and the cells they cover.
+
+    Args:
+        scene: With the originals that were used.
+        seeds: What was written.
+        total: Points in all, for methods that take a number; None for their default.
+        methods: All, with their parameters.
+        method: The one that made ``seeds``.
+        seed: As was used.
+        folder: Where the pictures go.
+        clock: Told the stages.
+    """
+    from splatseed.preview import (  # noqa: PLC0415  (Pillow)
+        preview_methods,
+        preview_origins,
+        preview_pair,
+    )
+
+    clouds = {}
+    for name in methods_for(scene):
+        if name == method:
+            clouds[name] = seeds
+            continue
+        number = None if chooses_number(methods[name]) else total
+        # Too few points for one of the methods, or depth that does not fit: show the others.
+        with suppress(PointCloudError, SceneFormatError):
+            clouds[name] = upsample(
+                scene, methods[name], num_points=number, seed=seed, progress=clock
+            )
+    clock("preview", 0.0)
+    preview_pair(scene, seeds, folder / PICTURES[0], title=method)
+    clock("preview", 0.5)
+    preview_methods(scene, clouds, folder / PICTURES[1])
+    if scene.has_photographs:
+        clock("preview", 0.7)
+        preview_origins(scene, seeds, folder / PICTURES[2])
+        _draw_cells(scene, seeds, folder / PICTURES[3])
+    clock("preview", 1.0)
+
+
+def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
+    """Which cells of some photographs hold a point, before and after."""
+    from splatseed.preview import CoveredView, preview_cells  # noqa: PLC0415  (Pillow)
+    from splatseed.seeding.coverage import covered_cells  # noqa: PLC0415  (kernels load with use)
+
+    images = photographed(scene)
+    views = read_views(scene, [images[i] for i in _some_of(images)], MAX_SIZE, silent)
+    clouds = [cloud.xyz[cloud.finite] for cloud in (scene.points, seeds)]
+    before, after = (covered_cells(views, xyz, CELL) for xyz in clouds)
+    shown = [
+        CoveredView(view.name, view.image, CELL, old, new)
+        for view, old, new in zip(views, before, after, strict=True)
+    ]
+    preview_cells(shown, path)
+
+
+def write_map_preview(
+    scene: Scene, method: Upsampler, seed: int, folder: Path, clock: StageClock
+) -> None:
+    """What stereo found of some photographs, if the method begins with it.
+
+    Args:
+        scene: As the method got it.
+        method: The one that was used.
+        seed: As was used.
+        folder: Where the picture goes.
+        clock: Told the stages.
+    """
+    from splatseed.preview import preview_maps  # noqa: PLC0415  (Pillow)
+
+    if isinstance(method, Stereo):
+        shown = _some_of(photographed(scene, method.hold_out))
+        # Found again, of the few that are shown: to keep the maps of all would take as much memory as the views.
+        maps = method.maps(scene, shown, seed, clock)
+        clock("preview", 0.9)
+        preview_maps(scene, maps, folder / MAPS)
+        clock("preview", 1.0)
+
+
+def _some_of(images: Sequence[Image]) -> list[int]:
+    """At most ``PHOTOGRAPHS_SHOWN``, evenly chosen."""
+    places = np.linspace(0, len(images) - 1, min(PHOTOGRAPHS_SHOWN, len(images)))
+    return [int(place) for place in np.unique(places.round())]
+
+
+def summarise(
+    scene: Scene,
+    seeds: PointCloud,
+    report: WriteReport,
+    seconds: Mapping[str, float],
+    found: Mapping[str, float],
+    output: Path,
+    pictures: bool,
+) -> None:
+    """The closing table and the commands to go on with.
+
+    Args:
+        scene: As it was read.
+        seeds: What was written.
+        report: What writing says.
+        seconds: By stage.
+        found: ``far``, the share of new points far from any original; ``before`` and ``after``, the
+            share of the pictures that the points cover.
+        output: Where it went.
+        pictures: Whether previews were drawn.
+    """
+    rows = [
+        ("points in", f"{len(scene.points):,}"),
+        ("points out", f"{report.num_points:,} ({_origins(seeds)})"),
+        *_findings(found),
+        ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
+        ("output", str(output)),
+    ]
+    if (output / "images").is_symlink():
+        where = (output / "images").resolve()
+        rows.append(("images", f"linked, not copied: {where}; --copy-images to take OUT elsewhere"))
+    if report.dropped_nonfinite + report.dropped_duplicates:
+        left_out = (
+            f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate"
+        )
+        rows.insert(2, ("left out", left_out))
+    if pictures:
+        drawn = [output / name for name in PICTURES if (output / name).is_file()]
+        rows += [("" if i else "pictures", str(path)) for i, path in enumerate(drawn)]
+    print_pairs("splatseed upsample", rows)
+    for note in report.notes:
+        print_note(note)
+    if report.layout == "transforms":
+        print_note(
+            "gsplat's examples, graphdeco's code and LichtFeld read COLMAP only: --format colmap."
+        )
+    if scene.images and scene.source is not None and scene.source.image_dir is not None:
+        print_commands("train it with", training_commands(output, report.layout))
+
+
+def _origins(seeds: PointCloud) -> str:
+    """How many points are of which origin."""
+    codes, counts = np.unique(seeds.source, return_counts=True)
+    return ", ".join(
+        f"{count:,} {origin_name(int(code))}" for code, count in zip(codes, counts, strict=True)
+    )
+
+
+def _findings(found: Mapping[str, float]) -> list[tuple[str, str]]:
+    rows = []
+    if "far" in found:
+        rows.append(
+            ("far from any original", f"{found['far']:.2%} of the new points, over 3 spacings")
+        )
+    if "after" in found:
+        share = f"{found['after']:.1%} of the pictures have a point in each 8 x 8 pixels"
+        rows.append(("covered", f"{share}; {found['before']:.1%} before"))
+    return rows

@@ -1,0 +1,1 @@
+"""Numbers about scenes and clouds: what is wrong with one, how far points lie from surfaces."""

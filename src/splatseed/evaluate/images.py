@@ -1,0 +1,37 @@
+"""PSNR and SSIM of one image beside another, in PyTorch.
+
+Notation: images are [H, W, 3], values about 0..1.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from splatseed.evaluate.ssim import C1, C2, WINDOW, window_weights
+
+__all__ = ["psnr", "ssim"]
+
+
+def ssim(render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
+    """Mean SSIM over the places where the 11 x 11 window fits whole, by convolutions."""
+    x, y = (image.permute(2, 0, 1).unsqueeze(1) for image in (render, truth))
+    weights = torch.from_numpy(window_weights()).to(render)
+    mean_x, mean_y, e_xy, e_2 = (
+        conv2d(conv2d(image, weights.view(1, 1, WINDOW, 1)), weights.view(1, 1, 1, WINDOW))
+        for image in (x, y, x * y, x * x + y * y)
+    )
+    product, squares = mean_x * mean_y, mean_x**2 + mean_y**2
+    c1, c2 = float(C1), float(C2)
+    above = (2 * product + c1) * (2 * (e_xy - product) + c2)
+    below = (squares + c1) * (e_2 - squares + c2)
+    return (above / below).mean()
+
+
+@torch.no_grad()
+def psnr(render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
+    """Peak signal-to-noise ratio in dB of a render clamped to [0, 1]."""
+    error = (render.clamp(0, 1) - truth).square().mean(dtype=torch.float64)
+    return float(-10 * torch.log10(error))

@@ -1,0 +1,1 @@
+"""COLMAP models: both forms of their files, and the scenes they hold."""

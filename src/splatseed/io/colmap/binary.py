@@ -1,0 +1,304 @@
+"""COLMAP models in binary form: ``cameras.bin``, ``images.bin``, ``points3D.bin``.
+
+Notation: ``_id`` comes from the file. Layouts as COLMAP's documentation of its output format gives
+them, little-endian. Promise: a file that was read is written back byte for byte; a malformed one
+raises a single error that names the file, the record and the byte; points are never looped over in
+Python. Writers write straight to ``path`` and let ``OSError`` pass: their caller stages the output.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64, UInt8
+
+from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.errors import OutputError
+from splatseed.io.binary import ByteReader
+from splatseed.io.colmap.model import (
+    EXPORT_AGAIN,
+    NO_POINT,
+    by_camera_id,
+    check_names,
+    check_unique,
+    make_image,
+    make_intrinsics,
+    make_points,
+    point_columns,
+)
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Observations, Tracks
+
+__all__ = [
+    "read_cameras",
+    "read_images",
+    "read_points3d",
+    "write_cameras",
+    "write_images",
+    "write_points3d",
+]
+
+_COUNT = struct.Struct("<Q")
+_CAMERA = struct.Struct("<IiQQ")  # camera id, model id, width, height; then the parameters
+_POSE = struct.Struct("<I7dI")  # image id, wxyz quaternion, translation, camera id; then the name
+_FEATURE = np.dtype([("xy", "<f8", 2), ("point_id", "<u8")])
+_POINT = np.dtype(
+    [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+)
+_OBSERVATION = np.dtype([("image_id", "<u4"), ("point2d_idx", "<u4")])
+_POINTS_AT_ONCE = 1 << 18  # bounds the writer's memory to some tens of megabytes
+
+
+def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
+    """The camera records of a ``cameras.bin``, in file order.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is unreadable or malformed, or a camera model is unknown.
+    """
+    reader = ByteReader(path, EXPORT_AGAIN)
+    count = reader.count(_CAMERA.size + 3 * 8, "cameras")
+    cameras = tuple(_read_camera(reader, i, count) for i in range(count))
+    reader.finish()
+    ids = np.array([camera.camera_id for camera in cameras], np.int64)
+    check_unique("camera", ids, path, _record)
+    return cameras
+
+
+def _read_camera(reader: ByteReader, idx: int, count: int) -> Intrinsics:
+    reader.record = f"{_record(idx)} of {count}"
+    where = reader.where
+    camera_id, model_id, width, height = reader.unpack(_CAMERA)
+    model = next((m for m in CAMERA_MODELS.values() if m.model_id == model_id), None)
+    if model is None:
+        raise reader.error("the id of a COLMAP camera model", str(model_id))
+    params = reader.unpack(struct.Struct(f"<{model.num_params}d"))
+    return make_intrinsics(where, camera_id, model.name, width, height, params)
+
+
+def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ...]:
+    """The image records of an ``images.bin``, in file order, with their features.
+
+    Args:
+        path: The file.
+        intrinsics: The camera records that the images refer to.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is unreadable or malformed, a pose is not finite, or an image names a
+            camera that is not there.
+    """
+    reader = ByteReader(path, EXPORT_AGAIN)
+    cameras = by_camera_id(intrinsics)
+    count = reader.count(_POSE.size + 1 + 8, "images")
+    images = tuple(_read_image(reader, cameras, i, count) for i in range(count))
+    reader.finish()
+    check_unique("image", np.array([im.image_id for im in images], np.int64), path, _record)
+    check_names(images, path, _record)
+    return images
+
+
+def _read_image(reader: ByteReader, cameras: dict[int, Intrinsics], idx: int, count: int) -> Image:
+    reader.record = f"{_record(idx)} of {count}"
+    where = reader.where
+    image_id, *pose, camera_id = reader.unpack(_POSE)
+    return make_image(
+        where,
+        cameras,
+        image_id=image_id,
+        camera_id=camera_id,
+        name=reader.text(),
+        pose=pose,
+        observations=_read_features(reader),
+    )
+
+
+def _read_features(reader: ByteReader) -> Observations:
+    features = reader.array(_FEATURE, reader.count(_FEATURE.itemsize, "features"))
+    point_ids = features["point_id"].astype(np.int64)  # COLMAP's "none", 2^64 - 1, becomes -1
+    if (point_ids < NO_POINT).any():
+        raise reader.error("features with point ids below 2^63", "a larger one")
+    return Observations(features["xy"].astype(np.float64), point_ids)
+
+
+def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
+    """The points of a ``points3D.bin`` in file order, and their tracks.
+
+    Coordinates may be NaN or infinite; nothing is repaired here.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is unreadable or malformed, or a point id occurs twice or exceeds
+            2^63 - 1.
+    """
+    reader = ByteReader(path, EXPORT_AGAIN)
+    count = reader.count(_POINT.itemsize, "points")
+    starts = _scan_points(reader, count)
+    points, observations = _split_points(reader, starts)
+    tracks = Tracks(
+        point_ids=points["id"].astype(np.int64),
+        xyz=points["xyz"].astype(np.float64),
+        errors=points["error"].astype(np.float64),
+        offsets=_track_offsets(starts),
+        image_ids=observations["image_id"].astype(np.uint32),
+        point2d_idx=observations["point2d_idx"].astype(np.uint32),
+    )
+    return make_points(path, _record, points["rgb"].copy(), tracks)
+
+
+def _scan_points(reader: ByteReader, count: int) -> Int64[np.ndarray, " N+1"]:
+    """The byte offset of each point record, then the end of the last; consumes the file."""
+    from splatseed.io.colmap.records import scan_records  # noqa: PLC0415  (imports Numba)
+
+    starts = np.empty(count + 1, np.int64)
+    complete = scan_records(np.frombuffer(reader.data, np.uint8), reader.offset, starts)
+    reader.offset = int(starts[complete])
+    if complete < count:
+        reader.record = f"{_record(complete)} of {count}"
+        raise reader.error("a whole point record", f"{reader.remaining} bytes to the file's end")
+    reader.finish()
+    return starts
+
+
+def _split_points(
+    reader: ByteReader, starts: Int64[np.ndarray, " N+1"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The heads [N] as ``_POINT`` and the track elements [T] as ``_OBSERVATION``."""
+    from splatseed.io.colmap.records import split_records  # noqa: PLC0415  (imports Numba)
+
+    points = np.empty(len(starts) - 1, _POINT)
+    observations = np.empty(_track_offsets(starts)[-1], _OBSERVATION)
+    split_records(
+        np.frombuffer(reader.data, np.uint8), starts, _rows_of(points), observations.view(np.uint8)
+    )
+    return points, observations
+
+
+def _track_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " N+1"]:
+    """Offsets into the track elements, from those of the records."""
+    heads = np.arange(len(starts)) * _POINT.itemsize
+    return np.asarray((starts - starts[0] - heads) // _OBSERVATION.itemsize)
+
+
+def write_cameras(path: Path, intrinsics: Sequence[Intrinsics]) -> None:
+    """Write a ``cameras.bin``.
+
+    Raises:
+        OutputError: A value does not fit its field.
+        OSError: The file cannot be written.
+    """
+    with path.open("wb") as file:
+        file.write(_COUNT.pack(len(intrinsics)))
+        for camera in intrinsics:
+            where = f"camera {camera.camera_id}"
+            head = (CAMERA_MODELS[camera.model].model_id, camera.width, camera.height)
+            file.write(_pack(_CAMERA, where, camera.camera_id, *head))
+            file.write(np.array(camera.params, "<f8").tobytes())
+
+
+def write_images(path: Path, images: Sequence[Image]) -> None:
+    """Write an ``images.bin``; images without observations get zero features.
+
+    Raises:
+        OutputError: A name holds a zero byte or is not Unicode, or a value does not fit its field.
+        OSError: The file cannot be written.
+    """
+    with path.open("wb") as file:
+        file.write(_COUNT.pack(len(images)))
+        for image in images:
+            pose = (*image.quat.tolist(), *image.translation.tolist())
+            values = (image.image_id, *pose, image.intrinsics.camera_id)
+            file.write(_pack(_POSE, f"image {image.name!r}", *values))
+            file.write(_encoded_name(image.name))
+            file.write(_packed_features(image.observations))
+
+
+def _pack(layout: struct.Struct, where: str, *values: float) -> bytes:
+    try:
+        return layout.pack(*values)
+    except struct.error as error:
+        raise OutputError(
+            f"values of {where} that COLMAP's binary form can hold",
+            found=f"{values} ({error})",
+            fix="Ids and sizes are non-negative, ids below 2^32.",
+        ) from None
+
+
+def _encoded_name(name: str) -> bytes:
+    encoded = name.encode("utf-8", errors="replace")
+    if b"\0" in encoded or encoded.decode("utf-8") != name:
+        raise OutputError(
+            "image names in UTF-8 without a zero byte", found=f"{name!r}", fix="Rename the image."
+        )
+    return encoded + b"\0"
+
+
+def _packed_features(observations: Observations | None) -> bytes:
+    if observations is None:
+        return _COUNT.pack(0)
+    features = np.empty(len(observations), _FEATURE)
+    features["xy"] = observations.xy
+    features["point_id"] = observations.point_ids.astype(np.uint64)
+    return _COUNT.pack(len(features)) + features.tobytes()
+
+
+def write_points3d(path: Path, points: PointCloud, tracks: Tracks | None) -> None:
+    """Write a ``points3D.bin``.
+
+    Args:
+        path: The file.
+        points: The cloud.
+        tracks: Ids, float64 positions, errors and tracks of the first ``len(tracks)`` points. The
+            others get the ids that follow the largest, error -1 (COLMAP's "unknown") and no track.
+            Without it all points do, with ids from 1.
+
+    Raises:
+        PointCloudError: There are more tracks than points.
+        OSError: The file cannot be written.
+    """
+    heads = _point_heads(points, tracks)
+    num_tracked = len(tracks) if tracks is not None else 0
+    with path.open("wb") as file:
+        file.write(_COUNT.pack(len(points)))
+        if tracks is not None:
+            for start in range(0, num_tracked, _POINTS_AT_ONCE):
+                stop = min(start + _POINTS_AT_ONCE, num_tracked)
+                file.write(_joined_records(heads[start:stop], tracks, start, stop).data)
+        file.write(heads[num_tracked:].view(np.uint8).data)  # a record without a track is its head
+
+
+def _point_heads(points: PointCloud, tracks: Tracks | None) -> np.ndarray:
+    heads = np.zeros(len(points), _POINT)
+    heads["id"], heads["xyz"], heads["error"] = point_columns(points, tracks)
+    heads["rgb"] = points.rgb
+    if tracks is not None:
+        heads["length"][: len(tracks)] = tracks.lengths
+    return heads
+
+
+def _joined_records(
+    heads: np.ndarray, tracks: Tracks, start: int, stop: int
+) -> UInt8[np.ndarray, " B"]:
+    """The bytes of the records of points ``start`` to ``stop``, which have tracks."""
+    from splatseed.io.colmap.records import join_records  # noqa: PLC0415  (imports Numba)
+
+    first, last = tracks.offsets[start], tracks.offsets[stop]
+    observations = np.empty(last - first, _OBSERVATION)
+    observations["image_id"] = tracks.image_ids[first:last]
+    observations["point2d_idx"] = tracks.point2d_idx[first:last]
+    record_offsets = (tracks.offsets[start : stop + 1] - first) * _OBSERVATION.itemsize
+    record_offsets += np.arange(len(record_offsets)) * _POINT.itemsize
+    buffer = np.empty(record_offsets[-1], np.uint8)
+    join_records(_rows_of(heads), observations.view(np.uint8), record_offsets, buffer)
+    return buffer
+
+
+def _rows_of(heads: np.ndarray) -> UInt8[np.ndarray, "N 51"]:
+    return heads.view(np.uint8).reshape(len(heads), _POINT.itemsize)
+
+
+def _record(idx: int) -> str:
+    return f"record {idx + 1}"

@@ -1,0 +1,133 @@
+"""Contiguous point ids for a COLMAP model that is written again.
+
+Notation: a *feature* is one observation slot of an image; all features of all images in a row are
+numbered by *slot*. A track element (image id, feature index) and a feature's point id say the same
+thing twice. Promise: in the result both say it alike, every id is 1..N in the cloud's order, and a
+model that was like that already comes out unchanged. No loop over points or features.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from splatseed.errors import PointCloudError
+from splatseed.io.colmap.model import NO_POINT
+from splatseed.scene import Image, Observations, Scene, Tracks
+
+__all__ = ["Renumbered", "renumber"]
+
+
+@dataclass(frozen=True, eq=False)
+class Renumbered:
+    """The tracks and images of the points that are kept, under their new ids.
+
+    Args:
+        tracks: Of the kept originals; None if the scene has none.
+        images: With the features' point ids renewed.
+        num_broken: References between points and features that were removed because one side
+            did not confirm them (those of dropped points aside).
+    """
+
+    tracks: Tracks | None
+    images: tuple[Image, ...]
+    num_broken: int
+
+
+def renumber(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Renumbered:
+    """Number the kept points 1, 2, ... in their order.
+
+    Args:
+        scene: Its tracks belong to the first ``len(scene.tracks)`` points.
+        keep: Which of the scene's points are kept.
+
+    Raises:
+        PointCloudError: There are more tracks than points.
+    """
+    old_ids = _feature_ids(scene.images)
+    if scene.tracks is None:
+        unset = np.full(len(old_ids), NO_POINT, np.int64)
+        num_broken = int(np.count_nonzero(old_ids != NO_POINT))
+        return Renumbered(None, _with_point_ids(scene.images, unset), num_broken)
+    tracks = scene.tracks
+    if len(tracks) > len(keep):
+        raise PointCloudError(
+            "at most one track a point",
+            found=f"{len(tracks)} tracks for {len(keep)} points",
+            fix="Replace the points by Scene.replace, which drops tracks that do not fit.",
+        )
+    keep = keep[: len(tracks)]
+    point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
+    slots = _slots(scene.images, tracks)
+    agreed = slots >= 0
+    agreed[agreed] = old_ids[slots[agreed]] == tracks.point_ids[point_idx[agreed]]
+    kept = agreed & keep[point_idx]
+    new_ids = np.full(len(old_ids), NO_POINT, np.int64)
+    new_ids[slots[kept]] = np.cumsum(keep)[point_idx[kept]]
+    confirmed = np.zeros(len(old_ids), bool)
+    confirmed[slots[agreed]] = True
+    unconfirmed = (old_ids != NO_POINT) & ~confirmed
+    return Renumbered(
+        _selected(tracks, keep, kept, point_idx),
+        _with_point_ids(scene.images, new_ids),
+        int(np.count_nonzero(~agreed) + np.count_nonzero(unconfirmed)),
+    )
+
+
+def _feature_ids(images: Sequence[Image]) -> Int64[np.ndarray, " S"]:
+    """The point id of every slot."""
+    ids = [im.observations.point_ids for im in images if im.observations is not None]
+    return np.concatenate([np.empty(0, np.int64), *ids])
+
+
+def _feature_counts(images: Sequence[Image]) -> Int64[np.ndarray, " I"]:
+    return np.array([len(im.observations or ()) for im in images], np.int64)
+
+
+def _slots(images: Sequence[Image], tracks: Tracks) -> Int64[np.ndarray, " T"]:
+    """The slot of every track element; -1 where there is no such image or feature."""
+    if not images:
+        return np.full(len(tracks.image_ids), -1, np.int64)
+    counts = _feature_counts(images)
+    firsts = np.cumsum(counts) - counts
+    image_ids = np.array([image.image_id for image in images], np.int64)
+    order = np.argsort(image_ids)
+    place = np.searchsorted(image_ids[order], tracks.image_ids).clip(max=len(images) - 1)
+    image_idx = order[place]
+    feature_idx = tracks.point2d_idx.astype(np.int64)
+    exists = (image_ids[image_idx] == tracks.image_ids) & (feature_idx < counts[image_idx])
+    return np.where(exists, firsts[image_idx] + feature_idx, -1)
+
+
+def _selected(
+    tracks: Tracks,
+    keep: Bool[np.ndarray, " N"],
+    kept_elements: Bool[np.ndarray, " T"],
+    point_idx: Int64[np.ndarray, " T"],
+) -> Tracks:
+    lengths = np.bincount(point_idx[kept_elements], minlength=len(tracks))[keep]
+    num_kept = len(lengths)
+    return Tracks(
+        point_ids=np.arange(1, num_kept + 1, dtype=np.int64),
+        xyz=tracks.xyz[keep],
+        errors=tracks.errors[keep],
+        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        image_ids=tracks.image_ids[kept_elements],
+        point2d_idx=tracks.point2d_idx[kept_elements],
+    )
+
+
+def _with_point_ids(
+    images: Sequence[Image], point_ids: Int64[np.ndarray, " S"]
+) -> tuple[Image, ...]:
+    """The images with the point ids of their slots."""
+    pieces = np.split(point_ids, np.cumsum(_feature_counts(images))[:-1])
+    return tuple(
+        image
+        if image.observations is None
+        else replace(image, observations=Observations(image.observations.xy, piece))
+        for image, piece in zip(images, pieces, strict=False)  # no image still makes one piece
+    )

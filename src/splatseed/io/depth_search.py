@@ -1,0 +1,92 @@
+"""Finding the depth maps of a scene's images: those of an RGB-D capture by time, all others by name."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+from splatseed.depthmap import DepthKind
+from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.io.depth.arrays import KINDS
+from splatseed.io.depth.files import SUFFIXES, DepthFiles
+from splatseed.io.depth.folder import safe_parts
+from splatseed.io.depth.matching import match_by_name
+from splatseed.io.rgbd.tum import find_tum_depths, is_tum
+from splatseed.scene import Scene
+
+__all__ = ["find_depths", "search_depths"]
+
+
+def find_depths(
+    scene: Scene, path: Path, *, kind: DepthKind | None = None, scale: float | None = None
+) -> DepthFiles:
+    """The depth maps in a folder that belong to images of a scene.
+
+    Args:
+        scene: Whose images.
+        path: The folder: maps named as the images are, with subfolders, or a COLMAP dense
+            workspace, an RGB-D capture in NICE-SLAM's or TUM's layout, or what ``splatseed depth``
+            wrote.
+        kind: What the values are; None: what the folder or file itself says, else planar z.
+        scale: Stored units per scene unit; None: what the folder itself says, else 1000 for
+            integers and 1 for floats.
+
+    Returns:
+        The maps, to be read one by one. An image without a map is not among them.
+
+    Raises:
+        ParameterError: The kind is none, or the scale not a positive number.
+        SceneNotFoundError: There is no such folder, or no image has a map in it.
+        SceneFormatError: Two images share a map, or the folder's description is damaged.
+    """
+    _check_options(kind, scale)
+    root = Path(path)
+    if not root.is_dir():
+        raise SceneNotFoundError(
+            f"a folder of depth maps at {root}",
+            found="a file" if root.exists() else "nothing",
+            fix="Name the folder that the maps lie in.",
+        )
+    found = search_depths(scene, root)
+    if found is None:
+        names = [image.name for image in scene.images[:3]]
+        raise SceneNotFoundError(
+            f"depth maps of the scene's images in {root}: {_looked_for(scene)}",
+            found="none" if names else "a scene without images",
+            fix="Name maps as their images are, with subfolders and another suffix.",
+        )
+    return replace(found, kind=kind or found.kind, scale=scale or found.scale)
+
+
+def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
+    """As ``find_depths``, but None where no image has a map.
+
+    Raises:
+        SceneFormatError: Two images share a map, or the folder's description is damaged.
+    """
+    if is_tum(root) and (found := find_tum_depths(scene, root)) is not None:
+        return found
+    if (found := match_by_name(scene, root)) is not None:
+        return found
+    capture = root.resolve().parent  # the folder of depth images alone was named
+    return find_tum_depths(scene, capture) if is_tum(capture) else None
+
+
+def _check_options(kind: DepthKind | None, scale: float | None) -> None:
+    if kind is not None and kind not in KINDS:
+        raise ParameterError(
+            f"a kind of depth: {', '.join(KINDS)}", found=repr(kind), fix="Choose one of them."
+        )
+    if scale is not None and not (math.isfinite(scale) and scale > 0):
+        raise ParameterError(
+            "a scale of depth above 0", found=f"{scale}", fix="Give stored units per scene unit."
+        )
+
+
+def _looked_for(scene: Scene) -> str:
+    if not scene.images:
+        return "no names"
+    name = "/".join(safe_parts(scene.images[0].name))
+    stem = str(PurePosixPath(name).with_suffix(""))
+    return f"{name}{SUFFIXES[0]}, {stem}{SUFFIXES[0]}, {stem}_depth{SUFFIXES[0]} or {stem}.png, ..."

@@ -1,0 +1,83 @@
+"""Opening files that a scene names, which may be anything.
+
+Promise: only regular files are opened, so that nothing is waited for or read without end (a pipe,
+``/dev/zero``), and none that is larger than the free memory. What is refused raises an ``OSError`` whose
+``strerror`` says why, as what the system refuses does; ``read_bytes`` makes one of our errors of it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.process.memory import free_memory
+
+__all__ = ["open_file", "read_bytes", "read_file"]
+
+_KINDS = (
+    (stat.S_ISDIR, errno.EISDIR, "a folder"),
+    (stat.S_ISFIFO, errno.EINVAL, "a pipe, not a file"),
+    (stat.S_ISSOCK, errno.EINVAL, "a socket, not a file"),
+    (lambda _: True, errno.EINVAL, "a device, not a file"),
+)
+_WAIT_NOT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+
+
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file for reading.
+
+    Raises:
+        OSError: There is none, it cannot be opened, or is of another kind.
+    """
+    _check(path, path.stat())  # opening alone can act on a device
+    file = os.fdopen(os.open(path, os.O_RDONLY | _WAIT_NOT), "rb")
+    try:
+        _check(path, os.fstat(file.fileno()))  # it may have been replaced meanwhile
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def read_file(path: Path) -> bytes:
+    """The whole content of a regular file.
+
+    Raises:
+        OSError: There is none, it cannot be read, is of another kind, or larger than the free memory.
+    """
+    with open_file(path) as file:
+        size, free = os.fstat(file.fileno()).st_size, free_memory()
+        if free is not None and size > free:
+            told = f"{size / 1e9:,.1f} GB, more than the {free / 1e9:,.1f} GB of free memory"
+            raise OSError(errno.EFBIG, told, str(path))
+        return file.read()
+
+
+def _check(path: Path, found: os.stat_result) -> None:
+    if stat.S_ISREG(found.st_mode):
+        return
+    number, kind = next((number, kind) for is_, number, kind in _KINDS if is_(found.st_mode))
+    raise OSError(number, kind, str(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    """The whole file.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
+    """
+    try:
+        return read_file(path)
+    except (FileNotFoundError, NotADirectoryError):
+        raise SceneNotFoundError(f"a file at {path}", found="none", fix="Check the path.") from None
+    except OSError as error:
+        raise SceneFormatError(
+            f"{path} to be a readable file",
+            found=error.strerror or type(error).__name__,
+            fix="Check that it is a file and that you may read it.",
+        ) from None

@@ -1,0 +1,79 @@
+"""What a user should know of a scene's images and lenses before training.
+
+Promise: only the headers of a few image files are opened; nothing here raises for what it finds.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatseed.io.files import open_file
+from splatseed.scene import Image
+
+__all__ = ["image_warnings", "lens_warnings"]
+
+_MAX_OPENED = 32  # files whose size is compared
+
+
+def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
+    """What the image files have against their records; only headers of a few are opened.
+
+    Args:
+        images: The images.
+        image_dir: What their names are relative to, if there is such a folder.
+        root: The scene's folder.
+    """
+    if not images:
+        return []
+    if image_dir is None:
+        return ["The images folder is missing; points can be made, but nothing can be trained."]
+    outside = [im.name for im in images if _leads_out(im.name, image_dir, root)]
+    missing = {im.name: None for im in images if not (image_dir / im.name).is_file()}
+    warnings = []
+    if missing:
+        count, first = f"{len(missing)} of {len(images)} images are", next(iter(missing))
+        warnings.append(f"{count} missing in {image_dir}, the first is {first}.")
+    if outside:
+        count, first = f"{len(outside)} of {len(images)} images lie", outside[0]
+        warnings.append(f"{count} outside of {root}, the first is {first}.")
+    present = [im for im in images if im.name not in missing]
+    sample = present[:: -(-len(present) // _MAX_OPENED) or 1]  # the first, and every so many
+    wrong = [text for im in sample if (text := _size_warning(im, image_dir))]
+    return [*warnings, *wrong[:1]]
+
+
+def _leads_out(name: str, image_dir: Path, root: Path) -> bool:
+    """Whether an image's name leads out of its scene; links, which somebody made, may lead anywhere."""
+    path, around = (os.path.abspath(each) for each in (image_dir / name, root))  # noqa: PTH100
+    return os.path.commonpath([path, around]) != around
+
+
+def _size_warning(image: Image, image_dir: Path) -> str | None:
+    from PIL import Image as PilImage, UnidentifiedImageError  # noqa: PLC0415  (slow to import)
+
+    try:
+        with open_file(image_dir / image.name) as file, PilImage.open(file) as picture:
+            size = picture.size
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, UnidentifiedImageError, PilImage.DecompressionBombError) as error:
+        return f"{image.name} cannot be read: {error}."
+    expected = (image.intrinsics.width, image.intrinsics.height)
+    if size == expected:
+        return None
+    return (
+        f"{image.name} has {size[0]} x {size[1]} pixels, its camera {image.intrinsics.camera_id}"
+        f" {expected[0]} x {expected[1]}; some trainers rescale, others fail."
+    )
+
+
+def lens_warnings(images: Sequence[Image]) -> list[str]:
+    """A sentence on lens distortion, which not every trainer takes."""
+    models = sorted({im.intrinsics.model for im in images if not im.intrinsics.is_pinhole})
+    if not models:
+        return []
+    lenses = f"Cameras have lens distortion ({', '.join(models)})"
+    trainers = "graphdeco's trainer and OpenSplat need PINHOLE"
+    return [f"{lenses}; {trainers}: undistort it with splatseed undistort SCENE -o OUT."]

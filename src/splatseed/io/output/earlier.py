@@ -1,0 +1,83 @@
+"""Scenes that splatseed wrote before: which of their points are originals, and what is known of them.
+
+Point files have no place for a point's origin, but ``splatseed.json`` beside them says how many of the
+points, the first ones, were in the input, and ``seeds.npz`` what made each of the others. New points
+must never be taken for originals: upsampling an output again starts from its originals and replaces
+what was made from them. Where no point at all is an original, all count as such.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from splatseed.io.output.seeds_npz import read_seeds
+from splatseed.io.output.staging import MANIFEST
+from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
+from splatseed.scene import Scene, Tracks
+
+__all__ = ["recall_seeds"]
+
+
+def recall_seeds(scene: Scene) -> Scene:
+    """The scene with what its ``seeds.npz`` and its manifest say of its points, where they fit."""
+    if scene.source is None or not len(scene.points):
+        return scene
+    known = read_seeds(scene.source.root, scene.points)
+    source = known.points.source if known.has_source else _by_manifest(scene)
+    points = known.points.replace(source=source if (source == ORIGINAL).any() else None)
+    notes = tuple(filter(None, (known.warning, _added_note(points))))
+    # Tracks belong to the points that come first, and a new point has none.
+    first_new = int(np.append(points.source != ORIGINAL, True).argmax())
+    tracks = None if scene.tracks is None else _first(scene.tracks, first_new)
+    return replace(scene, points=points, tracks=tracks, warnings=(*scene.warnings, *notes))
+
+
+def _by_manifest(scene: Scene) -> UInt8[np.ndarray, " N"]:
+    """The origin of each point by the number of originals in the manifest."""
+    root = scene.source.root if scene.source else Path()
+    total = len(scene.points)
+    source = np.full(total, GENERATED, np.uint8)
+    source[: _num_original(root / MANIFEST, total)] = ORIGINAL
+    return source
+
+
+def _added_note(points: PointCloud) -> str:
+    """What the user should know of points that are not originals; nothing if there are none."""
+    added = len(points) - points.num_original
+    if not added:
+        return ""
+    return (
+        f"{added:,} of the points were added by splatseed to {points.num_original:,} originals;"
+        " upsampling again would replace them."
+    )
+
+
+def _num_original(manifest: Path, total: int) -> int:
+    """How many of ``total`` points are originals; all unless a manifest of this cloud says so."""
+    try:
+        facts = json.loads(manifest.read_text(encoding="utf-8"))
+        num_points, num_original = facts["num_points"], facts["num_original"]
+    except (OSError, ValueError, TypeError, KeyError):
+        return total  # no manifest, or somebody else's file of that name
+    fits = num_points == total and isinstance(num_original, int) and 0 < num_original < total
+    return num_original if fits else total
+
+
+def _first(tracks: Tracks, n: int) -> Tracks:
+    """The tracks of the first ``n`` points."""
+    if n >= len(tracks):
+        return tracks
+    end = int(tracks.offsets[n])
+    return Tracks(
+        tracks.point_ids[:n],
+        tracks.xyz[:n],
+        tracks.errors[:n],
+        tracks.offsets[: n + 1],
+        tracks.image_ids[:end],
+        tracks.point2d_idx[:end],
+    )

@@ -1,0 +1,173 @@
+"""The two sets of files that trainers look for: COLMAP's, and nerfstudio's ``transforms.json``.
+
+Notation: ``keep`` [N] marks the scene's points that ``points`` is made of. Promise: every point
+file in a layout holds the same points in the same order, ``seeds.npz`` too; COLMAP's root holds no PLY, for Brush
+takes any it finds there. Writers write straight into ``folder`` and let ``OSError`` pass.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+
+from splatseed.camera import Intrinsics
+from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io.colmap.ids import Renumbered, renumber
+from splatseed.io.colmap.scene import read_model_cameras
+from splatseed.io.nerfstudio.content import (
+    NERFSTUDIO_FROM_COLMAP,
+    frame_paths,
+    kept_json,
+    transforms_json,
+)
+from splatseed.io.nerfstudio.transforms import apply_transform, read_transforms
+from splatseed.io.output.image_folders import frame_folders, image_folders
+from splatseed.io.output.seeds_npz import write_seeds
+from splatseed.io.ply.points import write_ply
+from splatseed.io.split import MODEL_LISTS, ROOT_LISTS, split_fields
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+
+__all__ = ["write_colmap", "write_json", "write_transforms"]
+
+_ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json")  # gsplat's examples read them if present
+_MODEL_EXTRAS = ("depth_params.json", *MODEL_LISTS)  # graphdeco's trainer reads them if present
+_RIG_FILES = ("rigs", "frames")
+
+
+def write_colmap(
+    scene: Scene, points: PointCloud, keep: Bool[np.ndarray, " N"], folder: Path
+) -> tuple[list[str], dict[str, Path]]:
+    """Write ``sparse/0``; returns notes for the user and the image folders that belong to it."""
+    model_dir = folder / "sparse" / "0"
+    model_dir.mkdir(parents=True)
+    model = renumber(scene, keep)
+    colmap_binary.write_cameras(model_dir / "cameras.bin", _all_cameras(scene))
+    colmap_binary.write_images(model_dir / "images.bin", model.images)
+    colmap_binary.write_points3d(model_dir / "points3D.bin", points, model.tracks)
+    write_ply(model_dir / "points3D.ply", points)
+    write_seeds(folder, points)
+    notes = [*_copy_extras(scene, folder, model_dir), *_model_notes(scene, model)]
+    _write_lists(scene, folder)
+    return notes, image_folders(scene)
+
+
+def write_transforms(
+    scene: Scene, points: PointCloud, _keep: Bool[np.ndarray, " N"], folder: Path
+) -> tuple[list[str], dict[str, Path]]:
+    """Write ``transforms.json`` and its PLY; returns notes and the image folders it names."""
+    source = scene.source
+    if source is not None and source.transforms_path is not None:
+        names = {image.name for image in scene.images}
+        content = kept_json(read_transforms(source.transforms_path), names)
+        paths = frame_paths(content["frames"])
+        if source.image_dir is not None and source.image_dir.resolve() == source.root.resolve():
+            paths += names  # a frame's own path may lack the extension
+        folders = frame_folders(source.root, paths)
+    else:
+        content = {**transforms_json(scene), **split_fields(scene)}
+        folders = image_folders(scene)
+        points = _in_nerfstudio_space(points)
+    write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
+    write_ply(folder / "sparse_pc.ply", points)
+    shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
+    write_seeds(folder, points)
+    if scene.source is not None:
+        _copy(scene.source.root, ROOT_LISTS, folder)
+    return [], folders
+
+
+def _in_nerfstudio_space(points: PointCloud) -> PointCloud:
+    """The points, and their normals, as nerfstudio turns those of a COLMAP model."""
+    xyz = apply_transform(NERFSTUDIO_FROM_COLMAP, points.xyz).astype(np.float32)
+    if points.normals is None:
+        return points.replace(xyz=xyz)
+    return points.replace(xyz=xyz, normals=points.normals @ NERFSTUDIO_FROM_COLMAP[:, :3].T)
+
+
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write readable JSON; paths and other foreign values become text, NumPy scalars numbers."""
+
+    def plain(value: Any) -> object:
+        return value.item() if isinstance(value, np.generic) else str(value)
+
+    path.write_text(json.dumps(content, indent=2, default=plain) + "\n", encoding="utf-8")
+
+
+def _all_cameras(scene: Scene) -> tuple[Intrinsics, ...]:
+    """The file's camera records, and those that only images know (in scenes made in memory)."""
+    cameras = {camera.camera_id: camera for camera in scene.intrinsics}
+    for image in scene.images:
+        cameras.setdefault(image.intrinsics.camera_id, image.intrinsics)
+    return tuple(cameras.values())
+
+
+def _copy_extras(scene: Scene, folder: Path, model_dir: Path) -> list[str]:
+    """Copy the small files beside the model byte for byte; returns notes."""
+    source = scene.source
+    if source is None or source.model_dir is None:
+        return []
+    rigs, notes = _rigs(scene, source.model_dir)
+    _copy(source.root, _ROOT_EXTRAS, folder)
+    _copy(source.model_dir, (*_MODEL_EXTRAS, *rigs), model_dir)
+    return notes
+
+
+def _copy(source: Path, names: Sequence[str], target: Path) -> None:
+    for name in names:
+        if (source / name).is_file():
+            shutil.copyfile(source / name, target / name)
+
+
+def _write_lists(scene: Scene, folder: Path) -> None:
+    """The lists of the scene's split: its own, or, if a transforms.json has it, as nerfstudio reads them."""
+    if scene.source is not None:
+        _copy(scene.source.root, ROOT_LISTS, folder)
+    if scene.listed is None or any((folder / name).exists() for name in ROOT_LISTS):
+        return
+    for part, images in zip(ROOT_LISTS, scene.split(), strict=False):  # train and test
+        text = "".join(f"{image.name}\n" for image in images)
+        (folder / part).write_text(text, "utf-8")
+
+
+def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
+    """The model's rigs and frames if they hold for the output too, else a note why not."""
+    there = [f"{name}.bin" for name in _RIG_FILES if (model_dir / f"{name}.bin").is_file()]
+    if there and _has_all_images(scene, model_dir):
+        return there, []
+    if there:
+        return [], ["Rigs and frames were left out: the scene no longer has the same images."]
+    if any((model_dir / f"{name}.txt").is_file() for name in _RIG_FILES):
+        return [], [
+            "Rigs and frames were left out: as text they would not be read beside the binary model."
+        ]
+    return [], []
+
+
+def _has_all_images(scene: Scene, model_dir: Path) -> bool:
+    """Whether the scene still has the very images of its model."""
+    _, images = read_model_cameras(model_dir)
+    return {(im.image_id, im.name) for im in images} == {
+        (im.image_id, im.name) for im in scene.images
+    }
+
+
+def _model_notes(scene: Scene, model: Renumbered) -> list[str]:
+    notes = []
+    if model.num_broken:
+        notes.append(
+            f"{model.num_broken} references between features and points were taken out: the other"
+            " side did not confirm them."
+        )
+    if not scene.images:
+        notes.append(
+            "The scene has no images, so it cannot be trained as it is: copy points3D.bin and"
+            " points3D.ply from sparse/0 into sparse/0 of the full scene."
+        )
+    return notes

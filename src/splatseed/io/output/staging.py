@@ -1,0 +1,270 @@
+"""Output that is there whole or not at all.
+
+Notation: the *target* is what the user named, the *partial* a hidden sibling ``.NAME.partial-XXXX``
+that is written first and renamed to the target at the end; a *leftover* is the partial of a process that
+was killed, which the next one for the same target removes. Promise: whatever interrupts the writing
+(an error, a full disk, Ctrl-C), the partial is removed and an older output is still there unharmed;
+an ``OSError`` becomes an ``OutputError`` that says what to do, and what cannot be removed is named.
+"""
+
+from __future__ import annotations
+
+import errno
+import secrets
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from splatseed.errors import OutputError
+from splatseed.io.output.leftovers import held, remove_leftovers, remove_tree
+from splatseed.io.output.manifest import MANIFEST, add_files, kind_of, seal, why_kept
+
+__all__ = [
+    "MANIFEST",
+    "add_files",
+    "atomic_file",
+    "check_apart",
+    "check_output",
+    "kind_of",
+    "output_folder",
+]
+
+_NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
+_NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}
+
+
+@contextmanager
+def output_folder(
+    path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
+) -> Iterator[Path]:
+    """A folder to write into that appears at ``path`` when the block ends without an error.
+
+    Missing parents are made. An empty folder at ``path`` is used up; a full one is replaced only
+    with ``overwrite``, and only if its ``splatseed.json`` says that the same kind wrote it and lists
+    all that is in it. That of the new one is written at the end, with what the block has put there.
+
+    Args:
+        path: Where the output is to be.
+        kind: What writes it, a verb of the command line if it has one.
+        overwrite: Whether an earlier output of this kind may be replaced.
+        protect: Files and folders that are read: the output may be neither one of them, nor inside
+            one, nor around one.
+
+    Yields:
+        The partial folder, empty.
+
+    Raises:
+        OutputError: ``path`` is taken or protected, or writing failed.
+    """
+    check_output(path, kind=kind, overwrite=overwrite, protect=protect)
+    target = _resolved(path)
+    remove_leftovers(target)
+    partial = _partial_name(target)
+    with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
+        try:
+            partial.mkdir()
+            hold()
+            yield partial
+            seal(partial, kind)
+            _put_in_place(partial, target, kind)
+        except BaseException as error:
+            _remove_after(error, partial)
+            raise
+
+
+def check_output(
+    path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
+) -> None:
+    """Refuse what ``output_folder`` would refuse, before any work is done; arguments as there.
+
+    Raises:
+        OutputError: ``path`` is taken or protected.
+    """
+    check_apart(path, protect)
+    target = _resolved(path)
+    _check_replaceable(target, kind, overwrite=overwrite)
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """A file name to write to; the file appears at ``path`` when the block ends without an error.
+
+    The name keeps the suffix, by which image writers choose the format. Missing parents are made,
+    and a file that is there is replaced.
+
+    Args:
+        path: Where the file is to be.
+
+    Yields:
+        The name of the partial file, which does not exist yet.
+
+    Raises:
+        OutputError: ``path`` is a folder or a device, or writing failed.
+    """
+    target = _resolved(path)
+    if target.exists() and not target.is_file():  # a device would be replaced by a file
+        found = "a folder" if target.is_dir() else "a device or a pipe"
+        raise OutputError(f"a file name at {target}", found=found, fix="Choose another name.")
+    partial = _partial_name(target, target.suffix)
+    with _oserror_as_output_error(target), _parents(target.parent):
+        try:
+            yield partial
+            partial.replace(target)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+
+
+def _resolved(path: Path) -> Path:
+    try:
+        return Path(path).resolve()
+    except (OSError, RuntimeError):  # RuntimeError before Python 3.13
+        raise OutputError(
+            f"a name at {path}",
+            found="a link that leads back to itself",
+            fix="Remove the link, or choose another name.",
+        ) from None
+
+
+def _partial_name(target: Path, suffix: str = "") -> Path:
+    return target.with_name(f".{target.name}.partial-{secrets.token_hex(4)}{suffix}")
+
+
+def check_apart(path: Path, protect: Sequence[Path]) -> None:
+    """Refuse an output that is one of ``protect``, lies inside one, or around one.
+
+    Raises:
+        OutputError: It is, or does.
+    """
+    target = _resolved(path)
+    for source in (_resolved(kept) for kept in protect):
+        if target == source or source in target.parents or target in source.parents:
+            raise OutputError(
+                "an output folder apart from the input",
+                found=f"{target}, which is, holds or lies in the input {source}",
+                fix="Choose a folder beside the input.",
+            )
+    here = Path.cwd()
+    if target == here or target in here.parents:
+        raise OutputError(
+            "an output folder that can be put in place whole",
+            found=f"{target}, which holds the working directory",
+            fix="Name a new folder.",
+        )
+
+
+def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
+    with _oserror_as_output_error(target):
+        if not target.exists() or (target.is_dir() and not any(target.iterdir())):
+            return
+    kept: tuple[str, str] | None
+    if not target.is_dir():
+        kept = "a file", "Choose another name."
+    else:
+        with _oserror_as_output_error(target):
+            kept = why_kept(target, kind)
+        if kept is None and not overwrite:
+            kept = "an earlier output", "Pass --overwrite to replace it, or choose another name."
+    if kept is not None:
+        found, fix = kept
+        raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
+
+
+@contextmanager
+def _parents(folder: Path) -> Iterator[None]:
+    """Make ``folder`` and its parents; take those made away again on an error."""
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        for each in missing:
+            with suppress(OSError):
+                each.rmdir()
+        raise
+
+
+def _put_in_place(partial: Path, target: Path, kind: str) -> None:
+    """Rename ``partial`` to ``target``; what was there steps aside and comes back on failure."""
+    if not target.exists():
+        partial.rename(target)
+        return
+    old = target.with_name(f".{target.name}.old-{secrets.token_hex(4)}")
+    try:
+        target.rename(old)
+        partial.rename(target)
+    except BaseException:
+        if not target.exists():
+            _restore(old, target)
+        raise
+    finally:
+        if old.exists() and target.exists():
+            _discard(old, target, kind)
+
+
+def _restore(old: Path, target: Path) -> None:
+    try:
+        old.rename(target)
+    except OSError as error:
+        raise OutputError(
+            f"the earlier output, set aside as {old}, to be put back",
+            found=_reason(error),
+            fix=f"Rename it to {target} yourself.",
+        ) from error
+
+
+def _discard(old: Path, target: Path, kind: str) -> None:
+    """Remove the earlier output, now that the new one is in its place."""
+    try:
+        kept = why_kept(old, kind) if any(old.iterdir()) else None
+        if kept is not None:  # somebody wrote there while we worked
+            raise OutputError(
+                f"nothing but the earlier output in {target}",
+                found=kept[0],
+                fix=f"The new output is complete there; the earlier one was kept as {old}.",
+            )
+        remove_tree(old)
+    except OSError as error:
+        raise OutputError(
+            f"the earlier output, set aside as {old}, to be removed",
+            found=_reason(error),
+            fix=f"Remove it yourself; the new output is complete at {target}.",
+        ) from error
+
+
+def _remove_after(failure: BaseException, partial: Path) -> None:
+    """Remove what an interrupted block has written, or say where it is."""
+    try:
+        remove_tree(partial)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        cause = f"{type(failure).__name__}: {failure}".rstrip(": ")
+        raise OutputError(
+            f"{partial}, left by a failure ({cause}), to be removed",
+            found=_reason(error),
+            fix="Remove it yourself before you try again.",
+        ) from failure
+
+
+def _reason(error: OSError) -> str:
+    where = f" at {error.filename}" if error.filename else ""
+    return f"{error.strerror or type(error).__name__}{where}"
+
+
+@contextmanager
+def _oserror_as_output_error(target: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _NO_SPACE:
+            fix = "Free some space, or choose another disk."
+        elif error.errno in _NO_PERMISSION:
+            fix = "Choose a folder that you may write to."
+        else:
+            fix = "Check the disk and try again."
+        raise OutputError(
+            f"{target} to be written",
+            found=_reason(error),
+            fix=f"{fix} Nothing half-written was left behind.",
+        ) from error

@@ -1,0 +1,1 @@
+"""PLY files: points, and what of trained Gaussians is recognised without being read."""

@@ -1,0 +1,1 @@
+"""Captures of cameras with a depth sensor, in the layouts of Replica and TUM."""

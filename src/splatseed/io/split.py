@@ -1,0 +1,131 @@
+"""Which images are for training and which for the test, where a scene has files that say so.
+
+Notation: a *list* is a text file with one image name a line. Promise: the first of these is followed,
+and told of: ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) of a transforms.json, as
+nerfstudio writes them; ``train_list.txt``, ``test_list.txt`` (else ``validation_list.txt``) in the scene's folder, as its
+COLMAP reader has them; ``test.txt`` in the model's folder (graphdeco); ``train.txt`` and ``test.txt`` in the
+scene's. A list whose names fit no image is left aside, and told of too.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+from splatseed.io.files import read_bytes
+from splatseed.scene import Scene, Split
+
+__all__ = ["MODEL_LISTS", "ROOT_LISTS", "follow_lists", "split_fields"]
+
+ROOT_LISTS = ("train_list.txt", "test_list.txt", "validation_list.txt", "train.txt", "test.txt")
+"""Lists in a scene's folder."""
+MODEL_LISTS = ("test.txt",)
+"""Lists beside a COLMAP model."""
+_PARTS = ("train", "test", "val")
+
+
+class _Lists(NamedTuple):
+    """Names for training, test and validation; empty where there is no list."""
+
+    origin: str
+    train: Sequence[str]
+    test: Sequence[str]
+    validation: Sequence[str] = ()
+
+
+def follow_lists(scene: Scene) -> Scene:
+    """The scene with the split of its lists, if it has some.
+
+    Raises:
+        SceneFormatError: A list cannot be read.
+    """
+    if scene.source is None or not scene.images or scene.listed is not None:
+        return scene
+    warnings = list(scene.warnings)
+    for lists in _lists(scene):
+        split = _split(scene, lists)
+        if split is not None:
+            return scene.replace(listed=split, warnings=tuple(warnings))
+        warnings.append(f"{lists.origin} was left aside: no split of the images comes of it.")
+    return scene.replace(warnings=tuple(warnings))
+
+
+def split_fields(scene: Scene) -> dict[str, list[str]]:
+    """The fields by which a new ``transforms.json`` tells nerfstudio of a split; none without one."""
+    if scene.listed is None:
+        return {}
+    train, test = scene.split()
+    parts = {"train": train, "test": test, "val": test}
+    return {
+        f"{part}_filenames": [f"images/{image.name}" for image in images]
+        for part, images in parts.items()
+    }
+
+
+def _lists(scene: Scene) -> Iterator[_Lists]:
+    """All lists of a scene that are there, those first that go first."""
+    source = scene.source
+    assert source is not None  # noqa: S101  (checked by the caller)
+    if source.transforms_path is not None:
+        fields = json.loads(read_bytes(source.transforms_path))
+        parts = [_names(fields, f"{part}_filenames") for part in _PARTS]
+        if any(parts):
+            yield _Lists("list of file names in transforms.json", *parts)
+    read = {name: _read(source.root / name) for name in ROOT_LISTS}
+    if any(read[name] for name in ROOT_LISTS[:3]):
+        there = " and ".join(name for name in ROOT_LISTS[:3] if read[name])
+        yield _Lists(there, *(read[name] for name in ROOT_LISTS[:3]))
+    if source.model_dir is not None and (names := _read(source.model_dir / MODEL_LISTS[0])):
+        yield _Lists(f"{MODEL_LISTS[0]} beside the model", (), names)
+    if any(read[name] for name in ROOT_LISTS[3:]):
+        there = " and ".join(name for name in ROOT_LISTS[3:] if read[name])
+        yield _Lists(there, read["train.txt"], read["test.txt"])
+
+
+def _names(fields: Mapping[str, Any], key: str) -> list[str]:
+    names = fields.get(key)
+    return [each for each in names if isinstance(each, str)] if isinstance(names, list) else []
+
+
+def _read(path: Path) -> list[str]:
+    if not path.is_file():
+        return []
+    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
+    return [line.strip() for line in lines if line.strip()]
+
+
+def _split(scene: Scene, lists: _Lists) -> Split | None:
+    """The split of the images; None if one part would be empty."""
+    names = [image.name for image in scene.images]
+    folder = scene.source.image_dir if scene.source else None
+    prefixes = ("", "images/", f"{folder.name}/" if folder else "")
+    train, test, validation = (_known(names, each, prefixes) for each in lists[1:])
+    test = test or validation
+    if lists.train and not lists.test and not lists.validation:
+        test = frozenset(names) - train
+    if not lists.train:
+        train = frozenset(names) - test
+    train -= test
+    return Split(train, test, lists.origin) if train and test else None
+
+
+def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str]) -> frozenset[str]:
+    """Those names that are listed: as they are, within their folder, or by file name or its stem."""
+    whole = {_plain(each) for each in listed}
+    found = frozenset(n for n in names if any(f"{prefix}{n}" in whole for prefix in prefixes))
+    if found:
+        return found
+    for field in ("name", "stem"):
+        parts = [getattr(PurePosixPath(name), field) for name in names]
+        if len(set(parts)) == len(parts):  # else it would not say which image is meant
+            wanted = {getattr(PurePosixPath(each), field) for each in whole}
+            found = frozenset(n for n, own in zip(names, parts, strict=True) if own in wanted)
+            if found:
+                return found
+    return frozenset()
+
+
+def _plain(name: str) -> str:
+    return name.replace("\\", "/").removeprefix("./")

@@ -1,0 +1,1 @@
+"""This process and its children: memory, and the interpreter that children run in."""

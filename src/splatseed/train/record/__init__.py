@@ -1,0 +1,1 @@
+"""What a run leaves on disk: its settings, its curve, its folder."""

@@ -1,0 +1,96 @@
+"""The curve of a run: loss, PSNR and number of Gaussians, as a table and as a picture.
+
+Notation: a record is taken every so many steps; its loss is the mean since the record before.
+Promise: both files appear whole or not at all, so that a run can be looked at while it goes on.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from splatseed.io.output.staging import atomic_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["Record", "write_curve_csv", "write_curve_png"]
+
+
+class Record(NamedTuple):
+    """How far a run was."""
+
+    step: int
+    """Steps done."""
+    seconds: float
+    """Spent training, without reading, scoring and writing."""
+    loss: float
+    """Mean since the last record."""
+    train_psnr: float
+    """Of the last photograph shown, dB."""
+    test_psnr: float | None
+    """Mean over the test views, dB; None where it was not taken."""
+    num_gaussians: int
+
+
+def write_curve_csv(path: Path, records: Sequence[Record]) -> None:
+    """Write one row a record, with a header; a PSNR not taken is left blank.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(Record._fields)
+        writer.writerows(records)
+
+
+def write_curve_png(path: Path, records: Sequence[Record]) -> None:
+    """Draw loss, PSNR and number of Gaussians over the steps, one below the other.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    figure = Figure(figsize=(7.0, 7.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    top, middle, bottom = figure.subplots(3, 1, sharex=True)
+    _draw_loss(top, records)
+    _draw_psnr(middle, records)
+    _draw_count(bottom, records)
+    with atomic_file(path) as partial:
+        figure.savefig(partial, dpi=100)
+
+
+def _draw_loss(axes: Axes, records: Sequence[Record]) -> None:
+    axes.semilogy([r.step for r in records], [r.loss for r in records], color="C3")
+    axes.set_ylabel("loss")
+    axes.grid(visible=True, which="both", alpha=0.3)
+
+
+def _draw_psnr(axes: Axes, records: Sequence[Record]) -> None:
+    axes.plot(
+        [r.step for r in records],
+        [r.train_psnr for r in records],
+        color="C0",
+        alpha=0.35,
+        label="training, single photographs",
+    )
+    tested = [(r.step, r.test_psnr) for r in records if r.test_psnr is not None]
+    axes.plot(*zip(*tested, strict=True), "o-", color="C0", label="test, mean")
+    axes.set_ylabel("PSNR, dB")
+    axes.legend(loc="lower right")
+    axes.grid(visible=True, alpha=0.3)
+
+
+def _draw_count(axes: Axes, records: Sequence[Record]) -> None:
+    axes.plot([r.step for r in records], [r.num_gaussians for r in records], color="C2")
+    axes.set_ylim(bottom=0)
+    axes.set_ylabel("Gaussians")
+    axes.set_xlabel("step")
+    axes.yaxis.set_major_formatter("{x:,.0f}")
+    axes.grid(visible=True, alpha=0.3)

@@ -1,0 +1,170 @@
+"""The folder of a run: what lies where, and who may write there.
+
+Promise: a folder that splatseed did not write is never touched; an earlier run is replaced only on
+request, and not before the new one is ready to start.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splatseed.errors import OutputError, SceneFormatError
+from splatseed.io.output.staging import MANIFEST, add_files, atomic_file, check_apart, check_output
+
+__all__ = ["RunFolder", "write_json"]
+
+
+KIND = "train"
+"""What a run's folder is marked as."""
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A run's folder.
+
+    Args:
+        path: Where it is, or will be.
+    """
+
+    path: Path
+
+    @property
+    def config(self) -> Path:
+        """The scene and the settings, as JSON."""
+        return self.path / "config.json"
+
+    @property
+    def checkpoint(self) -> Path:
+        """What an unfinished run goes on from."""
+        return self.path / "checkpoint.pt"
+
+    @property
+    def metrics(self) -> Path:
+        """The scores, as JSON; there once the run has finished."""
+        return self.path / "metrics.json"
+
+    @property
+    def gaussians(self) -> Path:
+        """The trained Gaussians."""
+        return self.path / "point_cloud.ply"
+
+    @property
+    def curve_csv(self) -> Path:
+        """The curve as a table."""
+        return self.path / "curve.csv"
+
+    @property
+    def curve_png(self) -> Path:
+        """The curve as a picture."""
+        return self.path / "curve.png"
+
+    @property
+    def renders(self) -> Path:
+        """Test views beside the truth."""
+        return self.path / "renders"
+
+    @property
+    def tensorboard(self) -> Path:
+        """TensorBoard's log, if asked for."""
+        return self.path / "tensorboard"
+
+    @property
+    def is_run(self) -> bool:
+        """Whether a run has begun here."""
+        return (self.path / MANIFEST).is_file() and self.config.is_file()
+
+    def check(self, *, overwrite: bool, resume: bool, protect: Sequence[Path]) -> None:
+        """Refuse a folder that must not be written to, before any work is done.
+
+        Raises:
+            OutputError: It is taken or protected.
+        """
+        if resume and self.metrics.is_file():
+            raise OutputError(
+                f"an unfinished run to go on with at {self.path}",
+                found="a finished one",
+                fix="See its metrics.json, or pass --overwrite to train again.",
+            )
+        if resume and self.is_run:
+            check_apart(self.path, protect)
+            return
+        check_output(self.path, kind=KIND, overwrite=overwrite or self.is_run, protect=protect)
+        if self.is_run and not overwrite:
+            raise OutputError(
+                f"no folder, or an empty one, at {self.path}",
+                found="an earlier run",
+                fix="Pass --resume to go on with it, --overwrite to replace it, or choose another.",
+            )
+
+    def begin(self, config: Mapping[str, object]) -> None:
+        """Make the folder, empty but for the config; what ``check`` let pass is removed.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        try:
+            if self.path.exists():
+                shutil.rmtree(self.path)
+        except OSError as error:
+            raise OutputError(
+                f"the earlier run at {self.path} to be removed",
+                found=error.strerror or type(error).__name__,
+                fix="Remove it yourself, or choose another folder.",
+            ) from None
+        # The mark first: a run that is cut off here can be replaced.
+        files = [self.config, self.checkpoint, self.metrics, self.gaussians]
+        files += [self.curve_csv, self.curve_png, self.path / MANIFEST]
+        mark = {"command": KIND, "version": config["splatseed"]}
+        write_json(self.path / MANIFEST, {**mark, "files": [path.name for path in files]})
+        write_json(self.config, config)
+
+    def claim(self, paths: Iterable[Path]) -> None:
+        """List files in the folder as the run's own, before or after they are written.
+
+        Raises:
+            OutputError: The list cannot be written.
+        """
+        names = [path.relative_to(self.path).as_posix() for path in paths]
+        try:
+            add_files(self.path, names)
+        except OSError as error:
+            raise OutputError(
+                f"{self.path / MANIFEST} to be written",
+                found=error.strerror or type(error).__name__,
+                fix="Check the disk and try again.",
+            ) from None
+
+    def read_config(self) -> dict[str, Any]:
+        """What ``begin`` wrote.
+
+        Raises:
+            SceneFormatError: It is no JSON object.
+        """
+        try:
+            config = json.loads(self.config.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise _unreadable(self.config, type(error).__name__) from None
+        if not isinstance(config, dict):
+            raise _unreadable(self.config, type(config).__name__)
+        return config
+
+
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write a JSON object.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    with atomic_file(path) as partial:
+        partial.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+
+
+def _unreadable(path: Path, found: str) -> SceneFormatError:
+    return SceneFormatError(
+        f"{path} to be the config of a run", found=found, fix="Start again with --overwrite."
+    )

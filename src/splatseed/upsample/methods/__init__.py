@@ -1,0 +1,1 @@
+"""The paper's methods, one file each."""

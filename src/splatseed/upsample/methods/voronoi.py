@@ -1,0 +1,143 @@
+"""Voronoi upsampling (paper, eq. 6): new points where the originals leave room.
+
+A cell is drawn with probability proportional to its volume, and the point is uniform in the ball
+(c_i, r_i / 2) about the cell's centre; its colour comes from the 5 nearest originals.
+
+Default: cells are clamped to half the distance of the 25th neighbour (``voronoi_cells``), and the
+draw is by the volume relative to the median of the neighbours', capped at 8: otherwise all new
+points go to the sparse background, most of them outside the scene.
+Paper: SciPy's Voronoi cells of the originals and the corners of the bounding box enlarged by 10%,
+drawn by volume (``voronoi_box``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.kernels.jit import kernel, parallel_range
+from splatseed.progress import Progress, blocks
+from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
+from splatseed.upsample.colors import interpolate_colors
+from splatseed.upsample.method import NewPoints, require
+from splatseed.upsample.nearest import NearestMethod
+from splatseed.upsample.neighbors import Neighbors, PreparedCloud, draw_bases
+from splatseed.upsample.surfaces.frames import local_frames
+
+__all__ = ["Voronoi"]
+
+BLOCK = 1 << 14
+
+
+@dataclass(frozen=True)
+class Voronoi(NearestMethod):
+    """Points in the Voronoi cells of the originals, more where cells are large (eq. 6).
+
+    Example:
+        >>> import numpy as np, splatseed as ss
+        >>> xyz = np.random.default_rng(0).random((200, 3))
+        >>> more, _ = ss.upsample_points(xyz, np.zeros((200, 3), np.uint8), method="voronoi")
+        >>> more.shape
+        (800, 3)
+    """
+
+    k: int = 25
+    """Neighbours that shape a cell; half the distance of the last bounds it."""
+    cells: Literal["clamped", "box"] = "clamped"
+    """Cells clamped to their neighbourhood, or Qhull's in the enlarged bounding box (paper: box)."""
+    ball: float = 0.5
+    """Radius of the ball that takes new points, as a share of the cell's radius (paper: 0.5)."""
+    color_k: int = 5
+    """Nearest originals that colour a new point (paper: 5)."""
+    max_weight: float = 8.0
+    """Cap on a cell's volume relative to the median of its neighbours' (clamped cells only)."""
+
+    min_points: ClassVar[int] = 4
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(4 <= self.k <= MAX_NEIGHBORS, f"voronoi.k from 4 to {MAX_NEIGHBORS}", self.k)
+        require(0 < self.ball <= 1, "voronoi.ball above 0 and up to 1", self.ball)
+        require(1 <= self.color_k <= self.k, "voronoi.color_k from 1 to voronoi.k", self.color_k)
+        require(self.max_weight >= 1, "voronoi.max_weight of at least 1", self.max_weight)
+
+    @classmethod
+    def paper(cls) -> Self:
+        """Cells in the bounding box enlarged by 10%, drawn by volume alone."""
+        return cls(cells="box", reject_isolated=False)
+
+    def __call__(
+        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+    ) -> NewPoints:
+        """Build every cell, draw by volume, and put ``num_new`` points in the cells' balls."""
+        neighbors, weight = self.neighborhoods(cloud, self.k)
+        neighbors = neighbors.nearest(self.k)
+        frames, _ = local_frames(cloud.xyz, neighbors.idx)
+        if self.cells == "box":
+            from splatseed.upsample.cells.box import box_cells  # noqa: PLC0415  (SciPy's Qhull)
+
+            center, radius, volume = box_cells(cloud, progress)
+            weight = weight * volume
+        else:
+            center, radius, volume, _ = _clamped_cells(cloud, neighbors, frames, progress)
+            weight = weight * _relative(volume, neighbors, self.max_weight)
+        bases = draw_bases(cloud, num_new, rng, weight=weight)
+        xyz = rng.random((num_new, 3), dtype=np.float32)
+        _place(
+            cloud.xyz, cloud.center, center, self.ball * radius, frames,
+            bases.start, bases.count, xyz,
+        )  # fmt: skip
+        return NewPoints(
+            xyz, interpolate_colors(cloud, neighbors.nearest(self.color_k), bases, xyz)
+        )
+
+
+def _clamped_cells(
+    cloud: PreparedCloud,
+    neighbors: Neighbors,
+    frames: Float64[np.ndarray, "n 3 3"],
+    progress: Progress,
+) -> Cells:
+    """The cells of all rows, block by block."""
+    n = len(cloud)
+    cells = Cells(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, bool))
+    for first, last in blocks(n, BLOCK, "voronoi", progress):
+        build_cells(cloud.xyz, neighbors.idx, neighbors.distance, frames, first, last, cells)
+    return cells
+
+
+def _relative(
+    volume: Float64[np.ndarray, " n"], neighbors: Neighbors, cap: float
+) -> Float64[np.ndarray, " n"]:
+    """Each volume relative to the median of its neighbours', at most ``cap``, [n]."""
+    relative = np.empty_like(volume)
+    _relative_volume(volume, neighbors.idx, float(cap), relative)
+    return relative
+
+
+@kernel
+def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]
+    for i in parallel_range(len(volume)):
+        around = np.sort(volume[idx[i]])
+        median = 0.5 * (around[(around.size - 1) // 2] + around[around.size // 2])
+        relative[i] = min(volume[i] / median, cap) if median > 0.0 else 1.0
+
+
+@kernel
+def _place(xyz, site_center, center, radius, frames, start, count, out):  # type: ignore[no-untyped-def]
+    """Uniform in each cell's ball, in place of the draws in ``out``; directions turn with frames."""
+    for i in parallel_range(len(xyz)):
+        for m in range(start[i], start[i] + count[i]):
+            r = radius[i] * np.float64(out[m, 0]) ** (1.0 / 3.0)
+            n = 2.0 * np.float64(out[m, 1]) - 1.0
+            angle = 2.0 * math.pi * np.float64(out[m, 2])
+            ring = math.sqrt(max(1.0 - n * n, 0.0))
+            u, v = ring * math.cos(angle), ring * math.sin(angle)
+            for axis in range(3):
+                direction = u * frames[i, 0, axis] + v * frames[i, 1, axis] + n * frames[i, 2, axis]
+                local = xyz[i, axis] + center[i, axis] + r * direction
+                out[m, axis] = site_center[axis] + local

@@ -1,0 +1,1 @@
+"""Height fields over neighbourhoods: frames, patches, where to sample, splines."""

@@ -1,0 +1,87 @@
+"""The frame of every method that fits a height field: neighbours, frames, places, heights, colours."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from jaxtyping import Float32
+
+from splatseed.progress import Progress, blocks
+from splatseed.upsample.colors import interpolate_colors
+from splatseed.upsample.method import NewPoints, require
+from splatseed.upsample.nearest import NearestMethod
+from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud, draw_bases
+from splatseed.upsample.surfaces.frames import local_frames, world_frames
+from splatseed.upsample.surfaces.patches import Patches, lift
+from splatseed.upsample.surfaces.placement import place_in_box, place_in_triangle, place_on_disc
+
+__all__ = ["PatchMethod"]
+
+BLOCK = 1 << 13
+MIN_NEIGHBORS = 3
+
+
+@dataclass(frozen=True)
+class PatchMethod(NearestMethod, ABC):
+    """Base of the methods that fit a height field to the neighbours of a base point."""
+
+    k: int = 16
+    """Neighbours in a fit."""
+    frame: Literal["local", "world"] = "local"
+    """Axes of the fit: the neighbourhood's principal axes, or the world's (paper: world)."""
+    placement: Literal["disc", "triangle", "box"] = "disc"
+    """Where: a disc (covers best), a triangle of neighbours (most exact), a box (paper: box)."""
+    disc_radius: float = 1.5
+    """Radius of the disc in units of the base point's spacing."""
+    clamp: float | None = 0.25
+    """How far a height may leave the neighbours' range, as a share of it (paper: no limit)."""
+
+    min_points: ClassVar[int] = 4
+    name: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.k >= MIN_NEIGHBORS, f"{self.name}.k of at least {MIN_NEIGHBORS}", self.k)
+        require(self.disc_radius > 0, f"{self.name}.disc_radius above 0", self.disc_radius)
+        require(
+            self.clamp is None or self.clamp >= 0, f"{self.name}.clamp of at least 0", self.clamp
+        )
+
+    @abstractmethod
+    def heights(
+        self, patches: Patches, first: int, last: int, out: Float32[np.ndarray, " M"]
+    ) -> None:
+        """Fit rows ``first:last`` and write S(u, v) of all their outputs into ``out`` [M]."""
+
+    def __call__(
+        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+    ) -> NewPoints:
+        """Fit a patch to every base and put ``num_new`` points on them."""
+        neighbors, weight = self.neighborhoods(cloud, self.k)
+        neighbors = neighbors.nearest(self.k)
+        bases = draw_bases(cloud, num_new, rng, weight=weight)
+        patches = self._place(cloud, neighbors, bases, rng)
+        height = np.empty(num_new, np.float32)
+        for first, last in blocks(len(cloud), BLOCK, self.name, progress):
+            self.heights(patches, first, last, height)
+        xyz = lift(patches, height, self.clamp)
+        return NewPoints(xyz, interpolate_colors(cloud, neighbors, bases, xyz))
+
+    def _place(
+        self, cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, rng: np.random.Generator
+    ) -> Patches:
+        """Stand a patch on every row and choose where its new points go."""
+        if self.frame == "local":
+            frames, collinear = local_frames(cloud.xyz, neighbors.idx)
+        else:
+            frames, collinear = world_frames(len(cloud))
+        if self.placement == "disc":
+            uv = place_on_disc(neighbors, bases, collinear, self.disc_radius, rng)
+        elif self.placement == "triangle":
+            uv = place_in_triangle(cloud, neighbors, bases, frames, rng)
+        else:
+            uv = place_in_box(cloud, neighbors, bases, frames, rng)
+        return Patches(cloud, neighbors, bases, frames, collinear, uv)

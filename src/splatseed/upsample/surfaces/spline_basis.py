@@ -1,0 +1,147 @@
+"""The tensor-product cubic B-spline of a patch: its basis, its roughness and its evaluation.
+
+Notation: C = 6 control values a side on the domain [-1, 1] (3 uniform intervals); coefficients
+c[a, b] lie flat as c[6 a + b]; S(u, v) = sum_ab B_a(u) B_b(v) c[a, b]. On a patch, u and v are
+scaled by the neighbours' largest |u| and |v|, and z by 1.5 times the k-th distance, so that every
+patch poses the same problem whatever the scene's units.
+Penalty: a discrete thin plate, D2'D2 x I + 2 D1'D1 x D1'D1 + I x D2'D2 (after P. Eilers and B. Marx,
+Flexible smoothing with B-splines and penalties, 1996, with the cross term of a thin plate). Its null
+space is the planes, so that strong smoothing tends to the least-squares plane.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int8
+
+from splatseed.kernels.jit import inline, kernel, parallel_range
+from splatseed.upsample.surfaces.patches import Patches
+
+__all__ = ["CONTROL", "PatchBasis", "evaluate", "patch_basis", "penalty"]
+
+CONTROL = 6
+HEIGHT_UNIT = 1.5
+LINE = 1e-6
+"""Least extent along v, as a share of the k-th distance: a line has none."""
+
+
+def penalty() -> Float64[np.ndarray, "36 36"]:
+    """The penalty matrix P, so that roughness = c' P c."""
+    identity = np.eye(CONTROL)
+    first = np.diff(identity, axis=0)
+    second = np.diff(identity, n=2, axis=0)
+    slopes, bends = first.T @ first, second.T @ second
+    return np.asarray(
+        np.kron(bends, identity) + 2.0 * np.kron(slopes, slopes) + np.kron(identity, bends)
+    )
+
+
+class PatchBasis(NamedTuple):
+    """The basis at the m = k + 1 data points of some rows; the base point is the last of each."""
+
+    weight: Float64[np.ndarray, "rows m 2 4"]
+    """The four non-zero cubic B-splines along u and along v."""
+    cell: Int8[np.ndarray, "rows m 2"]
+    """Index of the first of them."""
+    z: Float64[np.ndarray, "rows m"]
+    """Scaled heights."""
+    scale: Float64[np.ndarray, "rows 3"]
+    """Scene units per unit of u, v and z."""
+
+
+def patch_basis(patches: Patches, first: int, last: int) -> PatchBasis:
+    """The basis at the data points of rows ``first:last``; rows without outputs are left empty."""
+    rows, m = last - first, patches.neighbors.k + 1
+    basis = PatchBasis(
+        np.zeros((rows, m, 2, 4)), np.zeros((rows, m, 2), np.int8), np.zeros((rows, m)),
+        np.ones((rows, 3)),
+    )  # fmt: skip
+    _patch_basis(
+        patches.cloud.xyz, patches.neighbors.idx, patches.neighbors.distance, patches.frames,
+        patches.bases.count, first, last, *basis,
+    )  # fmt: skip
+    return basis
+
+
+def evaluate(
+    patches: Patches,
+    coefficients: Float64[np.ndarray, "rows 36"],
+    scale: Float64[np.ndarray, "rows 3"],
+    first: int,
+    last: int,
+    out: Float32[np.ndarray, " M"],
+) -> None:
+    """Write S(u, v), in scene units, of all outputs of rows ``first:last`` into ``out``.
+
+    Places outside the domain get the height of the nearest place in it.
+    """
+    _evaluate(
+        patches.bases.start, patches.bases.count, patches.uv, coefficients, scale, first, last, out
+    )
+
+
+@kernel
+def _patch_basis(xyz, idx, distance, frames, count, first, last, weight, cell, z, scale):  # type: ignore[no-untyped-def]
+    for i in parallel_range(first, last):
+        if count[i] > 0:
+            row = i - first
+            points = _local_points(xyz, i, idx[i], frames[i], distance[i, -1], scale[row])
+            for j in range(len(points)):
+                for axis in range(2):
+                    where, w0, w1, w2, w3 = _weights(points[j, axis])
+                    cell[row, j, axis] = where
+                    weight[row, j, axis, 0], weight[row, j, axis, 1] = w0, w1
+                    weight[row, j, axis, 2], weight[row, j, axis, 3] = w2, w3
+                z[row, j] = points[j, 2]
+
+
+@inline
+def _local_points(xyz, i, rows, frame, reach, scale):  # type: ignore[no-untyped-def]
+    """Scaled (u, v, z) of the neighbours and, last, the base [k + 1, 3]; fills the scales."""
+    k = rows.size
+    points = np.zeros((k + 1, 3))
+    scale[0], scale[1], scale[2] = LINE * reach, LINE * reach, HEIGHT_UNIT * reach
+    for j in range(k):
+        for axis in range(3):
+            step = xyz[rows[j], axis] - xyz[i, axis]
+            for out_axis in range(3):
+                points[j, out_axis] += step * frame[out_axis, axis]
+        scale[0], scale[1] = max(scale[0], abs(points[j, 0])), max(scale[1], abs(points[j, 1]))
+    for j in range(k):
+        for axis in range(3):
+            points[j, axis] /= scale[axis]
+    return points
+
+
+@inline
+def _weights(t):  # type: ignore[no-untyped-def]
+    """First control index and the four uniform cubic B-splines at t in [-1, 1]."""
+    x = (t + 1.0) * 0.5 * (CONTROL - 3)
+    cell = min(max(int(x), 0), CONTROL - 4)
+    f = x - cell
+    g = 1.0 - f
+    return (
+        cell,
+        g * g * g / 6.0,
+        (3.0 * f * f * f - 6.0 * f * f + 4.0) / 6.0,
+        (3.0 * g * g * g - 6.0 * g * g + 4.0) / 6.0,
+        f * f * f / 6.0,
+    )
+
+
+@kernel
+def _evaluate(start, count, uv, coefficients, scale, first, last, out):  # type: ignore[no-untyped-def]
+    for i in parallel_range(first, last):
+        c, unit = coefficients[i - first], scale[i - first]
+        for m in range(start[i], start[i] + count[i]):
+            u = min(max(np.float64(uv[m, 0]) / unit[0], -1.0), 1.0)
+            v = min(max(np.float64(uv[m, 1]) / unit[1], -1.0), 1.0)
+            ua, u0, u1, u2, u3 = _weights(u)
+            va, v0, v1, v2, v3 = _weights(v)
+            total = 0.0
+            for a, wu in enumerate((u0, u1, u2, u3)):
+                p = CONTROL * (ua + a) + va
+                total += wu * (v0 * c[p] + v1 * c[p + 1] + v2 * c[p + 2] + v3 * c[p + 3])
+            out[m] = unit[2] * total

@@ -1,0 +1,82 @@
+"""Estimates: in proportion to the work, and by what has been measured where something has."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from splatseed.bench.planning.estimate import Estimator
+from splatseed.bench.planning.records import SFM, Arm, ImageScore, RunResult, RunRow, RunSpec
+from splatseed.bench.planning.scenes import SceneFacts
+
+FACTS = SceneFacts("room", "", "ab12", num_points=10_000, num_images=80, pixels=800 * 600)
+SPEC = RunSpec("room", "ab12", Arm("mls", "default", 8, "none"), repeat=0, max_steps=1000)
+SCORES = (ImageScore("a.png", 21.5, 0.8, None),)
+RESULT = RunResult(
+    21.5, 0.8, None, SCORES, (), 80_000, 80_000, 1888, 0.2, 500.0, 0.01, 10**9, "CPU"
+)
+
+
+def _row(spec=SPEC, seconds=530.0, **changes):
+    result = dataclasses.replace(RESULT, **changes)
+    return RunRow(spec, "done", result, started=1000.0, finished=1000.0 + seconds)
+
+
+def _spec(**changes):
+    return dataclasses.replace(SPEC, **changes)
+
+
+def test_more_work_takes_longer():
+    estimator = Estimator([FACTS], [])
+    base = estimator.seconds(SPEC)
+    sfm = Arm(SFM, "default", 1, "none")
+    for less in (_spec(max_steps=500), _spec(data_factor=2), _spec(arm=sfm), _spec(cap_max=9)):
+        assert estimator.seconds(less) < base
+    assert estimator.seconds(_spec(arm=Arm("mls", "default", 8, "default"))) > base
+    assert Estimator([FACTS], [], threads=8).seconds(SPEC) < base
+    assert estimator.seconds(_spec(backend="cuda")) < base
+    assert estimator.disk(SPEC, models=True) - estimator.disk(SPEC, models=False) == pytest.approx(
+        80_000 * 59 * 4
+    )
+    assert estimator.checkpoint(SPEC) == pytest.approx(3 * 80_000 * 59 * 4)
+
+
+def test_a_run_like_one_that_is_done_takes_as_long():
+    estimator = Estimator([FACTS], [_row()])
+    assert estimator.num_measured == 1
+    assert estimator.seconds(SPEC) == pytest.approx(530)
+    assert estimator.seconds(_spec(max_steps=2000)) == pytest.approx(1030)
+
+
+def test_one_slow_run_does_not_spoil_the_estimate():
+    rows = [_row(seconds=530.0), _row(seconds=540.0), _row(train_seconds=9000.0, seconds=9030.0)]
+    assert Estimator([FACTS], rows).seconds(SPEC) == pytest.approx(530)
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc", "none"])
+def test_conventions_do_not_change_what_is_guessed_of_growth(strategy):
+    estimator = Estimator([FACTS], [])
+    own, in_3dgs = (Arm(SFM, "default", 1, name) for name in (strategy, f"{strategy}-3dgs"))
+    assert estimator.checkpoint(_spec(arm=own)) == estimator.checkpoint(_spec(arm=in_3dgs))
+
+
+def test_growth_is_learnt_by_strategy_and_ratio():
+    arm = Arm("mls", "default", 8, "default")
+    grown = _row(_spec(arm=arm), num_gaussians=400_000)
+    estimator = Estimator([FACTS], [grown])
+    assert estimator.checkpoint(_spec(arm=arm)) == pytest.approx(3 * 400_000 * 59 * 4)
+    assert estimator.checkpoint(SPEC) == pytest.approx(3 * 80_000 * 59 * 4)
+    sfm = Arm(SFM, "default", 1, "default")  # as long as nothing better is known
+    assert estimator.checkpoint(_spec(arm=sfm)) == pytest.approx(3 * 50_000 * 59 * 4)
+    few = _row(_spec(arm=sfm), num_seeds=10_000, num_gaussians=200_000)
+    estimator = Estimator([FACTS], [grown, few])
+    assert estimator.checkpoint(_spec(arm=sfm)) == pytest.approx(3 * 200_000 * 59 * 4)
+    assert estimator.checkpoint(_spec(arm=arm)) == pytest.approx(3 * 400_000 * 59 * 4)
+    capped = _spec(arm=arm, cap_max=100_000)
+    assert estimator.checkpoint(capped) == pytest.approx(3 * 100_000 * 59 * 4)
+
+
+def test_runs_of_scenes_that_are_not_known_tell_nothing():
+    elsewhere = _row(_spec(scene_digest="other"))
+    assert Estimator([FACTS], [elsewhere, RunRow(SPEC)]).num_measured == 0

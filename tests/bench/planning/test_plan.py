@@ -1,0 +1,219 @@
+"""Plans: what is in them, what files say, which runs they are, and when two runs are the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene, plan_runs
+from splatseed.bench.planning.plan_file import KINDS, plan_text, read_plan
+from splatseed.bench.planning.records import SFM, Arm
+from splatseed.bench.planning.scenes import survey
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene, write_scene
+from splatseed.train.settings import StrategyName
+
+TEXTS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20)
+RATIOS = st.floats(1, 1e6, exclude_min=True)
+
+
+def _written(plan, tmp_path):
+    path = tmp_path / "plan.toml"
+    path.write_text(plan_text(plan), "utf-8")
+    return read_plan(path)
+
+
+def _some(strategy):
+    return st.lists(strategy, min_size=1, max_size=3, unique=True).map(tuple)
+
+
+PLANS = st.builds(
+    Plan,
+    methods=_some(st.sampled_from(["sfm", "linear", "mls", "depth"])),
+    ratios=_some(RATIOS),
+    strategies=_some(st.sampled_from(get_args(StrategyName))),
+    profiles=_some(st.sampled_from(["default", "paper"])),
+    repeats=st.integers(1, 9),
+    cap_max=st.none() | st.integers(2, 10**9),
+    lpips=st.booleans(),
+    scenes=st.lists(
+        st.builds(
+            PlannedScene,
+            path=TEXTS.map(lambda text: f"/{text}"),
+            name=TEXTS,
+            images=st.just("") | TEXTS,
+            depth=st.just("") | TEXTS.map(lambda text: f"/{text}"),
+        ),
+        max_size=3,
+        unique_by=lambda scene: scene.name,
+    ).map(tuple),
+    parameters=st.just({}) | st.just({"mls": {"k": 12}, "depth": {"align": False}}),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(PLANS)
+def test_a_plan_survives_its_file(tmp_path_factory, plan):
+    again = _written(plan, tmp_path_factory.mktemp("plan"))
+    assert dataclasses.replace(again, scenes=()) == dataclasses.replace(plan, scenes=())
+    for a, b in zip(again.scenes, plan.scenes, strict=True):
+        assert (a.name, a.images, bool(a.depth)) == (b.name, b.images, bool(b.depth))
+        assert (Path(a.path), Path(a.depth)) == (Path(b.path), Path(b.depth))
+
+
+def test_a_file_has_a_key_for_each_field():
+    assert set(KINDS) == {each.name for each in dataclasses.fields(Plan)}
+    assert set(tomllib.loads(plan_text(Plan(cap_max=5)))) == set(KINDS) - {"scenes", "parameters"}
+
+
+def test_paths_in_a_file_are_beside_it(tmp_path):
+    (tmp_path / "plan.toml").write_text(
+        '[[scenes]]\npath = "garden"\ndepth = "d"\n[[scenes]]\npath = "demo:"\n'
+    )
+    garden, demo = read_plan(tmp_path / "plan.toml").scenes
+    assert (garden.path, garden.depth) == (str(tmp_path / "garden"), str(tmp_path / "d"))
+    assert (garden.label, demo.label, demo.path) == ("garden", "demo", DEMO)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("repeats = ", "plan.toml to be a plan in TOML"),
+        ("reapeats = 3", "'reapeats'"),
+        ('repeats = "3"', "repeats in .* to be a whole number"),
+        ("repeats = true", "repeats in .* to be a whole number"),
+        ("repeats = 0", "repeats of 1 or more in"),
+        ("ratios = [true]", "ratios in .* to be a list of numbers"),
+        ("ratios = [0.5]", "ratios above 1"),
+        ("ratios = []", "ratios of at least one"),
+        ("ratios = [4, 4.0]", "4.0 twice"),
+        ('methods = ["sfm", "magic"]', "magic"),
+        ('methods = "sfm"', "methods in .* to be a list"),
+        ('strategies = ["mcmcm"]', "mcmcm"),
+        ('backend = "gpu"', "found gpu"),
+        ("max_steps = 0", "max-steps of 1 or more in"),
+        ("scenes = [1]", r"headed \[\[scenes\]\]"),
+        ("[[scenes]]\nname = 'x'", "a path for each"),
+        ("[[scenes]]\npath = 'x'\nfolder = 'y'", "scenes.folder"),
+        ("[[scenes]]\npath = 'a/x'\n[[scenes]]\npath = 'b/x'", "x twice"),
+        ("[parameters.mls]\nneighbours = 3", "neighbours"),
+        ("[parameters.mls]\nk = -3", "mls.k"),
+        ("[parameters]\nmls = 3", "parameters.mls in .* to be a table"),
+        ("[parameters.magic]\nk = 1", "magic"),
+    ],
+)
+def test_bad_files_are_refused_by_key(tmp_path, text, said):
+    (tmp_path / "plan.toml").write_text(text)
+    with pytest.raises(SceneFormatError, match=said) as error:
+        read_plan(tmp_path / "plan.toml")
+    assert "plan.toml" in str(error.value)
+
+
+def test_files_that_are_not_there_and_paths_that_are_no_text(tmp_path):
+    with pytest.raises(SceneNotFoundError):
+        read_plan(tmp_path / "none.toml")
+    with pytest.raises(ParameterError, match="valid text"):
+        Plan(scenes=(PlannedScene("odd\udcff"),))
+
+
+def test_arms_are_all_combinations_and_the_original_cloud_once():
+    plan = Plan(methods=("linear", "sfm", "random"), ratios=(4, 8), profiles=("default", "paper"))
+    assert [arm.label for arm in plan.arms("none")] == [
+        "sfm", "linear 4x", "linear 8x", "linear 4x (paper)", "linear 8x (paper)",
+        "random 4x", "random 8x",  # whose profiles are the same
+    ]  # fmt: skip
+    assert plan.arms("mcmc")[0] == Arm(SFM, "default", 1, "mcmc")
+
+
+def test_runs_repeat_only_when_all_have_been_run(small_plan, room_path):
+    plan = dataclasses.replace(small_plan, strategies=("none", "default"), repeats=3)
+    facts = survey(room_path, "room")
+    runs = plan_runs(plan, [facts, dataclasses.replace(facts, name="other")], "cpu", "1")
+    assert [run.repeat for run in runs] == [0] * 8 + [1] * 8 + [2] * 8
+    assert len({run.key for run in runs}) == 24
+    assert runs[0].arm.method == SFM
+    assert {run.settings.seed for run in runs} == {0, 1, 2}
+
+
+def test_depth_needs_maps_and_never_sees_the_test_photographs(small_plan, room_path, tmp_path):
+    plan = dataclasses.replace(small_plan, methods=("sfm", "depth"), repeats=1)
+    without = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
+    assert [run.arm.method for run in without] == [SFM]
+    facts = survey(room_path, "room", with_depth=True)
+    assert facts.depth_path == str(room_path)
+    _, depth = plan_runs(plan, [facts], "cpu", "1")
+    assert depth.parameters == {"hold_out": plan.test_every}
+    assert depth.depth_digest == facts.depth_digest
+    with pytest.raises(SceneNotFoundError, match="folder of depth maps"):
+        survey(room_path, "room", depth=tmp_path / "none", with_depth=True)
+
+
+def test_a_stray_camera_is_named_before_anything_is_run(room_path, tmp_path):
+    scene = load_scene(room_path)
+    first, *others = scene.images
+    far = dataclasses.replace(first, translation=first.translation + np.array([0, 0, 1e4]))
+    write_scene(scene.replace(images=(far, *others)), tmp_path / "stray")
+    (said,) = survey(tmp_path / "stray", "stray").warnings
+    assert first.name in said
+    assert survey(room_path, "room").warnings == ()
+
+
+def test_a_scene_is_known_by_its_content(room_path, own_room):
+    before = survey(room_path, "room", with_depth=True)
+    copy = survey(own_room, "room", with_depth=True)
+    assert copy.path != before.path
+    assert (copy.digest, copy.depth_digest) == (before.digest, before.depth_digest)
+    photograph = next((own_room / "images").iterdir())
+    photograph.write_bytes(photograph.read_bytes() + b"\0")
+    assert survey(own_room, "room").digest != before.digest
+    depth = sorted((own_room / "depths").glob("*.png"))
+    depth[0].write_bytes(depth[1].read_bytes())
+    after = survey(own_room, "room", with_depth=True)
+    assert after.depth_digest != before.depth_digest
+
+
+def test_a_survey_says_what_there_is(room_path):
+    facts = survey(room_path, "room")
+    scene = load_scene(room_path)
+    assert (facts.num_images, facts.pixels) == (9, 64 * 48)
+    assert facts.num_points == len(scene.points)
+    assert (facts.depth_path, facts.depth_digest) == ("", "")
+
+
+def test_another_folder_of_photographs_can_be_named(own_room):
+    (own_room / "images").rename(own_room / "images_4")
+    (own_room / "images").mkdir()
+    facts = survey(own_room, "room", images="images_4")
+    assert facts.images == "images_4"
+    with pytest.raises(SceneNotFoundError, match="images_2"):
+        survey(own_room, "room", images="images_2")
+
+
+def test_what_would_fail_every_run_is_found_before(own_room):
+    missing = own_room / "images" / "view_003.png"
+    missing.unlink()
+    with pytest.raises(SceneNotFoundError, match=r"view_003\.png"):
+        survey(own_room, "room")
+    for each in (own_room / "sparse" / "0").iterdir():
+        if not each.name.startswith("points3D"):
+            each.unlink()
+    with pytest.raises(SceneNotFoundError, match="photographs in"):
+        survey(own_room, "room")
+
+
+def test_the_plan_of_the_published_results_is_the_one_they_tell_of():
+    folder = Path(__file__).parents[3] / "docs" / "results"
+    plan = read_plan(folder / "plan.toml")
+    told = (folder / "README.md").read_text("utf-8")
+    assert [each.label for each in plan.scenes] == ["bonsai", "fox", "fern", "treehill", "demo"]
+    scenes, kinds, strategies = len(plan.scenes), len(plan.methods), len(plan.strategies)
+    runs = scenes * kinds * strategies * plan.repeats
+    assert f"{scenes} x {kinds} x {strategies} x {plan.repeats} = {runs} runs" in told
+    assert f"{plan.max_steps} steps" in told
+    assert f"{plan.cap_max:,} Gaussians" in told

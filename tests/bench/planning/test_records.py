@@ -1,0 +1,53 @@
+"""Specifications and results of runs survive JSON, and keys tell runs apart."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from splatseed.bench.planning.records import SFM, Arm, CurvePoint, ImageScore, RunResult, RunSpec
+
+ARM = Arm("mls", "default", 8, "none")
+SPEC = RunSpec("room", "ab12", ARM, repeat=0, max_steps=100, parameters={"k": 12}, version="1")
+
+
+def test_specs_survive_json():
+    assert RunSpec.from_json(SPEC.to_json()) == SPEC
+    assert RunSpec.from_json(SPEC.to_json()).key == SPEC.key
+
+
+def test_results_survive_json():
+    result = RunResult(
+        21.5, 0.8, None, (ImageScore("a.png", 21.5, 0.8, None),), (CurvePoint(5, 0.1, 20.0, 7),),
+        7, 8, 1888, 0.2, 1.5, 0.01, 10**9, "CPU",
+    )  # fmt: skip
+    assert RunResult.from_json(result.to_json()) == result
+
+
+def test_where_a_scene_lies_is_no_part_of_the_key():
+    there = dataclasses.replace(SPEC, scene_path="/a", depth_path="/b", images="images_4")
+    assert there.key == SPEC.key
+
+
+def test_a_whole_ratio_may_be_written_either_way():
+    assert dataclasses.replace(SPEC, arm=Arm("mls", "default", 8.0, "none")).key == SPEC.key
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"scene": "x"}, {"scene_digest": "x"}, {"repeat": 1}, {"max_steps": 101}, {"data_factor": 2},
+     {"test_every": 4}, {"cap_max": 9}, {"sh_degree": 0}, {"backend": "cuda"}, {"version": "2"},
+     {"opacity_reset": True}, {"parameters": {"k": 13}}, {"depth_digest": "x"},
+     {"arm": Arm("mls", "default", 4, "none")}, {"arm": Arm("mls", "paper", 8, "none")},
+     {"arm": Arm("mls", "default", 8, "mcmc")}, {"arm": Arm("linear", "default", 8, "none")}],
+)  # fmt: skip
+def test_all_else_is(change):
+    assert dataclasses.replace(SPEC, **change).key != SPEC.key
+
+
+def test_settings_and_labels():
+    assert (SPEC.settings.strategy, SPEC.settings.seed) == ("none", 0)
+    assert ARM.label == "mls 8x"
+    assert Arm(SFM, "default", 1, "none").label == "sfm"
+    assert Arm("mls", "paper", 4, "none").label == "mls 4x (paper)"

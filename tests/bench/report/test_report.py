@@ -1,0 +1,374 @@
+"""Reports of ledgers whole, partial, failed and empty; and the page in a browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from splatseed.bench.analysis.gains import gains
+from splatseed.bench.analysis.study import studies
+from splatseed.bench.analysis.summary import summary
+from splatseed.bench.analysis.tables import Cell, Table, words
+from splatseed.bench.planning.digest import scene_digest
+from splatseed.bench.planning.records import SFM, RunRow
+from splatseed.bench.report import pictures as report_pictures
+from splatseed.bench.report.html import slider, table
+from splatseed.bench.report.pictures import safe_name
+from splatseed.bench.report.views import compared_views
+from splatseed.bench.report.write import REPORT, write_report
+from splatseed.bench.running.kept import kept_folder
+from splatseed.bench.running.ledger import LEDGER, Ledger
+from splatseed.cli import main
+from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene
+from splatseed.splat.pictures import beside_truth, write_picture
+from splatseed.synthetic import make_capture, write_capture
+
+from ..browser import CHROMIUM, chromium
+from ..planted import GAINS, result, rows, spec
+
+GONE = {"scene_path": "gone"}
+
+
+def write_ledger(bench, found):
+    """A benchmark's folder with these rows."""
+    bench.mkdir(exist_ok=True)
+    ledger = Ledger.open(bench / LEDGER)
+    ledger.add([row.spec for row in found])
+    for row in found:
+        if row.status == "done":
+            ledger.finish(row.spec.key, row.result)
+        elif row.status == "failed":
+            ledger.claim("w", {row.spec.key})
+            ledger.fail(row.spec.key, "w", row.error)
+    ledger.note_session({"command": "splatseed bench --scenes <A> 'b c'", "cpu": "abacus",
+                         "memory_bytes": 8 * 10**9, "versions": {"torch": "2.13"}})  # fmt: skip
+    return bench
+
+
+class Outline(HTMLParser):
+    """Tags that are opened and not closed, ids, and addresses."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.ids, self.addresses, self.words = [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        told = dict(attrs)
+        self.ids += [told["id"]] if "id" in told else []
+        self.addresses += [told[name] for name in ("src", "href") if name in told]
+        if tag not in {"meta", "img", "input", "br", "link"}:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+def outline(bench):
+    found = Outline((bench / REPORT).read_text("utf-8"))
+    assert not found.open
+    assert len(set(found.ids)) == len(found.ids)
+    assert all(each.startswith(("data:", "#")) for each in found.addresses)
+    assert {each[1:] for each in found.addresses if each[0] == "#"} <= set(found.ids)
+    return found
+
+
+def text_of(bench):
+    return " ".join(" ".join(outline(bench).words).split())
+
+
+def test_a_whole_ledger(tmp_path):
+    bench = write_ledger(tmp_path / "b", rows(strategies=("default", "none"), **GONE))
+    report = write_report(bench)
+    found = outline(bench)
+    assert {"summary", "scores", "gains", "convergence", "cost", "guidelines", "setup"} <= set(
+        found.ids
+    )
+    names = {path.name for path in (bench / "tables").iterdir()}
+    assert {f"{name}.{kind}" for name in ("table1_none", "table2_default", "table3_none",
+            "gains_none", "mean_gains", "convergence_default", "gain_by_ratio", "gain_by_strategy",
+            "equal_count", "winners_none") for kind in ("csv", "md", "tex")} <= names  # fmt: skip
+    figures = {path.name for path in (bench / "figures").iterdir()}
+    assert {"psnr_steps_none.png", "psnr_seconds_default.png", "gain_by_scene_none.png",
+            "gain_by_ratio.png", "gain_by_strategy.png"} <= figures  # fmt: skip
+    assert (report.tables * 3, report.figures) == (len(names) - 1, len(figures) - 2)
+    assert "mls 8x most (+0.50 ± 0.01 dB)" in report.summary[0]
+    said = text_of(bench)
+    assert "splatseed bench --scenes <A> 'b c'" in said
+    assert "abacus" in said
+
+
+def test_3dgs_conventions_are_strategies_of_their_own(tmp_path):
+    bench = write_ledger(tmp_path / "b", rows(strategies=("default", "default-3dgs")))
+    write_report(bench)
+    names = {path.name for path in (bench / "tables").iterdir()}
+    assert {"gains_default.md", "gains_default-3dgs.md", "gain_by_strategy.md"} <= names
+    assert "default-3dgs" in text_of(bench)
+
+
+def test_a_partial_ledger_says_what_is_missing(tmp_path):
+    found = [dataclasses.replace(r, status="pending", result=None) if i % 5 == 2 else r
+             for i, r in enumerate(rows(**GONE))]  # fmt: skip
+    found[0] = RunRow(found[0].spec, "failed", error="expected a <b>cat</b>; found a dog")
+    write_report(write_ledger(tmp_path / "b", found))
+    said = text_of(tmp_path / "b")
+    assert "Failed runs: 1" in said
+    assert "expected a <b>cat</b>; found a dog" in said  # as text: tags were escaped
+    assert "Runs still missing: 12" in said
+    assert "60 runs, 47 done, 1 failed, 12 to do" in said
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        {"repeats": 1},
+        {"scenes": ("fox",)},
+        {"scenes": ("fox",), "repeats": 1},
+        {"gains": {(SFM, 1): 0.0}},
+        {"gains": {("mls", 8): 0.1}},
+        {"gains": {(SFM, 1): 0.0, ("mls", 8): 0.0}, "noise": 0.0},
+    ],
+)
+def test_little_is_enough(tmp_path, planted):
+    write_report(write_ledger(tmp_path / "b", rows(**planted, **GONE)))
+    assert "1,000 steps" in text_of(tmp_path / "b")
+
+
+def test_an_empty_ledger(tmp_path):
+    report = write_report(write_ledger(tmp_path / "b", []))
+    assert report.summary == ("No run is done yet.",)
+    assert "0 runs" in text_of(tmp_path / "b")
+
+
+def test_infinite_and_curveless_runs(tmp_path):
+    odd = [RunRow(spec("fox", "mls", 8, repeat=7, **GONE), "done", result(math.inf)),
+           RunRow(spec("fox", SFM, 1, repeat=8, **GONE), "done", result(25.0, curve=()))]  # fmt: skip
+    write_report(write_ledger(tmp_path / "b", [*rows(**GONE), *odd]))
+    assert "fox, mls 8x, none, 7" in text_of(tmp_path / "b")
+
+
+def test_sets_of_runs_have_their_own_files_and_links(tmp_path):
+    more = rows(max_steps=2000, scenes=("fox",), **GONE)
+    bench = write_ledger(tmp_path / "b", [*rows(**GONE), *more])
+    write_report(bench)
+    assert "set2_gains" in outline(bench).ids
+    assert (bench / "tables" / "set2_gains_none.csv").is_file()
+    assert "Set 2: 2,000 steps" in text_of(bench)
+
+
+def test_one_run_each_claims_nothing():
+    (study,) = studies(rows(repeats=1))
+    said = " ".join(summary(study, "none"))
+    assert "no gain can be claimed" in said
+    assert "better" not in said
+
+
+def test_the_answer_is_no_where_there_is_no_gain():
+    null = dict.fromkeys(GAINS, 0.0)
+    answers = [summary(studies(rows(gains=null, seed=s))[0], "none")[0] for s in range(8)]
+    assert sum("no gain beyond noise was found among 4 variants" in each for each in answers) >= 7
+
+
+def test_losses_are_told():
+    (study,) = studies(rows())
+    assert "Beyond noise, random 8x loses." in summary(study, "none")[0]
+
+
+def test_an_earlier_report_is_replaced_and_others_files_are_not(tmp_path):
+    bench = write_ledger(tmp_path / "b", rows(scenes=("fox",), repeats=2, **GONE))
+    write_report(bench)
+    first = (bench / REPORT).read_bytes()
+    write_report(bench)
+    assert (bench / REPORT).read_bytes() == first
+    (bench / "tables" / "mine.txt").write_text("mine", "utf-8")
+    with pytest.raises(OutputError, match=r"mine\.txt"):
+        write_report(bench)
+    assert (bench / "tables" / "mine.txt").read_text("utf-8") == "mine"
+
+
+def test_bad_folders_are_one_error(tmp_path, capsys):
+    with pytest.raises(SceneNotFoundError, match="ledger"):
+        write_report(tmp_path)
+    (tmp_path / LEDGER).write_text("no database", "utf-8")
+    with pytest.raises(SceneFormatError, match="ledger"):
+        write_report(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        main(["bench", "report", str(tmp_path / "nowhere")])
+    assert stop.value.code == 2
+    assert "expected a benchmark's ledger" in capsys.readouterr().err
+
+
+def test_the_command_says_what_it_found(tmp_path, capsys):
+    bench = write_ledger(tmp_path / "b", rows(scenes=("fox",), **GONE))
+    main(["bench", "report", str(bench), "--no-from-scenes"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 scene: yes, 3 of 4 variants gain more than noise" in said
+    assert str(bench / REPORT) in said
+
+
+def test_names_are_escaped_in_tables():
+    evil = Table("x", "<T>", ("<h>",), ((words('<script>"'),), (Cell(1.0, mark="<"),)), ("<n>",))
+    text = table(evil)
+    assert not re.search(r"<(script|T|h|n)\b", text)
+    assert slider('"<x>', {"<a>": b"", "b": b""}, 1.5).count("<x>") == 0
+    assert safe_name("../a b") == ".._a_b"
+
+
+CAPTURE = {"gains": {(SFM, 1): 0.0, ("linear", 2): 0.2, ("mls", 3): 0.5}, "repeats": 2}
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A made-up scene in files, with its fingerprint."""
+    made = make_capture(num_views=4, width=64, height=48)
+    path = write_capture(made, tmp_path_factory.mktemp("scenes") / "room")
+    scene = load_scene(path)
+    return path, scene_digest(scene, scene.source.image_dir)
+
+
+def with_capture(bench, capture, **changes):
+    """A ledger of runs on the capture, with the pictures that runs keep."""
+    path, digest = capture
+    found = [
+        dataclasses.replace(
+            row, spec=dataclasses.replace(row.spec, scene_digest=digest, scene_path=str(path))
+        )
+        for row in rows(scenes=("room",), **{**CAPTURE, **changes})
+    ]
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 255, (30, 40, 3), np.uint8)
+    for row in found:
+        folder = kept_folder(bench, row.spec.key) / "renders"
+        folder.mkdir(parents=True)
+        for name in ("view0.png", "view1.png"):
+            noise = 40 * rng.standard_normal(truth.shape)
+            render = np.clip(truth + noise, 0, 255).astype(np.float32) / 255
+            write_picture(folder / name, beside_truth(truth, render))
+    return write_ledger(bench, found)
+
+
+def test_seeds_and_views_are_shown(tmp_path, capture):
+    bench = with_capture(tmp_path / "b", capture)
+    report = write_report(bench)
+    assert not report.notes
+    assert len(list((bench / "figures").glob("clouds_room_*.png"))) == 1
+    said = text_of(bench)
+    assert "room: what training begins with." in said
+    assert "test view view0: mls 3x, the best on this scene" in said
+    assert "texture" in said
+    kept = json.loads((bench / "descriptors.json").read_text("utf-8"))
+    assert list(kept["scenes"]) == [capture[1]]
+
+
+def test_what_is_kept_is_not_made_again(tmp_path, capture, monkeypatch):
+    bench = with_capture(tmp_path / "b", capture)
+    write_report(bench)
+    first = (bench / REPORT).read_bytes()
+    monkeypatch.setattr(report_pictures, "open_unchanged", pytest.fail)
+    write_report(bench)
+    assert (bench / REPORT).read_bytes() == first
+
+
+def test_a_changed_scene_costs_its_pictures_alone(tmp_path, capture):
+    path, digest = capture
+    bench = with_capture(tmp_path / "b", (path, digest[::-1]))
+    report = write_report(bench)
+    assert "expected the files of" in report.notes[0]
+    assert "test view view0" in text_of(bench)
+
+
+def test_views_are_those_of_baseline_and_best(tmp_path, capture):
+    bench = with_capture(tmp_path / "b", capture)
+    (study,) = studies(Ledger.open(bench / LEDGER, read_only=True).rows())
+    first, second = compared_views(study, "none", bench)
+    assert (first.name, second.name, first.best.label) == ("view0", "view1", "mls 3x")
+    assert first.gain == gains(study, "none").on_scene["room", first.best].mean
+    assert list(first.pictures) == ["sfm", "mls 3x", "photograph", "error of sfm",
+                                    "error of mls 3x"]  # fmt: skip
+    assert first.shape == pytest.approx(40 / 30)
+    for picture in bench.glob("runs/*/renders/view0.png"):
+        picture.write_bytes(b"damaged")
+    assert [each.name for each in compared_views(study, "none", bench)] == ["view1"]
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory, capture):
+    """A report in a browser."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
+    bench = with_capture(tmp_path_factory.mktemp("bench") / "b", capture)
+    write_report(bench)
+    with chromium(tmp_path_factory.mktemp("profile")) as page:
+        yield page, bench / REPORT
+
+
+@pytest.mark.parametrize(("width", "dark"), [(1200, False), (390, False), (320, True)])
+def test_the_page_opens_alone_and_fits(opened, width, dark):
+    page, path = opened
+    page.open(path, width, dark=dark)
+    assert [url for url in page.requests if not url.startswith("data:")] == [
+        path.resolve().as_uri()
+    ]
+    assert not page.errors
+    assert page.run("document.documentElement.scrollWidth") == width
+    assert page.run("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+    # No text runs out of its own block, except where the block scrolls.
+    wide = "[...document.querySelectorAll('h1,h2,h3,p,figcaption,summary')]"
+    assert page.run(f"{wide}.filter(e => e.scrollWidth > e.clientWidth + 1).length") == 0
+
+
+def test_the_slider_slides(opened):
+    page, path = opened
+    page.open(path, 1200)
+    at = "document.querySelector('.stage').style.getPropertyValue('--at')"
+    assert page.run(at) == "50%"
+    page.run("document.querySelector('.compare').scrollIntoView({behavior: 'instant'})")
+    frame = page.run(
+        "(r => [r.left, r.top, r.width, r.height])"
+        "(document.querySelector('.stage').getBoundingClientRect())"
+    )
+    left, top, width, height = frame
+    page.drag(left + 0.25 * width, top + 0.5 * height)
+    assert page.run(at) == "25%"
+    page.run(
+        "(r => { r.value = 80; r.dispatchEvent(new Event('input')); })"
+        "(document.querySelector('.compare input'))"
+    )
+    assert page.run(at) == "80%"
+
+
+def test_any_two_pictures_can_be_compared(opened):
+    page, path = opened
+    page.open(path, 1200)
+    shown = (
+        "['left', 'right'].map(c =>"
+        " document.querySelector('.stage').querySelector('.' + c)?.alt.split(',')[0])"
+    )
+    assert page.run(shown) == ["sfm", "mls 3x"]
+    choose = (
+        "(s => { s.selectedIndex = %d; s.dispatchEvent(new Event('change')); })"
+        "(document.querySelectorAll('.compare select')[%d])"
+    )
+    page.run(choose % (2, 0))
+    assert page.run(shown) == ["photograph", "mls 3x"]
+    page.run(choose % (2, 1))
+    assert page.run(shown) == [None, "photograph"]
+    page.run(choose % (3, 0))
+    assert page.run(shown) == ["error of sfm", "photograph"]
+
+
+def test_links_lead_to_sections(opened):
+    page, path = opened
+    page.open(path, 390)
+    page.run("document.querySelector('nav a[href=\"#cost\"]').click()")
+    assert page.run("location.hash") == "#cost"

@@ -1,0 +1,63 @@
+"""``splatseed demo`` goes the whole way, and says what its numbers do not show."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from splatseed.commands.demo import command as demo
+from splatseed.errors import MissingDependencyError
+
+WORDS = ("demo", "--views", "4", "--ratio", "2", "--no-preview")
+
+
+def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
+    pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
+    out = tmp_path / "demo"
+    run = splatseed(*WORDS, "--preview", "-o", out, "--train-steps", "8")
+    assert run.code == 0, run
+    counts = {}
+    for name in ("sfm", "auto"):
+        metrics = json.loads((out / f"run_{name}/metrics.json").read_text())
+        config = json.loads((out / f"run_{name}/config.json").read_text())
+        assert metrics["steps"] == 8
+        assert config["strategy"] == "none"
+        counts[name] = metrics["num_gaussians"]
+        assert f"{metrics['psnr']:.2f}" in run.out
+    assert counts["auto"] > counts["sfm"]
+    assert "8 steps" in run.out  # when the SfM run reached its own last PSNR
+    assert "no error bars" in run.out
+    with Image.open(out / "preview_trained.png") as file:
+        pixels = np.asarray(file)
+    assert pixels.shape[1] > 3 * 400
+    assert pixels.shape[0] > 2 * 300
+    # What the demo says to run next works: its runs know their scenes by where they lie now.
+    again = splatseed("evaluate", out / "run_auto")
+    assert again.code == 0, again
+    assert f"{metrics['psnr']:.2f}" in again.out
+
+
+def test_without_pytorch_the_demo_says_what_to_install(splatseed, tmp_path, monkeypatch):
+    def absent(*_):
+        raise MissingDependencyError(
+            "the packages", found="no torch", fix="Install them: pip install 'torch>=2.4'."
+        )
+
+    monkeypatch.setattr(demo, "require", absent)
+    run = splatseed(*WORDS, "-o", tmp_path / "demo")
+    assert run.code == 0, run
+    assert "not trained: no torch installed" in run.out
+    assert "pip install 'torch>=2.4'" in run.out
+    assert "splatseed evaluate" not in run.out
+    assert not (tmp_path / "demo" / "run_sfm").exists()
+    assert (tmp_path / "demo" / "geometry.csv").is_file()
+
+
+def test_negative_steps_are_refused(splatseed, tmp_path):
+    run = splatseed(*WORDS, "--train-steps", "-1", "-o", tmp_path / "demo")
+    assert run.code == 2
+    assert "--train-steps" in run.err
+    assert not (tmp_path / "demo").exists()

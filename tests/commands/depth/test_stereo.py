@@ -1,0 +1,144 @@
+"""``splatseed depth --stereo``: from its words to maps, with the maps themselves put in its place."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import splatseed.stereo
+from splatseed.io import find_depths, load_scene
+from splatseed.synthetic import make_capture, write_capture
+
+from ...bent import bend
+from ...stereo_maps import true_maps
+
+
+@pytest.fixture(scope="session")
+def maps():
+    return true_maps(make_capture(0, num_views=12, width=120, height=90), 2)
+
+
+@pytest.fixture
+def stereo(monkeypatch, maps):
+    """Stereo that knows the truth; ``calls`` notes how it was asked, ``maps`` is what it answers."""
+    known = SimpleNamespace(calls=[], maps=maps)
+
+    def stereo_depths(scene, *, max_size=800, grid=4, seed=0, progress=None):
+        known.calls.append((len(scene.images), max_size, grid, seed))
+        progress("stereo", 1.0)
+        return known.maps
+
+    monkeypatch.setattr(splatseed.stereo, "stereo_depths", stereo_depths, raising=False)
+    return known
+
+
+def test_a_plain_folder(room, tmp_path, splatseed, stereo, maps):
+    out = tmp_path / "maps"
+    run = splatseed("depth", room, "--stereo", "-o", out)
+    assert (run.code, run.err) == (0, "")
+    assert stereo.calls == [(12, 800, 4, 0)]
+    assert "12 depth maps of 60 x 45: 9" in run.out  # 9x% of their pixels
+    assert f"--method depth --depth {out}" in run.out
+    depths = find_depths(load_scene(room), out)
+    assert depths.kind == "z"
+    np.testing.assert_allclose(depths.read(maps[3].name).values, maps[3].depth, rtol=1e-6)
+    assert json.loads((out / "splatseed.json").read_text())["options"]["stereo"] is True
+    assert splatseed("depth", room, "--stereo", "-o", out).code == 2  # it is there
+    assert splatseed("depth", room, "--stereo", "-o", out, "--overwrite").code == 0
+
+
+def test_options_reach_stereo(room, tmp_path, splatseed, stereo):
+    words = ("--stereo", "--max-size", 500, "--grid", 2, "--seed", 7)
+    assert splatseed("depth", room, *words, "-o", tmp_path / "maps").code == 0
+    assert stereo.calls == [(12, 500, 2, 7)]
+
+
+@pytest.mark.usefixtures("stereo")
+def test_a_workspace_and_the_command_to_fuse_it(room, tmp_path, splatseed):
+    out = tmp_path / "dense folder"
+    run = splatseed("depth", room, "--stereo", "--colmap", "-o", out)
+    assert (run.code, run.err) == (0, "")
+    line = next(line for line in run.out.splitlines() if "stereo_fusion" in line)
+    command = line.split(maxsplit=1)[1]
+    if shutil.which("colmap") is None:
+        pytest.skip("colmap is not installed: the command that was printed is not run")
+    subprocess.run(command, shell=True, check=True, capture_output=True)  # noqa: S602
+    assert (out / "fused.ply").stat().st_size > 10_000
+
+
+def test_a_distorted_capture_becomes_a_cloud_on_its_surfaces(tmp_path, splatseed):
+    """From its own stereo to COLMAP's fusion."""
+    capture = make_capture(0, num_views=16, width=160, height=120)
+    scene = write_capture(bend(capture), tmp_path / "bent")
+    out = tmp_path / "dense"
+    words = ("--stereo", "--colmap", "--grid", 2, "--preview")
+    run = splatseed("depth", scene, *words, "-o", out)
+    assert (run.code, run.err) == (0, "")
+    assert f"splatseed info {out} --depth {out}" in run.out
+    assert splatseed("info", out, "--depth", out).code == 0
+    if shutil.which("colmap") is None:
+        pytest.skip("colmap is not installed: the command that was printed is not run")
+    line = next(line for line in run.out.splitlines() if "stereo_fusion" in line)
+    subprocess.run(line.split()[1:], check=True, capture_output=True)
+    xyz = load_scene(out / "fused.ply").points.xyz
+    assert len(xyz) > 1_000
+    assert np.median(capture.surfaces.distance(xyz.astype(float))) < 0.01  # metres
+
+
+@pytest.mark.usefixtures("stereo")
+def test_a_plain_folder_of_a_distorted_capture_says_what_it_fits(tmp_path, splatseed):
+    capture = make_capture(0, num_views=12, width=120, height=90)
+    scene = write_capture(bend(capture), tmp_path / "bent")
+    run = splatseed("depth", scene, "--stereo", "-o", tmp_path / "maps")
+    assert "--colmap writes both" in run.out
+    assert "--method depth" not in run.out
+
+
+def test_an_image_that_nothing_confirms_is_named(room, tmp_path, splatseed, stereo, maps):
+    blind = replace(maps[0], depth=np.full_like(maps[0].depth, np.nan))
+    stereo.maps = (blind, *maps[1:])
+    run = splatseed("depth", room, "--stereo", "-o", tmp_path / "maps")
+    assert f"no other view confirms any pixel of: {blind.name}" in run.out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "either --model or --stereo; found neither"),
+        (("--stereo", "--model", "some"), "either --model or --stereo; found both"),
+        (("--stereo", "--batch", 2, "--depth-kind", "z"), "found --batch, --depth-kind"),
+        (("--model", "some", "--colmap"), "found --colmap"),
+        (("--model", "some", "--seed", 1), "add --stereo"),
+    ],
+)
+def test_bad_words_end_in_one_line_and_no_folder(words, said, room, tmp_path, splatseed):
+    run = splatseed("depth", room, *words, "-o", tmp_path / "d")
+    assert run.code == 2
+    assert said in run.err
+    assert run.err.count("\n") == 1
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_missing_photograph_is_found_before_any_work(own_room, tmp_path, splatseed, stereo):
+    scene = load_scene(own_room)
+    path = scene.source.image_dir / scene.images[-1].name
+    path.unlink()
+    run = splatseed("depth", own_room, "--stereo", "--colmap", "-o", tmp_path / "d")
+    assert run.code == 2
+    assert path.name in run.err
+    assert stereo.calls == []
+
+
+def test_stereo_has_the_options():
+    parameters = inspect.signature(splatseed.stereo.stereo_depths).parameters
+    fields = {field.name for field in dataclasses.fields(splatseed.stereo.StereoSettings)}
+    assert {"seed", "progress"} <= set(parameters)
+    assert {"max_size", "grid"} <= fields

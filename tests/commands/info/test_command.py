@@ -1,0 +1,100 @@
+"""``splatseed info`` on every kind of scene."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.io import load_scene, write_scene
+from splatseed.io.colmap.binary import write_cameras
+from splatseed.io.ply.points import write_ply
+from splatseed.pointcloud import PointCloud
+
+
+def _rows(out):
+    """Label to value, from the table."""
+    lines = [line.strip().split("  ", 1) for line in out.splitlines()]
+    return {line[0]: line[1].strip() for line in lines if len(line) == 2}
+
+
+def test_a_colmap_scene(room, splatseed):
+    run = splatseed("info", room)
+    assert (run.code, run.err) == (0, "")
+    scene, rows = load_scene(room), _rows(run.out)
+    assert rows["format"] == "colmap"
+    assert rows["cameras"] == "1 PINHOLE 120x90"
+    assert rows["images"] == "12 (10 to train, 2 to test)"
+    assert rows["points"] == f"{len(scene.points):,}"
+    assert rows["track length, images"].startswith(f"mean {scene.tracks.lengths.mean():.3g},")
+    assert rows["reprojection error, px"].startswith(f"mean {scene.tracks.errors.mean():.3f},")
+    low = [float(x) for x in rows["bounding box"].split()[:3]]
+    np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
+    assert run.out.splitlines()[-1].strip().startswith("splatseed upsample")
+
+
+def test_a_transforms_scene(room, tmp_path, splatseed):
+    write_scene(load_scene(room), tmp_path / "nerf", format="transforms")
+    rows = _rows(splatseed("info", tmp_path / "nerf").out)
+    assert (rows["format"], rows["tracks"]) == ("transforms", "none")
+    assert rows["images"] == "12 (10 to train, 2 to test)"
+
+
+def test_poses_without_points_ask_for_triangulation(room, tmp_path, splatseed):
+    write_scene(load_scene(room), tmp_path / "nerf", format="transforms")
+    for path in (tmp_path / "nerf").glob("*.ply"):
+        path.unlink()
+    run = splatseed("info", tmp_path / "nerf")
+    assert run.code == 0
+    assert _rows(run.out)["points"] == "none"
+    assert "there are no points" in run.out
+    assert f"--poses-from {tmp_path / 'nerf'}" in run.out
+    assert "nan" not in run.out
+
+
+def test_an_rgbd_capture(tmp_path, splatseed):
+    camera = {"w": 16, "h": 12, "fx": 10, "fy": 10, "cx": 8, "cy": 6}
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    (tmp_path / "results").mkdir()
+    PilImage.new("RGB", (16, 12)).save(tmp_path / "results/frame000000.jpg")
+    (tmp_path / "traj.txt").write_text(" ".join(str(x) for x in np.eye(4).ravel()) + "\n")
+    run = splatseed("info", tmp_path)
+    assert run.code == 0
+    assert _rows(run.out)["format"] == "rgbd"
+    assert f"splatseed sfm {tmp_path / 'results'}" in run.out
+
+
+@pytest.mark.parametrize(
+    ("xyz", "points", "finite"),
+    [(np.zeros((0, 3)), "none", True), (np.full((4, 3), np.nan), "4", False)],
+)
+def test_clouds_of_nothing(xyz, points, finite, tmp_path, splatseed):
+    write_ply(tmp_path / "cloud.ply", PointCloud(xyz, np.zeros(xyz.shape, np.uint8)))
+    run = splatseed("info", tmp_path / "cloud.ply")
+    assert run.code == 0
+    assert _rows(run.out)["points"] == points
+    assert ("not finite" in run.out) != finite
+    assert "nan" not in run.out
+
+
+def test_one_point_has_no_spacing(tmp_path, splatseed):
+    write_ply(tmp_path / "one.ply", PointCloud(np.ones((1, 3)), np.zeros((1, 3), np.uint8)))
+    rows = _rows(splatseed("info", tmp_path / "one.ply").out)
+    assert (rows["points"], rows["spacing 5/25/50/75/95%"]) == ("1", "none")
+
+
+def test_what_the_reader_found_odd_is_a_problem(own_room, splatseed):
+    shutil.rmtree(own_room / "images")
+    out = splatseed("info", own_room).out
+    assert "images folder is missing" in out.partition("problems")[2]
+
+
+def test_many_kinds_of_cameras_are_counted_not_listed(own_room, splatseed):
+    record = load_scene(own_room).intrinsics[0]
+    kinds = [dataclasses.replace(record, camera_id=i, width=120 + i) for i in range(1, 41)]
+    write_cameras(own_room / "sparse/0/cameras.bin", (record, *kinds[1:]))
+    assert _rows(splatseed("info", own_room).out)["cameras"].endswith("37 kinds more")

@@ -1,0 +1,273 @@
+"""``splatseed upsample`` on the procedural room: what it writes, and what it says."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.io import load_scene
+from splatseed.io.ply.points import read_ply, write_ply
+from splatseed.upsample import METHODS, chooses_number, configure
+
+METHOD_NAMES = list(METHODS)
+WITH_RATIO = [name for name in METHOD_NAMES if not chooses_number(name)]
+
+
+def _manifest(folder):
+    return json.loads((folder / "splatseed.json").read_text())
+
+
+def _bytes(folder):
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "splatseed.json"
+    }
+
+
+@pytest.mark.parametrize("method", WITH_RATIO)
+def test_every_method_writes_a_scene_that_opens(method, room, tmp_path, splatseed):
+    out = tmp_path / "out"
+    maps = ["--depth", room] if method == "depth" else []
+    run = splatseed("upsample", room, "--method", method, *maps, "--ratio", 3, "-o", out)
+    assert (run.code, run.err) == (0, "")
+    before, after = load_scene(room), load_scene(out)
+    count = len(before.points)
+    assert len(after.points) == 3 * count
+    np.testing.assert_array_equal(after.points.xyz[:count], before.points.xyz)
+    np.testing.assert_array_equal(after.points.rgb[:count], before.points.rgb)
+    assert [image.name for image in after.images] == [image.name for image in before.images]
+    model = pycolmap.Reconstruction(out / "sparse/0")
+    assert (model.num_points3D(), model.num_images()) == (3 * count, 12)
+    assert (out / "images" / after.images[0].name).is_file()
+    written = _manifest(out)
+    assert (written["method"], written["num_new"]) == (method, 2 * count)
+
+
+def test_the_default_looks_at_the_photographs(room, tmp_path, splatseed):
+    out = tmp_path / "out"
+    run = splatseed("upsample", room, "--budget", 2000, "-o", out)
+    assert (run.code, run.err) == (0, "")
+    assert "as many as the photographs need" in run.out
+    assert re.search(r"[\d,]+ original, [\d,]+ stereo, [\d,]+ cover", run.out)
+    assert re.search(r"covered +[\d.]+% of the pictures", run.out)
+    written = _manifest(out)
+    assert (written["method"], written["budget"]) == ("auto", "2000")
+    assert len(load_scene(out).points) <= 2000
+    assert pycolmap.Reconstruction(out / "sparse/0").num_images() == 12
+
+
+def test_without_photographs_the_default_interpolates_and_says_so(own_room, tmp_path, splatseed):
+    shutil.rmtree(own_room / "images")
+    run = splatseed("upsample", own_room, "-o", tmp_path / "out")
+    assert run.code == 0
+    assert "-> mls" in run.out
+    assert "no photographs" in run.out + run.err
+
+
+@pytest.mark.parametrize("words", [["--ratio", 4], ["--num-points", 5000]])
+def test_a_number_for_the_default_is_refused_before_any_work(words, room, tmp_path, splatseed):
+    run = splatseed("upsample", room, *words, "-o", tmp_path / "out")
+    assert (run.code, run.out) == (2, "")
+    assert "--budget" in run.err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_closing_table_has_what_was_asked_for(room, tmp_path, splatseed):
+    out = tmp_path / "out"
+    run = splatseed("upsample", room, "--method", "mls", "--ratio", 2, "-o", out)
+    count = len(load_scene(room).points)
+    for text in (f"{count:,}", f"{2 * count:,}", "seconds", "read ", "write ", "far from any", out):
+        assert str(text) in run.out
+    before, _, after = run.out.partition("\nsplatseed upsample\n")
+    assert f"{2 * count:,} points" in before  # said before it is done
+    assert "train it with" in after
+
+
+def test_results_are_plain_text_and_the_rest_is_silent(room, tmp_path, splatseed):
+    run = splatseed("upsample", room, "-o", tmp_path / "out", "--preview")
+    assert run.err == ""
+    assert not set(run.out) & {"\r", "\x1b"}
+
+
+def test_the_commands_to_train_with_name_what_is_there(room, tmp_path, splatseed):
+    out = tmp_path / "my scene"
+    commands = _commands(splatseed("upsample", room, "-o", out).out)
+    assert set(commands) == {"gsplat", "graphdeco", "nerfstudio", "Brush", "OpenSplat", "LichtFeld"}
+    for words in commands.values():
+        assert str(out) in words  # one word, although it has a space
+    words = commands["gsplat"]
+    assert words[words.index("--data_factor") + 1] == "1"  # there is no images_2 beside images
+    words = commands["nerfstudio"]
+    assert (out / words[words.index("--colmap-path") + 1] / "images.bin").is_file()
+    assert words[words.index("--downscale-factor") + 1] == "1"
+
+
+def _commands(out):
+    """Trainer to the words of its command, from the last lines of the output."""
+    lines = out.partition("train it with\n")[2].splitlines()
+    return {line.split()[0]: shlex.split(line)[1:] for line in lines}
+
+
+def test_only_what_reads_transforms_json_is_offered_for_it(room, tmp_path, splatseed):
+    out = tmp_path / "out"
+    run = splatseed("upsample", room, "-o", out, "--format", "transforms")
+    assert set(_commands(run.out)) == {"nerfstudio", "Brush", "OpenSplat"}
+    assert (out / "transforms.json").is_file()
+    assert not (out / "sparse").exists()
+
+
+def test_transforms_in_transforms_out(room, tmp_path, splatseed):
+    first, second = tmp_path / "first", tmp_path / "second"
+    splatseed(
+        "upsample", room, "-o", first, "--format", "transforms", "--method", "mls", "--ratio", 1
+    )
+    run = splatseed("upsample", first, "-o", second, "--method", "mls", "--ratio", 2)
+    assert run.code == 0
+    assert _manifest(second)["format"] == "transforms"
+    before, after = load_scene(first), load_scene(second)
+    np.testing.assert_array_equal(after.points.xyz[: len(before.points)], before.points.xyz)
+    assert (second / "images").is_dir()
+    run = splatseed(
+        "upsample", first, "-o", tmp_path / "third", "--format", "colmap", "--method", "mls"
+    )
+    assert run.code == 0
+    assert pycolmap.Reconstruction(tmp_path / "third/sparse/0").num_images() == 12
+
+
+def test_a_bare_ply(room, tmp_path, splatseed):
+    write_ply(tmp_path / "cloud.ply", load_scene(room).points)
+    run = splatseed("upsample", tmp_path / "cloud.ply", "-o", tmp_path / "out", "--preview")
+    assert run.code == 0
+    assert "no images" in run.out
+    assert "train it with" not in run.out
+    assert len(read_ply(tmp_path / "out/sparse/0/points3D.ply")) > 0
+    _assert_drawn(tmp_path / "out/preview.png")
+
+
+def test_a_methods_flag_changes_the_method(room, tmp_path, splatseed):
+    for name, flags in (("plain", []), ("ten", ["--mls.k", 10])):
+        run = splatseed("upsample", room, "-o", tmp_path / name, "--method", "mls", *flags)
+        assert run.code == 0
+    assert _manifest(tmp_path / "ten")["parameters"]["k"] == 10
+    assert _manifest(tmp_path / "plain")["parameters"]["k"] == configure("mls").k
+    assert _bytes(tmp_path / "ten") != _bytes(tmp_path / "plain")
+
+
+@pytest.mark.parametrize("profile", [["--profile", "paper"], ["--profile=paper"]])
+def test_the_paper_profile_sets_defaults_and_flags_still_win(profile, room, tmp_path, splatseed):
+    words = ["upsample", room, "-o", tmp_path / "out", "--method", "mls", *profile]
+    assert splatseed(*words, "--mls.frame", "local").code == 0
+    written = _manifest(tmp_path / "out")
+    paper = configure("mls", "paper")
+    assert written["profile"] == "paper"
+    assert written["parameters"]["k"] == paper.k
+    assert written["parameters"]["placement"] == paper.placement
+    assert (paper.frame, written["parameters"]["frame"]) == ("world", "local")
+
+
+def test_the_last_profile_counts(room, tmp_path, splatseed):
+    profiles = ["--profile", "paper", "--profile", "default"]
+    splatseed("upsample", room, "--method", "mls", "-o", tmp_path / "out", *profiles)
+    written = _manifest(tmp_path / "out")
+    assert written["profile"] == "default"
+    assert written["parameters"]["k"] == configure("mls").k
+
+
+def test_a_number_of_points_is_met(room, tmp_path, splatseed):
+    run = splatseed(
+        "upsample", room, "--method", "mls", "-o", tmp_path / "out", "--num-points", 1234
+    )
+    assert "1,234" in run.out
+    assert len(load_scene(tmp_path / "out").points) == 1234
+    written = _manifest(tmp_path / "out")
+    assert (written["ratio"], written["num_points_asked"], written["num_points"]) == (
+        None,
+        1234,
+        1234,
+    )
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(room, tmp_path, splatseed):
+    for name, seed in (("a", 5), ("b", 5), ("c", 6)):
+        assert splatseed("upsample", room, "-o", tmp_path / name, "--seed", seed).code == 0
+    assert _bytes(tmp_path / "a") == _bytes(tmp_path / "b")
+    assert _bytes(tmp_path / "a") != _bytes(tmp_path / "c")
+    assert _manifest(tmp_path / "a") == _manifest(tmp_path / "b")
+
+
+def test_previews_show_something(room, tmp_path, splatseed):
+    out = tmp_path / "out"
+    run = splatseed("upsample", room, "-o", out, "--preview")
+    for name in ("preview.png", "preview_methods.png", "preview_maps.png"):
+        assert str(out / name) in run.out
+        _assert_drawn(out / name)
+
+
+def test_only_methods_that_begin_with_stereo_show_its_maps(room, tmp_path, splatseed):
+    for method, shown in (("stereo", True), ("cover", False), ("linear", False)):
+        out = tmp_path / method
+        run = splatseed("upsample", room, "--method", method, "-o", out, "--preview")
+        assert (out / "preview_maps.png").is_file() == shown
+        assert (str(out / "preview_maps.png") in run.out) == shown
+
+
+def _assert_drawn(path):
+    with PilImage.open(path) as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    assert min(pixels.shape[:2]) > 100
+    colored = np.ptp(pixels, axis=2) > 20  # neither paper nor ink
+    assert all(half.mean() > 0.002 for half in np.array_split(colored, 2, axis=1))
+
+
+def test_images_are_linked_or_copied(room, tmp_path, splatseed):
+    splatseed("upsample", room, "-o", tmp_path / "linked")
+    splatseed("upsample", room, "-o", tmp_path / "copied", "--copy-images")
+    assert (tmp_path / "linked/images").resolve() == (room / "images").resolve()
+    copied = tmp_path / "copied/images"
+    assert not copied.is_symlink()
+    for file in copied.iterdir():
+        assert file.read_bytes() == (room / "images" / file.name).read_bytes()
+
+
+def test_an_earlier_output_is_replaced_when_asked(room, tmp_path, splatseed):
+    out = tmp_path / "out"
+    for ratio, words in ((2, []), (3, ["--overwrite"])):
+        assert (
+            splatseed("upsample", room, "--method", "mls", "-o", out, "--ratio", ratio, *words).code
+            == 0
+        )
+    assert len(load_scene(out).points) == 3 * len(load_scene(room).points)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("name", ["a [bold] b", "ä ö", "it's"])
+def test_odd_names_are_printed_and_quoted(name, room, tmp_path, splatseed):
+    (tmp_path / "in").mkdir()
+    scene = Path(tmp_path / "in" / name)
+    scene.symlink_to(room)
+    run = splatseed("upsample", scene, "-o", tmp_path / name)
+    assert run.code == 0
+    assert str(scene) in run.out
+    assert str(tmp_path / name) in _commands(run.out)["graphdeco"]
+    assert str(tmp_path / name) in shlex.split(
+        splatseed("info", tmp_path / name).out.splitlines()[-1]
+    )
+
+
+@pytest.mark.parametrize("words", [["--help-all"], ["x", "--help-all"]])
+def test_help_lists_every_method_with_its_flags(words, splatseed):
+    run = splatseed("upsample", *words)
+    assert (run.code, run.err) == (0, "")
+    for name in METHOD_NAMES:
+        assert f"{name} options" in run.out or name == "random"
+    assert "--mls.k INT" in run.out
+    assert "NoneType" not in run.out

@@ -1,0 +1,156 @@
+"""Models in another world than their scene's are found out, and scored right with the transform."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+from splatseed.camera import quat_from_rotation, rotation_from_quat
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.evaluate import evaluate_model, load_model
+from splatseed.evaluate.world import find_transform
+from splatseed.io import load_scene
+from splatseed.similarity import Similarity, fit_similarity, similarity_of
+from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.ply import write_gaussians
+from splatseed.synthetic import make_capture, write_capture
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    path = tmp_path_factory.mktemp("room") / "room"
+    return write_capture(make_capture(0, num_views=12, width=120, height=90), path)
+
+
+@pytest.fixture(scope="module")
+def gaussians(room):
+    return initial_gaussians(load_scene(room).points, opacity=0.9)
+
+
+@pytest.fixture(scope="module")
+def psnr(room, gaussians, tmp_path_factory):
+    path = tmp_path_factory.mktemp("world") / "model.ply"
+    write_gaussians(path, gaussians)
+    return evaluate_model(load_model(path, room)).psnr
+
+
+def moved(gaussians, world):
+    """The same Gaussians in another world; of one colour each, as harmonics would turn too."""
+    rotations = [world.rotation @ rotation_from_quat(quat) for quat in gaussians.quats]
+    return dataclasses.replace(
+        gaussians,
+        means=world.points(gaussians.means).astype(np.float32),
+        scales=gaussians.scales + np.float32(np.log(world.scale)),
+        quats=np.array([quat_from_rotation(each) for each in rotations], np.float32),
+    )
+
+
+@pytest.fixture
+def other(rng):
+    quat = rng.normal(size=4)
+    return Similarity(0.3, rotation_from_quat(quat / np.linalg.norm(quat)), rng.normal(size=3))
+
+
+def test_what_gsplats_examples_write_is_refused_and_scored_right(room, gaussians, psnr, tmp_path):
+    path = tmp_path / "model.ply"
+    write_gaussians(path, moved(gaussians, find_transform("gsplat", load_scene(room))))
+    with pytest.raises(SceneFormatError, match=r"another frame.*fit with --transform gsplat"):
+        load_model(path, room)
+    assert evaluate_model(load_model(path, room, transform="gsplat")).psnr == pytest.approx(
+        psnr, abs=0.05
+    )
+    assert evaluate_model(load_model(path, room, transform="none")).psnr < psnr - 1
+
+
+@pytest.mark.parametrize(
+    "kind", ["matrix", "transform", "dataparser_transforms.json", "cameras.json"]
+)
+def test_a_file_tells_the_transform(kind, room, gaussians, psnr, other, tmp_path):
+    path = tmp_path / "point_cloud/iteration_7/point_cloud.ply"
+    path.parent.mkdir(parents=True)
+    write_gaussians(path, moved(gaussians, other))
+    rows = other.matrix.tolist()
+    unscaled = np.column_stack([other.rotation, other.translation / other.scale]).tolist()
+    cameras = [
+        {
+            "img_name": image.name[:-4],
+            "position": other.points(image.camera.center[None])[0].tolist(),
+        }
+        for image in load_scene(room).images
+    ]
+    content = {
+        "matrix": rows,
+        "transform": {"transform": [*rows, [0, 0, 0, 1]]},
+        "dataparser_transforms.json": {"transform": unscaled, "scale": other.scale},
+        "cameras.json": cameras,
+    }[kind]
+    file = tmp_path / (kind if kind.endswith("json") else "t.json")
+    file.write_text(json.dumps(content))
+    says = str(file) if kind.endswith("json") else "--transform FILE"
+    with pytest.raises(SceneFormatError, match=says):
+        load_model(path, room)
+    result = evaluate_model(load_model(path, room, transform=str(file)))
+    assert result.psnr == pytest.approx(psnr, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{", "JSON"),
+        ("{}", "to hold a similarity"),
+        ('{"transform": [[1, 2], [3, 4]]}', "to hold a similarity"),
+        ("[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "to hold a similarity"),
+        ('[{"img_name": "nobody", "position": [0, 0, 0]}]', "at least three images"),
+    ],
+)
+def test_a_file_that_tells_none_is_refused(text, says, room, tmp_path):
+    (tmp_path / "t.json").write_text(text)
+    with pytest.raises(SceneFormatError, match=says):
+        find_transform(str(tmp_path / "t.json"), load_scene(room))
+    with pytest.raises(SceneNotFoundError, match="found none"):
+        find_transform(str(tmp_path / "nowhere.json"), load_scene(room))
+    bare = load_scene(room / "sparse/0/points3D.ply")
+    with pytest.raises(ParameterError, match="0 cameras"):
+        find_transform("gsplat", bare)
+
+
+def test_a_wrong_transform_is_refused_too(room, gaussians, tmp_path):
+    write_gaussians(tmp_path / "model.ply", gaussians)
+    with pytest.raises(SceneFormatError, match="They fit with --transform none"):
+        load_model(tmp_path / "model.ply", room, transform="gsplat")
+
+
+def test_few_large_gaussians_are_still_a_model(room, gaussians, tmp_path):
+    few = {name: array[::8] for name, array in gaussians.arrays().items()}
+    few["scales"] = few["scales"] + np.float32(np.log(2.0))
+    write_gaussians(tmp_path / "few.ply", dataclasses.replace(gaussians, **few))
+    load_model(tmp_path / "few.ply", room)
+
+
+def test_a_fit_gives_the_similarity_back(rng, other):
+    xyz = rng.normal(size=(9, 3))
+    found = fit_similarity(xyz, other.points(xyz))
+    np.testing.assert_allclose(found.matrix, other.matrix, atol=1e-12)
+    np.testing.assert_allclose(similarity_of(other.matrix).matrix, other.matrix, atol=1e-12)
+    line = np.outer(np.arange(5.0), rng.normal(size=3))
+    assert fit_similarity(line, other.points(line)) is None
+    assert fit_similarity(xyz[:2], xyz[:2]) is None
+    assert similarity_of(np.diag([1.0, 1, -1, 1])) is None
+
+
+def test_a_camera_sees_the_same_in_the_other_world(rng, other):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = (
+        rotation_from_quat(np.array([0.5, 0.5, 0.5, 0.5])),
+        rng.normal(size=3),
+    )
+    xyz = rng.normal(size=(5, 3))
+    seen = xyz @ pose[:3, :3].T + pose[:3, 3]
+    turned = other.camera(pose)
+    again = other.points(xyz) @ turned[:3, :3].T + turned[:3, 3]
+    np.testing.assert_allclose(again, other.scale * seen, atol=1e-12)

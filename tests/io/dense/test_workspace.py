@@ -1,0 +1,333 @@
+"""A COLMAP dense workspace: what COLMAP reads of it, and what it makes of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.camera import Camera
+from splatseed.errors import (
+    InputError,
+    OutputError,
+    ParameterError,
+    SceneFormatError,
+    SceneNotFoundError,
+)
+from splatseed.io import find_depths, load_scene
+from splatseed.io.dense import write_dense_maps, write_dense_workspace
+from splatseed.io.ply.points import read_ply
+from splatseed.synthetic import make_capture, write_capture
+from splatseed.views.undistortion import undistort
+
+from ...bent import bend
+from ...stereo_maps import true_maps
+
+ON_SURFACE = 1e-5
+"""Metres: float32 of depths of some metres."""
+FLAT = 0.6
+"""The share of pixels on flat surfaces: planes through curved ones and leaves lie beside them."""
+PIXEL = 0.03
+"""Metres, of a photograph at the room's depth."""
+
+
+@pytest.fixture(scope="module")
+def capture():
+    """Sizes that no factor divides, so that maps are of another shape than their photographs."""
+    return make_capture(0, num_views=8, width=97, height=73)
+
+
+@pytest.fixture(scope="module")
+def room(capture, tmp_path_factory):
+    return load_scene(write_capture(capture, tmp_path_factory.mktemp("room") / "room"))
+
+
+@pytest.fixture(scope="module")
+def maps(capture):
+    """By the factor that they are smaller than the photographs."""
+    return {factor: true_maps(capture, factor) for factor in (1, 4)}
+
+
+@pytest.fixture(scope="module")
+def workspaces(room, maps, tmp_path_factory):
+    """By the same factors."""
+    root = tmp_path_factory.mktemp("dense")
+    for factor in (1, 4):
+        write_dense_workspace(room, maps[factor], root / f"{factor}")
+    return {factor: root / f"{factor}" for factor in (1, 4)}
+
+
+def _mat(path):
+    """A map as COLMAP's Mat<float>::Read and Get(row, col, slice) take it, [H, W, C]."""
+    width, height, depth, body = path.read_bytes().split(b"&", 3)
+    values = np.frombuffer(body, "<f4").reshape(int(depth), int(height), int(width))
+    return np.moveaxis(values, 0, -1)
+
+
+def _fused_points(workspace, image):
+    """World points and normals of a map's pixels, as COLMAP's StereoFusion places them."""
+    depth = _mat(workspace / f"stereo/depth_maps/{image.name}.geometric.bin")[..., 0]
+    normal = _mat(workspace / f"stereo/normal_maps/{image.name}.geometric.bin")
+    height, width = depth.shape
+    scale = np.array([width / image.camera.width, height / image.camera.height, 1])
+    camera = Camera(np.diag(scale) @ image.camera.K, width, height, image.camera.cam_from_world)
+    rows, columns = np.nonzero(depth > 0)
+    xyz = camera.unproject(np.stack([columns, rows], axis=1), depth[rows, columns])
+    return xyz, normal[rows, columns] @ camera.cam_from_world[:3, :3]
+
+
+@pytest.mark.parametrize("factor", [1, 4])
+def test_pixels_lie_on_the_surface_where_colmap_places_them(factor, capture, workspaces):
+    scene = load_scene(workspaces[factor])
+    for image in scene.images[:3]:
+        xyz, normal = _fused_points(workspaces[factor], image)
+        assert len(xyz) > 0.8 * (97 // factor) * (73 // factor)
+        away = np.abs(capture.surfaces.distance(xyz))
+        assert np.quantile(away, FLAT) < ON_SURFACE
+        assert np.quantile(away, 0.95) < PIXEL * factor
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1, atol=1e-5)
+        assert (np.einsum("ij,ij->i", normal, xyz - image.camera.center) < 0).all()
+
+
+@pytest.mark.parametrize("factor", [1, 4])
+def test_depth_at_pixel_centres_is_read_back(factor, capture, maps, workspaces):
+    scene = load_scene(workspaces[factor])
+    depths = find_depths(scene, workspaces[factor])
+    for truth in maps[factor][:3]:
+        image = next(image for image in scene.images if image.name == truth.name)
+        stored = depths.read(truth.name)
+        camera = stored.camera(image.camera)
+        rows, columns = np.nonzero(np.isfinite(stored.values))
+        uv = np.stack([columns, rows], axis=1) + 0.5
+        xyz = camera.unproject(uv, stored.values[rows, columns])
+        assert np.quantile(np.abs(capture.surfaces.distance(xyz)), FLAT) < ON_SURFACE
+        both = np.isfinite(stored.values) & np.isfinite(truth.depth)
+        np.testing.assert_allclose(stored.values[both], truth.depth[both], rtol=0.2)
+
+
+def test_both_passes_graphs_and_lists_are_there(room, maps, workspaces):
+    stereo = workspaces[4] / "stereo"
+    names = [image.name for image in room.images]
+    for name in names:
+        for folder in ("depth_maps", "normal_maps", "consistency_graphs"):
+            first, second = (
+                (stereo / folder / f"{name}.{kind}.bin").read_bytes()
+                for kind in ("photometric", "geometric")
+            )
+            assert first == second
+    assert (stereo / "fusion.cfg").read_text().splitlines() == names
+    lines = (stereo / "patch-match.cfg").read_text().splitlines()
+    assert lines[::2] == names
+    assert lines[1] == ", ".join(maps[4][0].sources)
+
+
+def test_graphs_name_images_by_their_place_in_the_model(maps, workspaces):
+    truth = maps[4][2]
+    scene = load_scene(workspaces[4])
+    ids = [image.image_id for image in scene.images]
+    assert ids == sorted(ids)  # COLMAP 3 counts in file order, COLMAP 4 by id
+    path = workspaces[4] / f"stereo/consistency_graphs/{truth.name}.geometric.bin"
+    body = path.read_bytes().split(b"&", 3)[3]
+    column, row, num, *rest = np.frombuffer(body, "<i4").tolist()
+    bits = truth.agreeing[row, column]
+    expected = [name for k, name in enumerate(truth.sources) if bits >> k & 1]
+    assert [scene.images[idx].name for idx in rest[:num]] == expected
+
+
+@pytest.mark.parametrize("factor", [1, 4])
+@pytest.mark.parametrize("tracked", [True, False])
+def test_colmap_fuses_it(factor, tracked, capture, maps, room, tmp_path):
+    if shutil.which("colmap") is None:
+        pytest.skip("colmap is not on the path (Debian: apt install colmap)")
+    scene = room if tracked else room.replace(tracks=None)
+    write_dense_workspace(scene, maps[factor], tmp_path / "w")
+    fused = tmp_path / "fused.ply"
+    words = ("--workspace_path", tmp_path / "w", "--output_path", fused)
+    words += ("--StereoFusion.min_num_pixels", "3")
+    subprocess.run(["colmap", "stereo_fusion", *words], check=True, capture_output=True)
+    _check_fused(fused, capture, factor)
+
+
+def test_pycolmap_fuses_it(capture, workspaces, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap", reason="needs splatseed[sfm]")
+    options = pycolmap.StereoFusionOptions()
+    options.min_num_pixels = 3
+    fused = tmp_path / "fused.ply"
+    pycolmap.stereo_fusion(fused, workspaces[4], options=options, output_type="ply")
+    _check_fused(fused, capture, 4)
+
+
+def _check_fused(path, capture, factor):
+    points = read_ply(path)
+    assert len(points) > 2000 / factor**2
+    away = np.abs(capture.surfaces.distance(points.xyz.astype(np.float64)))
+    assert np.median(away) < 2 * ON_SURFACE  # 0.3 pixels without the move to COLMAP's rays
+    assert np.quantile(away, 0.95) < PIXEL / 2 * factor
+
+
+@pytest.fixture(scope="module")
+def bent_room(capture, tmp_path_factory):
+    """The same room through a lens with distortion."""
+    return load_scene(write_capture(bend(capture), tmp_path_factory.mktemp("bent") / "room"))
+
+
+def test_distorted_photographs_come_without_their_distortion(bent_room, room, maps, tmp_path):
+    write_dense_workspace(bent_room, maps[4], tmp_path / "w", undistort=undistort)
+    scene = load_scene(tmp_path / "w")
+    assert {lens.model for lens in scene.intrinsics} == {"PINHOLE"}
+    assert not (tmp_path / "w/images").is_symlink()
+    for straight, lens, image in zip(room.images, bent_room.images, scene.images, strict=True):
+        np.testing.assert_allclose(image.camera.K, straight.camera.K)
+        np.testing.assert_allclose(image.observations.xy, straight.observations.xy, atol=1e-6)
+        found, bent, truth = (
+            np.asarray(PilImage.open(each.source.image_dir / image.name).convert("RGB"))
+            for each in (scene, bent_room, room)
+        )
+        expected, _ = undistort(bent, lens.intrinsics, image.camera.K)
+        np.testing.assert_array_equal(found, expected)
+        error, before = (np.abs(each.astype(int) - truth).mean() for each in (found, bent))
+        assert error < 0.8 * before  # two interpolations blur
+
+
+def test_a_workspace_of_distorted_photographs_is_fused(bent_room, capture, maps, tmp_path):
+    if shutil.which("colmap") is None:
+        pytest.skip("colmap is not on the path (Debian: apt install colmap)")
+    write_dense_workspace(bent_room, maps[1], tmp_path / "w", undistort=undistort)
+    fused = tmp_path / "fused.ply"
+    words = ("--workspace_path", tmp_path / "w", "--output_path", fused)
+    subprocess.run(["colmap", "stereo_fusion", *words], check=True, capture_output=True)
+    _check_fused(fused, capture, 1)
+
+
+def test_of_mixed_photographs_only_distorted_ones_are_written(bent_room, room, maps, tmp_path):
+    mixed = bent_room.replace(images=(*bent_room.images[:2], *room.images[2:]))
+    write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort)
+    links = [(tmp_path / "w/images" / image.name).is_symlink() for image in mixed.images]
+    assert links == [False, False, *[True] * 6]
+    write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort, overwrite=True)
+
+
+def test_a_photograph_that_cannot_be_written_again_is_refused(bent_room, maps, tmp_path):
+    name = "view.psd"
+    images = (replace(bent_room.images[0], name=name), *bent_room.images[1:])
+    with pytest.raises(SceneFormatError, match=name):
+        write_dense_workspace(
+            bent_room.replace(images=images), maps[4], tmp_path / "w", undistort=undistort
+        )
+
+
+def test_cameras_are_those_of_reduced_photographs(capture, maps, tmp_path):
+    path = write_capture(capture, tmp_path / "room")
+    for picture in (path / "images").iterdir():
+        with PilImage.open(picture) as image:
+            half = image.resize((48, 36))
+        half.save(picture)
+    scene = load_scene(path)
+    report = write_dense_workspace(scene, maps[4][:2], tmp_path / "w")
+    assert report.num_maps == 2
+    small = load_scene(tmp_path / "w")
+    assert {(camera.width, camera.height) for camera in small.intrinsics} == {(48, 36)}
+    np.testing.assert_allclose(
+        small.images[0].observations.xy, scene.images[0].observations.xy * [48 / 97, 36 / 73]
+    )
+    xyz, _ = _fused_points(tmp_path / "w", small.images[0])
+    assert np.median(np.abs(capture.surfaces.distance(xyz))) < ON_SURFACE
+    assert (tmp_path / "w/stereo/fusion.cfg").read_text().count("\n") == 2
+
+
+def test_points_that_were_added_are_left_out(maps, room, tmp_path):
+    more = room.points.concatenate(room.points, room.points.select(slice(0, 50)))
+    write_dense_workspace(room.replace(points=more, tracks=room.tracks), maps[4], tmp_path / "w")
+    again = load_scene(tmp_path / "w")
+    np.testing.assert_array_equal(again.points.xyz, room.points.xyz)
+    np.testing.assert_array_equal(again.tracks.offsets, room.tracks.offsets)
+
+
+def test_a_plain_folder_and_the_rest_beside_it(maps, room, tmp_path):
+    some = maps[4]
+    report = write_dense_maps(room, iter(some), tmp_path / "a")
+    write_dense_maps(room, some, tmp_path / "b")
+    known = sum(int(np.isfinite(each.depth).sum()) for each in some)
+    assert (report.num_maps, report.num_known) == (8, known)
+    name = some[0].name
+    for file in (f"{name}.npy", f"{name}.stereo.npz"):
+        assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+    depths = find_depths(room, tmp_path / "a")
+    assert (len(depths), depths.kind) == (8, "z")
+    rest = np.load(tmp_path / "a" / f"{name}.stereo.npz", allow_pickle=False)
+    np.testing.assert_array_equal(rest["normal"], some[0].normal)
+    np.testing.assert_array_equal(rest["agreeing"], some[0].agreeing)
+    assert tuple(rest["sources"]) == some[0].sources
+
+
+@pytest.mark.parametrize("write", [write_dense_workspace, write_dense_maps])
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda maps: maps[:0], "at least one depth map"),
+        (lambda maps: [maps[0], maps[0]], "one depth map an image"),
+        (lambda maps: [replace(maps[0], name="other.png")], "images of the scene"),
+        (lambda maps: [replace(maps[0], sources=("other.png",))], "images of the scene"),
+        (lambda maps: [replace(maps[0], sources=maps[0].sources * 3)], "at most 8 sources"),
+        (lambda maps: [replace(maps[0], depth=maps[0].depth[:-1])], "arrays of its camera's size"),
+        (lambda maps: [replace(maps[0], camera=_turned(maps[0].camera))], "the pose of its image"),
+    ],
+)
+def test_maps_that_do_not_belong_are_refused(write, spoil, said, maps, room, tmp_path):
+    with pytest.raises(InputError, match=said):
+        write(room, spoil(maps[4][:1]), tmp_path / "w")
+    assert list(tmp_path.iterdir()) == []
+
+
+def _turned(camera):
+    return replace(camera, cam_from_world=camera.cam_from_world[[1, 0, 2, 3]])
+
+
+def test_scenes_that_cannot_be_fused_are_refused(maps, room, tmp_path):
+    def refused(error, said, scene):
+        with pytest.raises(error, match=said):
+            write_dense_workspace(scene, maps[4][:1], tmp_path / "w")
+        assert list(tmp_path.iterdir()) == []
+
+    first = room.images[0]
+    lens = replace(first.intrinsics, model="SIMPLE_RADIAL", params=(100.0, 60.0, 45.0, 0.1))
+    refused(SceneFormatError, "distortion", _with_first(room, intrinsics=lens))
+    refused(OutputError, "stay inside", _with_first(room, name="../view_000.png"))
+    refused(SceneNotFoundError, "gone.png", _with_first(room, name="gone.png"))
+    refused(SceneNotFoundError, "photographs", room.replace(source=None))
+
+
+def _with_first(scene, **changes):
+    return scene.replace(images=(replace(scene.images[0], **changes), *scene.images[1:]))
+
+
+def test_only_an_earlier_workspace_is_replaced(maps, room, tmp_path):
+    some = maps[4][:2]
+    path = tmp_path / "w"
+    write_dense_workspace(room, some, path, provenance={"command": "depth"})
+    assert json.loads((path / "splatseed.json").read_text())["command"] == "depth"
+    assert (path / "images").is_symlink()
+    with pytest.raises(OutputError, match="overwrite"):
+        write_dense_workspace(room, some, path)
+    write_dense_workspace(room, some, path, overwrite=True, copy_images=True)
+    assert not (path / "images").is_symlink()
+    (path / "fused.ply").write_text("COLMAP's, and the user's")
+    with pytest.raises(OutputError, match=r"fused\.ply"):
+        write_dense_workspace(room, some, path, overwrite=True)
+    with pytest.raises(OutputError, match="apart"):
+        write_dense_workspace(room, some, room.source.root / "dense")
+
+
+def test_a_failure_on_the_way_leaves_nothing(maps, room, tmp_path):
+    def breaking():
+        yield maps[4][0]
+        raise ParameterError("no more", found="less", fix="Stop.")
+
+    with pytest.raises(ParameterError):
+        write_dense_workspace(room, breaking(), tmp_path / "w")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,371 @@
+"""Which file is the depth map of which image, and what its numbers mean."""
+
+from __future__ import annotations
+
+import json
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.camera import Intrinsics
+from splatseed.depthmap import DepthMap
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io import DepthFiles, find_depths, load_scene
+from splatseed.io.depth.files import SUFFIXES
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Scene, SceneSource
+
+LENS = Intrinsics(1, "PINHOLE", 40, 30, (35.0, 36.0, 20.0, 15.0))
+NO_POINTS = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+
+
+def scene_of(*names: str, image_dir: Path | None = None) -> Scene:
+    images = tuple(
+        Image(name, i + 1, LENS, np.array([1.0, 0, 0, 0]), np.zeros(3))
+        for i, name in enumerate(names)
+    )
+    source = SceneSource("colmap", Path(), Path(), image_dir=image_dir)
+    return Scene(NO_POINTS, images, (LENS,), source=source)
+
+
+def put(path: Path, value: float = 1.0) -> Path:
+    """A small map of one value, in the format of the file's suffix."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    array = np.full((3, 4), value, np.float32)
+    match path.suffix.lower():
+        case ".npy":
+            with path.open("wb") as file:
+                np.save(file, array)
+        case ".npz":
+            with path.open("wb") as file:
+                np.savez(file, array)
+        case ".png":
+            PilImage.fromarray(array.astype(np.uint16)).save(path)
+        case ".tif" | ".tiff":
+            PilImage.fromarray(array).save(path)
+        case ".pfm":
+            path.write_bytes(b"Pf\n4 3\n-1\n" + array.tobytes())
+        case ".bin":
+            path.write_bytes(b"4&3&1&" + array.tobytes())
+        case ".exr":
+            openexr = pytest.importorskip("OpenEXR")
+            openexr.File({}, {"Z": array}).write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_format_beside_the_image(tmp_path, suffix):
+    put(tmp_path / f"left/a{suffix}", 3)
+    depths = find_depths(scene_of("left/a.jpg"), tmp_path, scale=2)
+    read = depths.read("left/a.jpg")
+    assert isinstance(read, DepthMap)
+    assert read.kind == "z"
+    assert read.values.dtype == np.float32
+    np.testing.assert_array_equal(read.values, np.full((3, 4), 1.5))
+
+
+ORDER = [
+    "x/b.jpg.npy",
+    "x/b.jpg.npz",
+    "x/b.jpg.png",
+    "x/b.jpg.geometric.bin",
+    "x/b.jpg.photometric.bin",
+    "x/b.npy",
+    "x/b.exr",
+    "x/b.pfm",
+    "x/b.tiff",
+    "x/b.png",
+    "x/b_depth.npy",
+    "x/b_depth.png",
+]
+
+
+def test_the_first_of_several_candidates_is_taken(tmp_path):
+    scene = scene_of("x/b.jpg")
+    for name in ORDER:
+        put(tmp_path / name)
+    for name in ORDER:
+        assert find_depths(scene, tmp_path).paths == {"x/b.jpg": tmp_path / name}
+        (tmp_path / name).unlink()
+    with pytest.raises(SceneNotFoundError, match=r"x/b\.jpg\.npy, x/b\.npy, .*; found none"):
+        find_depths(scene, tmp_path)
+
+
+def test_suffixes_in_capitals(tmp_path):
+    put(tmp_path / "B.PNG", 2000)
+    put(tmp_path / "C.NPY", 3)
+    depths = find_depths(scene_of("B.JPG", "C.jpeg"), tmp_path)
+    assert depths.read("B.JPG").values[0, 0] == 2
+    assert depths.read("C.jpeg").values[0, 0] == 3
+    assert find_depths(scene_of("B.JPG", "c.jpg"), tmp_path).paths.keys() == {"B.JPG"}
+
+
+def test_images_without_a_map_are_not_there(tmp_path):
+    for name in ("c", "a", "stranger"):
+        put(tmp_path / f"{name}.npy")
+    depths = find_depths(scene_of("d.jpg", "c.jpg", "b.jpg", "a.jpg"), tmp_path)
+    assert list(depths) == ["a.jpg", "c.jpg"]
+    assert len(depths) == 2
+    assert "a.jpg" in depths
+    assert "b.jpg" not in depths
+    assert None not in depths
+    with pytest.raises(SceneNotFoundError, match=r"a depth map of b\.jpg"):
+        depths.read("b.jpg")
+
+
+def test_photographs_are_not_their_own_depth(tmp_path):
+    put(tmp_path / "images/a.png")
+    put(tmp_path / "images/b.png")
+    put(tmp_path / "images/a_depth.png")
+    depths = find_depths(
+        scene_of("a.png", "b.png", image_dir=tmp_path / "images"), tmp_path / "images"
+    )
+    assert depths.paths == {"a.png": tmp_path / "images/a_depth.png"}
+
+
+def test_leading_folders_may_be_missing(tmp_path):
+    put(tmp_path / "left/1.npy")
+    put(tmp_path / "right/1.npy", 2)
+    depths = find_depths(scene_of("images/left/1.jpg", "images/right/1.jpg"), tmp_path)
+    assert depths.read("images/right/1.jpg").values[0, 0] == 2
+    assert len(depths) == 2
+
+
+def test_one_map_for_two_images_is_refused(tmp_path):
+    put(tmp_path / "1.npy")
+    with pytest.raises(SceneFormatError, match=r"1\.npy for left/1\.jpg and for right/1\.jpg"):
+        find_depths(scene_of("left/1.jpg", "right/1.jpg"), tmp_path)
+    put(tmp_path / "left/1.npy")
+    assert list(find_depths(scene_of("left/1.jpg", "right/1.jpg"), tmp_path)) == ["left/1.jpg"]
+
+
+@pytest.mark.parametrize("name", ["../a.jpg", "/a.jpg", "../../x/../a.jpg"])
+def test_names_do_not_lead_out_of_the_folder(tmp_path, name):
+    put(tmp_path / "a.npy")
+    inside = tmp_path / "x" / "y"
+    put(inside / "other.npy")
+    with pytest.raises(SceneNotFoundError):
+        find_depths(scene_of(name), inside)
+
+
+@pytest.mark.parametrize("folder", ["", "stereo", "stereo/depth_maps"])
+def test_colmap_dense_workspace(tmp_path, folder):
+    maps = tmp_path / "stereo/depth_maps"
+    put(maps / "a.jpg.photometric.bin", 1)
+    put(maps / "a.jpg.geometric.bin", 2)
+    put(maps / "sub/b.jpg.photometric.bin", 3)
+    (tmp_path / "images/sub").mkdir(parents=True)
+    depths = find_depths(scene_of("a.jpg", "sub/b.jpg"), tmp_path / folder)
+    assert depths.read("a.jpg").values[0, 0] == 2
+    assert depths.read("sub/b.jpg").values[0, 0] == 3
+
+
+@pytest.mark.parametrize("name", ["results", "."])
+def test_rgbd_capture_by_the_frames_numbers(tmp_path, name):
+    put(tmp_path / "room/results/depth000007.png", 500)
+    put(tmp_path / "room/results/depth12.png", 1000)
+    (tmp_path / "cam_params.json").write_text('{"camera": {"scale": 250.0}}')
+    depths = find_depths(scene_of("frame7.jpg", "frame000012.jpg"), tmp_path / "room" / name)
+    assert depths.read("frame7.jpg").values[0, 0] == 2
+    assert depths.read("frame000012.jpg").values[0, 0] == 4
+    assert (
+        find_depths(scene_of("frame7.jpg"), tmp_path / "room", scale=500)
+        .read("frame7.jpg")
+        .values[0, 0]
+        == 1
+    )
+
+
+def test_the_scale_of_a_capture_is_that_of_its_integers(tmp_path):
+    put(tmp_path / "results/depth7.npy", 2)
+    (tmp_path / "cam_params.json").write_text('{"camera": {"scale": 250.0}}')
+    assert find_depths(scene_of("frame7.jpg"), tmp_path).read("frame7.jpg").values[0, 0] == 2
+
+
+def test_7scenes_names(tmp_path):
+    put(tmp_path / "frame-000003.depth.png", 1500)
+    (tmp_path / "frame-000003.color.png").touch()
+    scene = scene_of("frame-000003.color.png", image_dir=tmp_path)
+    assert find_depths(scene, tmp_path).read("frame-000003.color.png").values[0, 0] == 1.5
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"camera": {"scale": -1}}', '{"camera": {"scale": "x"}}']
+)
+def test_bad_camera_file(tmp_path, text):
+    put(tmp_path / "results/depth0.png")
+    (tmp_path / "cam_params.json").write_text(text)
+    with pytest.raises(SceneFormatError, match=r"cam_params\.json"):
+        find_depths(scene_of("frame0.jpg"), tmp_path)
+
+
+def test_description_beside_the_maps(tmp_path):
+    put(tmp_path / "depths/a.png", 500)
+    (tmp_path / "depths/depths.json").write_text('{"kind": "ray", "scale": 100}')
+    scene = scene_of("a.jpg")
+    for folder in (tmp_path, tmp_path / "depths"):
+        read = find_depths(scene, folder).read("a.jpg")
+        assert (read.kind, read.values[0, 0]) == ("ray", 5)
+    told = find_depths(scene, tmp_path, kind="inverse", scale=50).read("a.jpg")
+    assert (told.kind, told.values[0, 0]) == ("inverse", 10)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\xff\xfe{}",
+        b"[1]",
+        b'{"kind": "metric"}',
+        b'{"kind": ["z"]}',
+        b'{"scale": 0}',
+        b'{"scale": -2}',
+        b'{"scale": NaN}',
+        b'{"scale": 1e999}',
+        b'{"scale": true}',
+        b'{"scale": "1"}',
+        b'{"scale": 1' + b"0" * 400 + b"}",
+        b"[" * 100_000,
+    ],
+)
+def test_bad_description(tmp_path, content):
+    put(tmp_path / "a.png")
+    (tmp_path / "depths.json").write_bytes(content)
+    with pytest.raises(SceneFormatError, match=r"depths\.json"):
+        find_depths(scene_of("a.jpg"), tmp_path)
+
+
+def test_kind_of_an_archive(tmp_path):
+    np.savez(tmp_path / "a.npz", depth=np.ones((2, 3)), kind="ray")
+    put(tmp_path / "b.npz")
+    depths = find_depths(scene_of("a.jpg", "b.jpg"), tmp_path)
+    assert depths.read("a.jpg").kind == "ray"
+    assert depths.read("b.jpg").kind == "z"
+    assert find_depths(scene_of("a.jpg"), tmp_path, kind="z").read("a.jpg").kind == "z"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"scale": 0.0}, {"scale": -1.0}, {"scale": np.nan}, {"scale": np.inf}, {"kind": "metric"}],
+)
+def test_bad_options(tmp_path, options):
+    put(tmp_path / "a.npy")
+    with pytest.raises(ParameterError, match=r"scale|kind"):
+        find_depths(scene_of("a.jpg"), tmp_path, **options)
+
+
+def test_no_such_folder(tmp_path):
+    put(tmp_path / "a.npy")
+    with pytest.raises(SceneNotFoundError, match="found nothing"):
+        find_depths(scene_of("a.jpg"), tmp_path / "gone")
+    with pytest.raises(SceneNotFoundError, match="found a file"):
+        find_depths(scene_of("a.jpg"), tmp_path / "a.npy")
+    with pytest.raises(SceneNotFoundError, match="without images"):
+        find_depths(Scene(NO_POINTS), tmp_path)
+
+
+def test_where_nothing_is_known(tmp_path):
+    known = [0.5, 1e-30, 9e8]
+    unknown = [0, -0.0, -1, np.nan, np.inf, -np.inf, 1e10, 1e9]
+    np.save(tmp_path / "a.npy", np.array([[*known, *unknown]], np.float64))
+    values = find_depths(scene_of("a.jpg"), tmp_path).read("a.jpg").values
+    np.testing.assert_array_equal(values, np.array([[*known, *[np.nan] * 8]], np.float32))
+
+
+def test_inverse_depth_may_be_zero_or_less(tmp_path):
+    np.save(tmp_path / "a.npy", np.array([[0.0, -2, 3, np.nan, -np.inf]]))
+    PilImage.fromarray(np.array([[0, 5, 65535]], np.uint16)).save(tmp_path / "b.png")
+    depths = find_depths(scene_of("a.jpg", "b.jpg"), tmp_path, kind="inverse", scale=1)
+    np.testing.assert_array_equal(depths.read("a.jpg").values, [[0, -2, 3, np.nan, np.nan]])
+    np.testing.assert_array_equal(depths.read("b.jpg").values, [[np.nan, 5, 65535]])
+
+
+def test_integers_count_millimetres_unless_told(tmp_path):
+    PilImage.fromarray(np.array([[0, 1500, 65535]], np.uint16)).save(tmp_path / "a.png")
+    PilImage.fromarray(np.array([[0, 255, 100]], np.uint8)).save(tmp_path / "b.png")
+    np.save(tmp_path / "c.npy", np.array([[2000]]))
+    depths = find_depths(scene_of("a.jpg", "b.jpg", "c.jpg"), tmp_path)
+    np.testing.assert_array_equal(depths.read("a.jpg").values, [[np.nan, 1.5, np.nan]])
+    np.testing.assert_allclose(depths.read("b.jpg").values, [[np.nan, 0.255, 0.1]])
+    np.testing.assert_array_equal(depths.read("c.jpg").values, [[2]])
+
+
+def test_a_map_of_nothing_is_nan_everywhere(tmp_path):
+    np.save(tmp_path / "a.npy", np.full((3, 4), np.nan))
+    assert np.isnan(find_depths(scene_of("a.jpg"), tmp_path).read("a.jpg").values).all()
+
+
+def test_map_of_another_size_has_its_own_camera(tmp_path):
+    put(tmp_path / "a.npy")
+    scene = scene_of("a.jpg")
+    camera = find_depths(scene, tmp_path).read("a.jpg").camera(scene.images[0].camera)
+    np.testing.assert_allclose(camera.K, [[3.5, 0, 2], [0, 3.6, 1.5], [0, 0, 1]])
+    np.save(tmp_path / "a.npy", np.ones((4, 4)))
+    with pytest.raises(SceneFormatError, match="40 x 30; found 4 x 4"):
+        find_depths(scene, tmp_path).read("a.jpg").camera(scene.images[0].camera)
+
+
+def test_damage_is_told_when_the_map_is_read(tmp_path):
+    put(tmp_path / "a.npy")
+    put(tmp_path / "b.npy").write_bytes(b"\x93NUMPY")
+    depths = find_depths(scene_of("a.jpg", "b.jpg"), tmp_path)
+    with pytest.raises(SceneFormatError, match=r"b\.npy"):
+        depths.read("b.jpg")
+    (tmp_path / "a.npy").unlink()
+    with pytest.raises(SceneNotFoundError, match=r"a\.npy"):
+        depths.read("a.jpg")
+
+
+def test_many_threads_read_what_one_does(tmp_path, rng):
+    names = [f"{i:02d}.jpg" for i in range(24)]
+    for name in names:
+        array = rng.integers(0, 65536, (60, 80)).astype(np.uint16)
+        PilImage.fromarray(array).save(tmp_path / f"{name}.png")
+    depths = find_depths(scene_of(*names), tmp_path)
+    start = threading.Barrier(8)
+
+    def read(name):
+        if name in names[:8]:
+            start.wait(timeout=20)
+        return depths.read(name).values
+
+    with ThreadPoolExecutor(8) as pool:
+        for name, values in zip(names, pool.map(read, names), strict=True):
+            np.testing.assert_array_equal(values, depths.read(name).values)
+
+
+def test_reading_keeps_nothing(tmp_path, little_memory):
+    np.save(tmp_path / "a.npy", np.ones((256, 1024), np.float32))
+    depths = find_depths(scene_of("a.jpg"), tmp_path)
+    with little_memory(8 << 20):
+        for _ in range(10):
+            depths.read("a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "count"), [("replica/room0", 6553.5, 20), ("7scenes_redkitchen", 1000.0, 143)]
+)
+def test_real_captures_need_no_flags(scenes, name, scale, count):
+    scene = load_scene(scenes / name, require_points=False)
+    depths = find_depths(scene, scenes / name)
+    assert isinstance(scene.depths, DepthFiles)
+    assert depths.paths == scene.depths.paths
+    assert list(depths) == sorted(image.name for image in scene.images)
+    assert len(depths) == count
+    assert depths.scale == scale
+    values = depths.read(next(iter(depths))).values
+    assert values.shape == (scene.intrinsics[0].height, scene.intrinsics[0].width)
+    assert 0.5 < np.nanmedian(values) < 5  # metres, in a room
+    raw = np.asarray(PilImage.open(scenes / name / "results" / "depth000000.png"))
+    np.testing.assert_allclose(values[raw > 0] * scale, raw[raw > 0], rtol=1e-6)
+    assert np.isnan(values[raw == 0]).all()
+
+
+def test_capture_without_a_scale(tmp_path):
+    put(tmp_path / "results/depth0.png", 2000)
+    (tmp_path / "cam_params.json").write_text(json.dumps({"camera": {"w": 4}}))
+    assert find_depths(scene_of("frame0.jpg"), tmp_path).read("frame0.jpg").values[0, 0] == 2

@@ -1,0 +1,78 @@
+"""Points of an earlier upsampling are told from the originals, and never grow new ones."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from splatseed import load_scene, upsample, write_scene
+from splatseed.io.output.seeds_npz import SEEDS
+from splatseed.pointcloud import GENERATED
+from splatseed.synthetic import make_capture
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_capture(0, 6, 96, 72).scene
+
+
+@pytest.mark.parametrize("layout", ["colmap", "transforms"])
+def test_an_output_knows_its_originals(scene, tmp_path, layout):
+    seeds = upsample(scene, "mls", ratio=4)
+    write_scene(scene.replace(points=seeds), tmp_path / "out", format=layout)
+    again = load_scene(tmp_path / "out")
+    n = len(scene.points)
+    assert np.array_equal(again.points.source, seeds.source)
+    assert any("added by splatseed" in warning for warning in again.warnings)
+    assert again.tracks is None or len(again.tracks) == n
+    more = upsample(again, "linear", ratio=2)
+    assert len(more) == 2 * n
+    write_scene(again.replace(points=more), tmp_path / "more")
+    assert len(load_scene(tmp_path / "more").points.originals) == n
+
+
+def test_an_output_of_an_earlier_version_knows_its_originals(scene, tmp_path):
+    write_scene(scene.replace(points=upsample(scene, "linear", ratio=4)), tmp_path / "out")
+    (tmp_path / "out" / SEEDS).unlink()
+    again, n = load_scene(tmp_path / "out"), len(scene.points)
+    assert np.array_equal(again.points.source == GENERATED, np.arange(4 * n) >= n)
+    assert len(again.tracks) == n
+
+
+def test_where_no_point_is_an_original_all_are(scene, tmp_path):
+    new = scene.points.replace(source=np.full(len(scene.points), 6, np.uint8))
+    write_scene(scene.replace(points=new, tracks=None), tmp_path / "out")
+    again = load_scene(tmp_path / "out")
+    assert again.points.num_original == len(new)
+    assert not any("added by" in warning for warning in again.warnings)
+
+
+@pytest.mark.parametrize("layout", ["colmap", "transforms"])
+def test_an_output_is_written_back_byte_for_byte(scene, tmp_path, layout):
+    seeds = upsample(scene, "triangle", ratio=3)
+    write_scene(scene.replace(points=seeds), tmp_path / "out", format=layout)
+    report = write_scene(load_scene(tmp_path / "out"), tmp_path / "again")
+    assert report.layout == layout
+    assert (report.num_original, report.num_points) == (len(scene.points), len(seeds))
+    for name in set(report.files) - {"splatseed.json", "images"}:
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"num_points": 1, "num_original": 1}', '{"num_points": "x"}', "\xff"]
+)
+def test_a_manifest_that_does_not_fit_says_nothing(scene, tmp_path, text):
+    write_scene(scene, tmp_path / "out")
+    (tmp_path / "out" / "splatseed.json").write_text(text, encoding="latin-1")
+    assert not load_scene(tmp_path / "out").points.source.any()
+
+
+def test_a_cloud_that_was_changed_since_is_all_originals(scene, tmp_path):
+    write_scene(scene.replace(points=upsample(scene, "linear", ratio=2)), tmp_path / "out")
+    manifest = tmp_path / "out" / "splatseed.json"
+    facts = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps({**facts, "num_points": facts["num_points"] + 1}))
+    (tmp_path / "out" / SEEDS).unlink()
+    assert not load_scene(tmp_path / "out").points.source.any()

@@ -1,0 +1,192 @@
+"""What is known of points comes back with them, and is never given to others."""
+
+from __future__ import annotations
+
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra import numpy as hnp
+
+from splatseed import load_scene, write_scene
+from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io.output.seeds_npz import SEEDS, read_seeds, write_seeds
+from splatseed.pointcloud import ATTRIBUTES, PointCloud
+from splatseed.synthetic import make_capture
+
+NORMAL_STEP, CONFIDENCE_STEP = 1e-3, 5e-4
+"""Half precision: 11 bits."""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return make_capture(0, 6, 96, 72).scene
+
+
+@st.composite
+def clouds(draw):
+    """Distinct points, of which anything may be known or not."""
+    count = draw(st.integers(1, 12))
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    holes = hnp.arrays(bool, count)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    values = {
+        "normals": np.where(draw(holes)[:, None], np.nan, normals),
+        "sizes": np.where(draw(holes), np.nan, np.exp(rng.uniform(-30, 30, count))),
+        "confidence": np.where(draw(holes), np.nan, rng.random(count)),
+    }
+    known = {name: values[name] for name in values if draw(st.booleans())}
+    source = draw(hnp.arrays(np.uint8, count, elements=st.sampled_from([0, 4, 8, 9, 255])))
+    xyz = rng.normal(size=(count, 3)) * draw(st.sampled_from([1e-6, 1.0, 1e6]))
+    xyz[0] = [-0.0, 0.0, 1.0]
+    return PointCloud(xyz, np.zeros((count, 3), np.uint8), np.sort(source), **known)
+
+
+def assert_same(actual: PointCloud, expected: PointCloud) -> None:
+    """All that is known of any point is known again, as finely as it is kept."""
+    np.testing.assert_array_equal(actual.source, expected.source)
+    for name, shape in ATTRIBUTES.items():
+        unknown = np.full((len(expected), *shape), np.nan)
+        now, then = (each.attributes.get(name, unknown) for each in (actual, expected))
+        step = {"normals": NORMAL_STEP, "confidence": CONFIDENCE_STEP, "sizes": 0.0}[name]
+        np.testing.assert_allclose(now, then, rtol=0, atol=step)
+
+
+@settings(deadline=None, max_examples=100)
+@given(clouds())
+def test_all_that_is_known_comes_back(tmp_path_factory, cloud):
+    folder = tmp_path_factory.mktemp("seeds")
+    write_seeds(folder, cloud)
+    bare = PointCloud(cloud.xyz, cloud.rgb)
+    known = read_seeds(folder, bare)
+    assert known.warning == ""
+    if known.has_source:
+        assert_same(known.points, cloud)
+    else:
+        assert not known.points.source.any()
+        assert set(cloud.source) <= {0, 255}
+        assert_same(known.points, cloud.replace(source=None))
+
+
+@settings(deadline=None, max_examples=20)
+@given(cloud=clouds(), layout=st.sampled_from(["colmap", "transforms"]))
+def test_a_scene_keeps_what_is_known_of_its_seeds(scene, tmp_path_factory, cloud, layout):
+    folder = tmp_path_factory.mktemp("scene")
+    new = cloud.select(cloud.source > 0)
+    seeds = PointCloud.concatenate(scene.points, new)
+    report = write_scene(scene.replace(points=seeds), folder / "a", format=layout)
+    again = load_scene(folder / "a")
+    expected = seeds.select(seeds.distinct)
+    if layout == "transforms" and expected.normals is not None:  # (x, y, z) -> (x, z, -y)
+        expected = expected.replace(normals=expected.normals[:, [0, 2, 1]] * [1, 1, -1])
+    if SEEDS not in report.files:  # then there is nothing to know but which are new
+        assert (expected.source[len(scene.points) :] == 255).all()
+        assert all(np.isnan(values).all() for values in expected.attributes.values())
+    assert_same(again.points, expected)
+    assert (SEEDS in report.files) == (folder / "a" / SEEDS).exists()
+    write_scene(again, folder / "b", format=layout)
+    if (folder / "a" / SEEDS).exists():
+        assert (folder / "b" / SEEDS).read_bytes() == (folder / "a" / SEEDS).read_bytes()
+
+
+def test_points_that_are_left_out_take_what_is_known_of_them_along(scene, tmp_path):
+    xyz = np.array([[0, 0, 0], [np.nan, 0, 0], [1, 0, 0], [0, 0, 0], [2, 0, 0]])
+    rgb, code = np.zeros((5, 3), np.uint8), np.full(5, 8, np.uint8)
+    new = PointCloud(xyz, rgb, code, sizes=np.arange(1.0, 6.0))
+    write_scene(scene.replace(points=PointCloud.concatenate(scene.points, new)), tmp_path / "out")
+    assert load_scene(tmp_path / "out").points.sizes[-3:].tolist() == [1.0, 3.0, 5.0]
+
+
+def test_a_plain_scene_has_no_such_file(scene, tmp_path):
+    cloud = scene.points.replace(sizes=np.full(len(scene.points), np.nan))
+    report = write_scene(scene.replace(points=cloud), tmp_path / "out")
+    assert SEEDS not in report.files
+    assert not (tmp_path / "out" / SEEDS).exists()
+
+
+def test_the_tracks_of_originals_stay_theirs(scene, tmp_path):
+    new = PointCloud(np.eye(3), np.zeros((3, 3), np.uint8), np.full(3, 8, np.uint8))
+    seeds = PointCloud.concatenate(scene.points, new)
+    write_scene(scene.replace(points=seeds), tmp_path / "out")
+    again = load_scene(tmp_path / "out")
+    assert len(again.tracks) == len(scene.points) == again.points.num_original
+    np.testing.assert_array_equal(again.tracks.lengths, scene.tracks.lengths)
+
+
+def test_a_file_of_other_points_is_left_aside_and_told_of(scene, tmp_path):
+    seeds = scene.points.replace(sizes=np.ones(len(scene.points)))
+    out = write_scene(scene.replace(points=seeds), tmp_path / "out").path
+    model = out / "sparse/0/points3D.bin"
+    points, tracks = colmap_binary.read_points3d(model)
+    colmap_binary.write_points3d(model, points.replace(rgb=255 - points.rgb), tracks)
+    assert load_scene(out).points.sizes is not None  # another colour, the same place
+    other = points.select(slice(None, None, -1))
+    colmap_binary.write_points3d(model, other, None)
+    again = load_scene(out)
+    assert again.points.sizes is None
+    assert [w for w in again.warnings if SEEDS in w and "other points" in w]
+
+
+def damaged(arrays: dict[str, np.ndarray], how: str) -> dict[str, np.ndarray]:
+    """Arrays with one of them spoilt."""
+    count = len(arrays["sizes"])
+    spoilt = {
+        "short": {"sizes": arrays["sizes"][:-1]},
+        "wide": {"sizes": np.ones((count, 2), np.float32)},
+        "type": {"sizes": arrays["sizes"].astype(np.float64)},
+        "objects": {"sizes": np.array([None] * count)},
+        "negative": {"sizes": -arrays["sizes"]},
+        "long normals": {"normals": np.full((count, 3), 2.0, np.float16)},
+    }
+    return arrays | spoilt[how]
+
+
+@pytest.mark.parametrize("how", ["short", "wide", "type", "objects", "negative", "long normals"])
+def test_arrays_that_do_not_fit_are_left_aside_and_told_of(tmp_path, how):
+    cloud = PointCloud(np.eye(3), np.zeros((3, 3), np.uint8), sizes=np.ones(3))
+    write_seeds(tmp_path, cloud)
+    with np.load(tmp_path / SEEDS) as archive:
+        arrays = damaged(dict(archive), how)
+    np.savez_compressed(tmp_path / SEEDS, **arrays)
+    known = read_seeds(tmp_path, cloud.replace(sizes=None))
+    assert known.points.attributes == {}
+    assert SEEDS in known.warning
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x05\x06" + bytes(18), b"not an archive"])
+def test_files_that_are_none_of_ours_are_told_of(tmp_path, content):
+    (tmp_path / SEEDS).write_bytes(content)
+    assert (
+        "none of splatseed's"
+        in read_seeds(tmp_path, PointCloud(np.eye(3), np.zeros((3, 3), np.uint8))).warning
+    )
+
+
+@settings(deadline=None, max_examples=150)
+@given(st.data())
+def test_damage_anywhere_never_escapes(tmp_path_factory, data):
+    folder = tmp_path_factory.mktemp("damage")
+    cloud = PointCloud(np.eye(3), np.zeros((3, 3), np.uint8), sizes=np.ones(3))
+    write_seeds(folder, cloud)
+    content = bytearray((folder / SEEDS).read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    (folder / SEEDS).write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    sizes = read_seeds(folder, cloud.replace(sizes=None)).points.sizes
+    assert sizes is None or np.array_equal(sizes, np.ones(3))  # a checksum guards each array
+
+
+def test_a_header_is_not_believed(tmp_path):
+    """An archive whose header promises a terabyte."""
+    cloud = PointCloud(np.eye(3), np.zeros((3, 3), np.uint8), sizes=np.ones(3))
+    write_seeds(tmp_path, cloud)
+    with np.load(tmp_path / SEEDS) as archive:
+        digest = archive["digest"]
+    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }"
+    with zipfile.ZipFile(tmp_path / SEEDS, "w") as archive:
+        with archive.open("digest.npy", "w") as file:
+            np.save(file, digest)
+        archive.writestr("sizes.npy", header.ljust(127) + b"\n" + bytes(12))
+    assert "damaged" in read_seeds(tmp_path, cloud.replace(sizes=None)).warning

@@ -1,0 +1,42 @@
+"""Formats that are not read are named, with what converts them."""
+
+from __future__ import annotations
+
+import pytest
+
+from splatseed.errors import SceneFormatError
+from splatseed.io import load_scene
+from splatseed.io.ply.points import read_ply
+
+PACKED = """ply
+format binary_little_endian 1.0
+element chunk 1
+property float min_x
+element vertex 256
+property uint packed_position
+property uint packed_rotation
+end_header
+"""
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat", ".ksplat", ".sog", ".SPZ"])
+def test_a_format_that_is_not_read_is_named(suffix, tmp_path):
+    path = tmp_path / f"model{suffix}"
+    path.write_bytes(b"\x1f\x8b")
+    with pytest.raises(SceneFormatError, match=r"found Gaussians .*does not read.*splat-transform"):
+        load_scene(path)
+
+
+def test_a_compressed_ply_is_named(tmp_path):
+    path = tmp_path / "model.compressed.ply"
+    path.write_bytes(PACKED.encode() + bytes(4 + 256 * 8))
+    with pytest.raises(SceneFormatError, match=r"PlayCanvas's .compressed.ply"):
+        read_ply(path)
+
+
+def test_evaluate_names_them_too(tmp_path):
+    ply = pytest.importorskip("splatseed.splat.ply")
+    for name, content in (("a.splat", b""), ("a.ply", PACKED.encode())):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(SceneFormatError, match=r"found Gaussians .*does not read"):
+            ply.read_gaussians(tmp_path / name)

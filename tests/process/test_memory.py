@@ -1,0 +1,86 @@
+"""What cannot fit the memory is refused before any work, with the number that fits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatseed.commands.bench.machine import Machine, check_machine
+from splatseed.errors import ParameterError
+from splatseed.io import load_scene
+from splatseed.monocular import estimate
+from splatseed.pointcloud import PointCloud
+from splatseed.process import memory
+from splatseed.synthetic import make_capture, write_capture
+from splatseed.train.device import BYTES_EACH as BYTES_TRAINED
+from splatseed.upsample import BYTES_EACH, number_of_new, upsample
+from splatseed.views.view import load_views
+
+
+@pytest.fixture
+def free(monkeypatch):
+    """Sets the bytes that are said to be free."""
+    return lambda count: monkeypatch.setattr(memory, "free_memory", lambda: count)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    path = tmp_path_factory.mktemp("memory") / "room"
+    return load_scene(write_capture(make_capture(0, num_views=4, width=60, height=40), path))
+
+
+def test_upsample_says_how_many_points_fit(free, rng):
+    free(5000 * BYTES_EACH)
+    xyz = rng.random((100, 3))
+    cloud = PointCloud(xyz, np.zeros(xyz.shape, np.uint8))
+    assert len(upsample(cloud, "random", num_points=5000)) == 5000
+    with pytest.raises(
+        ParameterError,
+        match=r"at most 5,000 points.*free memory.*found 1,000,000,000.*Ask for 5000",
+    ):
+        upsample(cloud, "mls", num_points=10**9)
+
+
+def test_photographs_of_a_scene(free, scene):
+    free(4 * 60 * 40 * 3)
+    assert len(load_views(scene, scene.images)) == 4
+    free(3 * 60 * 40 * 3)
+    with pytest.raises(ParameterError, match=r"found 4 of 60 x 40.*--data-factor"):
+        load_views(scene, scene.images)
+    assert len(load_views(scene, scene.images, data_factor=2)) == 4
+
+
+def test_a_batch_for_a_network(free):
+    free(2 * 1000 * estimate.BYTES_A_PIXEL)
+    sizes = dict.fromkeys("abc", (40, 25))
+    estimate._check_memory(sizes, 2)
+    with pytest.raises(ParameterError, match="--batch 2"):
+        estimate._check_memory(sizes, 3)
+    estimate._check_memory({"a": (40, 25)}, 3)
+
+
+def test_the_runs_of_a_benchmark(free):
+    free(1000 * BYTES_TRAINED)
+    machine = Machine("this machine", "cpu", 2, 1, lambda *_: True, is_local=True)
+    check_machine(machine, 500)
+    with pytest.raises(
+        ParameterError, match=r"at most 500 seeds a run with 2 at a time.*--cap-max 500"
+    ):
+        check_machine(machine, 501)
+    check_machine(Machine("a cluster", "cpu", 2, 1, lambda *_: True), 501)
+
+
+def test_a_container_has_less_than_its_machine(monkeypatch, tmp_path):
+    monkeypatch.setattr(memory, "CGROUP", tmp_path)
+    whole = memory.free_memory()
+    (tmp_path / "memory.max").write_text("3000000\n")
+    (tmp_path / "memory.current").write_text("2500000\n")
+    (tmp_path / "memory.stat").write_text("anon 1\ninactive_file 400000\n")
+    assert memory.free_memory() == 900_000
+    (tmp_path / "memory.max").write_text("max\n")
+    assert memory.free_memory() == pytest.approx(whole, rel=0.5)
+
+
+def test_an_unknown_amount_refuses_nothing(free):
+    free(None)
+    assert number_of_new(None, "mls", 10, None, 10**9) == 10**9 - 10

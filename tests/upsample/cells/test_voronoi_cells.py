@@ -1,0 +1,113 @@
+"""Voronoi cells: the meshless and the boxed ones against SciPy's, cell by cell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import QhullError
+
+from splatseed import PointCloud
+from splatseed.errors import PointCloudError
+from splatseed.progress import silent
+from splatseed.upsample.cells import box as voronoi_box
+from splatseed.upsample.cells.box import box_cells
+from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
+from splatseed.upsample.neighbors import prepare
+from splatseed.upsample.surfaces.frames import local_frames
+
+from .. import references_voronoi as slow
+
+
+def prepared(xyz):
+    return prepare(PointCloud(np.asarray(xyz, np.float32), np.zeros(np.shape(xyz), np.uint8)))
+
+
+def meshless(cloud, k):
+    neighbors, n = cloud.neighbors(k), len(cloud)
+    cells = Cells(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, bool))
+    frames, _ = local_frames(cloud.xyz, neighbors.idx)
+    build_cells(cloud.xyz, neighbors.idx, neighbors.distance, frames, 0, n, cells)
+    return cells, neighbors
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_closed_cells_are_the_voronoi_cells(scale, rng):
+    cloud = prepared(scale * rng.random((600, 3)))
+    cells, neighbors = meshless(cloud, MAX_NEIGHBORS)
+    truth = slow.true_cells(cloud.xyz)
+    assert cells.closed.mean() > 0.3
+    for i in np.flatnonzero(cells.closed):
+        center, radius, volume = truth[i]
+        assert cells.volume[i] == pytest.approx(volume, rel=1e-9)
+        if radius + np.linalg.norm(center - cloud.xyz[i]) < 0.5 * neighbors.distance[i, -1]:
+            np.testing.assert_allclose(cloud.xyz[i] + cells.center[i], center, atol=1e-9 * scale)
+            assert cells.radius[i] == pytest.approx(radius, rel=1e-9)
+
+
+@pytest.mark.parametrize("k", [4, 10, 25])
+def test_open_cells_are_cut_from_their_cube(k, wavy, wavy_exact):
+    cloud = prepare(wavy)
+    cells, _ = meshless(cloud, k)
+    for row in range(0, len(cloud), 3):
+        i = cloud.rank[row]
+        center, radius, volume = slow.clamped_cell(wavy_exact.xyz, i, k)
+        assert cells.volume[row] == pytest.approx(volume, rel=1e-6)
+        np.testing.assert_allclose(
+            wavy_exact.xyz[i] + cells.center[row], center, rtol=0, atol=1e-6 * radius
+        )
+        assert cells.radius[row] == pytest.approx(radius, rel=1e-6)
+
+
+def test_closed_cells_do_not_overlap_and_fill_a_lattice():
+    lattice = np.stack(np.meshgrid(*[np.arange(7.0)] * 3), axis=-1).reshape(-1, 3)
+    cloud = prepared(lattice)
+    cells, _ = meshless(cloud, 40)
+    inner = (np.abs(cloud.xyz) < 1.5).all(axis=1)
+    np.testing.assert_allclose(cells.volume[inner], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(cells.center[inner], 0.0, atol=1e-6)
+    np.testing.assert_allclose(cells.radius[inner], np.sqrt(0.75), rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", ["plane", "line", "lattice", "near twins", "ring"])
+def test_cells_of_any_sites_are_bounded(shape, rng):
+    angle = np.linspace(0.0, 2 * np.pi, 100, endpoint=False)
+    xyz = {
+        "plane": rng.random((200, 3)) * [1, 1, 0],
+        "line": rng.random((200, 3)) * [1, 0, 0],
+        "lattice": np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 3),
+        "near twins": np.repeat(rng.random((100, 3)), 2, axis=0) + 1e-7 * rng.random((200, 3)),
+        "ring": np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1),
+    }[shape]
+    cloud = prepared(xyz)
+    cells, neighbors = meshless(cloud, 25)
+    side = neighbors.distance[:, -1]
+    assert (cells.volume > 0).all()
+    assert (cells.volume <= side**3 * (1 + 1e-9)).all()
+    assert (np.linalg.norm(cells.center, axis=1) <= 0.5 * side * (1 + 1e-9)).all()
+    assert (cells.radius <= side * (1 + 1e-9)).all()
+
+
+def test_boxed_cells_are_scipys(rng):
+    xyz = rng.random((150, 3)).astype(np.float32).astype(np.float64) * [3.0, 2.0, 1.0]
+    cloud = prepared(xyz)
+    center, radius, volume = box_cells(cloud, silent)
+    for row, (c, r, v) in enumerate(slow.box_cells(cloud.xyz)):
+        np.testing.assert_allclose(cloud.xyz[row] + center[row], c, rtol=0, atol=1e-7 * r)
+        assert radius[row] == pytest.approx(r, rel=1e-7)
+        assert volume[row] == pytest.approx(v, rel=1e-7)
+
+
+def test_most_of_the_boxed_volume_lies_outside_the_box(wavy):
+    # Why the default clamps: the paper's cells reach far beyond the scene.
+    cloud = prepare(wavy)
+    _, radius, _ = box_cells(cloud, silent)
+    assert radius.max() > np.linalg.norm(np.ptp(cloud.xyz, axis=0))
+
+
+def test_qhulls_failure_is_told_with_a_way_out(monkeypatch, wavy):
+    def fail(_sites):
+        raise QhullError("QH6154 initial simplex is flat\n\nWhile executing: ...")
+
+    monkeypatch.setattr(voronoi_box, "Delaunay", fail)
+    with pytest.raises(PointCloudError, match=r'QH6154.*"clamped"'):
+        box_cells(prepare(wavy), silent)
