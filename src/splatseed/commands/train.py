@@ -89,6 +89,8 @@ class Options:
     """Begin with the sizes that the scene's seeds.npz knows, not those of the gaps between seeds."""
     seed_normals: bool = DEFAULT.seed_normals
     """Begin with flat discs where the scene's seeds.npz knows the normals."""
+    seed_colors: bool = DEFAULT.seed_colors
+    """Begin with the colours that the training photographs show each seed in, by direction."""
     seeds: Annotated[
         Seeding | None,
         tyro.conf.arg(

@@ -60,6 +60,7 @@ def initial_gaussians(
     scale_factor: float = 1.0,
     largest: Float[np.ndarray, " N"] | None = None,
     flatness: float = 0.1,
+    harmonics: Float32[np.ndarray, "N 4 3"] | None = None,
 ) -> Gaussians:
     """One Gaussian a seed: as large as the seed's size, or else as the gap to its 3 nearest neighbours.
 
@@ -72,6 +73,7 @@ def initial_gaussians(
         scale_factor: Multiplies the size.
         largest: Most that each one's size may be, [N]; no bound when left out.
         flatness: Thickness of a disc, as a part of its size.
+        harmonics: Coefficients up to degree 1; the seed's colour from everywhere when left out.
 
     Raises:
         PointCloudError: Fewer than two distinct finite points.
@@ -86,14 +88,17 @@ def initial_gaussians(
         known = ~np.isnan(seeds.normals[:, 0])
         scales[known, 2] += np.log(flatness)
         quats[known] = _quats_to(seeds.normals[known])
-    sh0 = (seeds.rgb / 255.0 - 0.5) / SH_C0
+    sh0, sh_rest = (seeds.rgb / 255.0 - 0.5) / SH_C0, np.zeros((count, rest, 3), np.float32)
+    if harmonics is not None:
+        sh0, first = harmonics[:, 0], harmonics[:, 1 : rest + 1]
+        sh_rest[:, : first.shape[1]] = first
     return Gaussians(
         means=np.array(seeds.xyz, np.float32),
         scales=scales.astype(np.float32),
         quats=quats.astype(np.float32),
         opacities=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
         sh0=sh0.astype(np.float32)[:, None],
-        shN=np.zeros((count, rest, 3), np.float32),
+        shN=sh_rest,
     )
 
 

@@ -25,11 +25,9 @@ from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, training_frame
-from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.pictures import beside_truth, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
-from splatseed.train.near_depths import near_depths
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
 from splatseed.train.record.config import check_same_seeds, make_config, resumed_settings
 from splatseed.train.record.curve import Record, write_curve_csv, write_curve_png
@@ -37,6 +35,7 @@ from splatseed.train.record.folder import RunFolder, write_json
 from splatseed.train.record.tensorboard import Board
 from splatseed.train.seeds import seeded, usable_seeds
 from splatseed.train.settings import TrainSettings
+from splatseed.train.start import first_gaussians
 from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
 from splatseed.train.strategies import make_strategy
 from splatseed.train.trainer import Trainer
@@ -307,15 +306,6 @@ def _state(
     strategy, schedule = make_strategy(settings, device), settings.schedule
     if begun and begun.checkpoint.is_file():
         return load_checkpoint(begun.checkpoint, strategy, schedule, device)
-    seeds = frame.cloud_from_world(seeds)
-    lengths = near_depths(seeds.xyz, views)
-    gaussians = initial_gaussians(
-        seeds,
-        sh_degree=settings.sh_degree,
-        opacity=schedule.opacity,
-        scale_factor=schedule.scale_factor,
-        largest=schedule.largest * lengths,
-        flatness=schedule.flatness,
-    )
+    gaussians, lengths = first_gaussians(frame.cloud_from_world(seeds), views, settings)
     params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
     return TrainState(params, make_optimizers(params, schedule), strategy)

@@ -58,7 +58,8 @@ class TrainSettings:
     """Begin with the sizes that ``seeds.npz`` knows, else with those of the gaps between seeds."""
     seed_normals: bool = False
     """Begin with flat discs where ``seeds.npz`` knows the normals, else with balls alone."""
-
+    seed_colors: bool = False
+    """Begin with the colours that the training photographs show a seed in, by direction, not its own."""
     seeding: Seeding = "scene"
     """Begin with the scene's points as they are, or let method ``auto`` add to them what the training
     photographs ask for. Points that splatseed has added already, and 3DGS's conventions, are left alone."""

@@ -14,6 +14,7 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
+from splatseed.commands.upsample.start import check_start, write_start
 from splatseed.console import (
     OUT,
     StageClock,
@@ -35,6 +36,7 @@ from splatseed.io.output.staging import check_output
 from splatseed.literal import visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.scene import Scene
+from splatseed.seeding.photographs import photographed
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
 from splatseed.upsample import (
     METHODS,
@@ -123,6 +125,10 @@ class Options:
     """For --method depth: --no-align takes metric depth and poses as they are (--depth.no-align)."""
     preview: bool = False
     """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's maps."""
+    gaussians: Annotated[
+        Path | None, tyro.conf.arg(constructor=Path, help_behavior_hint="(default: none)")
+    ] = None
+    """Also write the Gaussians to begin training with, a 3DGS .ply, for trainers that start from one."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write; auto keeps the input's."""
     copy_images: bool = False
@@ -180,10 +186,14 @@ def run(arguments: list[str]) -> None:
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     inputs = [path for path in (options.scene, options.depth_maps) if path is not None]
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=inputs)
+    if options.gaussians is not None:
+        check_start(options.gaussians, options.output, overwrite=options.overwrite)
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
         scene = _read(options, methods[options.method])
+        if options.gaussians is not None:
+            photographed(scene)  # raises without any: their sizes are bounded by what views show
         options = _settle(options, scene, notes)
         method = methods[options.method]
         usable = find_usable(scene.points)
@@ -195,6 +205,9 @@ def run(arguments: list[str]) -> None:
         found = _check(scene, seeds, method, usable)
         clock("write", 0.0)
         report = _write(options, scene.replace(points=seeds), method)
+        if options.gaussians is not None:
+            write_start(options.gaussians, scene.replace(points=seeds), method, clock)
+            notes.append(f"The Gaussians to begin with are in {visible(options.gaussians)}.")
         if options.preview:
             shown = scene.replace(points=scene.points.select(usable.keep), tracks=None)
             write_previews(
