@@ -17,7 +17,7 @@ from typing import Any
 from benchmarks.common.clocks import Clock, start_clock
 
 from splatseed.render import blending, blending_vjp, functions
-from splatseed.render.functions import Blend, Harmonics, Project
+from splatseed.render.autograd import Blend, Harmonics, Project
 
 __all__ = ["RENDER_STAGES", "Stopwatch", "timed"]
 

@@ -303,7 +303,7 @@ def print_opensplat(
     header = [
         "view, Gaussians",
         "threads",
-        "OpenSplat, ms a step",
+        "OpenSplat, ms per step",
         "ours, median ms",
         "OpenSplat/ours",
     ]

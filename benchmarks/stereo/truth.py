@@ -26,7 +26,7 @@ from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.fusion import fuse
 from splatseed.stereo.result import Stereo
 from splatseed.stereo.settings import StereoSettings
-from splatseed.stereo.without_points import known_sightings
+from splatseed.stereo.without_points import known_visibility
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.raycast import render_views
 from splatseed.synthetic.room import Room
@@ -111,9 +111,9 @@ def _score(name: str, cache: Path, settings: StereoSettings, limit: int, without
         seen = seen.replace(depths=None)
     factor = data_factor(images, settings.max_size)
     views = load_views(scene, images, data_factor=factor)
-    find_stereo(views[:2], images[:2], known_sightings(scene), settings)  # compiled
+    find_stereo(views[:2], images[:2], known_visibility(scene), settings)  # compiled
     started = time.process_time()
-    stereo = find_stereo(views, images, known_sightings(seen), settings)
+    stereo = find_stereo(views, images, known_visibility(seen), settings)
     seeds = fuse(stereo, CELL)
     seconds = time.process_time() - started
     kept, one, five = _map_shares(stereo, scene)

@@ -165,7 +165,7 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
 
 
 def print_commands(title: str, commands: Sequence[tuple[str, str]]) -> None:
-    """Print commands one a line, unwrapped, so that they can be copied."""
+    """Print commands one per line, unwrapped, so that they can be copied."""
     _print_title(title)
     _print_columns(commands)
 

@@ -184,7 +184,7 @@ def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:
         raise PointCloudError(
             "xyz as numbers of shape [N, 3]",
             found=f"{xyz.dtype} {list(xyz.shape)}",
-            fix="Pass one row x, y, z a point.",
+            fix="Pass one row x, y, z per point.",
         )
     if rgb.shape != xyz.shape or rgb.dtype != np.uint8:
         raise PointCloudError(
@@ -196,7 +196,7 @@ def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:
         raise PointCloudError(
             f"source of shape [{len(xyz)}]",
             found=f"{list(source.shape)}",
-            fix="Pass one code a point, or leave it out.",
+            fix="Pass one code per point, or leave it out.",
         )
 
 
@@ -207,7 +207,7 @@ def _check_attribute(name: str, values: np.ndarray, num_points: int) -> None:
         raise PointCloudError(
             f"{name} as numbers of shape {list(shape)}",
             found=f"{values.dtype} {list(values.shape)}",
-            fix="Pass one value a point, NaN where it is not known, or leave them out.",
+            fix="Pass one value per point, NaN where it is not known, or leave them out.",
         )
     fits = np.isnan(values) | _in_range(name, values)
     wrong = np.unique(np.nonzero(~fits)[0])

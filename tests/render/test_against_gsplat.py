@@ -15,7 +15,7 @@ from gsplat.cuda._torch_impl import (
 from torch import Tensor
 
 from splatseed.render import rasterization
-from splatseed.render.functions import Harmonics
+from splatseed.render.autograd import Harmonics
 
 from .scenes import random_scene
 

@@ -47,7 +47,7 @@ class Options:
     data_factor: CountOrNone = None
     """By how much photographs are made smaller; a run's own, else 1."""
     test_every: CountOrNone = None
-    """Of the images sorted by name, every so many-th is scored; a run's own, else 8."""
+    """Score every n-th image, sorted by name; by default as the run was trained, else 8."""
     transform: Annotated[
         str | None,
         tyro.conf.arg(

@@ -229,7 +229,7 @@ def _summarise(options: Options, metrics: Mapping[str, Any]) -> None:
             ("test PSNR", psnr),
             ("test SSIM", f"{metrics['ssim']:.4f}"),
             ("Gaussians", f"{metrics['num_gaussians']:,} from {metrics['num_seeds']:,} seeds"),
-            ("training", f"{seconds:.1f} s, {1e3 * seconds / steps:.1f} ms a step"),
+            ("training", f"{seconds:.1f} s, {1e3 * seconds / steps:.1f} ms per step"),
             ("Gaussians in", str(options.output / "point_cloud.ply")),
             ("pictures", f"{options.output / 'renders'}, {options.output / 'curve.png'}"),
         ],

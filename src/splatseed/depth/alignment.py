@@ -28,7 +28,7 @@ from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
-from splatseed.views.sightings import SeenPoints, camera_points, find_sightings
+from splatseed.views.visibility import SeenPoints, camera_points, find_visibility
 
 __all__ = ["Alignment", "Fit", "align", "align_map", "reject_outliers", "trust_units", "values_at"]
 
@@ -96,7 +96,7 @@ def align(
         raise SceneNotFoundError(
             "a scene with depth maps", found="none", fix="Name their folder with --depth."
         )
-    depths, sightings = scene.depths, find_sightings(scene)
+    depths, visibility = scene.depths, find_visibility(scene)
     images = [image for image in scene.images if image.name in depths]
     found: list[Alignment | None] = [None] * len(images)
 
@@ -104,7 +104,7 @@ def align(
         for i in range(start, stop):
             depth = depths.read(images[i].name)
             camera = map_camera(depth, images[i])
-            points = camera_points(camera, sightings.of(images[i]))
+            points = camera_points(camera, visibility.of(images[i]))
             found[i] = align_map(depth, camera, points, fit, min_points)
 
     in_threads(work, len(images), 1, "align depth", progress)

@@ -34,7 +34,7 @@ LEAST = 0.05
 """How much rays that coincide cover."""
 SEEN = 0.25
 """A view sees a sample if its own depth there differs by less than this share."""
-FAR = 1e6
+MOST_COLUMNS = 1e6
 """No grid has so many columns."""
 PIECE = 8
 """Views that a thread takes at a time."""
@@ -145,7 +145,7 @@ def _nearest(point, m):  # type: ignore[no-untyped-def]
     """Depth of a point in a view, and the nearest point of its grid; column -1 where there is none."""
     column, row, depth = place(point, m)
     column, row = column + 0.5, row + 0.5
-    if not (0.0 <= column < FAR and 0.0 <= row < FAR):
+    if not (0.0 <= column < MOST_COLUMNS and 0.0 <= row < MOST_COLUMNS):
         return depth, -1, -1
     return depth, int(column), int(row)
 

@@ -20,7 +20,7 @@ class Settings:
     fit: Literal["robust", "least-squares"] = "robust"
     """How: medians and reweighting, or the paper's equation 7 (paper: least-squares)."""
     min_points: int = 20
-    """SfM points an image must see, or it is left out (paper: 1)."""
+    """Fewest SfM points that an image must see, else it is left out (paper: 1)."""
     max_residual_ratio: float | None = 3.0
     """Leave out images that fit this many times worse than the median one (paper: none)."""
     harmonize: bool = True
@@ -48,7 +48,7 @@ class Settings:
     spread: bool = True
     """Take points as evenly apart as their number allows, whatever image they are from (paper: no)."""
     hold_out: int = 0
-    """Leave out every so many-th image by name, as trainers do for the test (8); 0 = use all."""
+    """Leave out every n-th image by name, as trainers do for the test (8); 0 = use all."""
 
     @property
     def harmonizes(self) -> bool:

@@ -1,4 +1,4 @@
-"""Reading scenes and writing them, one file a format.
+"""Reading scenes and writing them, one file per format.
 
 ``load_scene`` finds out what a path holds; ``write_scene`` makes a folder that every 3D Gaussian
 Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a scene's images.

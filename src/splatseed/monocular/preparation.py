@@ -57,7 +57,7 @@ class Preparation:
             )
         if self.std is not None and min(self.std) <= 0:
             raise ParameterError(
-                "--std above 0", found=f"{self.std}", fix="Give one number a channel."
+                "--std above 0", found=f"{self.std}", fix="Give one number per channel."
             )
 
 

@@ -180,8 +180,8 @@ def harmonics_vjp(
                 _prefetch(rest, row + AHEAD * (skipped + ROW))
                 _prefetch(d_rest, row + AHEAD * (skipped + ROW))
                 d_color = triple(red, green, blue)
-                slopes = _row_vjp(*_vectors(x, y, z), d_color, rest, row, table, d_rest)
-                dx, dy, dz = lane_0(slopes), lane_4(slopes), lane_8(slopes)
+                gradients = _row_vjp(*_vectors(x, y, z), d_color, rest, row, table, d_rest)
+                dx, dy, dz = lane_0(gradients), lane_4(gradients), lane_8(gradients)
                 along = dx * x + dy * y + dz * z
                 dx, dy = (dx - along * x) * inverse, (dy - along * y) * inverse
                 dz = (dz - along * z) * inverse
@@ -298,7 +298,7 @@ def _slope(twice, one, other, square, with_one, with_other, table):
 
 
 @always_inline
-def _weighted(slopes, a, b, c):
+def _weighted(gradients, a, b, c):
     """Slopes times the numbers of a row, to be summed over lanes."""
-    total = fma(spread_1(slopes), b, multiply(spread_0(slopes), a))
-    return fma(spread_2(slopes), c, total)
+    total = fma(spread_1(gradients), b, multiply(spread_0(gradients), a))
+    return fma(spread_2(gradients), c, total)

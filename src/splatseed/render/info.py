@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from splatseed.render.functions import is_seen
+from splatseed.render.autograd import is_seen
 from splatseed.render.intersections import Grid, Intersections, intersect
 
 __all__ = ["Info", "View", "make_info"]

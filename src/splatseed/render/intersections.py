@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseed.render.functions import is_seen
+from splatseed.render.autograd import is_seen
 
 __all__ = ["Grid", "Intersections", "intersect"]
 

@@ -16,15 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseed.render.arguments import (
+from splatseed.render.autograd import Blend, Harmonics, Lens, Project
+from splatseed.render.info import Info, View, make_info
+from splatseed.render.validation import (
     check_absgrad,
     check_numbers,
     check_sparse,
     check_tensors,
     check_unsupported,
 )
-from splatseed.render.functions import Blend, Harmonics, Lens, Project
-from splatseed.render.info import Info, View, make_info
 from splatseed.requirements import require
 
 __all__ = ["rasterization"]

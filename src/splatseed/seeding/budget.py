@@ -39,7 +39,7 @@ CLOSE_ENOUGH = 0.02
 """How many fewer than the number a spacing may keep."""
 STEPS = 24
 LEAST_POWER = 0.2
-"""Of the number kept as a power of 1 / spacing, lest a step be too long; on surfaces it is 2."""
+"""Least exponent e assumed in: number kept ~ (1 / spacing)^e; bounds a step. On surfaces e is 2."""
 ACROSS = 4096.0
 """Pixels that a cloud without views is taken to measure."""
 FREE = np.uint64(0)
@@ -140,7 +140,7 @@ def _order(
         raise PointCloudError(
             f"priority of shape [{num}]",
             found=f"{list(priority.shape)}",
-            fix="Pass one number a point, or leave it out.",
+            fix="Pass one number per point, or leave it out.",
         )
     return np.lexsort((-priority, np.arange(num) >= first))  # stable
 

@@ -45,7 +45,7 @@ HIDING = 5
 """How many of the eight must be."""
 BLOCK = 512
 """Points that are projected before any is put into its cell, so that the former is vectorised."""
-FARTHEST = 3e38
+GREATEST_DEPTH = 3e38
 """Depths that float32 holds."""
 NONE = np.float32(np.inf)
 
@@ -103,7 +103,7 @@ def check_points(
     xyz = np.asarray(xyz)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise PointCloudError(
-            "xyz of shape [N, 3]", found=f"{list(xyz.shape)}", fix="Pass one row x, y, z a point."
+            "xyz of shape [N, 3]", found=f"{list(xyz.shape)}", fix="Pass one row x, y, z per point."
         )
     return np.ascontiguousarray(xyz, np.float32)
 
@@ -147,7 +147,7 @@ def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-unty
         project_block(xyz[start : start + num], matrix, at)
         for k in range(num):
             column, row, depth = at[0, k], at[1, k], at[2, k]
-            inside = 0.0 <= column < cols and 0.0 <= row < rows and 0.0 < depth < FARTHEST
+            inside = 0.0 <= column < cols and 0.0 <= row < rows and 0.0 < depth < GREATEST_DEPTH
             cells[start + k] = int(row) * cols + int(column) if inside else -1
             depths[start + k] = depth
 

@@ -78,7 +78,7 @@ def upsample(
         seed: The same seed gives the same bytes, whatever the number of threads.
         profile: "default", or "paper" for the paper's text to the letter.
         progress: Told each stage and the fraction done.
-        note: Told what was left out or made do with, one sentence each.
+        note: Told what was left out or replaced, one sentence each.
         parameters: Fields of the method, such as ``k=12``.
 
     Returns:
@@ -167,7 +167,7 @@ def add_verified(
         SceneNotFoundError: There are no photographs.
     """
     from splatseed.seeding.verify import verify  # noqa: PLC0415  (kernels load with use)
-    from splatseed.views.sightings import find_sightings  # noqa: PLC0415
+    from splatseed.views.visibility import find_visibility  # noqa: PLC0415
 
     codes = [source_code(name) for name in INTERPOLATING]
     guessed = np.isin(cloud.source, codes)
@@ -178,7 +178,7 @@ def add_verified(
     views = read_views(scene, images, MAX_SIZE, progress)
     points = cloud.select(guessed)
     new = NewPoints(points.xyz, points.rgb, (), source=points.source)
-    checked = verify(views, images, find_sightings(scene), new, progress)
+    checked = verify(views, images, find_visibility(scene), new, progress)
     for sentence in checked.notes:
         note(sentence)
     known = {name: getattr(checked, name) for name in ATTRIBUTES}

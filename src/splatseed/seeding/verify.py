@@ -24,8 +24,8 @@ from splatseed.stereo.matching import make_pictures
 from splatseed.stereo.quads import grey_image
 from splatseed.upsample.method import NewPoints
 from splatseed.views.pairs import choose_sources
-from splatseed.views.sightings import Sightings
 from splatseed.views.view import View
+from splatseed.views.visibility import Visibility
 
 __all__ = ["BARE_CONFIDENCE", "MAX_COST", "verify"]
 
@@ -39,7 +39,7 @@ BARE_CONFIDENCE = 0.1
 """Of points on flat places without texture, which are kept where they are."""
 STEEPEST = 0.3
 """Cosine between ray and normal: what is steeper is taken for so steep, as its normal cannot be right."""
-FARTHEST = 0.3
+LARGEST_MOVE = 0.3
 """Largest move of a plane along its normal, in spacings, as a share of its distance from the camera."""
 MOVED = 0.25
 """Spacings from which on a point counts as moved, in what is told."""
@@ -65,7 +65,7 @@ class _Trials:
 def verify(
     views: Sequence[View],
     images: Sequence[Image],
-    sightings: Sightings,
+    visibility: Visibility,
     new: NewPoints,
     progress: Progress = silent,
 ) -> NewPoints:
@@ -78,7 +78,7 @@ def verify(
     Args:
         views: The photographs, at the size to compare.
         images: The images they are of, in the same order.
-        sightings: The originals that the points were made from, and who sees them.
+        visibility: The originals that the points were made from, and who sees them.
         new: The points, finite.
         progress: Told how far it is.
 
@@ -86,14 +86,14 @@ def verify(
         Those that stay, in their order, with confidence and normals (towards the judge; NaN where the
         originals lie on a line); what else was known of them, and notes on how many were dropped and why.
     """
-    if len(sightings.xyz) < 2 or not len(new.xyz) or not views:
+    if len(visibility.xyz) < 2 or not len(new.xyz) or not views:
         return _unchecked(new)
-    seen = [sightings.rows_of(image) for image in images]
+    seen = [visibility.rows_of(image) for image in images]
     poses = np.stack([view.cam_from_world for view in views])
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
-    sources = choose_sources(seen, sightings.xyz, centers, NUM_SOURCES)
-    around = survey(sightings.xyz, new.xyz, progress)
-    judges = choose_judges(new.xyz, around, views, seen, len(sightings.xyz), sources)
+    sources = choose_sources(seen, visibility.xyz, centers, NUM_SOURCES)
+    around = survey(visibility.xyz, new.xyz, progress)
+    judges = choose_judges(new.xyz, around, views, seen, len(visibility.xyz), sources)
     trials = _try_all(new.xyz, around, views, judges, sources, progress)
     return _decide(new, around, trials, centers[judges])
 
@@ -179,7 +179,7 @@ def _planes(
     # n K^-1 (u, v, 1) w^-1 = n X, so w is linear in u and v with the slopes of n K^-1 / (n X)
     slopes = (n @ np.linalg.inv(view.K))[:, :2] / distance[:, None]
     planes = np.column_stack([1.0 / cam[:, 2], slopes])
-    reach = np.maximum(spacing / distance, -FARTHEST)
+    reach = np.maximum(spacing / distance, -LARGEST_MOVE)
     return uv.astype(np.float32), planes.astype(np.float32), reach.astype(np.float32)
 
 
@@ -241,7 +241,7 @@ def _notes(
     bare: Bool[np.ndarray, " M"],
     unknown: Bool[np.ndarray, " M"],
 ) -> tuple[str, ...]:
-    """How many points had which fate, a sentence each."""
+    """How many points had which fate, one sentence each."""
     dropped = ~(agrees | bare | unknown)
     fates = (
         (moved, "were moved by more than a quarter of their spacing to where they do"),

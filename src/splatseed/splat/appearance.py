@@ -51,7 +51,7 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
 
     With the colours p_v that V views show from directions d_v, and the seed's own colour p, it solves
     min over h of sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1 h_1..3|^2,
-    a ridge regression of four unknowns a colour channel.
+    a ridge regression of four unknowns per colour channel.
 
     Args:
         seeds: N points and their colours.

@@ -1,6 +1,6 @@
 """PatchMatch: planes handed from pixel to pixel and changed at random, where that lowers their cost.
 
-Notation: planes (w, gx, gy) float32 [3, h, w], inverse depth at a grid point's place and its slopes a pixel; costs
+Notation: planes (w, gx, gy) float32 [3, h, w], inverse depth at a grid point's place and its slopes per pixel; costs
 float32 [h, w]. Grid point (i, j) lies at pixel ((j + 0.5) g, (i + 0.5) g). Points are red and black as on a
 chequerboard; a half sweep visits those of one colour, sixteen of a row at a time, and reads only the other colour.
 Promise: the planes depend on the pictures, the start and ``key`` alone: random numbers are hashed from the key and

@@ -25,9 +25,9 @@ class Stereo:
 
     Args:
         views: The photographs at the size that was compared.
-        planes: Of each view, float32 [3, h, w]: inverse depth and its slopes a pixel of the view.
+        planes: Of each view, float32 [3, h, w]: inverse depth and its slopes per pixel of the view.
         costs: Of each view, float32 [h, w].
-        agreeing: Of each view, which of its witnesses confirm a pixel, a bit each, uint8 [h, w].
+        agreeing: Of each view, which of its witnesses confirm a pixel, one bit per witness, uint8 [h, w].
         sources: The views that each was compared with, best first, int64 [V, K]; -1 = none.
         settings: How.
     """

@@ -187,7 +187,7 @@ def settings_table(found: Comparison) -> Table:
 
 
 def change_table(found: Comparison) -> Table:
-    """All changes: a row an arm, a column a scene, the mean last.
+    """All changes: a row per arm, a column per scene, the mean last.
 
     Args:
         found: The comparison.

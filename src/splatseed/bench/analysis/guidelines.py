@@ -126,7 +126,7 @@ def rank_correlation(
     """Spearman's correlation and its two-sided p value.
 
     Args:
-        x: One value a scene, not all equal.
+        x: One value per scene, not all equal.
         y: Another, likewise.
 
     Returns:

@@ -149,7 +149,7 @@ def these_scenes(scenes: Sequence[Difference]) -> Difference:
     """The mean of differences on several scenes, for these scenes alone.
 
     Args:
-        scenes: One a scene, at least one.
+        scenes: One per scene, at least one.
     """
     mean = float(np.mean([each.mean for each in scenes]))
     variance = np.array([each.se**2 for each in scenes])

@@ -102,7 +102,7 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
     longer = _times(study, strategy, best, lambda r: r.train_seconds)
     larger = _times(study, strategy, best, lambda r: float(r.num_gaussians))
     text = (
-        f"{best.label} costs {seconds:.1f} s of upsampling a scene, {longer:.2f} times {BASELINE.label}'s"
+        f"{best.label} costs {seconds:.1f} s of upsampling per scene, {longer:.2f} times {BASELINE.label}'s"
         f" training time and {larger:.2f} times its Gaussians."
     )
     sooner = speed(study, strategy, best)

@@ -175,7 +175,7 @@ class RunResult:
         psnr: Mean over test images of each one's PSNR, dB.
         ssim: Mean SSIM.
         lpips: Mean LPIPS; None where it was not measured.
-        per_image: One score a test view.
+        per_image: One score per test view.
         curve: The test views on the way, in order of steps.
         num_seeds: Points that training began with.
         num_gaussians: Gaussians at the end.

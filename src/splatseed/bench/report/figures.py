@@ -71,7 +71,7 @@ def shown_variants(variants: Sequence[Variant]) -> tuple[Variant, ...]:
 
 
 def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
-    """Test PSNR over steps or over seconds, a panel a scene; None where there are no curves.
+    """Test PSNR over steps or over seconds, a panel per scene; None where there are no curves.
 
     Args:
         study: The study.

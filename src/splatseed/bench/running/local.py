@@ -38,7 +38,7 @@ class LocalExecutor(Executor):
     Args:
         ledger: The ledger.
         bench: The benchmark's folder.
-        environments: The variables of each slot's processes; one slot an entry.
+        environments: The variables of each slot's processes; one entry per slot.
         options: What runs do beside.
         watcher: Told what happens.
     """

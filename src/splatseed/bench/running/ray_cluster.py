@@ -107,7 +107,7 @@ def ray_cluster(address: str | None) -> Iterator[Cluster]:
     """Be connected to a cluster while the block runs.
 
     Args:
-        address: Its, or "auto" on one of its nodes; None for one of this machine alone, which is
+        address: Of the cluster, or "auto" on one of its nodes; None for one of this machine alone, which is
             started for the purpose.
 
     Raises:

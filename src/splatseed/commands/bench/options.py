@@ -91,7 +91,7 @@ class Options:
     training: Annotated[PlanTraining, tyro.conf.arg(name="")] = PlanTraining()
     """How each run is trained: its fields are options of their own."""
     depth: Annotated[tuple[Path, ...], _hint("the scene's")] = ()
-    """For method depth: a folder of maps a scene, or one folder with a subfolder of each one's name."""
+    """For method depth: a folder of maps per scene, or one folder with a subfolder of each one's name."""
     preset: Annotated[PresetName | None, _hint("none")] = None
     """A plan made before: the paper's data sets (with --data), or quick, for a laptop."""
     data: Annotated[Path | None, _one(Path, "none")] = None
@@ -102,7 +102,7 @@ class Options:
     """Print the plan, how many runs it is, and an estimate of hours and disk; run nothing."""
     executor: Literal["local", "ray"] = "local"
     """Processes on this machine, or tasks on a Ray cluster (extra cluster)."""
-    jobs: Annotated[int | None, _one(int, "one a GPU, else 1; ray: what fits")] = None
+    jobs: Annotated[int | None, _one(int, "one per GPU, else 1; ray: what fits")] = None
     """Runs at a time."""
     threads: Annotated[int | None, _one(int, "the cores shared out")] = None
     """Threads of each run on the CPU."""
@@ -111,7 +111,7 @@ class Options:
     retry_failed: bool = False
     """Run again what has failed."""
     keep_models: bool = False
-    """Keep trained models: some 236 bytes a Gaussian."""
+    """Keep trained models: some 236 bytes per Gaussian."""
     lpips: bool = False
     """Measure LPIPS too; its weights must be there (see splatseed evaluate)."""
 

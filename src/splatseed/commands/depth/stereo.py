@@ -130,7 +130,7 @@ def _summarise(
 
 
 def _sizes(maps: Sequence[StereoMap]) -> str:
-    """Of the smallest and the largest map, if they differ."""
+    """Sizes of the smallest and the largest map, if they differ."""
     ordered = sorted((each.depth.shape for each in maps), key=math.prod)
     ends = dict.fromkeys((ordered[0], ordered[-1]))
     return " to ".join(f"{width} x {height}" for height, width in ends)

@@ -33,7 +33,7 @@ from splatseed.scene import Scene
 __all__ = ["Options", "run"]
 
 KINDS_SHOWN = 3
-"""Kinds of cameras listed; collections of photographs from the web have one a photograph."""
+"""Kinds of cameras listed; collections of photographs from the web have one per photograph."""
 
 
 def _path(metavar: str) -> Any:
@@ -159,7 +159,7 @@ def _cloud_rows(cloud: CloudStatistics) -> list[tuple[str, str]]:
         ("isolated", f"{cloud.isolated:,}"),
         ("spacing 5/25/50/75/95%", spacing or "none"),
         ("bounding box", f"{low}  to  {high}"),
-        ("float32 step there", f"{cloud.resolution:.2g}"),
+        ("float32 resolution", f"{cloud.resolution:.2g}"),
     ]
 
 

@@ -62,7 +62,7 @@ def _summary(
     rows = [
         ("maps", maps),
         ("left out", f"{len(alignments) - len(used):,}"),
-        ("SfM points an image", _spread((a.num_points for a in alignments.values()), ".0f")),
+        ("SfM points per image", _spread((a.num_points for a in alignments.values()), ".0f")),
     ]
     if used:
         rows += [("scale", _spread((a.scale for a in used), ".4g"))]

@@ -159,7 +159,7 @@ def _help(arguments: list[str]) -> None:
 
 
 def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
-    """Options with one more field a method, whose default is the method given."""
+    """Options with one more field per method, whose default is the method given."""
     names = tuple(METHODS)
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()

@@ -36,7 +36,7 @@ class Record(NamedTuple):
 
 
 def write_curve_csv(path: Path, records: Sequence[Record]) -> None:
-    """Write one row a record, with a header; a PSNR not taken is left blank.
+    """Write one row per record, with a header; a PSNR not taken is left blank.
 
     Raises:
         OutputError: The file cannot be written.

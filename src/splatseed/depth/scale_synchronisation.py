@@ -1,4 +1,4 @@
-"""One factor an image, so that maps agree with one another where they overlap.
+"""Scale synchronisation: one factor per image, so that maps agree with one another where they overlap.
 
 Notation: V views; depth of view i is multiplied by exp(g_i). A pair (i, j) that sees the same places has
 a = median log(d_j / z_ij), where z_ij is the depth in view j of candidates of view i, and d_j what view j
@@ -36,7 +36,7 @@ SAMPLES = 96
 PAIRS = 6
 """Neighbours of a view that it is compared with: more do not change the result."""
 LEAST_SAMPLES = 12
-FAR = 0.25
+OTHER_SURFACE = 0.25
 """Logarithms of ratios beyond this are of other surfaces."""
 LEAST_SIGMA, LEAST_RESIDUAL = 0.005, 0.0005
 """No pair, and no SfM cloud, is believed to more than this."""
@@ -61,7 +61,7 @@ def harmonize(
         progress: Told how many are compared.
     """
     residuals = np.array([view.alignment.residual for view in views])
-    sigma = np.maximum(np.where(np.isfinite(residuals), residuals, FAR), LEAST_RESIDUAL)
+    sigma = np.maximum(np.where(np.isfinite(residuals), residuals, OTHER_SURFACE), LEAST_RESIDUAL)
     g = np.zeros(len(views))
     for _ in range(ROUNDS):
         g = _solve(_compare_all(views, neighbors, g, progress), g, sigma)
@@ -133,7 +133,7 @@ def _compare_pair(samples, z, factor, m, out):  # type: ignore[no-untyped-def]
         if not (0 <= column < z.shape[1] and 0 <= row < z.shape[0] and z[row, column] > 0):
             continue
         log = np.log(factor * z[row, column] / depth)
-        if abs(log) <= FAR:
+        if abs(log) <= OTHER_SURFACE:
             logs[count] = log
             count += 1
     if count >= LEAST_SAMPLES:

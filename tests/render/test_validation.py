@@ -110,7 +110,7 @@ def test_names_and_defaults_are_gsplats() -> None:
 
     from gsplat import rasterization as gsplats  # noqa: PLC0415
 
-    from splatseed.render.arguments import CUDA_ONLY  # noqa: PLC0415
+    from splatseed.render.validation import CUDA_ONLY  # noqa: PLC0415
 
     ours, theirs = signature(rasterization).parameters, signature(gsplats).parameters
     named = [name for name in ours if name != "unsupported"]

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatseed.depth.settings import Settings
 from splatseed.kernels.jit import inline
 
-__all__ = ["Drawn", "draw_pixels"]
+__all__ = ["Drawn", "sample_pixels"]
 
 CELLS = 64
 """Cells along the longer side of a map, at most."""
@@ -45,7 +45,7 @@ class Drawn:
     edge: Bool[np.ndarray, " C"]
 
 
-def draw_pixels(
+def sample_pixels(
     values: Float32[np.ndarray, "H W"],
     num: int,
     points: Float64[np.ndarray, "M 2"],
