@@ -113,7 +113,7 @@ def _step(
     """Take a step from where all steps begin; its seconds by stage, the rest and the whole."""
     _put_back(trainer.state.params, before)
     watch.lap()
-    watch.wrap("rest", trainer._advance)(FIRST_STEP + i % (LAST_STEP - FIRST_STEP))  # noqa: SLF001
+    watch.wrap("rest", trainer._advance)(FIRST_STEP + i % (LAST_STEP - FIRST_STEP))  # noqa: SLF001  (there is no public way)
     lap = watch.lap()
     return {**lap, "whole": sum(lap.values())}
 
@@ -142,8 +142,8 @@ def _stages(trainer: Trainer) -> dict[str, Sequence[Place]]:
     optimizers, strategy = trainer.state.optimizers.values(), trainer.state.strategy
     return {
         **RENDER_STAGES,
-        "loss": [(losses._CpuLoss, "forward")],  # noqa: SLF001
-        "loss backward": [(losses._CpuLoss, "backward")],  # noqa: SLF001
+        "loss": [(losses._CpuLoss, "forward")],  # noqa: SLF001  (there is no public way)
+        "loss backward": [(losses._CpuLoss, "backward")],  # noqa: SLF001  (there is no public way)
         "photograph": [(loop, "photograph")],
         "Adam": [(each, name) for each in optimizers for name in ("step", "zero_grad")],
         "strategy": [(strategy, "before"), (strategy, "after")],

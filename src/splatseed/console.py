@@ -134,7 +134,7 @@ def _compilation_shown(clock: StageClock) -> Iterator[None]:
         def on_start(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
             clock.begin_compilation()
 
-        def on_end(self, event: object) -> None:  # noqa: ARG002
+        def on_end(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
             clock.end_compilation()
 
     with event.install_listener("numba:compile", _Listener()):

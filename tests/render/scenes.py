@@ -74,7 +74,7 @@ def slow_rasterization(
     sh_degree: int | None = None,
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
-    packed: bool = True,  # noqa: ARG001  (makes no difference to the picture)
+    packed: bool = True,
     **rest: Any,
 ) -> tuple[Tensor, Tensor]:
     """``rasterize_reference`` for C cameras, all colour models and modes: images and alphas."""

@@ -106,7 +106,7 @@ def check_photograph(path: Path) -> tuple[int, int]:
 
 def _eight_bits(path: Path, picture: PilImage.Image) -> PilImage.Image:
     """Grey of 16 bits or of floats, as 8 bits."""
-    from PIL import Image  # noqa: PLC0415
+    from PIL import Image  # noqa: PLC0415  (loads with its use)
 
     try:
         values = np.asarray(picture)
@@ -129,7 +129,7 @@ def _eight_bits(path: Path, picture: PilImage.Image) -> PilImage.Image:
 
 
 def _over_black(picture: PilImage.Image) -> PilImage.Image:
-    from PIL import Image  # noqa: PLC0415
+    from PIL import Image  # noqa: PLC0415  (loads with its use)
 
     black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
     return Image.alpha_composite(black, picture).convert("RGB")

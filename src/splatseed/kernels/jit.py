@@ -25,7 +25,7 @@ __all__ = ["always_inline", "inline", "kernel", "parallel_range"]
 
 # TBB, where a distribution ships it, can hang at interpreter exit; a user's own choice stands.
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-    config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]
+    config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]  # absent from Numba's stubs
 
 parallel_range = numba.prange
 
@@ -71,6 +71,6 @@ def _key_on_sources(compiled: Any, function: Callable[..., Any]) -> None:
         with suppress(OSError):
             path = Path(function.__code__.co_filename)
             digest = source_digest(path, function.__module__)
-            file._source_stamp = digest  # noqa: SLF001
+            file._source_stamp = digest  # noqa: SLF001  (there is no public way)
             # Looked at before the rest is unpickled, which may name modules that are gone.
-            file._version = f"{numba.__version__} {digest}"  # noqa: SLF001
+            file._version = f"{numba.__version__} {digest}"  # noqa: SLF001  (there is no public way)

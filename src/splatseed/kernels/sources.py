@@ -84,7 +84,7 @@ def _own_package(path: Path, module: str) -> Packages:
 
 
 @cache
-def _read(path: Path, packages: Packages, mtime_ns: int, size: int) -> _Source:  # noqa: ARG001
+def _read(path: Path, packages: Packages, mtime_ns: int, size: int) -> _Source:  # noqa: ARG001  (part of the cache's key)
     """A file is read again if its date or its size says that it has changed."""
     text = path.read_bytes()
     return _Source(hashlib.sha256(text).digest(), tuple(_imports(path, text, packages)))

@@ -56,7 +56,7 @@ class Project(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(  # type: ignore[override]  # PyTorch's own takes anything
         ctx: Any,
         means: Tensor,
         quats: Tensor,
@@ -82,7 +82,7 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]  # PyTorch's own takes anything
         """Gradients of the inputs."""
         means, quats, scales, viewmat = (_array(t) for t in ctx.saved_tensors)
         lens: Lens = ctx.lens
@@ -121,7 +121,7 @@ class Harmonics(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(  # type: ignore[override]  # PyTorch's own takes anything
         ctx: Any,
         means: Tensor,
         origin: Tensor,
@@ -142,7 +142,7 @@ class Harmonics(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, d_colors: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, d_colors: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]  # PyTorch's own takes anything
         """Gradients of the inputs."""
         means, origin, base, rest, radii = ctx.saved_tensors
         first, rows, skipped = _coefficients(base, rest)
@@ -216,7 +216,7 @@ class Blend(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(  # type: ignore[override]  # PyTorch's own takes anything
         ctx: Any,
         means2d: Tensor,
         conics: Tensor,
@@ -252,7 +252,7 @@ class Blend(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(  # type: ignore[override]
+    def backward(  # type: ignore[override]  # PyTorch's own takes anything
         ctx: Any, d_image: Tensor, d_alphas: Tensor
     ) -> tuple[Tensor | None, ...]:
         """Gradients of the inputs."""

@@ -118,7 +118,7 @@ def rasterization(
         require("gsplat")
         from gsplat import rasterization as on_cuda  # noqa: PLC0415  (needs CUDA)
 
-        return on_cuda(  # type: ignore[no-any-return]
+        return on_cuda(  # type: ignore[no-any-return]  # gsplat is untyped
             means, quats, scales, opacities,
             torch.cat(colors, dim=1) if isinstance(colors, tuple) else colors,
             viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, backgrounds, render_mode,
@@ -172,7 +172,7 @@ def _project(
     lens: Lens,
     sparse: bool,
 ) -> View:
-    radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]
+    radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
         means, quats, scales, opacities, viewmat, lens, sparse
     )
     if lens.antialiased:
@@ -196,7 +196,7 @@ def _colors(
         return base
     # The general inverse, as gsplat takes it: the rigid one has another gradient off the rotations.
     origin = torch.linalg.inv_ex(viewmats[camera]).inverse[:3, 3]
-    shades: Tensor = Harmonics.apply(means, origin, base, rest, view.radii, sh_degree)  # type: ignore[no-untyped-call]
+    shades: Tensor = Harmonics.apply(means, origin, base, rest, view.radii, sh_degree)  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
     return shades
 
 
@@ -235,7 +235,7 @@ def _blend(
         if ids is not None:  # a full slice would be copied by backward
             each = ids[rows]
             shapes, depths, radii = tuple(t[each] for t in shapes), depths[each], radii[each]
-        image, alpha = Blend.apply(  # type: ignore[no-untyped-call]
+        image, alpha = Blend.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
             means2d[rows], *shapes,
             None if backgrounds is None else backgrounds[camera],
             depths, radii, info["width"], info["height"],

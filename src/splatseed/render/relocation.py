@@ -44,7 +44,7 @@ def compute_relocation(
     if opacities.is_cuda:
         from gsplat.relocation import compute_relocation as on_cuda  # noqa: PLC0415  (needs CUDA)
 
-        return on_cuda(opacities, scales, ratios, binoms)  # type: ignore[no-any-return]
+        return on_cuda(opacities, scales, ratios, binoms)  # type: ignore[no-any-return]  # gsplat is untyped
     largest = len(binoms)
     shares = ratios.clamp(1, largest).view_as(opacities)
     old = opacities.to(torch.float64)
@@ -76,7 +76,7 @@ def covariances(
     if quats.is_cuda:
         from gsplat import quat_scale_to_covar_preci as on_cuda  # noqa: PLC0415  (needs CUDA)
 
-        return on_cuda(quats, scales, compute_covar, compute_preci, triu)  # type: ignore[no-any-return]
+        return on_cuda(quats, scales, compute_covar, compute_preci, triu)  # type: ignore[no-any-return]  # gsplat is untyped
     from gsplat.utils import normalized_quat_to_rotmat  # noqa: PLC0415  (as above)
 
     half = normalized_quat_to_rotmat(normalize(quats, dim=-1)) * scales[:, None, :]

@@ -144,8 +144,8 @@ class Stereo(PhotographMethod):
 
     def _find(self, given: _Given, only: Sequence[int] | None = None) -> FoundStereo:
         from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
-        from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415
-        from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415
+        from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
+        from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415  (loads with its use)
 
         settings, seed = StereoSettings(grid=self.grid), int(given.rng.integers(1 << 32))
         visibility = known_visibility(given.scene)

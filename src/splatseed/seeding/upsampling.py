@@ -167,7 +167,7 @@ def add_verified(
         SceneNotFoundError: There are no photographs.
     """
     from splatseed.seeding.verify import verify  # noqa: PLC0415  (kernels load with use)
-    from splatseed.views.visibility import find_visibility  # noqa: PLC0415
+    from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
     codes = [source_code(name) for name in INTERPOLATING]
     guessed = np.isin(cloud.source, codes)

@@ -45,7 +45,7 @@ def match_views(
         progress: Told how far it is.
     """
     greys = [grey_image(view.image) for view in views]
-    found: list[Found] = [None] * len(views)  # type: ignore[list-item]
+    found: list[Found] = [None] * len(views)  # type: ignore[list-item]  # filled in below
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):

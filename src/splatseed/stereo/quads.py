@@ -63,7 +63,7 @@ def _pack(grey, out):
 
 
 @intrinsic
-def sample(typing_context, quads, width, height, column, row):  # noqa: ARG001  (Numba's signature)
+def sample(typing_context, quads, width, height, column, row):
     """The image between its pixels: lane i at (column i, row i); NaN reads the first pixel.
 
     ``quads`` is the flattened quad image, int32 [height * width]; ``width`` and ``height`` are int64.
@@ -85,10 +85,10 @@ def sample(typing_context, quads, width, height, column, row):  # noqa: ARG001  
 
 
 @intrinsic
-def square_root(typing_context, v):  # noqa: ARG001
+def square_root(typing_context, v):
     """The square root in each lane."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         kind = ir.FunctionType(VECTOR, [VECTOR])
         function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{LANES}f32")
         return builder.call(function, arguments)

@@ -45,7 +45,7 @@ def seeded(
     if as_it_is or _was_seeded(scene):
         return scene
     from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
-    from splatseed.upsample import configure  # noqa: PLC0415
+    from splatseed.upsample import configure  # noqa: PLC0415  (loads with its use)
 
     start = time.perf_counter()
     part = SEEDS_SHARE.get(settings.densification, 1.0)

@@ -124,7 +124,7 @@ def test_each_run_gets_a_share_that_any_node_has(monkeypatch):
 
 
 def test_no_cluster_and_no_ray_are_one_line(monkeypatch):
-    import ray  # noqa: PLC0415
+    import ray
 
     def none(**_):
         raise ConnectionError("nobody\nthere")

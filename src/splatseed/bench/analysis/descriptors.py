@@ -157,7 +157,7 @@ def _texture(scene: Scene, progress: Progress) -> float:
     for image in _some(scene) if folder is not None else []:
         progress("describe photographs", len(energies) / VIEWS)
         with suppress(SplatseedError):  # a photograph that cannot be read is not part of the mean
-            energies.append(_energy(_grey(folder / image.name)))  # type: ignore[operator]
+            energies.append(_energy(_grey(folder / image.name)))  # type: ignore[operator]  # checked by the caller
     return float(np.mean(energies)) if energies else np.nan
 
 

@@ -163,7 +163,7 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
         return (words(name), *(gain(each) for each in found.variants))
 
     rows = [
-        row(scene, lambda v, scene=scene: gain_cell(found.on_scene.get((scene, v))))  # type: ignore[misc]
+        row(scene, lambda v, scene=scene: gain_cell(found.on_scene.get((scene, v))))  # type: ignore[misc]  # mypy cannot infer a lambda's default
         for scene in found.scenes
     ]
     rows.append(row("mean, these scenes", lambda v: gain_cell(found.on_these[v])))

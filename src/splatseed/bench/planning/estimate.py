@@ -143,8 +143,8 @@ def _measured_growth(done: Sequence[RunRow]) -> dict[tuple[str, float | None], f
 def _seconds_around(row: RunRow) -> float:
     """What a run took beside its steps; little if it was begun before and went on."""
     assert row.result is not None  # noqa: S101  (only finished runs are asked about)
-    assert row.started is not None  # noqa: S101
-    assert row.finished is not None  # noqa: S101
+    assert row.started is not None  # noqa: S101  (for mypy: it is known here)
+    assert row.finished is not None  # noqa: S101  (for mypy: it is known here)
     return max(row.finished - row.started - row.result.train_seconds, 0.0)
 
 

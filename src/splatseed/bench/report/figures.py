@@ -301,7 +301,7 @@ def _marked(variant: Variant) -> dict[str, Any]:
 
 def _figure(width: float, height: float) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415  (loads with its use)
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)

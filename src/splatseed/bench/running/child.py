@@ -94,7 +94,7 @@ class Child:
         """
         outcome = None
         assert self._process.stdin is not None  # noqa: S101  (asked for above)
-        assert self._process.stdout is not None  # noqa: S101
+        assert self._process.stdout is not None  # noqa: S101  (for mypy: it is known here)
         try:
             self._process.stdin.write(json.dumps(asdict(self._order)) + "\n")
             self._process.stdin.flush()

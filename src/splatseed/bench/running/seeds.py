@@ -69,7 +69,7 @@ def _compilation() -> Iterator[list[float]]:
         def on_start(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
             running.append(time.perf_counter())
 
-        def on_end(self, event: object) -> None:  # noqa: ARG002
+        def on_end(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
             begun = running.pop()
             if not running:  # else it is a part of the one that it came into
                 spans.append(time.perf_counter() - begun)

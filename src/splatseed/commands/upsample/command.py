@@ -280,7 +280,7 @@ def _announce(
     for name in idle:
         print_note(f"The flags of {name} change nothing with --method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
-    parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]
+    parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]  # a method is a dataclass
     number = "as many as the photographs need" if total is None else f"{total:,} points"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} points)\n"
@@ -318,7 +318,7 @@ def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
         "command": "upsample",
         "method": options.method,
         "profile": options.profile,
-        "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]
+        "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]  # a method is a dataclass
         "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
         "ratio": options.ratio,
         "num_points_asked": options.num_points,

@@ -74,7 +74,7 @@ def write_seeds(folder: Path, points: PointCloud) -> None:
     if not arrays:
         return
     digest = np.frombuffer(_digest(points.xyz), np.uint8)
-    np.savez_compressed(folder / SEEDS, digest=digest, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(folder / SEEDS, digest=digest, **arrays)  # type: ignore[arg-type]  # savez takes arrays by name
 
 
 def read_seeds(folder: Path, points: PointCloud) -> KnownOfSeeds:
