@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
-.PHONY: demo test coverage lint format bench clean
+.PHONY: demo test quick coverage lint format bench clean
 .DEFAULT_GOAL := test
 
 $(READY): pyproject.toml constraints.txt
@@ -19,6 +19,12 @@ demo: $(READY)
 # A file's tests share what they make, so a file goes to one process.
 test: $(READY)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+# The tests of the rooms that differ from BASE, without the slow ones: under 90 seconds.
+BASE ?= HEAD
+quick: $(READY)
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m 'not slow' \
+	  $$($(BIN)/python tests/changed.py $(BASE))
 
 coverage: $(READY)
 	$(BIN)/python -m pytest --cov --cov-report=term

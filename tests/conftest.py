@@ -11,6 +11,11 @@ import pytest
 SCENES = Path(os.environ.get("SPLATSEED_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
 
 
+def pytest_collection_modifyitems(items) -> None:
+    """Slow tests last: what fails is known before they begin."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)

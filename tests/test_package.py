@@ -151,6 +151,7 @@ def test_an_import_loads_nothing_heavy():
     assert not heavy & set(run.stdout.split())
 
 
+@pytest.mark.slow
 def test_every_module_can_be_imported_first():
     """Each in a process of its own, forked from one that has loaded what is not ours, and the front
     door, which Python loads before any module behind it."""
