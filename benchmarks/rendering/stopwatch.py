@@ -1,9 +1,9 @@
 """Where the time of a render or a training step goes, without a change to what is timed.
 
-Notation: a *stage* is some of the package's functions; its time is its own, less that of stages that
-it calls, by one of ``clocks``. Promise: functions are replaced by ones that call them and look at the
-clock, and put back afterwards; a stage that never ran is an error, so that a renamed function cannot
-read as no time.
+Notation: a *stage* is some of the package's functions; its time is its own, less that of stages
+that it calls, by one of ``clocks``. Promise: functions are replaced by ones that call them and look
+at the clock, and put back afterwards; a stage that never ran is an error, so that a renamed
+function cannot read as no time.
 """
 
 from __future__ import annotations

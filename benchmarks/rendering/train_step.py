@@ -1,9 +1,9 @@
 """Time and memory of one training step on the CPU, where they go, and what starting up costs.
 
 Notation: a step shows one photograph: render, loss, backward, Adam and the bookkeeping of strategy
-``default``, with spherical harmonics of degree 3. Promise: it is the trainer's own step that is timed;
-the Gaussians are put back before each, so that all have the same work; every measurement has a process
-of its own. Each table is Markdown. See README.md for what is and is not measured.
+``default``, with spherical harmonics of degree 3. Promise: it is the trainer's own step that is
+timed; the Gaussians are put back before each, so that all have the same work; every measurement has
+a process of its own. Each table is Markdown. See README.md for what is and is not measured.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
 """Verify: what it makes of interpolated points where the surfaces are known, and how long it takes.
 
-Notation: points of ``mls`` at 16x are held against the training photographs of a capture; *judged*, *error* and *off*
-are those of ``depth.py``, by the depth of the held-out frames; of the made room the surfaces themselves are known. A
-*fate* is what verify made of a point: it agrees, lies
-on a flat place without texture (bare), is seen by too few photographs (unchecked), or was dropped. Promise: the
-captures are only read; speed is measured in a process of its own, on the made room that ``stereo.py`` keeps.
+Notation: points of ``mls`` at 16x are held against the training photographs of a capture; *judged*,
+*error* and *off* are those of ``depth.py``, by the depth of the held-out frames; of the made room
+the surfaces themselves are known. A *fate* is what verify made of a point: it agrees, lies on a
+flat place without texture (bare), is seen by too few photographs (unchecked), or was dropped.
+Promise: the captures are only read; speed is measured in a process of its own, on the made room
+that ``stereo.py`` keeps.
 """
 
 from __future__ import annotations

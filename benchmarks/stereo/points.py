@@ -1,9 +1,9 @@
 """Stereo on captures without true depth, against SfM's points of which it was not told.
 
-Notation: of a capture's training photographs (the test views are taken out) some neighbours by name; of its points every
-second is *held out*. A held-out point that an image sees is *known* if its pixel has a depth; its error is that of
-the plane there, relative. Promise: captures are only read. Points are no truth: they lie on texture, and are
-themselves off by a part of a percent.
+Notation: of a capture's training photographs (the test views are taken out) some neighbours by
+name; of its points every second is *held out*. A held-out point that an image sees is *known* if
+its pixel has a depth; its error is that of the plane there, relative. Promise: captures are only
+read. Points are no truth: they lie on texture, and are themselves off by a part of a percent.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ class PointScore:
 
     Args:
         kept: Share of the maps' pixels that have a depth.
-        known: Share of the held-out points, once for each image that sees them, whose pixel has one.
+        known: Share of the held-out points, once for each image that sees them, whose pixel has
+            one.
         within_1: Share of these that are within 1% of it.
         within_5: Likewise 5%.
         seconds: Processor time.

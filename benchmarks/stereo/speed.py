@@ -1,8 +1,8 @@
 """How fast stereo is: a hypothesis beside a scalar loop, and a hundred views from photographs to seeds.
 
-Notation: a *hypothesis* is one plane at one pixel, tried in five sources of 25 samples; seconds are one thread's on
-a core. Promise: every measurement has a process of its own, which has compiled before the clock starts; both
-cost functions are seen to give the same costs.
+Notation: a *hypothesis* is one plane at one pixel, tried in five sources of 25 samples; seconds are
+one thread's on a core. Promise: every measurement has a process of its own, which has compiled
+before the clock starts; both cost functions are seen to give the same costs.
 """
 
 from __future__ import annotations

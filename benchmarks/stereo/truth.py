@@ -1,9 +1,9 @@
 """Stereo against true depth: two real captures with a depth camera, a made room, and the room without texture.
 
-Notation: every eighth photograph by name is *held out*: stereo does not see it, and its depth is the surface that
-seeds are held against. A *pixel* is one of a stereo map; its true depth is that of the four depth pixels around its
-centre: their mean where they lie on one surface, any of them where they do not. Promise: captures are only
-read; what is made goes into a cache.
+Notation: every eighth photograph by name is *held out*: stereo does not see it, and its depth is
+the surface that seeds are held against. A *pixel* is one of a stereo map; its true depth is that of
+the four depth pixels around its centre: their mean where they lie on one surface, any of them where
+they do not. Promise: captures are only read; what is made goes into a cache.
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ def score_all(
         cache: Where.
         settings: Fields of ``StereoSettings``.
         limit: Photographs of a capture at most, the first by name.
-        without: "points": forget what Structure-from-Motion found; "depths": the depth maps as well.
+        without: "points": forget what Structure-from-Motion found; "depths": the depth maps as
+            well.
     """
     chosen = StereoSettings(**settings)
     return {name: asdict(_score(name, Path(cache), chosen, limit, without)) for name in names}

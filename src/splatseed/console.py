@@ -1,7 +1,7 @@
 """The terminal: progress bars on stderr, results on stdout.
 
-Promise: nothing is drawn when stderr is not a terminal; a stage's time runs until the next begins; what is
-printed is shown as it is, so that no file name can colour, move or rewrite anything.
+Promise: nothing is drawn when stderr is not a terminal; a stage's time runs until the next begins;
+what is printed is shown as it is, so that no file name can colour, move or rewrite anything.
 """
 
 from __future__ import annotations

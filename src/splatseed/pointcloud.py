@@ -3,8 +3,8 @@
 Notation: N points; ``xyz`` in scene units and the scene's world frame; ``rgb`` 8-bit sRGB as stored
 by COLMAP; ``source`` 0 for an original point, otherwise the code of the method that made the point.
 The *attributes* normals, sizes and confidence are there or not, and NaN where they are not known of
-a point. Promise: arrays have the shapes and dtypes below and are read-only; methods return new clouds,
-in which every point keeps all that is known of it.
+a point. Promise: arrays have the shapes and dtypes below and are read-only; methods return new
+clouds, in which every point keeps all that is known of it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ ORIGINAL = 0
 """The ``source`` code of points that were in the input."""
 
 GENERATED = 255
-"""The ``source`` code of points made by a method that has no code of its own, or that is not known."""
+"""The ``source`` code of points made by a method that has no code of its own, or that is not
+known."""
 
 ATTRIBUTES: Mapping[str, tuple[int, ...]] = MappingProxyType(
     {"normals": (3,), "sizes": (), "confidence": ()}

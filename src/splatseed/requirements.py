@@ -19,7 +19,8 @@ INSTALL = {
     "OpenEXR": "OpenEXR>=3.3",
     "ray": "ray>=2.40",
 }
-"""What to ask pip for, as in pyproject.toml: extras of splatseed itself can only be had from its folder."""
+"""What to ask pip for, as in pyproject.toml: extras of splatseed itself can only be had from its
+folder."""
 
 
 def require(*packages: str) -> None:

@@ -228,7 +228,8 @@ def test_the_quick_preset_makes_its_own_scene(bench, tmp_path, monkeypatch):
 def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
     """It takes a second; to make the room and to import PyTorch took over a minute."""
     code = (
-        "import sys; from splatseed.cli import main; main(['bench', '--preset', 'quick', '--dry-run']);"
+        "import sys; from splatseed.cli import main; main(['bench', '--preset', 'quick', "
+        "'--dry-run']);"
         "print(*sys.modules)"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

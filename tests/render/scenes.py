@@ -1,8 +1,8 @@
 """Small random scenes, and the slow reference called as ``rasterization`` is.
 
 Notation: N Gaussians, C cameras, D channels, K coefficients. A scene is a dictionary of
-``rasterization``'s arguments; ``losses`` weights every output with fixed random numbers, so that one
-backward pass asks for every gradient at once.
+``rasterization``'s arguments; ``losses`` weights every output with fixed random numbers, so that
+one backward pass asks for every gradient at once.
 """
 
 from __future__ import annotations

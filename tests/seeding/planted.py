@@ -1,7 +1,8 @@
 """A textured plane before a few cameras, and new points beside it: where each belongs is known.
 
-Notation: the plane goes through the world's origin, ``NORMAL`` towards the cameras; N originals lie on it in rows
-and columns, ``STEP`` metres apart. New points carry their numbers in their colours, so that what is left can be told.
+Notation: the plane goes through the world's origin, ``NORMAL`` towards the cameras; N originals lie
+on it in rows and columns, ``STEP`` metres apart. New points carry their numbers in their colours,
+so that what is left can be told.
 """
 
 from __future__ import annotations

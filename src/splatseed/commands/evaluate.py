@@ -57,8 +57,8 @@ class Options:
         ),
     ] = None
     """From the scene's world to the model's, where its trainer normalised that: a JSON file with a
-    matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for what its
-    examples do; none: score the model where it is, whatever it looks like."""
+    matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for what
+    its examples do; none: score the model where it is, whatever it looks like."""
     lpips_net: Literal["vgg", "alex"] = "vgg"
     """The network that LPIPS compares features of."""
     lpips_weights: PathOrNone = None

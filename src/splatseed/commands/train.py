@@ -61,8 +61,8 @@ class Options:
     training: Annotated[TrainSettings, tyro.conf.arg(name="")] = DEFAULT
     """How to train: its fields are options of their own."""
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
-    """The same, as upsample has it: a number, or Gaussians per pixel of a photograph at its training
-    size, such as 0.25rho."""
+    """The same, as upsample has it: a number, or Gaussians per pixel of a photograph at its
+    training size, such as 0.25rho."""
     seeds: Annotated[
         Seeding | None,
         tyro.conf.arg(
@@ -147,8 +147,10 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
         print_note(note)
     settings, views = training.settings, training.trainer.train_views
     OUT.print(
-        f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} test views"
-        f" of {views[0].width} x {views[0].height}, {len(training.state.params['means']):,} Gaussians)\n"
+        f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} "
+        "test views"
+        f" of {views[0].width} x {views[0].height}, {len(training.state.params['means']):,} "
+        "Gaussians)\n"
         f"  -> {settings.strategy}, {settings.max_steps:,} steps, seed {settings.seed},"
         f" on {training.device}\n"
         f"  -> {visible(options.output)}",

@@ -1,8 +1,9 @@
 """The candidates of all images in one list, how far each can be trusted, and the choice among them.
 
-Notation: C candidates; ``tier`` 0 is sound, then come ``UNCONFIRMED``, ``NEAR_EDGE`` and ``DISTRUSTED``.
-Promise: a candidate of a higher tier is taken only if all of the lower tiers are; among those of one
-tier, points are spread evenly in space, or every image gives the same number as far as it can.
+Notation: C candidates; ``tier`` 0 is sound, then come ``UNCONFIRMED``, ``NEAR_EDGE`` and
+``DISTRUSTED``.
+Promise: a candidate of a higher tier is taken only if all of the lower tiers are; among those of
+one tier, points are spread evenly in space, or every image gives the same number as far as it can.
 """
 
 from __future__ import annotations

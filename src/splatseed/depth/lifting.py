@@ -1,9 +1,10 @@
 """Depth-guided lifting, from the images of a scene to new points.
 
-Notation: every image gives *candidates*; a candidate is *sound* if enough views confirm it, none looks
-through it, and no jump of depth is near. Promise: exactly the number asked for, or one error that says
-how many there can be; sound candidates first, then those that too few views confirm, then those near
-jumps, and none that a view looks through (unless that is allowed). A note says when it came to that.
+Notation: every image gives *candidates*; a candidate is *sound* if enough views confirm it, none
+looks through it, and no jump of depth is near. Promise: exactly the number asked for, or one error
+that says how many there can be; sound candidates first, then those that too few views confirm, then
+those near jumps, and none that a view looks through (unless that is allowed). A note says when it
+came to that.
 """
 
 from __future__ import annotations
@@ -96,7 +97,8 @@ def lift(
 def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
     """The scene with the mean of its cameras at the origin, and where that was.
 
-    Candidates are float32, which far from the origin (UTM coordinates) would be too coarse to compare.
+    Candidates are float32, which far from the origin (UTM coordinates) would be too coarse to
+    compare.
     """
     if not scene.images:
         return scene, np.zeros(3)

@@ -1,10 +1,11 @@
 """Which other views to ask about a view's points.
 
-Notation: V views, S sample points of each. A view *covers* a sample of another, with a weight by the angle
-that the two cameras' rays to it enclose: little where the rays nearly coincide, since a sensor errs alike
-from one place, and none from 90 degrees on, where the other side of a surface is seen. Promise: neighbours
-are chosen one after another, each for the samples that those before it cover least, first by frames alone
-(few of all views), then by what each sees there according to its map (``num`` of these few).
+Notation: V views, S sample points of each. A view *covers* a sample of another, with a weight by
+the angle that the two cameras' rays to it enclose: little where the rays nearly coincide, since a
+sensor errs alike from one place, and none from 90 degrees on, where the other side of a surface is
+seen. Promise: neighbours are chosen one after another, each for the samples that those before it
+cover least, first by frames alone (few of all views), then by what each sees there according to its
+map (``num`` of these few).
 """
 
 from __future__ import annotations

@@ -1,17 +1,18 @@
 """Scale synchronisation: one factor per image, so that maps agree with one another where they overlap.
 
-Notation: V views; depth of view i is multiplied by exp(g_i). A pair (i, j) that sees the same places has
-a = median log(d_j / z_ij), where z_ij is the depth in view j of candidates of view i, and d_j what view j
-knows there. Then to first order
+Notation: V views; depth of view i is multiplied by exp(g_i). A pair (i, j) that sees the same
+places has a = median log(d_j / z_ij), where z_ij is the depth in view j of candidates of view i,
+and d_j what view j knows there. Then to first order
 
     g_j - g_i = -a, to within the spread of the samples,    and    g_i = 0, to within the image's residual,
 
-the latter by its SfM points. Promise: the most probable g under these, with Huber's weights, found twice,
-the second time from where the first left the maps. Pairs move maps only against each other: the scale of
-all that overlap remains that of the SfM points. Nothing is random.
+the latter by its SfM points. Promise: the most probable g under these, with Huber's weights, found
+twice, the second time from where the first left the maps. Pairs move maps only against each other:
+the scale of all that overlap remains that of the SfM points. Nothing is random.
 
-SfM points of one image err together: on 7-Scenes red kitchen, where one sensor's scale is the same for all
-frames, scales fitted to one image at a time are off by 4% (standard deviation), and by up to 20%.
+SfM points of one image err together: on 7-Scenes red kitchen, where one sensor's scale is the same
+for all frames, scales fitted to one image at a time are off by 4% (standard deviation), and by up
+to 20%.
 """
 
 from __future__ import annotations

@@ -46,7 +46,8 @@ class Settings:
     color_tolerance: float | None = 0.15
     """Mean difference of a colour, 0 to 1, at which two views agree; none = not compared."""
     spread: bool = True
-    """Take points as evenly apart as their number allows, whatever image they are from (paper: no)."""
+    """Take points as evenly apart as their number allows, whatever image they are from (paper:
+    no)."""
     hold_out: int = 0
     """Leave out every n-th image by name, as trainers do for the test (8); 0 = use all."""
 

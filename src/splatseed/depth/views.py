@@ -1,9 +1,9 @@
 """One image at a time: align its map, draw pixels, lift them, colour them; keep a reduced copy.
 
-Notation: a *view* is what stays of an image once its files are closed: C candidates, and the map and
-the photograph reduced to ``GRID`` pixels at most along the longer side, with which other images'
-candidates are compared. Promise: each file is read once; the candidates depend on the image, the seed
-and the settings alone, not on threads or other images.
+Notation: a *view* is what stays of an image once its files are closed: C candidates, and the map
+and the photograph reduced to ``GRID`` pixels at most along the longer side, with which other
+images' candidates are compared. Promise: each file is read once; the candidates depend on the
+image, the seed and the settings alone, not on threads or other images.
 """
 
 from __future__ import annotations
@@ -228,7 +228,8 @@ def _reduce(seen: _Seen, coarse: Float32[np.ndarray, "h w"], photograph: PilImag
     first = factor // 2 + 0.5
     grid_from_map = np.array([[1, 0, -first], [0, 1, -first], [0, 0, factor]]) / factor
     size = [-(-side // -(-max(photograph.size) // GRID)) for side in photograph.size]
-    # The mean of 2 x 2 samples of each block is smooth enough, and several times as fast as the block's.
+    # The mean of 2 x 2 samples of each block is smooth enough, and several times as fast as the
+    # block's.
     samples = photograph.resize((2 * size[0], 2 * size[1]), resample=0)
     block_from_map = np.array(size) / [camera.width, camera.height]
     return Reduced(

@@ -1,9 +1,9 @@
 """A given number of points out of many candidates, as far apart as that number allows.
 
-Notation: space is cut into cubes of one *side*; the key of a cube is its place, three numbers of 21 bits,
-scrambled so that any bits of it are as good as random ones. Promise: one candidate at most is taken of each cube, that of
-the finest footprint, and none where an original lies; the side is the largest that gives the number, to
-about a fiftieth; the result does not depend on threads.
+Notation: space is cut into cubes of one *side*; the key of a cube is its place, three numbers of 21
+bits, scrambled so that any bits of it are as good as random ones. Promise: one candidate at most is
+taken of each cube, that of the finest footprint, and none where an original lies; the side is the
+largest that gives the number, to about a fiftieth; the result does not depend on threads.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """How good a cloud is where the surfaces are known, and how far new points stray where not.
 
 Notation: h is a cloud's spacing: the mean over its points of the mean distance to the 6 nearest
-others. All scores are in units of h of the *originals*, so that scenes of any size compare. Promise:
-exact duplicates and non-finite points do not count as neighbours; nothing is random unless a ``rng``
-is passed.
+others. All scores are in units of h of the *originals*, so that scenes of any size compare.
+Promise: exact duplicates and non-finite points do not count as neighbours; nothing is random unless
+a ``rng`` is passed.
 """
 
 from __future__ import annotations

@@ -90,8 +90,8 @@ def load_model(
 
     Raises:
         SceneNotFoundError: The model, the scene or its images are missing.
-        SceneFormatError: One of them is not what its format promises, or the model's Gaussians are not
-            where the scene's points are.
+        SceneFormatError: One of them is not what its format promises, or the model's Gaussians are
+            not where the scene's points are.
         ParameterError: The transform cannot be computed.
     """
     gaussians = read_gaussians(path)

@@ -1,8 +1,8 @@
 """Sixteen float32 lanes: a Numba type whose values live in vector registers.
 
 Auto-vectorisation fails on the rasteriser's loops (they branch, carry state over Gaussians and end
-early), and costs a factor of five to eight. This file gives kernels LLVM's ``<16 x float>`` instead:
-one AVX-512 register, which LLVM splits in two on AVX2 and in four on NEON.
+early), and costs a factor of five to eight. This file gives kernels LLVM's ``<16 x float>``
+instead: one AVX-512 register, which LLVM splits in two on AVX2 and in four on NEON.
 Promise: every operation is exactly the float32 one in each lane, in the order written; sums over
 lanes run in one fixed tree. Nothing here is ``fastmath``, so results do not depend on how a kernel
 was compiled or cached.

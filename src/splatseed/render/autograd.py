@@ -116,8 +116,8 @@ def _sparse(dense: Tensor, rows: Tensor) -> Tensor:
 class Harmonics(torch.autograd.Function):
     """Harmonics to colours [N, 3]: 0.5 more, and at least 0.
 
-    Inputs: means [N, 3], the camera's place [3], coefficients, radii [N, 2], degree. Coefficients come
-    in one tensor [N, K, 3] and None, or in two, [N, 1, 3] and [N, K - 1, 3].
+    Inputs: means [N, 3], the camera's place [3], coefficients, radii [N, 2], degree. Coefficients
+    come in one tensor [N, K, 3] and None, or in two, [N, 1, 3] and [N, K - 1, 3].
     """
 
     @staticmethod

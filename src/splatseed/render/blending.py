@@ -1,24 +1,24 @@
 """Front-to-back blending of Gaussians into pixels; ``blending_vjp`` is its gradient.
 
 Specification (``reference.py`` is its readable form): over the Gaussians of a pixel, nearest first,
-sigma = (a dx^2 + c dy^2) / 2 + b dx dy, alpha = min(0.999, opacity exp(-sigma)); those with
-alpha < 1/255 are skipped; blending ends before the Gaussian that would bring the transmittance T
-to 1e-4 or less; colour += alpha T c, T <- T (1 - alpha). (The reference skips sigma < 0 too; records
-hold ellipses, whose sigma is negative by rounding at most.)
+sigma = (a dx^2 + c dy^2) / 2 + b dx dy, alpha = min(0.999, opacity exp(-sigma)); those with alpha <
+1/255 are skipped; blending ends before the Gaussian that would bring the transmittance T to 1e-4 or
+less; colour += alpha T c, T <- T (1 - alpha). (The reference skips sigma < 0 too; records hold
+ellipses, whose sigma is negative by rounding at most.)
 
-Notation: h = (log opacity - sigma) / 8, so that alpha = exp(8 h); ``top`` = log(opacity) / 8 is where
-sigma is 0; LOWEST is where alpha is 1/255. A pixel that is done keeps its transmittance with a minus
-sign. A tile's 64 pixels are four blocks of 4 x 4, one vector each; the *hits* of a Gaussian in a tile
-are the blocks that it adds to, as bits.
+Notation: h = (log opacity - sigma) / 8, so that alpha = exp(8 h); ``top`` = log(opacity) / 8 is
+where sigma is 0; LOWEST is where alpha is 1/255. A pixel that is done keeps its transmittance with
+a minus sign. A tile's 64 pixels are four blocks of 4 x 4, one vector each; the *hits* of a Gaussian
+in a tile are the blocks that it adds to, as bits.
 
 Stages: a tile's list is taken in chunks. First h is formed for all four blocks and a whole chunk,
-without a branch, and which blocks are hit is noted down; then each block's hits are blended, with all
-state in registers. Deciding block by block instead costs half of the time: the processor guesses such
-branches wrong, and finds out late.
+without a branch, and which blocks are hit is noted down; then each block's hits are blended, with
+all state in registers. Deciding block by block instead costs half of the time: the processor
+guesses such branches wrong, and finds out late.
 
 Arrays: a *record* of a Gaussian is 16 float32: mean x, y; -a/16, -b/8, -c/16; top; 0; the channels;
-rest 0. A block image is [tiles, 4 blocks, channels, 16 lanes]. Arrays that begin at a multiple of 64
-bytes are read and written fastest.
+rest 0. A block image is [tiles, 4 blocks, channels, 16 lanes]. Arrays that begin at a multiple of
+64 bytes are read and written fastest.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -195,7 +195,8 @@ def _blend_block(records, hit, h, q, count, fourth, state):
         # alpha = min(0.999, exp(8 h)), and 0 below 1/255
         alpha = select_greater(exponent, splat(LOWEST), exp_of_eighth(exponent), zero)
         alpha = minimum(alpha, splat(MAX_ALPHA))
-        # T' = T (1 - alpha); where T' <= 1e-4 the pixel is done: no weight, and T keeps a minus sign
+        # T' = T (1 - alpha); where T' <= 1e-4 the pixel is done: no weight, and T keeps a minus
+        # sign
         after = fnma(transmittance, alpha, transmittance)
         weight = select_greater(after, stop, multiply(transmittance, alpha), zero)
         transmittance = select_greater(after, stop, after, negative_magnitude(transmittance))

@@ -1,18 +1,19 @@
 """Gradients of ``blending``, whose notation and arrays this file shares.
 
-It walks front to back again: with the image known, what lies behind a Gaussian is what the image has
-less what has been blended so far, so nothing need be stored but which blocks each Gaussian hits.
+It walks front to back again: with the image known, what lies behind a Gaussian is what the image
+has less what has been blended so far, so nothing need be stored but which blocks each Gaussian
+hits.
 
-Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums are kept by *span*, a Gaussian in a row
-of tiles: p; p dx, p dy; p dx^2, p dx dy, p dy^2; d channels; |d mean x|, |d mean y|; rest 0, each
-summed over the row's pixels. With pixels at (x, y) from a block's centre and the mean at (mx, my),
-dx = mx - x, so that all of them follow from the moments of p about the centre.
+Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums are kept by *span*, a Gaussian in
+a row of tiles: p; p dx, p dy; p dx^2, p dx dy, p dy^2; d channels; |d mean x|, |d mean y|; rest 0,
+each summed over the row's pixels. With pixels at (x, y) from a block's centre and the mean at (mx,
+my), dx = mx - x, so that all of them follow from the moments of p about the centre.
 
 Stages: per tile and block the hits are queued, then blended with all state in registers. p and the
 weights alpha T of sixteen hits at a time are turned, so that a vector holds one pixel of sixteen
-Gaussians: their sums over pixels are then plain additions, and pixels have the same few coordinates.
-One thread takes a row of tiles from left to right, so that a span's sums are added up in a fixed order
-without atomics, while they are still in the cache: the same bytes every time.
+Gaussians: their sums over pixels are then plain additions, and pixels have the same few
+coordinates. One thread takes a row of tiles from left to right, so that a span's sums are added up
+in a fixed order without atomics, while they are still in the cache: the same bytes every time.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"

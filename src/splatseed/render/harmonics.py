@@ -1,13 +1,14 @@
 """Colour by direction: real spherical harmonics up to degree 3, and their gradient.
 
-Basis, order and signs are those of 3D Gaussian Splatting and gsplat (P.-P. Sloan, Efficient Spherical
-Harmonic Evaluation, 2013). The direction runs from the camera to the Gaussian and is normalised here.
+Basis, order and signs are those of 3D Gaussian Splatting and gsplat (P.-P. Sloan, Efficient
+Spherical Harmonic Evaluation, 2013). The direction runs from the camera to the Gaussian and is
+normalised here.
 
-Notation: x, y, z is the unit direction. Every basis function is a *factor* (1, x, y or z) times a *form*,
-c0 + c1 xx + c2 yy + c3 zz + c4 xy + c5 yz + c6 xz: lane k of a vector holds function k. A *row* is the
-45 numbers of a Gaussian beyond its first coefficients, three channels of 15; it is read as three
-vectors from ``FIRST`` on, which overlap.
-Directions are normalised in float64, the rest is float32.
+Notation: x, y, z is the unit direction. Every basis function is a *factor* (1, x, y or z) times a
+*form*, c0 + c1 xx + c2 yy + c3 zz + c4 xy + c5 yz + c6 xz: lane k of a vector holds function k. A
+*row* is the 45 numbers of a Gaussian beyond its first coefficients, three channels of 15; it is
+read as three vectors from ``FIRST`` on, which overlap. Directions are normalised in float64, the
+rest is float32.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -41,8 +42,8 @@ ROW = 45
 CHUNKS = 64
 """Pieces that threads take."""
 AHEAD = 10
-"""How many rows ahead memory is asked for: those of Gaussians out of sight are not read, and what is
-read in leaps does not come by itself."""
+"""How many rows ahead memory is asked for: those of Gaussians out of sight are not read, and what
+is read in leaps does not come by itself."""
 FIRST = (0, 15, 29)
 """Where in a row its three vectors begin: the last of them ends with it."""
 PART = 15

@@ -44,8 +44,8 @@ class _Wait(Enum):
 class Info(dict[str, Any]):
     """A dictionary whose lists of intersections are made when one of them is read.
 
-    ``in``, ``len``, ``keys()`` and printing know all names and make nothing; whatever hands out an entry,
-    a copy of the dictionary too, makes it.
+    ``in``, ``len``, ``keys()`` and printing know all names and make nothing; whatever hands out an
+    entry, a copy of the dictionary too, makes it.
     """
 
     def __getitem__(self, name: str) -> Any:

@@ -1,10 +1,10 @@
 """Between PyTorch's arrays and those of the blending kernels.
 
-Notation: N Gaussians of which G are visible; ``order`` [G] leads from depth rank to index; an image is
-[H, W, D]; records and block images are ``blending``'s. ``first`` is the first of the up to
-four channels that one pass of blending takes.
-Promise: every array is read and written once, in a fixed order; NumPy's gathers and transpositions of
-the same took a tenth of a training step.
+Notation: N Gaussians of which G are visible; ``order`` [G] leads from depth rank to index; an image
+is [H, W, D]; records and block images are ``blending``'s. ``first`` is the first of the up to four
+channels that one pass of blending takes.
+Promise: every array is read and written once, in a fixed order; NumPy's gathers and transpositions
+of the same took a tenth of a training step.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"

@@ -1,15 +1,16 @@
 """Projection of 3D Gaussians to the image plane (EWA splatting), and its gradient.
 
-Specification (``reference.py`` is its readable form). With W, t the camera's rotation and translation,
-m_c = W m + t = (x, y, z), R = R(q / |q|), s the scales and J the Jacobian of the pinhole projection at
-m_c (its x / z and y / z held within 15% of the image's size beyond its edges), the 2D covariance is
-P P' + eps2d I with P = U diag(s), U = T R and T = J W; its inverse is the conic (a, b, c).
-(M. Zwicker et al., EWA Splatting, 2002; conventions and cut-offs as gsplat 1.5.3 publishes them.)
+Specification (``reference.py`` is its readable form). With W, t the camera's rotation and
+translation, m_c = W m + t = (x, y, z), R = R(q / |q|), s the scales and J the Jacobian of the
+pinhole projection at m_c (its x / z and y / z held within 15% of the image's size beyond its
+edges), the 2D covariance is P P' + eps2d I with P = U diag(s), U = T R and T = J W; its inverse is
+the conic (a, b, c). (M. Zwicker et al., EWA Splatting, 2002; conventions and cut-offs as gsplat
+1.5.3 publishes them.)
 
-Culled, with a radius of 0: z outside of the near and far planes, opacity under 1/255, nothing of the
-bounding box in the image, and whatever is not finite.
-Arithmetic is float64 inside, float32 in and out. Gaussians are worked on in blocks, a quantity per row, so
-that the compiler takes several at once; every one's numbers are as if it stood alone.
+Culled, with a radius of 0: z outside of the near and far planes, opacity under 1/255, nothing of
+the bounding box in the image, and whatever is not finite. Arithmetic is float64 inside, float32 in
+and out. Gaussians are worked on in blocks, a quantity per row, so that the compiler takes several
+at once; every one's numbers are as if it stood alone.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"

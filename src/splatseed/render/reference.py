@@ -1,8 +1,8 @@
 """The specification of the rasteriser: slow, dense, readable, float64 if its inputs are.
 
-Every Gaussian meets every pixel; PyTorch's autograd gives all gradients. The fast stages are held to
-this file by tests; where they disagree, this file is right. Conventions: OpenCV camera axes, pixel
-centres at +0.5, quaternions wxyz. Cut-offs are those that gsplat 1.5.3 publishes.
+Every Gaussian meets every pixel; PyTorch's autograd gives all gradients. The fast stages are held
+to this file by tests; where they disagree, this file is right. Conventions: OpenCV camera axes,
+pixel centres at +0.5, quaternions wxyz. Cut-offs are those that gsplat 1.5.3 publishes.
 """
 
 from __future__ import annotations

@@ -5,8 +5,8 @@ Notation: o opacity, s scales, n how many Gaussians share the place. With o' = 1
 
     s' = s o / sum_{k=0}^{n-1} (-1)^k C(n, k+1) o'^(k+1) / sqrt(k+1)
 
-Promise: float64 inside, as the sum alternates; gsplat's files are not touched, and CUDA tensors go to
-gsplat's own functions.
+Promise: float64 inside, as the sum alternates; gsplat's files are not touched, and CUDA tensors go
+to gsplat's own functions.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
 """Which parts of the pictures hold a point: the depths of a cloud on coarse cells.
 
-Notation: a view of W x H pixels is cut into ``ceil(H / c) x ceil(W / c)`` equal cells, of c x c pixels
-or a little less. The depth (planar z) of a cell is the lower quartile of the depths of the points that
-fall into it, infinite where none does. A cell is *hidden* if at least ``HIDING`` of its eight neighbours
-are nearer by more than ``NEARER``: a surface hides what shows between its points. It is *covered* if
-it holds a point and is not hidden.
+Notation: a view of W x H pixels is cut into ``ceil(H / c) x ceil(W / c)`` equal cells, of c x c
+pixels or a little less. The depth (planar z) of a cell is the lower quartile of the depths of the
+points that fall into it, infinite where none does. A cell is *hidden* if at least ``HIDING`` of its
+eight neighbours are nearer by more than ``NEARER``: a surface hides what shows between its points.
+It is *covered* if it holds a point and is not hidden.
 Promise: the bytes depend neither on the order of the points nor on the threads.
 
 The nearest depth, as a z-buffer keeps, will not do: of the points that their own tracks prove to be
 visible, a z-buffer that looks at neighbouring cells hides 7% (fox) to 97% (treehill), since
-Structure-from-Motion leaves a few points hanging in front of the cameras. This rule hides 0.3% to 16%.
+Structure-from-Motion leaves a few points hanging in front of the cameras. This rule hides 0.3% to
+16%.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Methods that look at the photographs: ``auto``, ``stereo`` and ``cover``.
 
-``stereo`` puts seeds on surfaces, found by comparing photographs; ``cover`` gives every part of every photograph that
-no point falls in one seed to look at; ``auto`` does both, in this order. Promise: how many seeds there are follows from
-the photographs, not from a ratio; held-out views are never looked at.
+``stereo`` puts seeds on surfaces, found by comparing photographs; ``cover`` gives every part of
+every photograph that no point falls in one seed to look at; ``auto`` does both, in this order.
+Promise: how many seeds there are follows from the photographs, not from a ratio; held-out views are
+never looked at.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """``upsample``: a scene's points and new ones, made, checked, completed and thinned.
 
-Four steps, of which all but the first are asked for: a method makes points; ``verify`` holds interpolated ones
-against the photographs; ``cover`` gives the parts of photographs that no point falls in a seed; a budget thins all.
-Promise: without a budget the originals come first and unchanged; the same seed gives the same bytes whatever the number
-of threads; every point is finite.
+Four steps, of which all but the first are asked for: a method makes points; ``verify`` holds
+interpolated ones against the photographs; ``cover`` gives the parts of photographs that no point
+falls in a seed; a budget thins all.
+Promise: without a budget the originals come first and unchanged; the same seed gives the same bytes
+whatever the number of threads; every point is finite.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ CELL = 8
 """Side in pixels of the cells by which coverage is measured."""
 
 INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
-"""Methods whose points are guesses between others, which ``verify`` holds against the photographs."""
+"""Methods whose points are guesses between others, which ``verify`` holds against the
+photographs."""
 
 Note = Callable[[str], None]
 
@@ -65,16 +67,18 @@ def upsample(
     Args:
         scene: A scene, or a bare cloud. Points with ``source`` other than 0 are put aside: new
             points are made from originals only, and replace earlier new ones.
-        method: A key of ``METHODS``, or a method with its parameters. ``auto``, the default, looks at the
-            photographs; where there are none, ``mls`` is taken, and ``note`` is told.
-        ratio: Points in all, as a multiple of the originals (r N), for methods that interpolate;
-            4 when neither is given. The photographs say how many ``auto``, ``stereo`` and ``cover`` make.
+        method: A key of ``METHODS``, or a method with its parameters. ``auto``, the default, looks
+            at the photographs; where there are none, ``mls`` is taken, and ``note`` is told.
+        ratio: Points in all, as a multiple of the originals (r N), for methods that interpolate; 4
+            when neither is given. The photographs say how many ``auto``, ``stereo`` and ``cover``
+            make.
         num_points: Points in all, instead of ``ratio``.
-        budget: Most points in all: a number, or a string such as "0.25rho", Gaussians per pixel of one
-            photograph. May be below the number of originals.
-        cover: Side in pixels of the parts of the photographs that get a seed where no point falls in.
-        verify: Hold interpolated points against the photographs: slide them onto the surface, drop what
-            does not fit.
+        budget: Most points in all: a number, or a string such as "0.25rho", Gaussians per pixel of
+            one photograph. May be below the number of originals.
+        cover: Side in pixels of the parts of the photographs that get a seed where no point falls
+            in.
+        verify: Hold interpolated points against the photographs: slide them onto the surface, drop
+            what does not fit.
         seed: The same seed gives the same bytes, whatever the number of threads.
         profile: "default", or "paper" for the paper's text to the letter.
         progress: Told each stage and the fraction done.
@@ -82,7 +86,8 @@ def upsample(
         parameters: Fields of the method, such as ``k=12``.
 
     Returns:
-        The N originals, then the new points; ``source`` tells them apart. A budget takes points of both.
+        The N originals, then the new points; ``source`` tells them apart. A budget takes points of
+        both.
 
     Raises:
         ParameterError: An unknown method, profile or parameter, or a value or size out of range.

@@ -1,10 +1,11 @@
 """verify: interpolated points held against the photographs, moved onto the surface or dropped.
 
-Notation: M new points, each with a spacing h and a normal from the originals around it (``surroundings``), and up to
-two views that judge it (``judges``), each with its sources. In each, the point slides along its normal to where the
-photographs agree (``sliding``), at a cost of one minus correlation; the better judge counts. Promise: the order of
-points stays; the same input gives the same bytes, whatever the number of threads; what no photograph can judge is kept
-and said to be unknown.
+Notation: M new points, each with a spacing h and a normal from the originals around it
+(``surroundings``), and up to two views that judge it (``judges``), each with its sources. In each,
+the point slides along its normal to where the photographs agree (``sliding``), at a cost of one
+minus correlation; the better judge counts. Promise: the order of points stays; the same input gives
+the same bytes, whatever the number of threads; what no photograph can judge is kept and said to be
+unknown.
 """
 
 from __future__ import annotations
@@ -38,9 +39,11 @@ TEXTURE = 4.0
 BARE_CONFIDENCE = 0.1
 """Of points on flat places without texture, which are kept where they are."""
 STEEPEST = 0.3
-"""Cosine between ray and normal: what is steeper is taken for so steep, as its normal cannot be right."""
+"""Cosine between ray and normal: what is steeper is taken for so steep, as its normal cannot be
+right."""
 LARGEST_MOVE = 0.3
-"""Largest move of a plane along its normal, in spacings, as a share of its distance from the camera."""
+"""Largest move of a plane along its normal, in spacings, as a share of its distance from the
+camera."""
 MOVED = 0.25
 """Spacings from which on a point counts as moved, in what is told."""
 
@@ -71,9 +74,10 @@ def verify(
 ) -> NewPoints:
     """Hold interpolated points against the photographs.
 
-    A point stays, moved by up to 1.5 spacings along its normal, if the photographs agree there; its confidence
-    is their correlation. It stays where it is, with ``BARE_CONFIDENCE``, on a flat place without texture, and
-    with unknown confidence (NaN) where fewer than two photographs see it. All others are dropped.
+    A point stays, moved by up to 1.5 spacings along its normal, if the photographs agree there; its
+    confidence is their correlation. It stays where it is, with ``BARE_CONFIDENCE``, on a flat place
+    without texture, and with unknown confidence (NaN) where fewer than two photographs see it. All
+    others are dropped.
 
     Args:
         views: The photographs, at the size to compare.
@@ -83,8 +87,9 @@ def verify(
         progress: Told how far it is.
 
     Returns:
-        Those that stay, in their order, with confidence and normals (towards the judge; NaN where the
-        originals lie on a line); what else was known of them, and notes on how many were dropped and why.
+        Those that stay, in their order, with confidence and normals (towards the judge; NaN where
+        the originals lie on a line); what else was known of them, and notes on how many were
+        dropped and why.
     """
     if len(visibility.xyz) < 2 or not len(new.xyz) or not views:
         return _unchecked(new)

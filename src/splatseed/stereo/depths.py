@@ -1,7 +1,8 @@
 """Depth maps from photographs alone: every view compared with a few others, then with their maps.
 
-Notation: V views of a scene. Promise: the same scene, settings and seed give the same bytes, whatever the number of
-threads; a depth stands only where other views' maps, found without it, agree.
+Notation: V views of a scene. Promise: the same scene, settings and seed give the same bytes,
+whatever the number of threads; a depth stands only where other views' maps, found without it,
+agree.
 """
 
 from __future__ import annotations
@@ -40,13 +41,13 @@ def find_stereo(
     Args:
         views: The photographs at the size to compare.
         images: The images they are of, in the same order.
-        visibility: The points that each image sees, which depth is looked for around. Where there are too few,
-            small copies of the photographs are compared first, to have some.
+        visibility: The points that each image sees, which depth is looked for around. Where there
+            are too few, small copies of the photographs are compared first, to have some.
         settings: How.
         seed: The same seed gives the same bytes.
         progress: Told how far it is.
-        only: The views whose maps are wanted: these have the same bytes as if all were, and of the others no more
-            is found than what confirms them. All when left out.
+        only: The views whose maps are wanted: these have the same bytes as if all were, and of the
+            others no more is found than what confirms them. All when left out.
     """
     if len(visibility.xyz) < TOO_FEW:
         visibility = glimpse(views, seed, progress)

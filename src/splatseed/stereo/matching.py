@@ -1,7 +1,7 @@
 """Planes of every view by comparing it with others, and which of these others' planes agree.
 
-Notation: as in ``result``. Promise: a view's planes depend on the photographs, what is known beforehand and the seed
-alone: threads take whole views.
+Notation: as in ``result``. Promise: a view's planes depend on the photographs, what is known
+beforehand and the seed alone: threads take whole views.
 """
 
 from __future__ import annotations

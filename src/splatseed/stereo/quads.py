@@ -1,9 +1,9 @@
 """A grey image as words of four pixels, read between pixels sixteen places at a time.
 
-Notation: word (y, x) of a *quad image* holds the 8-bit pixels (y, x), (y, x+1), (y+1, x), (y+1, x+1) from
-its lowest byte on, so that one load of a lane brings all that bilinear interpolation needs. Column and row
-count from the centre of the first pixel. Promise: the value is the bilinear one, exact to float32 rounding;
-places outside the image take its border.
+Notation: word (y, x) of a *quad image* holds the 8-bit pixels (y, x), (y, x+1), (y+1, x), (y+1,
+x+1) from its lowest byte on, so that one load of a lane brings all that bilinear interpolation
+needs. Column and row count from the centre of the first pixel. Promise: the value is the bilinear
+one, exact to float32 rounding; places outside the image take its border.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
@@ -66,7 +66,8 @@ def _pack(grey, out):
 def sample(typing_context, quads, width, height, column, row):
     """The image between its pixels: lane i at (column i, row i); NaN reads the first pixel.
 
-    ``quads`` is the flattened quad image, int32 [height * width]; ``width`` and ``height`` are int64.
+    ``quads`` is the flattened quad image, int32 [height * width]; ``width`` and ``height`` are
+    int64.
     """
 
     def generate(context, builder, signature, arguments):

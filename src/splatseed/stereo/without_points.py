@@ -1,10 +1,11 @@
 """Points for a scene that has none: from its depth maps, or from a glimpse at small photographs.
 
-Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, twice. First some views are compared with
-neighbours chosen by pose, and any depth is tried at which the picture moves by less than its width; half of the good
-pixels are nearer than the *middle* depth that this gives. Then all views are compared with those that see such depths
-from well beside, and what others confirm are points. Promise: as for all of stereo, the same bytes for a seed; points
-that no photographs confirm are not made up.
+Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, twice. First some views are
+compared with neighbours chosen by pose, and any depth is tried at which the picture moves by less
+than its width; half of the good pixels are nearer than the *middle* depth that this gives. Then all
+views are compared with those that see such depths from well beside, and what others confirm are
+points. Promise: as for all of stereo, the same bytes for a seed; points that no photographs confirm
+are not made up.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Which SfM points each image sees: what depth maps are held against.
 
-Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the scene's world.
-Promise: only distinct finite originals take part. Where Structure-from-Motion says which features a point has
-(its track), that is taken; without tracks, points are projected, and of those that fall close together
-in the image only the nearest stay, as the others are probably hidden.
+Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the scene's
+world.
+Promise: only distinct finite originals take part. Where Structure-from-Motion says which features a
+point has (its track), that is taken; without tracks, points are projected, and of those that fall
+close together in the image only the nearest stay, as the others are probably hidden.
 """
 
 from __future__ import annotations

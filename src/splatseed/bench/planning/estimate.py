@@ -1,8 +1,8 @@
 """How long a benchmark will take, and how much disk: an estimate, which its own runs make better.
 
-Notation: a step of training takes about a + b G + c P seconds for G Gaussians and P pixels. Promise:
-before there are runs that tell, a, b and c are those of one machine, so that the estimate can be off by
-several times; with finished runs in the ledger their median takes the place of these.
+Notation: a step of training takes about a + b G + c P seconds for G Gaussians and P pixels.
+Promise: before there are runs that tell, a, b and c are those of one machine, so that the estimate
+can be off by several times; with finished runs in the ledger their median takes the place of these.
 """
 
 from __future__ import annotations

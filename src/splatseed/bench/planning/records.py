@@ -1,8 +1,9 @@
 """What a run of the benchmark is asked for, and what came of it.
 
-Notation: an *arm* is everything about a run but its scene and its repeat: two runs are *paired* when
-those two are equal. Promise: ``RunSpec.key`` depends on all that determines the result and on nothing
-else (not on where the scene lies), so that a run that is in the ledger need never be repeated.
+Notation: an *arm* is everything about a run but its scene and its repeat: two runs are *paired*
+when those two are equal. Promise: ``RunSpec.key`` depends on all that determines the result and on
+nothing else (not on where the scene lies), so that a run that is in the ledger need never be
+repeated.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The local executor: processes on this machine, some at a time.
 
-Notation: a *slot* runs one process after the other; a machine's cores and GPUs are shared out among the
-slots. Promise: when the user stops, runs in training leave checkpoints; a second word stops at once.
+Notation: a *slot* runs one process after the other; a machine's cores and GPUs are shared out among
+the slots. Promise: when the user stops, runs in training leave checkpoints; a second word stops at
+once.
 """
 
 from __future__ import annotations

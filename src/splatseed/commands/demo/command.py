@@ -181,7 +181,8 @@ def _summarise(
     seconds: Mapping[str, float],
 ) -> None:
     print_table(
-        f"{len(scene.points):,} points, {options.ratio:g}x where the method has a ratio; distances in "
+        f"{len(scene.points):,} points, {options.ratio:g}x where the method has a ratio; distances "
+        "in "
         "units of the originals' spacing, less is better",
         ("method", "error", "median", "95%", "coverage", "far"),
         [

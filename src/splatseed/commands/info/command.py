@@ -53,7 +53,8 @@ class Options:
     scene: Annotated[Path, tyro.conf.Positional]
     """A COLMAP scene folder, a folder with transforms.json, an RGB-D capture, or a .ply."""
     depth: Annotated[Path | None, _path("DIR")] = None
-    """Also hold a folder of depth maps, in any layout of docs/formats.md, against the SfM points."""
+    """Also hold a folder of depth maps, in any layout of docs/formats.md, against the SfM
+    points."""
     depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
     """What their values are: planar depth, distance along the ray, or inverse depth."""
     depth_scale: Annotated[float | None, _default("what the folder says")] = None

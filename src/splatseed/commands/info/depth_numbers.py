@@ -1,6 +1,7 @@
 """What ``splatseed info --depth`` says of a scene's depth maps, in words and numbers.
 
-Promise: images are listed worst first: those left out, then by residual; all of them only if asked for.
+Promise: images are listed worst first: those left out, then by residual; all of them only if asked
+for.
 """
 
 from __future__ import annotations

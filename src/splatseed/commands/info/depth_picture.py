@@ -2,8 +2,8 @@
 
 Notation: a row is one image: its photograph, its depth (near is yellow, far is violet, unknown is
 grey; logarithmic, so that both near and far are told apart), and its SfM points on the photograph,
-coloured by |depth of the map / depth of the point - 1|. Promise: the images shown are a typical one,
-the best and the worst aligned ones, and one that was left out, where there are such.
+coloured by |depth of the map / depth of the point - 1|. Promise: the images shown are a typical
+one, the best and the worst aligned ones, and one that was left out, where there are such.
 """
 
 from __future__ import annotations

@@ -45,7 +45,8 @@ _READERS: dict[str, Callable[[Path], StoredDepth]] = {
     ".png": read_picture,
 }
 SUFFIXES = tuple(_READERS)
-"""Suffixes of files that can be read. A PNG comes last: beside exact numbers it is their picture."""
+"""Suffixes of files that can be read. A PNG comes last: beside exact numbers it is their
+picture."""
 
 
 @dataclass(frozen=True, eq=False)

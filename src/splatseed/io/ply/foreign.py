@@ -50,7 +50,9 @@ def _foreign(path: Path, found: str) -> SceneFormatError:
     return SceneFormatError(
         f"{path} to be a .ply as 3DGS writes it, or of points",
         found=f"{found}, which splatseed does not read",
-        fix="Convert it: PlayCanvas's splat-transform (npx @playcanvas/splat-transform IN OUT.ply) and"
-        " SuperSplat write such a .ply. It holds a trained model, not a scene: score it with splatseed"
+        fix="Convert it: PlayCanvas's splat-transform (npx @playcanvas/splat-transform IN "
+        "OUT.ply) and"
+        " SuperSplat write such a .ply. It holds a trained model, not a scene: score it with "
+        "splatseed"
         " evaluate.",
     )

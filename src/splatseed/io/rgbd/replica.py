@@ -1,7 +1,7 @@
 """RGB-D captures in the layout of NICE-SLAM's Replica: colour images, poses and one camera.
 
-A folder holds ``results/frame*.jpg`` (or .png) and ``results/depth*.png``, ``traj.txt`` with
-one row-major 4x4 ``world_from_cam`` in OpenCV axes and metres per line, a line per frame in the order
+A folder holds ``results/frame*.jpg`` (or .png) and ``results/depth*.png``, ``traj.txt`` with one
+row-major 4x4 ``world_from_cam`` in OpenCV axes and metres per line, a line per frame in the order
 of the frames' numbers, and ``cam_params.json``, here or one folder up.
 
 The layout's principal point takes the centre of the top-left pixel as (0, 0): Replica's 1200 pixel
