@@ -150,7 +150,8 @@ def onnx_sum(
     half: bool = False,
     factor: int = 1,
 ) -> Path:
-    """Write a network whose map is red + 2 green + 4 blue of its input, ``factor`` times smaller."""
+    """Write a network whose map is red + 2 green + 4 blue of its input, ``factor`` times
+    smaller."""
     from onnx import TensorProto, checker, helper, numpy_helper, save
 
     dtype, kind = (np.float16, TensorProto.FLOAT16) if half else (np.float32, TensorProto.FLOAT)

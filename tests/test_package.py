@@ -66,7 +66,8 @@ LIGHT = {"numpy", "jaxtyping", "numba", "scipy"}
 
 
 def _imports(path):
-    """The modules that a file imports anywhere, also within functions, or names as "module:Class"."""
+    """The modules that a file imports anywhere, also within functions, or names as
+    "module:Class"."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

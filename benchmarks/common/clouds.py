@@ -1,4 +1,4 @@
-"""The clouds that benchmarks run on: a made room of any size, and real captures where there are any.
+"""The clouds that benchmarks run on: a made room of any size, and real captures where there are.
 
 Notation: N points, xyz float32 in scene units (the room's metres), rgb uint8. Promise: a made cloud
 is the same for the same size and seed. Its density varies smoothly, several times from place to

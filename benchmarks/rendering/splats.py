@@ -1,4 +1,4 @@
-"""A room of Gaussians as training leaves them, its photographs, and how much there is to blend in it.
+"""A room of Gaussians as training leaves them, its photographs, and how much is blended in it.
 
 Notation: N Gaussians in the made room's metres (``splatseed.synthetic``), V cameras of W x H
 pixels. A *useful pair* is a pixel with a Gaussian that adds to its colour: alpha is at least 1/255,

@@ -63,7 +63,7 @@ def rasterize(
 def _tile_lists(
     means2d: Float[Tensor, "G 2"], radii: Int[Tensor, "G 2"], width: int, height: int
 ) -> tuple[Int[Tensor, " P"], list[int]]:
-    """Gaussians by tile, in the order given, and where each tile's begin: bounding boxes of 3.33 sigma."""
+    """Gaussians by tile, in order, and where each tile's begin: bounding boxes of 3.33 sigma."""
     tiles = torch.tensor([-(-width // TILE), -(-height // TILE)])
     low = ((means2d - radii) / TILE).floor().long().clamp(min=0)
     high = torch.minimum(((means2d + radii) / TILE).ceil().long(), tiles)

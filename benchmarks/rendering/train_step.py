@@ -223,7 +223,8 @@ def measured_runs(
         workload.save(path)
         return [
             Run(name, threads, target, **call(
-                "benchmarks.rendering.train_step:measure", threads=threads, path=str(path), steps=settings.steps,
+                "benchmarks.rendering.train_step:measure", threads=threads, path=str(path),
+                steps=settings.steps,
  clock=settings.clock
             ))
             for threads in THREADS
@@ -267,7 +268,8 @@ def print_start_up(clock: Clock) -> None:
         make_workload(*SMALL).save(path)
         for name in ("nothing on disk, so compiling", "compiled kernels on disk"):
             seconds = call(
-                "benchmarks.rendering.train_step:first_step", threads=THREADS[-1], environment=cache,
+                "benchmarks.rendering.train_step:first_step", threads=THREADS[-1],
+                environment=cache,
                 path=str(path), clock=clock,
             )  # fmt: skip
             rows.append([f"first step of a process, {name}", f"{seconds:.2f}", ""])

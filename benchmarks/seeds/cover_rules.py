@@ -74,7 +74,10 @@ def _nearest(depths: np.ndarray, cell: tuple[int, int], num: int) -> np.ndarray:
 
 
 def _linear(depths: np.ndarray, cell: tuple[int, int]) -> float:
-    """Linear in 1 / depth on the Delaunay triangulation; the median of the nearest outside of it."""
+    """Linear in 1 / depth on the Delaunay triangulation.
+
+    The median of the nearest outside of it.
+    """
     known = np.argwhere(np.isfinite(depths))
     near = known[np.argsort(((known - cell) ** 2).sum(axis=1), kind="stable")[:400]]
     try:

@@ -1,4 +1,4 @@
-"""Depth-guided lifting on two real captures: how far from the surfaces it puts points, and how long it takes.
+"""Depth-guided lifting on two real captures: how exact it is, and how long it takes.
 
 Notation: *held out* is every eighth frame by name: its photograph and depth are never lifted from,
 and its depth is the surface that new points are held against. A point is *judged* if in some
@@ -100,7 +100,7 @@ class Truth:
 
     @classmethod
     def of(cls, scene: Scene, step: int) -> Truth:
-        """The held-out frames of a scene, every ``step``-th pixel of a row and column as surface."""
+        """The held-out frames of a scene, with every ``step``-th pixel as surface."""
         frames, surface = [], []
         for image in scene.split(HELD_OUT)[1]:
             depth = scene.depths.read(image.name)
@@ -230,7 +230,10 @@ def draw(scene: Scene, clouds: dict[str, ss.PointCloud], path: Path) -> None:
 
 
 def at_hand(names: Sequence[str]) -> list[str]:
-    """Those scenes that need no capture, and the others where there are captures; says which are skipped."""
+    """Those scenes that need no capture, and the others where there are captures.
+
+    Says which are skipped.
+    """
     try:
         find_scenes()
     except SceneNotFoundError as error:

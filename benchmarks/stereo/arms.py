@@ -37,9 +37,9 @@ class Arm:
 
 
 MEAN_OF_ALL = (
-    (COST, "least, second = splat(_WORST), splat(_WORST)", "least, second = splat(_NOTHING), splat(_NOTHING)"),
-    (COST, "least, second = minimum(least, cost), minimum(second, worse)", "least = add(least, cost)"),
-    (COST, "multiply(add(least, second), splat(_HALF))", "divide(least, splat(np.float32(len(sizes))))"),
+    (COST, "least, second = splat(_WORST), splat(_WORST)", "least, second = splat(_NOTHING), splat(_NOTHING)"),  # noqa: E501  (the sources' own lines)
+    (COST, "least, second = minimum(least, cost), minimum(second, worse)", "least = add(least, cost)"),  # noqa: E501  (the sources' own lines)
+    (COST, "multiply(add(least, second), splat(_HALF))", "divide(least, splat(np.float32(len(sizes))))"),  # noqa: E501  (the sources' own lines)
 )  # fmt: skip
 
 ARMS: dict[str, Arm] = {
@@ -57,16 +57,16 @@ ARMS: dict[str, Arm] = {
         ]
     ),
     "- noise of 0.5": Arm(edits=[(COST, "NOISE = 0.1", "NOISE = 0.5")]),
-    "- window at every pixel": Arm(edits=[(COST, "RADIUS, STRIDE = 2, 2", "RADIUS, STRIDE = 2, 1")]),
+    "- window at every pixel": Arm(edits=[(COST, "RADIUS, STRIDE = 2, 2", "RADIUS, STRIDE = 2, 1")]),  # noqa: E501  (the sources' own lines)
     "- window of 7 x 7": Arm(edits=[(COST, "RADIUS, STRIDE = 2, 2", "RADIUS, STRIDE = 3, 2")]),
     "- no slopes": Arm(
         edits=[
-            (MATCH, "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5", "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.0"),
+            (MATCH, "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5", "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.0"),  # noqa: E501  (the sources' own lines)
             (START, "guesses[NEAREST] = _fit(", "guesses[NEAREST] = 0 * _fit("),
         ]
     ),
     "- slopes not refined": Arm(
-        edits=[(MATCH, "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5", "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.0")]
+        edits=[(MATCH, "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5", "DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.0")]  # noqa: E501  (the sources' own lines)
     ),
     "- no arms": Arm(edits=[(MATCH, "for way in range(8):", "for way in range(4):")]),
     "- start without the fitted plane": Arm(
@@ -97,7 +97,7 @@ FOLIAGE: dict[str, Arm] = {
 
 
 def scores_of(arm: Arm, function: str, **arguments: Any) -> dict[str, dict[str, float]]:
-    """What a function of a module beside this file says of an arm, measured in a process of its own.
+    """What a function of a module beside this file says of an arm, in a process of its own.
 
     Args:
         arm: Which.

@@ -1,4 +1,4 @@
-"""How fast stereo is: a hypothesis beside a scalar loop, and a hundred views from photographs to seeds.
+"""How fast stereo is: a hypothesis beside a scalar loop, and a hundred views to seeds.
 
 Notation: a *hypothesis* is one plane at one pixel, tried in five sources of 25 samples; seconds are
 one thread's on a core. Promise: every measurement has a process of its own, which has compiled
@@ -48,7 +48,7 @@ def prepare_views(cache: Path) -> Path:
 
 
 def hypothesis_seconds(peer_rows: int) -> dict[str, float]:
-    """Seconds of a hypothesis: planes alone, in a sweep, and of the peer, on its first rows of the grid."""
+    """Seconds of a hypothesis: alone, in a sweep, and of the peer, on the grid's first rows."""
     images, warps, guesses = _workload()
     pictures = _pictures(images, warps)
     shape = guesses.shape[2:]

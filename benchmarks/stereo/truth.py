@@ -1,4 +1,4 @@
-"""Stereo against true depth: two real captures with a depth camera, a made room, and the room without texture.
+"""Stereo against true depth: two captures with a depth camera, a made room, a bare one.
 
 Notation: every eighth photograph by name is *held out*: stereo does not see it, and its depth is
 the surface that seeds are held against. A *pixel* is one of a stereo map; its true depth is that of

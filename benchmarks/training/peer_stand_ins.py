@@ -297,7 +297,7 @@ class Neighbors:
 
 
 def fused_ssim(x: Tensor, y: Tensor, padding: str) -> Tensor:
-    """Mean SSIM of two images [1, 3, H, W] where the window fits whole, differentiable in the first."""
+    """Mean SSIM of two images [1, 3, H, W], valid windows only, differentiable in the first."""
     if padding != "valid" or len(x) != 1:
         raise NotImplementedError(f"{padding} padding, {len(x)} images")
     pair = (each[0].permute(1, 2, 0).contiguous() for each in (x, y))

@@ -62,7 +62,8 @@ def run(key: Key, scenes: Path, ledger: Path) -> None:
     scene, arm, strategy, rho, max_steps, data_factor, seed = key
     say(f"{scene}, {arm}, {strategy}, rho {rho:g}, seed {seed} ...")
     result = call(
-        "benchmarks.training.seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm, strategy=strategy,
+        "benchmarks.training.seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
+        strategy=strategy,
         rho=rho, max_steps=max_steps, data_factor=data_factor, seed=seed,
     )  # fmt: skip
     write_line(ledger, key, result)
@@ -81,7 +82,7 @@ def wanted(settings: Settings) -> Iterable[Key]:
 
 
 def rows(results: Mapping[Any, Mapping[str, Any]], settings: Settings) -> Iterable[list[str]]:
-    """Strategy, rho and arm each: PSNR / SSIM (Gaussians, of them seeds) by capture, and the mean."""
+    """By strategy, rho and arm: PSNR / SSIM (Gaussians, seeds) per capture, and the mean."""
     for strategy in settings.strategies:
         for rho in settings.rho:
             for arm in settings.arms:

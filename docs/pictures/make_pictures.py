@@ -124,7 +124,7 @@ def draw_depth() -> None:
 def as_predicted(
     z: Float32[np.ndarray, "H W"], rng: np.random.Generator
 ) -> Float32[np.ndarray, "H W"]:
-    """Depth as a relative network would have it: inverse, of any scale and shift, soft, and bent."""
+    """Depth as a relative network has it: inverse, of any scale and shift, soft, and bent."""
     inverse = gaussian_filter(1 / np.nan_to_num(z, nan=np.inf), 2.0)
     bent = gaussian_filter(rng.normal(size=z.shape), 40.0)
     bent *= rng.uniform(0.02, 0.12) / np.abs(bent).max()
@@ -146,7 +146,7 @@ def draw_method(scene: ss.Scene, name: str, cloud: ss.PointCloud) -> None:
 
 
 def draw_lifting(capture: Capture, scene: ss.Scene, cloud: ss.PointCloud) -> None:
-    """Lifting: what an image gives, and the cloud that comes of all of them, as in the paper's figure 2."""
+    """Lifting: what an image gives, and the cloud of all images, as in the paper's figure 2."""
     width, camera = 350, choose_camera(scene)
     image = choose_image(scene)
     pixels = lifted_from(scene, image, cloud)

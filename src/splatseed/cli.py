@@ -102,7 +102,10 @@ def _run(verb: str, words: list[str]) -> None:
 
 @contextmanager
 def _termination_raised() -> Iterator[None]:
-    """Have SIGTERM raise, so that what is half-written is removed; the handler of before comes back."""
+    """Have SIGTERM raise, so that what is half-written is removed.
+
+    The handler of before comes back.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -155,7 +158,7 @@ def _fail(message: str) -> NoReturn:
 
 
 def _forget_output() -> None:
-    """Have nothing more written to a full or closed output, where Python would complain at its exit."""
+    """Write no more to a full or closed output, of which Python would complain at exit."""
     try:
         sys.stdout.flush()
     except (OSError, ValueError):

@@ -32,7 +32,7 @@ __all__ = [
 
 
 class LiteralConsole(Console):
-    """A console without markup, emoji codes and highlighting, that escapes what terminals act on."""
+    """A console without markup, emoji and highlighting, that escapes what terminals act on."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)

@@ -83,7 +83,7 @@ def rays_through(lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]) -> Float64[n
 
 
 def fold_radius(lens: Intrinsics, most: float) -> float:
-    """The distance from (0, 0) at which the lens folds: farther rays would come nearer to the centre.
+    """The distance from (0, 0) at which the lens folds: farther rays would come nearer.
 
     Polynomials are fitted to the image; beyond it they turn back sooner or later, and would show
     the image a second time.
@@ -103,7 +103,7 @@ def fold_radius(lens: Intrinsics, most: float) -> float:
 
 
 class _Terms(NamedTuple):
-    """Coefficients of a lens: of r^2, r^4, ... in numerator and denominator, p1 and p2, and a prism's.
+    """Coefficients of a lens: of r^2, r^4, ... above and below, p1 and p2, and a prism's.
 
     The prism's are of r^2 and r^4, first for u, then for v.
     """

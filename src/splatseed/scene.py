@@ -219,7 +219,7 @@ class Scene:
         return folder is not None and any((folder / each.name).is_file() for each in self.images)
 
     def split(self, test_every: int = 8) -> tuple[tuple[Image, ...], tuple[Image, ...]]:
-        """Training and test images, by name: the scene's own, else every ``test_every``-th is tested."""
+        """Training and test images by name: as listed, else every ``test_every``-th is tested."""
         ordered = sorted(self.images, key=lambda image: image.name)
         if self.listed is not None:
             parts = (self.listed.train, self.listed.test)

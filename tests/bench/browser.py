@@ -19,7 +19,8 @@ CHROMIUM = next(
 )
 PATIENCE = 60.0
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--disable-extensions", "--no-first-run",
-         "--disable-background-networking", "--hide-scrollbars", "--remote-debugging-pipe")  # fmt: skip
+         "--disable-background-networking", "--hide-scrollbars",
+         "--remote-debugging-pipe")  # fmt: skip
 
 START = """
 import fcntl, os, sys

@@ -61,7 +61,8 @@ def spec(scene, method, ratio, *, strategy="none", repeat=0, profile="default", 
 def rows(
     scenes=SCENES, gains=GAINS, strategies=("none",), repeats=3, noise=NOISE, seed=0, **changes
 ):
-    """All runs of a plan, done; every scene has its level, every repeat its own, every run noise."""
+    """All runs of a plan, done; every scene has its level, every repeat its own, every run
+    noise."""
     rng = np.random.default_rng(seed)
     found = []
     for strategy in strategies:

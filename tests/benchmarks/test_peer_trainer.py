@@ -1,4 +1,5 @@
-"""The comparison with gsplat's trainer: what stands in for CUDA, on a stand-in for its files too."""
+"""The comparison with gsplat's trainer: what stands in for CUDA, on a stand-in for its files
+too."""
 
 from __future__ import annotations
 
@@ -347,7 +348,10 @@ def test_options_that_make_no_sense_are_refused(bench, wrong, says):
 
 def test_the_script_says_what_is_missing_without_a_traceback(room):
     done = subprocess.run(
-        [sys.executable, "-m", "benchmarks.training.peer_trainer", "--scene", room, "--gsplat-examples", "none"],
+        [
+            *(sys.executable, "-m", "benchmarks.training.peer_trainer"),
+            *("--scene", room, "--gsplat-examples", "none"),
+        ],
         cwd=ROOT, capture_output=True, check=False, text=True,
     )  # fmt: skip
     assert done.returncode == 1

@@ -58,7 +58,8 @@ def test_a_planted_scale_and_shift_of_inverse_depth_are_found(exact, make_maps):
 
 
 def test_a_point_takes_the_pixel_it_falls_into(exact):
-    """Centres are at +0.5: on a map of noise, half a pixel to any side is another value altogether."""
+    """Centres are at +0.5: on a map of noise, half a pixel to any side is another value
+    altogether."""
     image, rng = exact.images[0], np.random.default_rng(0)
     values = rng.uniform(1.0, 5.0, (120, 160)).astype(np.float32)
     row, column = rng.integers(0, (120, 160), (200, 2)).T

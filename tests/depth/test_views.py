@@ -1,4 +1,5 @@
-"""What other views say of a point, which of them are asked, and how their maps are made to agree."""
+"""What other views say of a point, which of them are asked, and how their maps are made to
+agree."""
 
 from __future__ import annotations
 
@@ -146,7 +147,8 @@ def test_neighbors_see_the_same_from_another_side():
 
 
 def test_maps_are_scaled_to_agree():
-    """Ten cameras before a wall and a nearer one beside it, each map wrong by a factor of its own."""
+    """Ten cameras before a wall and a nearer one beside it, each map wrong by a factor of its
+    own."""
     rng = np.random.default_rng(0)
     cameras = [camera_at(*xy) for xy in rng.uniform(-0.4, 0.4, (10, 2))]
     factors = np.exp(rng.normal(scale=0.05, size=10))

@@ -1,4 +1,5 @@
-"""Files that a scene names and that are none: pipes, devices, links into themselves, archives that burst."""
+"""Files that a scene names and that are none: pipes, devices, links into themselves, archives that
+burst."""
 
 from __future__ import annotations
 

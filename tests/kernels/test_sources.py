@@ -1,4 +1,5 @@
-"""Machine code from the cache is of the sources as they are, in every file that a kernel reaches."""
+"""Machine code from the cache is of the sources as they are, in every file that a kernel
+reaches."""
 
 from __future__ import annotations
 
@@ -54,7 +55,8 @@ print(value, len(twice_shifted.stats.cache_hits))
 
 @pytest.fixture
 def tiny(tmp_path):
-    """A package with a kernel that calls functions of a second file, which use constants of a third."""
+    """A package with a kernel that calls functions of a second file, which use constants of a
+    third."""
     folder = tmp_path / "tiny"
     folder.mkdir()
     for name, text in FILES.items():

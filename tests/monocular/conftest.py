@@ -31,7 +31,8 @@ def photographs(rng):
 
 @pytest.fixture
 def ramp():
-    """A photograph, 118 x 77, whose red is u + 2 v with (u, v) the pixel's centre, from 0 at the corner."""
+    """A photograph, 118 x 77, whose red is u + 2 v with (u, v) the pixel's centre, from 0 at the
+    corner."""
     v, u = np.mgrid[:77, :118] + 0.5
     return np.repeat((u + v)[..., None], 3, axis=2).astype(np.uint8)
 

@@ -71,7 +71,8 @@ def test_predictions_are_those_of_transformers_at_the_photographs_size(name, sav
 
 
 class _SeesItself(torch.nn.Module):
-    """Predicts the first channel of its input: where a pixel of a map lies can then be read off it."""
+    """Predicts the first channel of its input: where a pixel of a map lies can then be read off
+    it."""
 
     def __init__(self, config, processor):
         super().__init__()

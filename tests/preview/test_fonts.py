@@ -1,4 +1,5 @@
-"""Names in any script in figures: shown where a font has them, escaped where none has, never a formula."""
+"""Names in any script in figures: shown where a font has them, escaped where none has, never a
+formula."""
 
 from __future__ import annotations
 

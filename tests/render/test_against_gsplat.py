@@ -35,7 +35,8 @@ def theirs(scene: dict[str, Any], **options: Any) -> dict[str, Tensor]:
 
 
 def crowded(rng: np.random.Generator) -> dict[str, Any]:
-    """Two cameras close enough that some Gaussians lie behind them and many outside of the image."""
+    """Two cameras close enough that some Gaussians lie behind them and many outside of the
+    image."""
     scene = random_scene(rng, 400, cameras=2, size=(50, 37))
     scene["viewmats"][:, 2, 3] = 0.8
     return scene

@@ -46,7 +46,8 @@ def assert_same(ours: Tensor, theirs: Tensor, what: str, tolerance: float = 1e-4
 
 
 def assert_agrees(scene: dict[str, Any], **options: Any) -> tuple[Tensor, Tensor]:
-    """Compare; return the reference's image and alpha, for tests to check that they are not empty."""
+    """Compare; return the reference's image and alpha, for tests to check that they are not
+    empty."""
     image, alpha, found = gradients(scene, **options)
     slow_image, slow_alpha, expected = gradients(scene, slow=True, **options)
     assert_same(image, slow_image, "image")
@@ -112,7 +113,8 @@ def test_a_pair_of_coefficients_is_their_concatenation(rng, degree: int) -> None
 
 @pytest.mark.parametrize("seed", range(3))
 def test_opaque_walls_end_blending_and_hold_alpha(seed: int) -> None:
-    """Both cut-offs of opaque scenes: alpha held at 0.999, and the end at a transmittance of 1e-4."""
+    """Both cut-offs of opaque scenes: alpha held at 0.999, and the end at a transmittance of
+    1e-4."""
     scene = random_scene(np.random.default_rng(seed), 150)
     scene["opacities"] = 1.0 - 0.02 * (1.0 - scene["opacities"])
     scene["scales"] = scene["scales"].clamp(min=0.15)
@@ -156,7 +158,8 @@ def test_info_lists_what_is_visible(rng) -> None:
 
 @pytest.mark.parametrize(("packed", "channels"), [(True, 3), (False, 3), (False, 4)])
 def test_gradient_of_2d_means(rng, packed: bool, channels: int) -> None:
-    """What densification reads: d loss / d means2d, and the sum of its absolute values over pixels."""
+    """What densification reads: d loss / d means2d, and the sum of its absolute values over
+    pixels."""
     scene = random_scene(rng, cameras=2, channels=channels)
     ours, ours_abs, seen = _gradients_of_2d_means(scene, packed=packed)
     for camera in range(2):

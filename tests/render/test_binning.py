@@ -23,7 +23,8 @@ def lists_of(
 
 
 def random_view(rng: np.random.Generator, n: int, width: int, height: int) -> View:
-    """Ellipses of all sizes and shapes in and around an image, some of one pixel, some of a thousand."""
+    """Ellipses of all sizes and shapes in and around an image, some of one pixel, some of a
+    thousand."""
     axes = np.exp(rng.uniform(np.log(0.55), np.log(300.0), (n, 2)))
     axes[n // 2 :] = axes[n // 2 :].clip(max=4.0)
     angles = rng.uniform(0.0, np.pi, n)
@@ -37,7 +38,8 @@ def random_view(rng: np.random.Generator, n: int, width: int, height: int) -> Vi
 
 
 def touched(view: View, slack: float) -> np.ndarray:
-    """Which Gaussian has a pixel of which tile with sigma <= reach + slack: bool [G, rows, columns]."""
+    """Which Gaussian has a pixel of which tile with sigma <= reach + slack: bool [G, rows,
+    columns]."""
     means2d, conics, reach, width, height = view
     columns, rows = -(-width // TILE), -(-height // TILE)
     x = np.arange(columns * TILE)[None, None, :] + 0.5 - means2d[:, 0, None, None].astype(float)
@@ -109,7 +111,8 @@ def test_nothing_to_list() -> None:
 
 
 @pytest.mark.parametrize("conic", [(1e-12, 0.0, 1e-12), (1e-38, 0.0, 1e-38), (0.0, 0.0, 0.0),
-                                   (1e-40, 0.0, 1e-40), (1.0, 1.0, 1.0), (1.0, -1.0001, 1.0)])  # fmt: skip
+                                   (1e-40, 0.0, 1e-40), (1.0, 1.0, 1.0),
+                                   (1.0, -1.0001, 1.0)])  # fmt: skip
 def test_giants_and_broken_needles_are_listed_everywhere(conic: tuple[float, ...]) -> None:
     lists = lists_of(
         np.array([[5.0, 7.0]], np.float32), np.array([conic], np.float32),

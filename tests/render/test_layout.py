@@ -16,7 +16,8 @@ def _records(conics: np.ndarray) -> np.ndarray:
     records = np.full(RECORD * num, np.nan, np.float32)
     zeros = np.zeros((num, 3), np.float32)
     layout.gather(
-        np.arange(num, dtype=np.int32), zeros[:, :2].copy(), conics, zeros[:, 0].copy(), zeros, 0, records
+        np.arange(num, dtype=np.int32), zeros[:, :2].copy(), conics, zeros[:, 0].copy(), zeros, 0,
+        records
     )  # fmt: skip
     return records.reshape(num, RECORD)
 

@@ -79,7 +79,8 @@ def test_seeds_of_a_wall_lie_on_it(rng):
 
 
 def test_of_two_surfaces_a_seed_takes_the_one_that_no_view_looks_through(rng):
-    """Between a near and a far half, seeds beside the near one hang before the far one from aside."""
+    """Between a near and a far half, seeds beside the near one hang before the far one from
+    aside."""
     view = slow.make_view(rng, 80, 48, 60, eye=(0, -1, 0))
     left = [slow.lift(view, 8, i, j, 2.0) for i in range(6) for j in range(4)]
     right = [slow.lift(view, 8, i, j, 4.0) for i in range(6) for j in range(6, 10)]

@@ -25,7 +25,8 @@ NUM = 21
 
 @pytest.fixture
 def images(rng):
-    """A picture and three others: the same shifted by its planes' parallax, darker, and noise in it."""
+    """A picture and three others: the same shifted by its planes' parallax, darker, and noise in
+    it."""
     wide = rng.uniform(0, 255, (HEIGHT, WIDTH + 40))
     for axis in (0, 1):
         wide = (np.roll(wide, 1, axis) + 2 * wide + np.roll(wide, -1, axis)) / 4

@@ -1,4 +1,5 @@
-"""``upsample``: photographs by default, a fallback without them, cover, verify and budgets for all."""
+"""``upsample``: photographs by default, a fallback without them, cover, verify and budgets for
+all."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""verify: points beside a planted plane go back onto it, points far from it go, nothing is made up."""
+"""verify: points beside a planted plane go back onto it, points far from it go, nothing is made
+up."""
 
 from __future__ import annotations
 

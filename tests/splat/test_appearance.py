@@ -1,4 +1,5 @@
-"""First colours: least squares over the views that show a seed, against a plain one and planted ones."""
+"""First colours: least squares over the views that show a seed, against a plain one and planted
+ones."""
 
 from __future__ import annotations
 

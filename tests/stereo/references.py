@@ -73,7 +73,8 @@ def best_of(costs: list[float]) -> float:
 def agrees(
     planes: np.ndarray, grid: int, row: int, column: int, warp: np.ndarray, other: np.ndarray
 ) -> float:
-    """How far another map's depth is from that of a pixel of a view, relative; inf where it cannot say."""
+    """How far another map's depth is from that of a pixel of a view, relative; inf where it cannot
+    say."""
     z = 1.0 / planes[0, row, column]
     u, v = (column + 0.5) * grid, (row + 0.5) * grid
     x, y, depth = warp @ [u * z, v * z, z, 1.0]

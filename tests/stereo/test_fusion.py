@@ -47,7 +47,8 @@ def test_a_cell_of_a_view_has_one_seed_at_a_depth(seeds, ball):
 
 
 def test_every_kept_pixel_has_a_seed_near_it(seeds, ball):
-    """What was not taken was left out for a seed of its cell, in its own view or a confirming one."""
+    """What was not taken was left out for a seed of its cell, in its own view or a confirming
+    one."""
     stereo, xyz = ball.stereo, seeds.xyz.astype(float)
     for i in range(len(stereo.views)):
         found = stereo.map(i)

@@ -1,4 +1,5 @@
-"""Scenes that no Structure-from-Motion has been at: stereo finds its own points, or takes depth maps."""
+"""Scenes that no Structure-from-Motion has been at: stereo finds its own points, or takes depth
+maps."""
 
 from __future__ import annotations
 

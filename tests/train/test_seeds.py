@@ -125,7 +125,8 @@ def test_what_upsample_only_thinned_is_left_alone(room, tmp_path):
     "settings", [{}, {"seeding": "auto", "strategy": "default-3dgs"}, {"seeding": "auto"}]
 )
 def test_other_points_are_left_alone(settings, room):
-    """Those that are to stay, those of 3DGS's conventions, and those that splatseed has added to."""
+    """Those that are to stay, those of 3DGS's conventions, and those that splatseed has added
+    to."""
     touched = room.replace(
         points=room.points.replace(source=np.full(len(room.points), 4, np.uint8))
     )

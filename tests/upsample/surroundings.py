@@ -70,7 +70,8 @@ def _looking_at(center, target, down):
 
 
 def _photographs(rgb):
-    """A folder of photographs, all alike, whose colours run from the least to the largest of a cloud."""
+    """A folder of photographs, all alike, whose colours run from the least to the largest of a
+    cloud."""
     low, high = rgb.min(axis=0).astype(int), rgb.max(axis=0).astype(int)
     folder = Path(FOLDER.name) / "_".join(map(str, [*low, *high]))
     if not folder.exists():

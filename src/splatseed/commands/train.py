@@ -175,7 +175,10 @@ def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
 
 
 def bar_columns() -> tuple[ProgressColumn, ...]:
-    """Steps and the time left whole; what else there is to say fills the rest, cut where it ends."""
+    """Steps and the time left whole.
+
+    What else there is to say fills the rest, cut where it ends.
+    """
 
     def whole() -> Column:
         return Column(no_wrap=True, overflow="ignore")

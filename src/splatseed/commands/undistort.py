@@ -20,7 +20,7 @@ __all__ = ["run"]
 
 @dataclass(frozen=True)
 class Options:
-    """Take the lens distortion out of a scene's photographs, and make its cameras PINHOLE (pycolmap)."""
+    """Take lens distortion out of a scene's photographs; its cameras become PINHOLE (pycolmap)."""
 
     scene: Annotated[Path, tyro.conf.Positional]
     """A scene with photographs, in any layout."""

@@ -212,7 +212,10 @@ def _residual(
     scale: float,
     shift: float,
 ) -> float:
-    """Median relative error of depth; a point that would lie behind the camera counts as infinite."""
+    """Median relative error of depth.
+
+    A point that would lie behind the camera counts as infinite.
+    """
     aligned = scale * value + shift
     if kind == "inverse":
         aligned = 1.0 / np.where(aligned > 0, aligned, np.nan)

@@ -82,7 +82,7 @@ def find_support(
 
 @inline
 def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[no-untyped-def]
-    """The colours of a view's own reduced photograph at its candidates: as smooth as the others'."""
+    """Colours of a view's own reduced photograph at its candidates, as smooth as the others'."""
     for k in range(len(xyz)):
         column, row, _ = place(xyz[k], grid_from_world)
         p, q = _block(column, row, rgb_from_grid, rgb.shape)

@@ -143,7 +143,10 @@ def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]
 
 @inline
 def _nearest(point, m):  # type: ignore[no-untyped-def]
-    """Depth of a point in a view, and the nearest point of its grid; column -1 where there is none."""
+    """Depth of a point in a view, and the nearest point of its grid.
+
+    Column -1 where there is none.
+    """
     column, row, depth = place(point, m)
     column, row = column + 0.5, row + 0.5
     if not (0.0 <= column < MOST_COLUMNS and 0.0 <= row < MOST_COLUMNS):

@@ -146,7 +146,7 @@ def _with_rest(
 
 @inline
 def _spread_distance(distance):  # type: ignore[no-untyped-def]
-    """Chamfer distances from the zeros of a grid, in place, too long by 8% at most (Borgefors, 1986)."""
+    """Chamfer distances from a grid's zeros, in place, at most 8% too long (Borgefors, 1986)."""
     rows, columns = distance.shape
     for sweep in range(2):
         for a in range(rows):

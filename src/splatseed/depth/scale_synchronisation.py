@@ -1,10 +1,11 @@
-"""Scale synchronisation: one factor per image, so that maps agree with one another where they overlap.
+"""Scale synchronisation: one factor per image, so that maps agree where they overlap.
 
 Notation: V views; depth of view i is multiplied by exp(g_i). A pair (i, j) that sees the same
 places has a = median log(d_j / z_ij), where z_ij is the depth in view j of candidates of view i,
 and d_j what view j knows there. Then to first order
 
-    g_j - g_i = -a, to within the spread of the samples,    and    g_i = 0, to within the image's residual,
+    g_j - g_i = -a, to within the spread of the samples, and
+    g_i = 0, to within the image's residual,
 
 the latter by its SfM points. Promise: the most probable g under these, with Huber's weights, found
 twice, the second time from where the first left the maps. Pairs move maps only against each other:

@@ -132,7 +132,10 @@ class _Cubes:
 
 @kernel
 def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]
-    """The key of each point's cube; those outside of the candidates' box share keys that no other has."""
+    """The key of each point's cube.
+
+    Those outside of the candidates' box share keys that no other has.
+    """
     for k in parallel_range(len(xyz)):
         key = np.uint64(0)
         for axis in range(3):

@@ -99,7 +99,8 @@ def check_world(
     fix = (
         f"They fit with --transform {word}."
         if word
-        else "Name the transform that its trainer applied with --transform FILE; to score it as it is, "
+        else "Name the transform that its trainer applied with --transform FILE; "
+        "to score it as it is, "
         f"pass --transform {NO_TRANSFORM}."
     )
     raise SceneFormatError(
@@ -112,7 +113,10 @@ def check_world(
 
 
 def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None], float] | None:
-    """A function from a transform to how far apart points and Gaussians are; None without enough."""
+    """A function from a transform to how far apart points and Gaussians are.
+
+    None without enough.
+    """
     from scipy.spatial import KDTree  # noqa: PLC0415  (slow to import)
 
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Finding the depth maps of a scene's images: those of an RGB-D capture by time, all others by name."""
+"""Finding the depth maps of a scene's images: by time in an RGB-D capture, else by name."""
 
 from __future__ import annotations
 

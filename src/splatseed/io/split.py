@@ -54,7 +54,10 @@ def follow_lists(scene: Scene) -> Scene:
 
 
 def split_fields(scene: Scene) -> dict[str, list[str]]:
-    """The fields by which a new ``transforms.json`` tells nerfstudio of a split; none without one."""
+    """The fields by which a new ``transforms.json`` tells nerfstudio of a split.
+
+    None without one.
+    """
     if scene.listed is None:
         return {}
     train, test = scene.split()
@@ -113,7 +116,7 @@ def _split(scene: Scene, lists: _Lists) -> Split | None:
 
 
 def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str]) -> frozenset[str]:
-    """Those names that are listed: as they are, within their folder, or by file name or its stem."""
+    """The names that are listed: as they are, within their folder, or by file name or stem."""
     whole = {_plain(each) for each in listed}
     found = frozenset(n for n in names if any(f"{prefix}{n}" in whole for prefix in prefixes))
     if found:

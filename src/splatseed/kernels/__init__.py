@@ -1,1 +1,1 @@
-"""What compiled code stands on: Numba's settings, its cache's key, and vectors of sixteen floats."""
+"""What compiled code stands on: Numba's settings, its cache's key, vectors of 16 floats."""

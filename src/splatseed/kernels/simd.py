@@ -157,7 +157,10 @@ def _splat(builder, x):
 
 @intrinsic
 def broadcast(typing_context, array, index):
-    """Element ``index`` of a contiguous float32 array in every lane; like ``element``'s, not below 0."""
+    """Element ``index`` of a contiguous float32 array in every lane.
+
+    Like ``element``'s, not below 0.
+    """
 
     def generate(context, builder, signature, arguments):
         return _splat(builder, _element(context, builder, signature.args[0], *arguments))
@@ -277,7 +280,7 @@ def _transposed(builder, rows):
 
 
 def _exchange(builder, rows, width):
-    """Swap, in every square of 2 x 2 blocks of ``width`` rows and lanes, the two off its diagonal."""
+    """Swap the off-diagonal pair in every square of 2 x 2 blocks of ``width`` rows and lanes."""
     out = list(rows)
     low = [k if not k & width else k - width + LANES for k in range(LANES)]
     high = [k + width if not k & width else k + LANES for k in range(LANES)]

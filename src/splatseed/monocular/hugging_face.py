@@ -162,7 +162,10 @@ def load_hugging_face(
 
 
 def _failed(error: Exception, values: Float[Tensor, "B 3 h w"]) -> SplatseedError:
-    """What to tell of a network that stopped; PyTorch's word for memory on the CPU is "allocate"."""
+    """What to tell of a network that stopped.
+
+    PyTorch's word for memory on the CPU is "allocate".
+    """
     batch, _, height, width = values.shape
     if isinstance(error, torch.cuda.OutOfMemoryError) or "allocate" in str(error):
         return ParameterError(

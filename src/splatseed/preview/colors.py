@@ -48,7 +48,7 @@ def usual_range(values: Float[np.ndarray, "H W"]) -> tuple[float, float]:
 
 
 def color_bar(low: str, high: str, colormap: str = "plasma") -> UInt8[np.ndarray, "H W 3"]:
-    """A strip of colours, those of ``heat`` by default, with what its ends mean written beside it."""
+    """A strip of colours, by default of ``heat``, with the meaning of its ends beside it."""
     strip = map_colors(np.tile(np.linspace(0.0, 1.0, 240), (20, 1)), 0.0, 1.0, colormap)
     bar = PillowImage.new("RGB", (GRID_SIDE, 44), PAPER)
     bar.paste(PillowImage.fromarray(strip), (70, 12))

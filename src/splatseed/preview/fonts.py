@@ -38,7 +38,9 @@ def font_families() -> tuple[str, ...]:
 
 
 def plain(text: str) -> str:
-    r"""A name as text for matplotlib: a dollar would begin a formula; what no font has becomes \u....
+    r"""A name as text for matplotlib: a dollar would begin a formula.
+
+    What no font has becomes \u....
 
     Example:
         >>> plain("a$b")

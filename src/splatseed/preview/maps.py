@@ -79,7 +79,7 @@ def preview_maps(
 
 
 def map_tiles(maps: ViewMaps, photograph: UInt8[np.ndarray, "H W 3"]) -> list[Tile]:
-    """The photograph, depth, normals and confidence of a view, as four tiles of the photograph's size.
+    """Photograph, depth, normals and confidence of a view: four tiles of the photograph's size.
 
     Args:
         maps: The maps.

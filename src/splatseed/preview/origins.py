@@ -92,7 +92,7 @@ def _bleached(
 
 
 def origin_legend(points: PointCloud, width: int) -> UInt8[np.ndarray, "H W 3"]:
-    """A strip that names the origins of a cloud's points, in their colours and with their numbers."""
+    """A strip that names the origins of a cloud's points, with their colours and numbers."""
     codes, counts = np.unique(points.source, return_counts=True)
     colors = [tuple(color) for color in origin_colors(codes.astype(np.uint8)).tolist()]
     strip = PillowImage.new("RGB", (width, 44), PAPER)

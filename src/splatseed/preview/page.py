@@ -59,7 +59,7 @@ def fitted(width: int, height: int, side: int = GRID_SIDE) -> tuple[int, int]:
 
 
 def centered(tiles: Sequence[Tile]) -> list[Tile]:
-    """The tiles on white, all as large as the largest: images of a scene may be of several sizes."""
+    """The tiles on white, all as large as the largest: a scene's images may differ in size."""
     height, width = np.max([tile.picture.shape[:2] for tile in tiles], axis=0)
     return [Tile(tile.label, _centered(tile.picture, height, width)) for tile in tiles]
 

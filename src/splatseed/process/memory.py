@@ -61,7 +61,10 @@ def _of_machine() -> int | None:
 
 
 def _of_container() -> int | None:
-    """What a container's limit leaves; copies of files, which give way, are not counted as taken."""
+    """What a container's limit leaves.
+
+    Copies of files, which give way, are not counted as taken.
+    """
     try:
         limit = (CGROUP / "memory.max").read_text("ascii").strip()
         used = int((CGROUP / "memory.current").read_text("ascii"))

@@ -266,7 +266,8 @@ class Blend(torch.autograd.Function):
         for first in range(0, colors.shape[1], blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
             totals = _backward(
-                prepared, records, ctx.hits, gradient, ctx.image, _array(d_alphas), transmittance, first,
+                prepared, records, ctx.hits, gradient, ctx.image, _array(d_alphas), transmittance,
+                first,
                 absolute,
             )  # fmt: skip
             layout.scatter(  # type: ignore[call-arg]  # star arguments
@@ -366,7 +367,8 @@ def _backward(
     sums = _aligned(int(lists.span_start[-1]) * blending_vjp.SUMS, zero=True)
     blending_vjp.backward(
         records, lists.tile_start, lists.listed_rank, lists.listed_span, hits, prepared.row_order,
-        blending.COLUMN, blending.ROW, d_image.shape[2] - first >= blending.CHANNELS, gradient, behind,
+        blending.COLUMN, blending.ROW, d_image.shape[2] - first >= blending.CHANNELS, gradient,
+        behind,
         absolute, sums,
     )  # fmt: skip
     totals = np.empty((len(prepared.order), blending_vjp.SUMS), np.float32)

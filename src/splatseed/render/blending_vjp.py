@@ -69,7 +69,8 @@ OUTER = np.float32(1.5)
 
 @kernel
 def backward(
-    records, tile_start, listed_rank, listed_span, hits, row_order, lane_x, lane_y, fourth, gradient,
+    records, tile_start, listed_rank, listed_span, hits, row_order, lane_x, lane_y, fourth,
+    gradient,
     behind, absolute, sums,
 ):  # fmt: skip
     """The sums of every span.

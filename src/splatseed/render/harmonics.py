@@ -235,7 +235,10 @@ def _prefetch(rows, row):
 
 @always_inline
 def _row(rest, row, table):
-    """A row's three vectors; what does not count is 0, also if it is NaN, and so are repetitions."""
+    """A row's three vectors.
+
+    What does not count is 0, also if it is NaN, and so are repetitions.
+    """
     return (
         _live(load(rest, row + FIRST[0]), load(table, LIVE)),
         _live(load(rest, row + FIRST[1]), load(table, LIVE + LANES)),
@@ -293,7 +296,7 @@ def _row_vjp(x, y, z, d_color, rest, row, table, d_rest):
 
 @always_inline
 def _slope(twice, one, other, square, with_one, with_other, table):
-    """Derivatives of the forms along an axis: of its square, and of its products with the others."""
+    """Derivatives of the forms along an axis: its square, and its products with the others."""
     slope = fma(load(table, with_one), one, multiply(load(table, with_other), other))
     return fma(load(table, square), twice, slope)
 

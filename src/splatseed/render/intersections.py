@@ -1,4 +1,6 @@
-"""Which Gaussians touch which tiles, in gsplat's layout; for whoever asks: the CPU rasteriser has its own.
+"""Which Gaussians touch which tiles, in gsplat's layout.
+
+For whoever asks: the CPU rasteriser has its own.
 
 Notation: G projected Gaussians, C cameras one after the other, I pairs of a Gaussian and a tile,
 and ceil(height / size) x ceil(width / size) tiles a camera. A pair's id is, from the highest bit

@@ -79,7 +79,7 @@ def gather(order, means2d, conics, log_opacities, colors, first, records):
 
 @always_inline
 def _held(a, b, c):
-    """b, or as much of it as leaves the conic an ellipse, where float32 has rounded a needle past one.
+    """b, or as much as leaves the conic an ellipse, where float32 rounded a needle past one.
 
     Blending relies on sigma >= 0.
     """
@@ -176,7 +176,7 @@ def _from_lanes(colors, T, background, first, count, depth, pixels, out_T):
 
 @kernel
 def to_blocks(d_image, image, d_alphas, transmittance, columns, first, gradient, behind):
-    """This pass's channels of the gradient to a block image, and what lies behind the first Gaussian.
+    """This pass's gradient channels as a block image, and what lies behind the first Gaussian.
 
     Every pass takes its own channels' part of what lies behind; the first takes that of alpha too.
 

@@ -123,7 +123,8 @@ def rasterization(
         return on_cuda(  # type: ignore[no-any-return]  # gsplat is untyped
             means, quats, scales, opacities,
             torch.cat(colors, dim=1) if isinstance(colors, tuple) else colors,
-            viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, backgrounds, render_mode,
+            viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree,
+            packed, tile_size, backgrounds, render_mode,
             sparse_grad, absgrad, rasterize_mode, channel_chunk, **unsupported,
         )  # fmt: skip
     check_unsupported(unsupported)

@@ -123,7 +123,7 @@ def _covariance2d(
 def _touches_image(
     means2d: Tensor, covariance: Tensor, opacities: Tensor, width: int, height: int
 ) -> Tensor:
-    """Whether the bounding box of where alpha reaches 1/255, at most 3.33 sigmas, is in the image."""
+    """Whether the box where alpha reaches 1/255, at most 3.33 sigmas, is in the image."""
     sigmas = (
         (2 * torch.log(opacities.clamp(min=MIN_ALPHA) / MIN_ALPHA)).sqrt().clamp(max=MAX_SIGMAS)
     )

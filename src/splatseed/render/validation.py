@@ -101,7 +101,7 @@ def check_tensors(
     tensors: Mapping[str, Tensor | None],
     sh_degree: int | None,
 ) -> None:
-    """Check the types and shapes of colors, means, quats, scales, opacities, viewmats, Ks, backgrounds.
+    """Check types and shapes: colors, means, quats, scales, opacities, viewmats, Ks, backgrounds.
 
     Raises:
         ParameterError: One is not a float32 CPU tensor or its shape does not go with the others'.

@@ -65,7 +65,10 @@ def call_witnesses(
 
 
 def world_from_grid(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
-    """(column depth, row depth, depth, 1) to the world, columns and rows in cells; float64 [3, 4]."""
+    """(column depth, row depth, depth, 1) to the world, columns and rows in cells.
+
+    Float64 [3, 4].
+    """
     forward = np.vstack([grid_from_world(view, cell), [0.0, 0.0, 0.0, 1.0]])
     return np.asarray(np.linalg.inv(forward)[:3])
 
@@ -138,7 +141,10 @@ def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-u
 
 @inline
 def _look_around(depths, i, j, nearest, found):  # type: ignore[no-untyped-def]
-    """The nearest covered cell of each sector, by squared distance; of equals the first, ring by ring."""
+    """The nearest covered cell of each sector, by squared distance.
+
+    Of equals the first, ring by ring.
+    """
     rows, cols = depths.shape
     last = max(i, rows - 1 - i, j, cols - 1 - j)
     ring, seen = 1, False

@@ -108,7 +108,7 @@ def _holds(matrix, size, point):  # type: ignore[no-untyped-def]
 
 @inline
 def _sight(point, normal, center):  # type: ignore[no-untyped-def]
-    """How well a surface is seen from a place: (cos of the angle to its normal + OBLIQUE) / distance."""
+    """How well a surface is seen: (cos of the angle to its normal + OBLIQUE) / distance."""
     dot, squared = 0.0, 0.0
     for axis in range(3):
         ray = point[axis] - center[axis]

@@ -122,7 +122,7 @@ class Stereo(PhotographMethod):
     def maps(
         self, scene: Scene, only: Sequence[int], seed: int, progress: Progress
     ) -> tuple[StereoMap, ...]:
-        """Depth and normals of some photographs: those that ``upsample`` with this seed makes seeds of.
+        """Depth and normals of some photographs, as ``upsample`` finds them with this seed.
 
         Args:
             scene: The scene.
@@ -171,7 +171,7 @@ class Cover(PhotographMethod):
 
 @dataclass(frozen=True)
 class Auto(Stereo):
-    """Stereo, then cover: a seed for every part of every photograph, on surfaces where they are found."""
+    """Stereo, then cover: a seed for every part of every photograph, on surfaces where found."""
 
     cell: int = 8
     """Side of the parts, in pixels, that get a seed where none falls in."""
@@ -209,7 +209,7 @@ def photographed(scene: Scene, hold_out: int = 0) -> tuple[Image, ...]:
 def read_views(
     scene: Scene, images: Sequence[Image], max_size: int, progress: Progress
 ) -> tuple[View, ...]:
-    """The photographs of some images, undistorted, their longer side at most ``max_size`` pixels."""
+    """The photographs of some images, undistorted, at most ``max_size`` pixels a side."""
     from splatseed.views.view import data_factor, load_views  # noqa: PLC0415  (loads with use)
 
     factor = data_factor(images, max_size)
@@ -244,7 +244,7 @@ def cover_cloud(
 def with_cover(
     views: Sequence[View], points: PointCloud, cell: int, seed: int, progress: Progress
 ) -> PointCloud:
-    """The points, and a seed in each cell of the views that they leave empty (see ``cover_cloud``)."""
+    """The points, and a seed in each cell of the views that they leave empty."""
     code = source_code("cover")
     new = cover_cloud(views, points, cell, np.random.default_rng([seed, code]), progress)
     source = np.full(len(new.xyz), code, np.uint8)

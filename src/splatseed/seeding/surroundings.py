@@ -1,4 +1,4 @@
-"""What the originals around a new point say of the surface there: how far apart they are, which way it faces.
+"""What the originals around a new point say of the surface there: its spacing and normal.
 
 Notation: n originals, M new points; the *base* of a new point is its nearest original, and h, the
 mean distance of the base to its 6 nearest, its spacing. The normal is the last principal axis of

@@ -1,4 +1,4 @@
-"""A scene's points within a budget: those that are known by where they are seen, guesses for what they leave.
+"""A scene's points within a budget: known ones by where they are seen, then guesses.
 
 Promise: no more points than the number, and all of it where there are as many; nothing is drawn at
 random but the order of the views in which ``cover`` fills gaps.

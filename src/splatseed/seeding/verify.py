@@ -148,7 +148,10 @@ def _judge(
     mine: Int64[np.ndarray, " T"],
     trials: _Trials,
 ) -> None:
-    """Let view i judge its points; ``mine`` counts through the trials, judge by judge within point."""
+    """Let view i judge its points.
+
+    ``mine`` counts through the trials, judge by judge within point.
+    """
     view, (point, judge) = views[i], np.unravel_index(mine, trials.costs.shape)
     world = xyz[point].astype(np.float64)
     uv, planes, reach = _planes(view, world, around.normals[point], around.spacing[point])
@@ -175,7 +178,7 @@ def _planes(
     normals: Float64[np.ndarray, "T 3"],
     spacing: Float64[np.ndarray, " T"],
 ) -> tuple[Float32[np.ndarray, "T 2"], Float32[np.ndarray, "T 3"], Float32[np.ndarray, " T"]]:
-    """Pixels of points, the planes through them (w, gx, gy), and h / (n X), as ``slide`` takes them."""
+    """Pixels of points, planes through them (w, gx, gy), and h / (n X), as ``slide`` has them."""
     rotation, translation = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
     cam = xyz @ rotation.T + translation
     n = _facing(normals @ rotation.T, cam)

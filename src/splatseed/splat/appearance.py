@@ -47,7 +47,7 @@ class _Shown(NamedTuple):
 
 
 def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarray, "N 4 3"]:
-    """Coefficients h of each seed: least squares over the views that show it, held to its own colour.
+    """Coefficients h of each seed: ridge regression over the views that show it.
 
     With the colours p_v that V views show from directions d_v, and the seed's own colour p, it
     solves min over h of sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1
@@ -96,7 +96,7 @@ def _shown(xyz: Float32[np.ndarray, "N 3"], view: View) -> _Shown:
 
 
 def _place(xyz: Float32[np.ndarray, "N 3"], view: View) -> Float64[np.ndarray, "3 N"]:
-    """Pixels times depth, and depth. Sums are written out: BLAS may add in another order on more threads."""
+    """Pixels times depth, and depth, in written-out sums: BLAS's order varies with threads."""
     matrix, columns = view.K @ view.cam_from_world[:3], xyz.T.astype(np.float64)
     return np.stack(
         [row[0] * columns[0] + row[1] * columns[1] + row[2] * columns[2] + row[3] for row in matrix]

@@ -79,7 +79,10 @@ class TrainingFrame:
 
 
 def training_frame(views: Sequence[View]) -> TrainingFrame:
-    """The frame of these cameras but the strays; that of the world, moved, if all are in one place."""
+    """The frame of these cameras but the strays.
+
+    That of the world, moved, if all are in one place.
+    """
     centers = _centers(views)
     near = centers[~_is_stray(centers)]
     origin = near.mean(axis=0)
@@ -106,7 +109,7 @@ def _centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
 
 
 def _is_stray(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
-    """Which cameras are out of all proportion to the others, never more than a tenth of them, or one."""
+    """Which cameras are out of all proportion to the others: a tenth at most, or one."""
     if len(centers) < MIN_CAMERAS:
         return np.zeros(len(centers), bool)
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)

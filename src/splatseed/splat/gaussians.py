@@ -62,7 +62,7 @@ def initial_gaussians(
     flatness: float = 0.1,
     harmonics: Float32[np.ndarray, "N 4 3"] | None = None,
 ) -> Gaussians:
-    """One Gaussian a seed: as large as the seed's size, or else as the gap to its 3 nearest neighbours.
+    """One Gaussian per seed: of the seed's size, else of the gap to its 3 nearest neighbours.
 
     It is round, or where the seed's normal is known a disc at right angles to it.
 
@@ -111,7 +111,7 @@ def _first_sizes(seeds: PointCloud) -> Float64[np.ndarray, " N"]:
 
 
 def _quats_to(normals: Float32[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 4"]:
-    """Unit wxyz quaternions of the shortest turns that take the z axis onto normals, or their opposites.
+    """Unit wxyz quaternions of the shortest turns of the z axis onto normals or their opposites.
 
     The turn from z to n is (1 + n_z, z x n) up to its length; a disc has no front, so the n with
     n_z >= 0 is taken, where that never vanishes.

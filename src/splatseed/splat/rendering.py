@@ -40,7 +40,7 @@ def render_features(
     view: View,
     features: Float[Tensor, "N D"],
 ) -> Float[Tensor, "H W D"]:
-    """What the Gaussians look like from a view if these numbers, whatever they mean, are their colours."""
+    """The Gaussians from a view, with these numbers, whatever they mean, as their colours."""
     return _rasterize(params, view, features, None)[0]
 
 

@@ -2,9 +2,8 @@
 
 Notation: view i has planes [3, h, w] on its grid; point X at one of its grid points falls on the
 grid of view j at (column, row), where j's own plane at the nearest grid point says inverse depth
-w_j. Both *agree* if
-|z_ij w_j - 1| <= tolerance, z_ij the depth of X in j. Promise: only maps and cameras are read; every pair is asked
-in one direction only, so the order of views does not show.
+w_j. Both *agree* if |z_ij w_j - 1| <= tolerance, z_ij the depth of X in j. Promise: only maps and
+cameras are read; every pair is asked in one direction only, so the order of views does not show.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"

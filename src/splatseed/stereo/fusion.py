@@ -83,7 +83,10 @@ def _choose(
     offsets: Int64[np.ndarray, " V+1"],
     shapes: Int64[np.ndarray, "V 2"],
 ) -> Int64[np.ndarray, " M"]:
-    """The pixels of a view that become seeds; their cells are taken in all views that confirm them."""
+    """The pixels of a view that become seeds.
+
+    Their cells are taken in all views that confirm them.
+    """
     confidence = stereo.confidence(i).ravel()
     order = np.argsort(-confidence, kind="stable")[: np.count_nonzero(confidence)]
     others = stereo.sources[i]

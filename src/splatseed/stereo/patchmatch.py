@@ -1,4 +1,4 @@
-"""PatchMatch: planes handed from pixel to pixel and changed at random, where that lowers their cost.
+"""PatchMatch: planes passed from pixel to pixel, or changed at random, if that costs less.
 
 Notation: planes (w, gx, gy) float32 [3, h, w], inverse depth at a grid point's place and its slopes
 per pixel; costs float32 [h, w]. Grid point (i, j) lies at pixel ((j + 0.5) g, (i + 0.5) g). Points
@@ -112,7 +112,7 @@ def sweep(pictures, color, number, key, planes, costs):
 
 @inline
 def _buffers():
-    """Columns of the lanes, their pixels u and v, weights and likeness of windows, planes, costs."""
+    """Lanes' columns, pixels u and v, weights and likeness of windows, planes and costs."""
     return (
         np.zeros(LANES, np.int64),
         np.zeros((2, LANES), np.float32),

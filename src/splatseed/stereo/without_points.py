@@ -50,7 +50,10 @@ SAMPLES = 18
 
 
 def known_visibility(scene: Scene) -> Visibility:
-    """The points that each image sees: SfM's; where there are none, places of the scene's depth maps."""
+    """The points that each image sees: SfM's.
+
+    Where there are none, places of the scene's depth maps.
+    """
     visibility, maps = find_visibility(scene), scene.depths
     if len(visibility.xyz) >= TOO_FEW or maps is None:
         return visibility
@@ -124,7 +127,7 @@ def _between(low: float, high: float) -> Hints:
 def _spread_of_depth(
     views: Sequence[View], seed: int, progress: Progress
 ) -> Float64[np.ndarray, "V 3"]:
-    """Of each view, the inverse depths that a tenth, half, and nine tenths of its pixels are beyond."""
+    """Of each view, inverse depths at the 10th, 50th and 90th percentile of its pixels."""
     sources = choose_by_pose(np.stack([view.cam_from_world for view in views]), LOOK.num_sources)
     looked = np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).round().astype(np.int64))
     hints: list[Hints | None] = [None] * len(views)

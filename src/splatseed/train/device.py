@@ -14,7 +14,8 @@ from splatseed.process.memory import free_memory
 from splatseed.train.settings import BYTES_EACH, Backend
 
 __all__ = [
-    "BYTES_EACH", "Capacity", "check_fits", "device_name", "free_bytes", "peak_gpu_bytes", "pick_device",
+    "BYTES_EACH", "Capacity", "check_fits", "device_name", "free_bytes", "peak_gpu_bytes",
+    "pick_device",
 ]  # fmt: skip
 
 
@@ -76,7 +77,7 @@ class Capacity:
         self._device = device
 
     def limit(self, count: int, wanted: int) -> int:
-        """The most that ``count`` Gaussians may become when strategy and gradients ask for ``wanted``."""
+        """The most that ``count`` Gaussians may become where the strategy wants ``wanted``."""
         most = wanted if self.cap is None else min(self.cap, wanted)
         free = free_bytes(self._device)
         if free is None or most - count <= free // BYTES_EACH:

@@ -82,7 +82,7 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
 
 
 def chooses_number(method: str | Upsampler) -> bool:
-    """Whether a method makes as many points as the photographs need, rather than a number asked for."""
+    """Whether a method makes as many points as the photographs need, not a number asked for."""
     return traits_of(configure(method) if isinstance(method, str) else method).chooses_number
 
 
@@ -114,7 +114,7 @@ def upsample(
     note: Callable[[str], None] = lambda _: None,
     **parameters: Any,
 ) -> PointCloud:
-    """The originals of a scene, then the new points of one method: step one of ``splatseed.upsample``.
+    """A scene's originals, then the new points of one method: step one of ``splatseed.upsample``.
 
     Arguments, errors and promises are those of that function; here the default method is ``mls``.
 

@@ -50,7 +50,7 @@ def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # t
 
 @inline
 def _gather(xyz, rgb, i, rows):  # type: ignore[no-untyped-def]
-    """Positions relative to the base [3, k + 1] and colours [k + 1, 3], once for all its outputs."""
+    """Positions relative to the base [3, k + 1] and colours [k + 1, 3], for all its outputs."""
     k = rows.size
     around, color = np.zeros((3, k + 1), np.float32), np.empty((k + 1, 3), np.float32)
     for axis in range(3):

@@ -59,7 +59,7 @@ class Neighbors:
 
     @cached_property
     def spacing(self) -> Float64[np.ndarray, " n"]:
-        """Local spacing h of every row: mean distance to the 6 nearest (fewer where there are fewer)."""
+        """Local spacing h of every row: mean distance to the 6 nearest (or to all there are)."""
         return np.asarray(self.distance[:, :SPACING_NEIGHBORS].mean(axis=1))
 
     def nearest(self, k: int) -> Neighbors:

@@ -35,7 +35,9 @@ def choose_sources(
     centers: Float64[np.ndarray, "V 3"],
     num: int,
 ) -> Int64[np.ndarray, "V num"]:
-    """The ``num`` views to compare each view with, best first, int64 [V, num]; -1 where there is none.
+    """The ``num`` views to compare each view with, best first, int64 [V, num].
+
+    -1 where there is none.
 
     Args:
         seen: The points that each view sees, as rows of ``xyz``.

@@ -14,7 +14,7 @@ __all__ = ["cosine_between"]
 
 @always_inline
 def cosine_between(point, first, second):  # type: ignore[no-untyped-def]
-    """Cosine of the angle at a point [3] between the rays of cameras at ``first`` and ``second`` [3]."""
+    """Cosine of the angle at a point [3] between rays to cameras at ``first`` and ``second``."""
     dot, first_squared, second_squared = 0.0, 0.0, 0.0
     for axis in range(3):
         a, b = point[axis] - first[axis], point[axis] - second[axis]

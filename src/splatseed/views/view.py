@@ -79,7 +79,7 @@ def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
 
 
 def data_factor(images: Sequence[Image], max_size: int) -> int:
-    """By how much photographs are made smaller, for the largest to have ``max_size`` pixels a side."""
+    """Whole factor that makes the largest photograph at most ``max_size`` pixels a side."""
     side = max(max(image.camera.width, image.camera.height) for image in images)
     return max(1, -(-side // max_size))
 

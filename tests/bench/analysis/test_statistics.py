@@ -21,7 +21,8 @@ from splatseed.bench.analysis.statistics import (
 
 
 def plant(rng, *, scenes, arms, repeats, gain=0.0, noise=0.06, spread=0.0):
-    """Scores [scene, arm, repeat]: scenes and repeats differ, arm 1 gains, its gain varies by scene."""
+    """Scores [scene, arm, repeat]: scenes and repeats differ, arm 1 gains, its gain varies by
+    scene."""
     level = rng.uniform(20, 35, (scenes, 1, 1))
     repeat = 0.05 * rng.standard_normal((scenes, 1, repeats))
     effect = np.zeros((scenes, arms, 1))
@@ -138,13 +139,15 @@ def rates(rng, judged, **planted):
 
 
 def test_a_null_is_claimed_at_most_at_the_stated_rate(rng):
-    """5% of tables may claim anything at all; 300 tables stray by 1.3 points, hence 9% is 3 sigma."""
+    """5% of tables may claim anything at all; 300 tables stray by 1.3 points, hence 9% is 3
+    sigma."""
     found = rates(rng, any, scenes=5, arms=6, repeats=3)
     assert max(found) < 0.09
 
 
 def test_gains_that_only_vary_by_scene_are_not_claimed_for_scenes_like_these(rng):
-    """The mean gain is 0 but each scene has its own: runs as samples would claim it far too often."""
+    """The mean gain is 0 but each scene has its own: runs as samples would claim it far too
+    often."""
     planted = {"scenes": 5, "arms": 2, "repeats": 4, "noise": 0.05, "spread": 0.3}
     assert rates(rng, any, **planted)[2] < 0.09
     runs = [

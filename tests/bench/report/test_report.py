@@ -152,7 +152,8 @@ def test_an_empty_ledger(tmp_path):
 
 def test_infinite_and_curveless_runs(tmp_path):
     odd = [RunRow(spec("fox", "mls", 8, repeat=7, **GONE), "done", result(math.inf)),
-           RunRow(spec("fox", SFM, 1, repeat=8, **GONE), "done", result(25.0, curve=()))]  # fmt: skip
+           RunRow(spec("fox", SFM, 1, repeat=8, **GONE), "done",
+                  result(25.0, curve=()))]  # fmt: skip
     write_report(write_ledger(tmp_path / "b", [*rows(**GONE), *odd]))
     assert "fox, mls 8x, none, 7" in text_of(tmp_path / "b")
 

@@ -208,7 +208,8 @@ def wait(spec):
 job.scene_of = wait
 ''' + child.PROGRAM
 spec = RunSpec("room", "ab12", Arm("mls", "default", 8, "none"), 0)
-one = child.Child(spec, Path({str(tmp_path)!r}) / "one", Path({str(tmp_path)!r}) / "kept", JobOptions(), {{}})
+here = Path({str(tmp_path)!r})
+one = child.Child(spec, here / "one", here / "kept", JobOptions(), {{}})
 one.wait(lambda stage, part: None)
 """
     with subprocess.Popen([sys.executable, "-c", code]) as parent:

@@ -1,4 +1,5 @@
-"""``splatseed depth --stereo``: from its words to maps, with the maps themselves put in its place."""
+"""``splatseed depth --stereo``: from its words to maps, with the maps themselves put in its
+place."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ def maps():
 
 @pytest.fixture
 def stereo(monkeypatch, maps):
-    """Stereo that knows the truth; ``calls`` notes how it was asked, ``maps`` is what it answers."""
+    """Stereo that knows the truth; ``calls`` notes how it was asked, ``maps`` is what it
+    answers."""
     known = SimpleNamespace(calls=[], maps=maps)
 
     def stereo_depths(scene, *, max_size=800, grid=4, seed=0, progress=None):

@@ -57,7 +57,7 @@ def test_comments_blank_lines_and_line_ends_do_not_matter(tmp_path):
 
 
 def test_feature_lines_may_be_blank_or_missing(tmp_path):
-    text = "# images\n1 1 0 0 0 0 0 0 1 a.jpg\n\n\n2 1 0 0 0 0 0 0 1 b.jpg\n1 2 -1 3 4 9\n3 1 0 0 0 0 0 0 1 c.jpg"
+    text = "# images\n1 1 0 0 0 0 0 0 1 a.jpg\n\n\n2 1 0 0 0 0 0 0 1 b.jpg\n1 2 -1 3 4 9\n3 1 0 0 0 0 0 0 1 c.jpg"  # noqa: E501  (one file in one text)
     images = text_form.read_images(_text(tmp_path, text), CAMERAS)
     assert [image.name for image in images] == ["a.jpg", "b.jpg", "c.jpg"]
     assert [len(image.observations) for image in images] == [0, 2, 0]

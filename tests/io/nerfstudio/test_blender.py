@@ -17,7 +17,8 @@ COUNTS = {"train": 5, "val": 2, "test": 3}
 
 @pytest.fixture
 def lego(tmp_path, rng):
-    """As NeRF's data set has it: paths without suffix, one angle of view, names alike in each part."""
+    """As NeRF's data set has it: paths without suffix, one angle of view, names alike in each
+    part."""
     root = tmp_path / "lego"
     for part, count in COUNTS.items():
         (root / part).mkdir(parents=True)

@@ -175,7 +175,8 @@ def test_cameras_tell_how_colmaps_points_are_brought_over(content, scene_dir, mo
 
 
 def test_instant_ngps_recentred_poses_are_fitted(content, scene_dir, model, rng):
-    """Its converter turns the up axis, moves what cameras look at to 0, and scales by one number."""
+    """Its converter turns the up axis, moves what cameras look at to 0, and scales by one
+    number."""
     del content["applied_transform"]
     rotation = rotation_from_quat(rng.normal(size=4))
     moved = Similarity(0.37, rotation, rng.normal(size=3))

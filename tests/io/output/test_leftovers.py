@@ -1,4 +1,5 @@
-"""What a killed process left is removed by the next for the same output; what is written to is not."""
+"""What a killed process left is removed by the next for the same output; what is written to is
+not."""
 
 from __future__ import annotations
 

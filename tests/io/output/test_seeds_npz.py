@@ -184,7 +184,7 @@ def test_a_header_is_not_believed(tmp_path):
     write_seeds(tmp_path, cloud)
     with np.load(tmp_path / SEEDS) as archive:
         digest = archive["digest"]
-    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }"
+    header = b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }"  # noqa: E501  (a header as it is)
     with zipfile.ZipFile(tmp_path / SEEDS, "w") as archive:
         with archive.open("digest.npy", "w") as file:
             np.save(file, digest)

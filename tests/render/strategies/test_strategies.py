@@ -27,7 +27,8 @@ def parameters(scene: dict[str, Any]) -> torch.nn.ParameterDict:
 def render(params: torch.nn.ParameterDict, scene: dict[str, Any], **options: Any) -> Any:
     return rasterization(
         params["means"], params["quats"], params["scales"].exp(), params["opacities"].sigmoid(),
-        params["colors"], scene["viewmats"], scene["Ks"], scene["width"], scene["height"], **options,
+        params["colors"], scene["viewmats"], scene["Ks"], scene["width"], scene["height"],
+        **options,
     )  # fmt: skip
 
 

@@ -97,7 +97,10 @@ def compare(a: Sequence[RunRow], b: Sequence[RunRow]) -> Comparison | None:
 
 
 def _closest(a: Sequence[Study], b: Sequence[Study]) -> tuple[Study, Study] | None:
-    """The pair of studies with the fewest settings that differ; of equals, with the most in common."""
+    """The pair of studies with the fewest settings that differ.
+
+    Of equals, with the most in common.
+    """
     pairs = [(one, other) for one in a for other in b]
     return min(
         pairs,

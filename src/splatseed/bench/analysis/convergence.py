@@ -135,7 +135,7 @@ def _mean(scenes: Sequence[Sequence[float]]) -> float | None:
 
 
 def _log(scenes: Sequence[Sequence[tuple[float, float]]]) -> Difference:
-    """The mean over scenes of log(own / base), with its error over scenes, or over repeats of one."""
+    """Mean over scenes of log(own / base), with its error over scenes, or over repeats of one."""
     logs = [[math.log(max(own, 1e-9) / max(base, 1e-9)) for base, own in scene] for scene in scenes]
     return over_scenes(logs[0] if len(logs) == 1 else [fmean(each) for each in logs])
 

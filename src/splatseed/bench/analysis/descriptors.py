@@ -181,7 +181,9 @@ def _energy(grey: Float32[np.ndarray, "H W"]) -> float:
 
 
 def read_descriptors(path: Path) -> dict[str, Descriptors]:
-    """What ``write_descriptors`` wrote, by the scenes' fingerprints; nothing where it cannot be used.
+    """What ``write_descriptors`` wrote, by the scenes' fingerprints.
+
+    Nothing where it cannot be used.
 
     Args:
         path: The file.

@@ -160,7 +160,9 @@ def gain_cell(gain: Difference | None) -> Cell:
 
 
 def gain_table(study: Study, strategy: StrategyName) -> Table:
-    """What each variant gains: on each scene, on these scenes, on scenes like these; and the paper's.
+    """What each variant gains: on each scene, on these scenes, on scenes like these.
+
+    The paper's gains stand beside ours.
 
     Args:
         study: The study.

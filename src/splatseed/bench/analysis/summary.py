@@ -1,4 +1,4 @@
-"""The answer in a few sentences: does upsampling help on these scenes, by which method, at what cost?
+"""The answer in a few sentences: does upsampling help here, by which method, at what cost?
 
 Promise: a gain is called one only where it is more than noise after adjusting for the number of
 variants; where a single run was made of each, the sentences say that nothing is known of the noise.
@@ -54,7 +54,8 @@ def _answer(found: Gains, best: Variant) -> str:
     better, worse = (_those(found, verdict) for verdict in ("better", "worse"))
     of = f"of {_count(len(found.variants), 'variant')}"
     if better:
-        text = f"{lead} yes, {len(better)} {of} gain more than noise, {best.label} most ({decibels(top)})."
+        most = f"{best.label} most ({decibels(top)})"
+        text = f"{lead} yes, {len(better)} {of} gain more than noise, {most}."
     else:
         text = (
             f"{lead} no gain beyond noise was found among "
@@ -93,7 +94,8 @@ def _elsewhere(found: Gains, best: Variant) -> str:
     low, high = like.interval()
     span = f"95% interval {low:+.2f} to {high:+.2f} dB"
     if like.verdict == "within noise":
-        return f"For scenes like these it is not shown to gain: {span} before adjusting for the choice."
+        lead = "For scenes like these it is not shown to gain"
+        return f"{lead}: {span} before adjusting for the choice."
     gain = "a gain" if like.mean > 0 else "a loss"
     return f"For scenes like these {gain} is shown too: {span}."
 

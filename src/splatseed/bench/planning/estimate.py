@@ -100,7 +100,7 @@ class Estimator:
         return pictures + model + SMALL_FILES
 
     def checkpoint(self, spec: RunSpec) -> float:
-        """Bytes that a run needs while it goes on: its Gaussians, and two moments of each number."""
+        """Bytes that a run needs meanwhile: its Gaussians, and two moments of each number."""
         return 3.0 * self._counts(spec)[1] * _bytes_each(spec.settings)
 
     def _counts(self, spec: RunSpec) -> tuple[float, float]:

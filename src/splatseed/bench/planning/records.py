@@ -131,7 +131,10 @@ class RunSpec:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """What ``to_json`` wrote; settings that a ledger is too old to have are at their defaults."""
+        """What ``to_json`` wrote.
+
+        Settings that a ledger is too old to have are at their defaults.
+        """
         values = json.loads(text)
         training = TrainSettings(**{k: values.pop(k) for k in SHARED if k in values})
         return cls(**{**values, "arm": Arm(**values["arm"]), "training": training})

@@ -338,7 +338,10 @@ def _mark_only(variant: Variant) -> dict[str, Any]:
 
 
 def _png(figure: Figure) -> bytes:
-    """The figure's bytes; without the version of the library, so that the same data give the same."""
+    """The figure's bytes.
+
+    Without the version of the library, so that the same data give the same.
+    """
     out = BytesIO()
     figure.savefig(out, dpi=DPI, format="png", metadata={"Software": None})
     return out.getvalue()

@@ -180,7 +180,8 @@ def slider(title: str, pictures: Mapping[str, bytes], shape: float) -> str:
     )
     choices = "".join(f"<option>{escape(name)}</option>" for name in pictures)
     return (
-        f'<figure class="compare" style="--shape: {shape:.4f}"><figcaption>{escape(title)}</figcaption>'
+        f'<figure class="compare" style="--shape: {shape:.4f}">'
+        f"<figcaption>{escape(title)}</figcaption>"
         f'<div class="stage">{images}</div>'
         '<input type="range" min="0" max="100" value="50" aria-label="where the two meet">'
         f'<div class="choices"><label>left <select data-side="left">{choices}</select></label>'

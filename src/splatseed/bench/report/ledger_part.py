@@ -1,4 +1,4 @@
-"""What the report says of the ledger: failed and missing runs, the command, the machine, the plan."""
+"""The report's part on the ledger: failed and missing runs, command, machine and plan."""
 
 from __future__ import annotations
 

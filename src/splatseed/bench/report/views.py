@@ -91,7 +91,10 @@ def _common(first: Path, second: Path) -> list[str]:
 
 
 def _pictures(base: Path, own: Path, best: Variant) -> tuple[dict[str, bytes], float] | None:
-    """The pictures of a view and their shape; None where they cannot be read or do not fit together."""
+    """The pictures of a view and their shape.
+
+    None where they cannot be read or do not fit together.
+    """
     try:
         parts = [_apart(path) for path in (base, own)]
     except SplatseedError:

@@ -135,7 +135,7 @@ def _train(
 
 
 def _check_unchanged(scene: Scene, spec: RunSpec) -> None:
-    """Hold the scene to what was planned: it may have been changed since, or be another elsewhere."""
+    """Refuse a scene that is not as it was planned: changed since, or another on this node."""
     folder = scene.source.image_dir if scene.source else None
     same = folder is not None and scene_digest(scene, folder) == spec.scene_digest
     if same and spec.depth_digest and scene.depths is not None:

@@ -247,7 +247,7 @@ class Ledger:
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:
-        """A connection for one transaction, which is committed if the block ends without an error."""
+        """A connection for one transaction, committed if the block ends without an error."""
         try:
             with closing(self._connect()) as db:
                 db.execute("BEGIN" if self._read_only else "BEGIN IMMEDIATE")

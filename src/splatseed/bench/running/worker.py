@@ -56,7 +56,10 @@ def _exists(process: int) -> bool:
 
 @cache
 def _space() -> str:
-    """Which set of process numbers this process's is one of; empty where the system does not tell."""
+    """Which set of process numbers this process's is one of.
+
+    Empty where the system does not tell.
+    """
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii")[:8]
         return f"{boot}-{Path('/proc/self/ns/pid').stat().st_ino}"

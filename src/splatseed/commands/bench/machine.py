@@ -1,4 +1,4 @@
-"""Where a benchmark is run: this machine or a Ray cluster, how many runs at a time, with what each."""
+"""Where a benchmark runs: this machine or a Ray cluster, how many runs at a time."""
 
 from __future__ import annotations
 
@@ -78,7 +78,9 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
 
 
 def check_machine(machine: Machine, seeds: int) -> None:
-    """Refuse runs that this machine's memory cannot hold; what nodes of a cluster hold is not known.
+    """Refuse runs that this machine's memory cannot hold.
+
+    What nodes of a cluster hold is not known.
 
     Args:
         machine: Where they shall run.

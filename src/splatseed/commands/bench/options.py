@@ -74,7 +74,10 @@ class Options:
     see ``splatseed bench report BENCH``, and ``splatseed bench compare A B`` for two benchmarks.
     """
 
-    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], constructor=Path, metavar="DIR", help_behavior_hint="")] = None  # fmt: skip
+    output: Annotated[
+        Path | None,
+        tyro.conf.arg(aliases=["-o"], constructor=Path, metavar="DIR", help_behavior_hint=""),
+    ] = None
     """The folder of the benchmark, new or to go on with."""
     scenes: Annotated[tuple[str, ...], _hint("the plan's")] = ()
     """Scenes with photographs; demo: is a made-up room."""

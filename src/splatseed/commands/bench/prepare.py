@@ -92,7 +92,8 @@ def _notes(plan: Plan, scenes: Sequence[SceneFacts]) -> Iterator[str]:
         yield from (f"{scene.name}: {warning}" for warning in scene.warnings)
     bare = [scene.name for scene in scenes if not scene.depth_digest]
     if DEPTH in plan.methods and bare:
-        yield f"without depth maps, and so without the method depth: {', '.join(bare)} (--depth DIR)"
+        names = ", ".join(bare)
+        yield f"without depth maps, and so without the method depth: {names} (--depth DIR)"
     if SFM not in plan.methods:
         yield "Without sfm among the methods there is nothing to compare with."
     if len(plan.profiles) > 1:

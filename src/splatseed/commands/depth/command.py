@@ -1,4 +1,4 @@
-"""``splatseed depth``: a depth map for every photograph, by a network or from the photographs alone."""
+"""``splatseed depth``: a depth map per photograph, by a network or from photographs alone."""
 
 from __future__ import annotations
 

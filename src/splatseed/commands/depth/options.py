@@ -30,7 +30,7 @@ _BESIDE = tyro.conf.arg(help_behavior_hint="(default: as beside the file, else I
 
 @dataclass(frozen=True)
 class Options:
-    """Make a depth map for every photograph of a scene: by a network, or from the photographs alone.
+    """Make a depth map for every photograph: by a network, or from the photographs alone.
 
     Nothing is downloaded.
     """

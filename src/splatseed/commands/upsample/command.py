@@ -248,7 +248,7 @@ def _make(
 
 
 def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, float]:
-    """What can be said of the points: how far off they are, or how much of the pictures they cover."""
+    """How far off the points are, or how much of the pictures they cover."""
     found = {}
     new = seeds.xyz[seeds.source != ORIGINAL]
     if len(scene.points) and not chooses_number(method):

@@ -44,7 +44,7 @@ def write_previews(
     folder: Path,
     clock: StageClock,
 ) -> None:
-    """Before and after, every method, and, with photographs, seeds by origin and the cells they cover.
+    """Before and after, every method; with photographs, seeds by origin and covered cells.
 
     Args:
         scene: With the originals that were used.

@@ -1,4 +1,4 @@
-"""``splatseed upsample --gaussians``: the first Gaussians, for trainers that begin from a 3DGS .ply."""
+"""``splatseed upsample --gaussians``: the first Gaussians, for trainers that take a 3DGS .ply."""
 
 from __future__ import annotations
 

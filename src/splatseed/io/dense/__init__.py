@@ -1,4 +1,4 @@
-"""Depth maps with normals, as stereo makes them, in files: a COLMAP dense workspace, a plain folder."""
+"""Stereo's depth maps and normals in files: a COLMAP dense workspace, a plain folder."""
 
 from splatseed.io.dense.maps import DenseMap
 from splatseed.io.dense.plain import write_dense_maps

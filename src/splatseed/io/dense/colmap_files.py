@@ -1,4 +1,4 @@
-"""The files of COLMAP's dense stereo: maps of floats, and graphs of which images confirm which pixels.
+"""The files of COLMAP's dense stereo: maps of floats, and consistency graphs.
 
 Notation: layouts as COLMAP's mvs/mat.h and mvs/consistency_graph.h have them, little-endian. Both
 begin with the text ``W&H&C&``. A map follows with C x H x W float32, one channel after another; a
@@ -54,7 +54,7 @@ def write_consistency_graph(
 def consistency_records(
     agreeing: UInt8[np.ndarray, "H W"], image_idxs: Sequence[int]
 ) -> Int32[np.ndarray, " M"]:
-    """Column, row, count and image indices of each pixel with any, one after another, row by row."""
+    """Column, row, count and image indices of each pixel that has any, row by row."""
     bits = (agreeing[..., None] >> np.arange(len(image_idxs), dtype=np.uint8)) & 1
     rows, columns = np.nonzero(bits.any(axis=-1))
     bits = bits[rows, columns].astype(bool)

@@ -1,4 +1,4 @@
-"""The photographs of a COLMAP dense workspace: as they are, or without the distortion of their lens.
+"""The photographs of a COLMAP dense workspace: as they are, or undistorted.
 
 Notation: the pinhole camera of an undistorted photograph has the lens's own focal length, centre
 and size. Promise: photographs are linked, or copied, and never written to; undistorted ones keep

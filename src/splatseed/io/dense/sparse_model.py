@@ -119,6 +119,9 @@ def _in_pixels_of(image: Image, record: Intrinsics) -> Image:
 
 
 def _straightened(lens: Intrinsics, uv: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 2"]:
-    """Where an undistorted photograph has the features of a lens; as they are where none of its rays leads."""
+    """Where an undistorted photograph has the features of a lens.
+
+    As they are where none of its rays leads.
+    """
     straight = rays_through(lens, uv) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
     return np.where(np.isnan(straight), uv, straight)

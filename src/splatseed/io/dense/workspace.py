@@ -172,7 +172,10 @@ class _Stereo:
 
 
 def _matches(sources: tuple[str, ...]) -> str:
-    """The line of sources; COLMAP's own choice where there are none or a comma would split names."""
+    """The line of sources.
+
+    COLMAP's own choice where there are none or a comma would split names.
+    """
     if not sources or any("," in name for name in sources):
         return "__auto__, 20"
     return ", ".join(sources)

@@ -35,7 +35,9 @@ _CAPTURED = re.compile(r"depth(\d+)", re.IGNORECASE)
 
 
 def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
-    """The depth maps in a folder whose names are those of a scene's images; None where there is none.
+    """The depth maps in a folder whose names are those of a scene's images.
+
+    None where there is none.
 
     Raises:
         SceneFormatError: Two images share a map, or the folder's description is damaged.

@@ -90,7 +90,7 @@ def _channel(path: Path, channels: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _check_windows(path: Path, header: Mapping[str, Any]) -> None:
-    """Check, before pixels are decoded, that every one is stored and their number can be believed."""
+    """Check, before decoding, that every pixel is stored and their number can be believed."""
     data, display = np.array(header["dataWindow"]), np.array(header["displayWindow"])
     size = (data[1] - data[0] + 1)[::-1].tolist()
     check_stored(path, tuple(size), np.dtype(np.float32))

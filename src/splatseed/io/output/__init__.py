@@ -1,1 +1,1 @@
-"""Output that trainers load: its layouts, what is ours in it, and how it comes to be there whole."""
+"""Output that trainers load: its layouts, what we add, and how it is written whole."""

@@ -1,4 +1,4 @@
-"""Scenes that splatseed wrote before: which of their points are originals, and what is known of them.
+"""Scenes that splatseed wrote: which points are originals, and what is known of them.
 
 Point files have no place for a point's origin, but ``splatseed.json`` beside them says how many of
 the points, the first ones, were in the input, and ``seeds.npz`` what made each of the others. New

@@ -81,7 +81,7 @@ def _siblings(root: Path) -> dict[str, Path]:
 
 
 def _goal(source: Path, link: Path, around: Path) -> Path:
-    """What a link says: the way from here if output and source lie side by side, and can move together."""
+    """The target of a link: relative if output and source lie side by side, to move together."""
     if around not in source.parents or around == Path(around.anchor):
         return source
     return Path(os.path.relpath(source, link.parent.resolve()))

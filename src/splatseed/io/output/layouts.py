@@ -121,7 +121,7 @@ def _copy(source: Path, names: Sequence[str], target: Path) -> None:
 
 
 def _write_lists(scene: Scene, folder: Path) -> None:
-    """The lists of the scene's split: its own, or, if a transforms.json has it, as nerfstudio reads them."""
+    """Write the split's lists: the scene's own, or those of transforms.json as nerfstudio's."""
     if scene.source is not None:
         _copy(scene.source.root, ROOT_LISTS, folder)
     if scene.listed is None or any((folder / name).exists() for name in ROOT_LISTS):

@@ -42,7 +42,10 @@ def held(partial: Path) -> Iterator[Callable[[], None]]:
 
 
 def remove_leftovers(target: Path) -> None:
-    """Remove the partials that processes left which were killed while they wrote ``target``; log it."""
+    """Remove the partials that processes left which were killed while they wrote ``target``.
+
+    Log it.
+    """
     name = re.compile(re.escape(f".{target.name}.partial-") + "[0-9a-f]{8}")
     with suppress(OSError):
         for path in target.parent.iterdir():
@@ -63,7 +66,10 @@ def _remove_unless_held(leftover: Path) -> None:
 
 
 def _lock(folder: Path) -> list[int]:
-    """A descriptor that locks a folder until it is closed; none if another process does, or none can."""
+    """A descriptor that locks a folder until it is closed.
+
+    None if another process does, or none can.
+    """
     try:
         import fcntl  # noqa: PLC0415  (not on Windows)
     except ImportError:

@@ -90,7 +90,8 @@ def why_kept(folder: Path, kind: str) -> tuple[str, str] | None:
         return found, "Choose another folder, or empty this one yourself."
     if names := unlisted_files(folder):
         more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
-        found = f"an earlier output with files that splatseed did not write: {', '.join(names[:3])}{more}"
+        some = f"{', '.join(names[:3])}{more}"
+        found = f"an earlier output with files that splatseed did not write: {some}"
         return found, "Move them elsewhere, or choose another name."
     return None
 

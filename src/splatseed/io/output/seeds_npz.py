@@ -110,7 +110,7 @@ def _known(points: PointCloud) -> dict[str, np.ndarray]:
 
 
 def _digest(xyz: Float32[np.ndarray, "N 3"]) -> bytes:
-    """A fingerprint of positions, whichever zero they have and whatever the machine's byte order."""
+    """A fingerprint of positions, the same for both zeros and for any byte order."""
     rows = np.ascontiguousarray(xyz + np.float32(0.0), "<f4")  # adding turns -0.0 into 0.0
     return hashlib.blake2b(rows.tobytes(), digest_size=_DIGEST_BYTES).digest()
 

@@ -1,4 +1,4 @@
-"""Formats of trained Gaussians that are not read, so that errors can say what a file is and what reads it.
+"""Formats of trained Gaussians that are not read, so that errors can name what reads them.
 
 Promise: only a file's name and, of a PLY, its header are looked at.
 """

@@ -4,7 +4,7 @@
 | --- | --- |
 | ``base`` | what every strategy can do |
 | ``densification`` | gsplat's strategies, held to a cap and to the memory |
-| ``growing``, ``contributions`` | splatseed's own: a budget, spent where the photographs are still wrong |
+| ``growing``, ``contributions`` | splatseed's own: a budget, spent where renders are wrong |
 | ``choice`` | the strategy that settings name |
 """
 

@@ -126,7 +126,7 @@ class Growing(Strategy):
         return needless
 
     def _grow(self, params: Parameters, optimizers: Optimizers, step: int) -> None:
-        """Split those with the most E / sqrt(c): E alone favours the large, E / c the accidental."""
+        """Split where E / sqrt(c) is largest: E alone favours the large, E / c the accidental."""
         sums = self._sums(params)
         scores = sums["errors"] / sums["pixels"].clamp_min(1e-6).sqrt()
         wanted = self._room(len(scores), step)

@@ -1,1 +1,1 @@
-"""Voronoi cells: the paper's, in a bounding box, and the default's, each from its neighbours alone."""
+"""Voronoi cells: the paper's, in a bounding box, and the default's, from neighbours alone."""

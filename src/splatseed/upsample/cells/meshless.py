@@ -5,10 +5,10 @@ and is cut by the bisector with each neighbour, nearest first, until the next ne
 twice as far as the cell's farthest vertex (the security radius), when no further one can cut it.
 (N. Ray, D. Sokolov, S. Lefebvre, B. Levy, Meshless Voronoi on the GPU, 2018, formulate this.)
 
-Notation: coordinates are relative to the site. A plane f is {x : normal_f . x = offset_f}, planes 0-5
-being the cube's. A vertex is the meeting of three planes, kept as an oriented triple (a, b, c);
-``twin[a, b]`` is the vertex whose triple runs through a then b, so that the other end of its edge is
-``twin[b, a]``. Promise: a cut only ever moves along edges, so vertices stay inside the cube.
+Notation: coordinates are relative to the site. A plane f is {x : normal_f . x = offset_f}, planes
+0-5 being the cube's. A vertex is the meeting of three planes, kept as an oriented triple (a, b, c);
+``twin[a, b]`` is the vertex whose triple runs through a then b, so that the other end of its edge
+is ``twin[b, a]``. Promise: a cut only ever moves along edges, so vertices stay inside the cube.
 """
 
 from __future__ import annotations

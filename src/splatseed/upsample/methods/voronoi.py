@@ -132,7 +132,10 @@ def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def
 
 @kernel
 def _place(xyz, site_center, center, radius, frames, start, count, out):  # type: ignore[no-untyped-def]
-    """Uniform in each cell's ball, in place of the draws in ``out``; directions turn with frames."""
+    """Uniform in each cell's ball, in place of the draws in ``out``.
+
+    Directions turn with frames.
+    """
     for i in parallel_range(len(xyz)):
         for m in range(start[i], start[i] + count[i]):
             r = radius[i] * np.float64(out[m, 0]) ** (1.0 / 3.0)

@@ -1,4 +1,4 @@
-"""The frame of every method that fits a height field: neighbours, frames, places, heights, colours."""
+"""The steps of a method that fits a height field: frames, places, heights, colours."""
 
 from __future__ import annotations
 

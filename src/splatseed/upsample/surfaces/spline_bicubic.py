@@ -64,7 +64,7 @@ def _design(xyz, i, rows, frame, reach):  # type: ignore[no-untyped-def]
 
 @inline
 def _terms(u, v, out):  # type: ignore[no-untyped-def]
-    """Products of the Chebyshev polynomials T0..T3 of u and of v, better conditioned than powers."""
+    """Products of Chebyshev polynomials T0..T3 of u and v, better conditioned than powers."""
     tu = (1.0, u, 2.0 * u * u - 1.0, u * (4.0 * u * u - 3.0))
     tv = (1.0, v, 2.0 * v * v - 1.0, v * (4.0 * v * v - 3.0))
     for a in range(DEGREE + 1):
