@@ -1,9 +1,10 @@
 """``splatseed demo``: the main job from end to end, on a capture whose truth is known.
 
 It photographs a made-up room, finds points as Structure-from-Motion would, writes them as a COLMAP
-scene, reads that back, upsamples it by every method, and measures how far the new points lie from
-the true surfaces and how well they cover them. Then, where PyTorch and gsplat are installed, it
-trains for a short while from the points as found and from the upsampled ones, and compares.
+scene, reads that back, upsamples it and shows the result. Then it does so by every method, and measures
+how far the new points lie from the true surfaces and how well they cover them. Then, where PyTorch and
+gsplat are installed, it trains for a short while from the points as found and from the upsampled ones,
+and compares. What has to be compiled is compiled by a second process ahead of the first.
 """
 
 from __future__ import annotations
@@ -12,11 +13,13 @@ import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
 
+from splatseed.commands._demo_kernels import TRAINING, KernelsAhead, kernels_ahead
+from splatseed.commands._demo_methods import SHOWN, upsample_by
 from splatseed.commands._options import parse_options
 from splatseed.console import (
     StageClock,
@@ -26,36 +29,29 @@ from splatseed.console import (
     print_table,
     stage_display,
 )
-from splatseed.errors import MissingDependencyError, ParameterError
+from splatseed.errors import MissingDependencyError, OutputError, ParameterError
 from splatseed.geometry import GeometryScore, measure, spacing
 from splatseed.io import find_depths, load_scene, write_scene
-from splatseed.io.staging import add_files, atomic_file, output_folder
+from splatseed.io.staging import add_files, atomic_file, kind_of, output_folder
 from splatseed.literal import quoted
 from splatseed.pointcloud import PointCloud
 from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.synthetic import Capture, make_capture, write_capture
-from splatseed.upsample import (
-    METHODS,
-    chooses_number,
-    configure,
-    methods_for,
-    planned_size,
-    upsample,
-)
+from splatseed.upsample import methods_for, planned_size
 
 if TYPE_CHECKING:  # importing PyTorch takes a while, and it may be absent
     from splatseed.commands._demo_training import TrainedArm
 
 __all__ = ["run"]
 
-SHOWN = "auto"
-TEST_EVERY = 8
-"""Photographs kept for the test of what is trained: no method looks at them."""
 SAMPLES = 20_000
 """Places on the surfaces at which coverage is taken."""
+FIRST_PICTURE = "preview.png"
+METHOD_PICTURES = ("preview_methods.png", "preview_errors.png")
 TRAINED_PICTURE = "preview_trained.png"
+TABLE = "geometry.csv"
 
 
 @dataclass(frozen=True)
@@ -72,6 +68,9 @@ class Options:
     """The same seed gives the same demo."""
     train_steps: int = 500
     """Training steps from each of two sets of seeds; 0 for no training."""
+    training: Literal["now", "later", "only"] = "now"
+    """When to train: now, at the end; later, when PyTorch is being installed meanwhile; only, in a demo
+    folder that was made with later."""
     preview: bool = True
     """Write pictures."""
     overwrite: bool = False
@@ -82,27 +81,15 @@ def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
     options = parse_options(Options, "demo", arguments)
     _check(options)
-    with (
-        stage_display() as clock,
-        output_folder(options.output, kind="demo", overwrite=options.overwrite) as folder,
-    ):
-        clock("photograph", 0.0)
-        capture = make_capture(options.seed, options.views)
-        write_capture(capture, folder / "scene")
-        scene = load_scene(folder / "scene")
-        scene = scene.replace(depths=find_depths(scene, folder / "scene"))
-        clouds = _upsample_all(options, scene, clock)
-        scores = _measure_all(capture, scene, clouds, clock)
-        clock("write", 0.0)
-        # Images are copied: a link would point into the folder's temporary place.
-        seeded = scene.replace(points=clouds[SHOWN])
-        write_scene(seeded, folder / f"scene_{SHOWN}", copy_images=True)
-        _write_table(folder / "geometry.csv", scores)
-        if options.preview:
-            _write_pictures(folder, capture, scene, clouds, clock)
-        seconds = clock.seconds()
-    _summarise(options, scene, scores, seconds)
-    trained = _train(options) if options.train_steps else False
+    with kernels_ahead(training=options.training != "only" and options.train_steps > 0) as ahead:
+        if options.training != "only":
+            clock = StageClock()
+            capture, seeded = _make_first(options, clock, ahead)
+            _make_rest(options, capture, seeded, clock, ahead)
+        if options.training == "later":
+            ahead.wait_for(TRAINING)
+            return
+        trained = _train(options, ahead) if options.train_steps else False
     _say_what_next(options, trained=trained)
 
 
@@ -113,19 +100,87 @@ def _check(options: Options) -> None:
         raise ParameterError(
             "--train-steps of 0 or more", found=f"{options.train_steps}", fix="Pass 0 not to train."
         )
+    if options.training == "only" and kind_of(options.output) != "demo":
+        raise OutputError(
+            f"a demo at {options.output}", found="none", fix="Make it first: splatseed demo."
+        )
 
 
-def _upsample_all(options: Options, scene: Scene, clock: StageClock) -> dict[str, PointCloud]:
-    """The scene upsampled by every method."""
-    clouds, methods = {}, methods_for(scene)
-    for done, name in enumerate(methods):
-        clock("upsample", done / len(methods))
-        looks = hasattr(METHODS[name], "hold_out")
-        method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)
-        ratio = None if chooses_number(name) else options.ratio
-        clouds[name] = upsample(scene, method, ratio=ratio, seed=options.seed)
+def _make_first(
+    options: Options, clock: StageClock, ahead: KernelsAhead
+) -> tuple[Capture, PointCloud]:
+    """The capture, its points as the default method adds to them, both as scenes, and a picture."""
+    with (
+        stage_display(clock),
+        output_folder(options.output, kind="demo", overwrite=options.overwrite) as folder,
+    ):
+        clock("photograph", 0.0)
+        capture = make_capture(options.seed, options.views)
+        write_capture(capture, folder / "scene")
+        scene = _load(folder)
+        _wait(ahead, SHOWN, clock)
+        clock("upsample", 0.0)
+        seeded = upsample_by(SHOWN, scene, options.ratio, options.seed)
+        clock("write", 0.0)
+        # Images are copied: a link would point into the folder's temporary place.
+        write_scene(scene.replace(points=seeded), folder / f"scene_{SHOWN}", copy_images=True)
+        if options.preview:
+            clock("pictures", 0.0)
+            preview_pair(scene, seeded, folder / FIRST_PICTURE, title=SHOWN)
+    if options.preview:
+        seconds = sum(clock.seconds().values())
+        print_note(
+            f"the first picture is there after {seconds:.0f} s: {options.output / FIRST_PICTURE}"
+        )
+    return capture, seeded
+
+
+def _load(folder: Path) -> Scene:
+    scene = load_scene(folder / "scene")
+    return scene.replace(depths=find_depths(scene, folder / "scene"))
+
+
+def _wait(ahead: KernelsAhead, part: str, clock: StageClock) -> None:
+    """Wait for what the other process compiles just now, and count that as compilation."""
+    clock.begin_compilation()
+    ahead.wait_for(part)
+    clock.end_compilation()
+
+
+def _make_rest(
+    options: Options, capture: Capture, seeded: PointCloud, clock: StageClock, ahead: KernelsAhead
+) -> None:
+    """Every other method, the table and the pictures of all."""
+    folder = options.output
+    scene = _load(folder)
+    add_files(folder, [TABLE, *METHOD_PICTURES])
+    with stage_display(clock):
+        clouds = _upsample_all(options, scene, {SHOWN: seeded}, clock, ahead)
+        scores = _measure_all(capture, scene, clouds, clock)
+        _write_table(folder / TABLE, scores)
+        if options.preview:
+            _write_pictures(folder, capture, scene, clouds, clock)
+        seconds = clock.seconds()
+    _summarise(options, scene, scores, seconds)
+
+
+def _upsample_all(
+    options: Options,
+    scene: Scene,
+    done: Mapping[str, PointCloud],
+    clock: StageClock,
+    ahead: KernelsAhead,
+) -> dict[str, PointCloud]:
+    """The scene upsampled by every method, in the table's order."""
+    methods = methods_for(scene)
+    clouds = dict(done)
+    for name in ahead.last_first(methods):
+        if name not in clouds:
+            clock("upsample", len(clouds) / len(methods))
+            _wait(ahead, name, clock)
+            clouds[name] = upsample_by(name, scene, options.ratio, options.seed)
     clock("upsample", 1.0)
-    return clouds
+    return {name: clouds[name] for name in methods}
 
 
 def _measure_all(
@@ -161,16 +216,15 @@ def _write_pictures(
     clouds: Mapping[str, PointCloud],
     clock: StageClock,
 ) -> None:
-    """Before and after, every method, and every method's errors."""
+    """Every method, and every method's errors."""
     clock("pictures", 0.0)
-    preview_pair(scene, clouds[SHOWN], folder / "preview.png", title=SHOWN)
-    clock("pictures", 0.2)
-    preview_methods(scene, clouds, folder / "preview_methods.png")
+    methods, faults = (folder / name for name in METHOD_PICTURES)
+    preview_methods(scene, clouds, methods)
     clock("pictures", 0.6)
     h = spacing(scene.points.xyz)
     new = {name: c.select(slice(len(scene.points), None)) for name, c in clouds.items()}
     errors = {name: capture.surfaces.distance(c.xyz) / h for name, c in new.items()}
-    preview_errors(new, errors, choose_camera(scene), folder / "preview_errors.png")
+    preview_errors(new, errors, choose_camera(scene), faults)
     clock("pictures", 1.0)
 
 
@@ -193,7 +247,7 @@ def _summarise(
             for name, s in scores.items()
         ],
     )
-    names = ["preview.png", "preview_methods.png", "preview_errors.png"] if options.preview else []
+    names = [FIRST_PICTURE, *METHOD_PICTURES] if options.preview else []
     rows = [
         (
             "error",
@@ -208,7 +262,7 @@ def _summarise(
     print_pairs("splatseed demo", rows)
 
 
-def _train(options: Options) -> bool:
+def _train(options: Options, ahead: KernelsAhead) -> bool:
     """Train from both sets of seeds and compare, if what it takes is installed."""
     try:
         require("torch", "gsplat")
@@ -228,6 +282,7 @@ def _train(options: Options) -> bool:
     ]
     settings = TrainSettings(strategy="none", max_steps=options.train_steps, seed=options.seed)
     with stage_display() as clock:
+        _wait(ahead, TRAINING, clock)
         trained = [train_arm(arm, settings, clock) for arm in arms]
         if options.preview:
             write_comparison(trained, folder / TRAINED_PICTURE)
