@@ -30,6 +30,7 @@ ORDER = (
     "requirements",
     "progress",
     "kernel_sources",
+    "compilation",
     "jit",
     "simd",
     "camera",

@@ -39,7 +39,7 @@ class _Teller(event.Listener):
         tell(begins=False)
 
 
-event.register("numba:compile", _Teller())
+event.register("numba:compile", _Teller())  # type: ignore[no-untyped-call]
 
 parallel_range = numba.prange
 

@@ -58,9 +58,9 @@ def test_a_process_that_ended_is_not_waited_for(program):
         assert not (ahead._folder / "auto.done").exists()
 
 
-@pytest.mark.parametrize("part", kernels.PARTS)
-def test_what_the_second_process_does_is_a_small_demo(part, tmp_path, monkeypatch):
+def test_what_the_second_process_does_is_a_small_demo(tmp_path, monkeypatch):
     """A failure there would go unseen: the demo would compile by itself, and be slow."""
+    pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
     failed = []
     real = kernels._compile
 
@@ -72,18 +72,11 @@ def test_what_the_second_process_does_is_a_small_demo(part, tmp_path, monkeypatc
             raise
 
     monkeypatch.setattr(kernels, "_compile", compile_part)
-    kernels.compile_parts(str(tmp_path), part)
+    parts = (*kernels.PARTS, kernels.TRAINING)
+    kernels.compile_parts(str(tmp_path), *parts)
     assert not failed
-    assert (tmp_path / f"{part}.done").exists()
-
-
-def test_training_is_compiled_too(tmp_path, monkeypatch):
-    pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
-    trained = []
-    real = kernels._train
-    monkeypatch.setattr(kernels, "_train", lambda scene: trained.append(real(scene)))
-    kernels.compile_parts(str(tmp_path), kernels.TRAINING)
-    assert trained
+    assert all((tmp_path / f"{part}.done").exists() for part in parts)
+    assert (tmp_path / "small/preview.png").exists()
     assert (tmp_path / "small/run/metrics.json").exists()
 
 

@@ -388,14 +388,10 @@ def test_a_disk_that_is_full_among_the_results_leaves_none(begin, monkeypatch):
 def test_a_run_keeps_a_checkpoint_before_its_first_step(begin, monkeypatch):
     run = begin(max_steps=30)
     before = _bytes(run)
-    monkeypatch.setattr(trainer.Trainer, "_advance", _interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    monkeypatch.delattr(trainer.Trainer, "_advance")  # so that the first step fails
+    with pytest.raises(AttributeError):
         run.train()
     assert run.folder.checkpoint.is_file()
     resumed = begin(options=RESUME, max_steps=30)
     assert resumed.state.step == 0
     assert _bytes(resumed) == before
-
-
-def _interrupted(*_):
-    raise KeyboardInterrupt
