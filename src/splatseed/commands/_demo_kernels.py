@@ -21,9 +21,10 @@ from pathlib import Path
 
 from splatseed.commands._demo_methods import SHOWN, upsample_by
 from splatseed.compilation import watched
+from splatseed.console import StageClock
 from splatseed.interpreter import child_command, child_environment
 
-__all__ = ["TRAINING", "KernelsAhead", "compile_parts", "kernels_ahead"]
+__all__ = ["TRAINING", "KernelsAhead", "compile_parts", "kernels_ahead", "wait"]
 
 TRAINING = "training"
 PARTS = (SHOWN, "voronoi", "spline")
@@ -94,6 +95,13 @@ class KernelsAhead:
             self._process.wait()
 
 
+def wait(ahead: KernelsAhead, part: str, clock: StageClock) -> None:
+    """Wait for what the other process compiles just now, and count that as compilation."""
+    clock.begin_compilation()
+    ahead.wait_for(part)
+    clock.end_compilation()
+
+
 def compile_parts(folder: str, *parts: str) -> None:
     """Compile parts, by doing a small demo; the second process runs this.
 
@@ -131,7 +139,6 @@ def _compile(part: str, path: Path) -> None:
 
 def _train(scene: Path) -> None:
     from splatseed.commands._demo_training import Arm, train_arm  # noqa: PLC0415
-    from splatseed.console import StageClock  # noqa: PLC0415
     from splatseed.train.settings import TrainSettings  # noqa: PLC0415
 
     arm = Arm("", scene, scene.with_name("run"))
