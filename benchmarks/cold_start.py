@@ -20,7 +20,9 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
+from types import SimpleNamespace
 
 from machine import describe, warn_if_busy
 from markdown import table
@@ -133,7 +135,7 @@ def inside(num: int, output: str) -> None:
                 spent[name] += time.process_time() - begun
 
     demo.kernels_ahead = _nobody_ahead  # type: ignore[attr-defined]
-    with event.install_listener("numba:compile", _Clock()):
+    with redirect_stdout(sys.stderr), event.install_listener("numba:compile", _Clock()):
         demo.run(["--output", output, "--train-steps", "20"])
     rows = [[name, f"{seconds:.1f}"] for name, seconds in spent.most_common(num)]
     print()
@@ -142,9 +144,6 @@ def inside(num: int, output: str) -> None:
 
 
 def _nobody_ahead(**_: bool) -> object:
-    from contextlib import nullcontext  # noqa: PLC0415
-    from types import SimpleNamespace  # noqa: PLC0415
-
     return nullcontext(SimpleNamespace(wait_for=lambda _: None, last_first=list))
 
 

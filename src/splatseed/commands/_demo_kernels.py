@@ -28,7 +28,7 @@ __all__ = ["TRAINING", "KernelsAhead", "compile_parts", "kernels_ahead", "wait"]
 
 TRAINING = "training"
 PARTS = (SHOWN, "voronoi", "spline")
-"""What the second process compiles, in this order, and then training. The first does the others."""
+"""What the second process compiles, in this order, and training as soon as it can after the first of them."""
 SIZE = {"num_views": 8, "width": 96, "height": 72}
 POLL = 0.05
 """Seconds between looks at what the other process has done."""
@@ -45,7 +45,7 @@ def kernels_ahead(*, training: bool) -> Iterator[KernelsAhead]:
         training: Whether it compiles what training needs, too, once PyTorch is installed.
     """
     with tempfile.TemporaryDirectory(prefix="splatseed-", ignore_cleanup_errors=True) as folder:
-        ahead = KernelsAhead(Path(folder), (*PARTS, TRAINING) if training else PARTS)
+        ahead = KernelsAhead(Path(folder), (SHOWN, TRAINING, *PARTS[1:]) if training else PARTS)
         try:
             with watched(ahead.start):
                 yield ahead
@@ -113,9 +113,13 @@ def compile_parts(folder: str, *parts: str) -> None:
 
     place = Path(folder)
     scene = write_capture(make_capture(0, **SIZE), place / "small" / "scene")
-    for part in parts:
-        if part == TRAINING:
-            _wait_for_pytorch()
+    waiting = list(parts)
+    while waiting:
+        part = next((each for each in waiting if each != TRAINING or _has_pytorch()), None)
+        if part is None:  # it may be being installed
+            time.sleep(POLL)
+            continue
+        waiting.remove(part)
         if _claim(place, part):
             with suppress(Exception):  # the demo itself will meet it, and say what it is
                 _compile(part, scene)
@@ -145,17 +149,15 @@ def _train(scene: Path) -> None:
     train_arm(arm, TrainSettings(strategy="none", max_steps=2), StageClock())
 
 
-def _wait_for_pytorch() -> None:
-    """Return once training's packages are installed, each to the end; it may be happening just now."""
-    while True:
-        try:
-            for package in ("torch", "gsplat", "torchmetrics"):
-                version(package)  # what pip writes last
-        except PackageNotFoundError:
-            time.sleep(1.0)
-            invalidate_caches()
-        else:
-            return
+def _has_pytorch() -> bool:
+    """Whether training's packages are installed, each to the end."""
+    invalidate_caches()
+    try:
+        for package in ("torch", "gsplat", "torchmetrics"):
+            version(package)  # from what pip writes last
+    except PackageNotFoundError:
+        return False
+    return True
 
 
 def _claim(folder: Path, part: str) -> bool:
