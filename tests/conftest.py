@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
@@ -9,6 +10,12 @@ import numpy as np
 import pytest
 
 SCENES = Path(os.environ.get("SPLATSEED_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
+
+
+@pytest.fixture(autouse=True)
+def _untold_compilation(monkeypatch):
+    """What commands say on stderr must not depend on what is compiled already."""
+    monkeypatch.setattr("splatseed.console.TOLD_AFTER", math.inf)
 
 
 @pytest.fixture

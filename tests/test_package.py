@@ -151,6 +151,24 @@ def test_an_import_loads_nothing_heavy():
     assert not heavy & set(run.stdout.split())
 
 
+VERBS_HELP = """
+import contextlib, importlib, sys
+from splatseed.cli import VERBS, main
+for words in (["--help"], *([verb, "--help"] for verb in VERBS)):
+    with contextlib.suppress(SystemExit):
+        main(words)
+    assert "numba" not in sys.modules, words
+    assert "torch" not in sys.modules, words
+"""
+
+
+def test_help_does_not_wait_for_what_computes():
+    run = subprocess.run(
+        [sys.executable, "-c", VERBS_HELP], capture_output=True, check=False, text=True
+    )
+    assert run.returncode == 0, run.stderr
+
+
 def test_every_module_can_be_imported_first():
     """Each in a process of its own, forked from one that has loaded what is not ours, and the front
     door, which Python loads before any module behind it."""
