@@ -117,7 +117,7 @@ def compile_parts(folder: str, *parts: str) -> None:
     while waiting:
         part = next((each for each in waiting if each != TRAINING or _has_pytorch()), None)
         if part is None:  # it may be being installed
-            time.sleep(POLL)
+            time.sleep(10 * POLL)
             continue
         waiting.remove(part)
         if _claim(place, part):
