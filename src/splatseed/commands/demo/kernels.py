@@ -146,7 +146,7 @@ def _train(scene: Path) -> None:
     from splatseed.train.settings import TrainSettings  # noqa: PLC0415
 
     arm = Arm("", scene, scene.with_name("run"))
-    train_arm(arm, TrainSettings(strategy="none", max_steps=2), StageClock())
+    train_arm(arm, TrainSettings(strategy="grow", cap_max=2000, max_steps=4), StageClock())
 
 
 def _has_pytorch() -> bool:

@@ -65,7 +65,12 @@ def _make_first(
         seeded = upsample_by(SHOWN, scene, options.ratio, options.seed)
         clock("write", 0.0)
         # Images are copied: a link would point into the folder's temporary place.
-        write_scene(scene.replace(points=seeded), folder / f"scene_{SHOWN}", copy_images=True)
+        write_scene(
+            scene.replace(points=seeded),
+            folder / f"scene_{SHOWN}",
+            copy_images=True,
+            provenance={"method": SHOWN, "seconds": clock.seconds()["upsample"]},
+        )
         if options.preview:
             clock("pictures", 0.0)
             preview_pair(scene, seeded, folder / FIRST_PICTURE, title=SHOWN)
