@@ -16,7 +16,7 @@ from jaxtyping import Float32
 
 from splatseed.errors import SceneFormatError
 from splatseed.io._binary import ByteReader
-from splatseed.io._foreign import refuse_foreign, refuse_packed
+from splatseed.io._foreign import refuse_packed
 from splatseed.io._ply_header import EXPORT_PLY_AGAIN, Element, parse_header
 from splatseed.io.staging import atomic_file
 from splatseed.train.gaussians import Gaussians
@@ -68,7 +68,6 @@ def read_gaussians(path: Path) -> Gaussians:
         SceneNotFoundError: There is no such file.
         SceneFormatError: It is no PLY, is cut short, or does not hold Gaussians.
     """
-    refuse_foreign(path)
     reader = ByteReader(path, EXPORT_PLY_AGAIN)
     header = parse_header(path, reader.data)
     for element in header.elements:
