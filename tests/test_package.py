@@ -56,6 +56,7 @@ ORDER = (
     "train",
     "export",
     "evaluate",
+    "view",
     "bench",
     "console",
     "commands",
@@ -239,7 +240,7 @@ def test_dependencies_are_those_that_are_imported():
     for path in SOURCE.rglob("*.py"):
         imported = {name.split(".")[0] for name in _imports(path)}
         needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
-        trains = {"render", "train", "evaluate", "commands"} & set(path.parts)
+        trains = {"render", "train", "evaluate", "view", "commands"} & set(path.parts)
         allowed = base | more if trains else base
         allowed = base | names["depth"] if "monocular" in path.parts else allowed
         allowed = base | names["cluster"] if "bench" in path.parts else allowed
