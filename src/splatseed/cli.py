@@ -28,6 +28,7 @@ VERBS = {
     "train": "Train 3D Gaussians on a scene, on a GPU or on the CPU.",
     "evaluate": "Score a trained model: PSNR, SSIM, LPIPS.",
     "export": "Write a trained model as .ply, .spz, .sog or .splat; crop it.",
+    "view": "Look at scenes and models in the browser.",
     "flight": "Fly through a trained model: a video.",
     "bench": "Compare methods by training: many runs, resumable, then a report.",
     "depth": "Make depth maps of the photographs, by a network or by stereo.",

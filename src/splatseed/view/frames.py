@@ -17,7 +17,6 @@ __all__ = [
     "depth_colors",
     "depth_range",
     "flight_frames",
-    "labelled",
     "split_picture",
 ]
 
@@ -93,22 +92,27 @@ def split_picture(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The left part of one picture and the right part of another, a white line between them, named."""
     column = round(at * left.shape[1])
-    picture = np.concatenate([left[:, :column], right[:, column:]], axis=1)
+    named = (
+        labelled(left, left_name, 0)[:, :column],
+        labelled(right, right_name, column)[:, column:],
+    )
+    picture = np.concatenate(named, axis=1)
     picture[:, max(column - LINE // 2, 0) : column + LINE // 2] = WHITE
-    return labelled(picture, [(0, left_name), (column, right_name)])
+    return picture
 
 
 def labelled(
-    picture: UInt8[np.ndarray, "H W 3"], labels: Sequence[tuple[int, str]]
+    picture: UInt8[np.ndarray, "H W 3"], name: str, column: int
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture with names at its lower edge, each beginning at a column."""
+    """A picture with a name at its lower edge, from a column on."""
     from PIL import Image, ImageDraw  # noqa: PLC0415  (slow to import)
 
+    if not name:
+        return picture
     size = max(10, min(picture.shape[0] // 28, 28))
     image = Image.fromarray(picture)
-    draw = ImageDraw.Draw(image)
-    for column, name in labels:
-        place = (column + size // 2, picture.shape[0] - size // 2)
-        draw.text(place, name, fill="white", font=font(size), anchor="ld",
-                  stroke_width=2, stroke_fill="black")  # fmt: skip
+    place = (column + size // 2, picture.shape[0] - size // 2)
+    ImageDraw.Draw(image).text(
+        place, name, fill="white", font=font(size), anchor="ld", stroke_width=2, stroke_fill="black"
+    )
     return np.array(image)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -55,7 +55,7 @@ class ModelRenderer:
         self._degree = math.isqrt(1 + gaussians.shN.shape[1]) - 1
         tensors = {name: torch.tensor(a, device=device) for name, a in gaussians.arrays().items()}
         self._means = torch.tensor(frame.points_from_world(gaussians.means), device=device)
-        self._shapes = {
+        self._shapes: dict[str, Any] = {
             "quats": tensors["quats"],
             "scales": torch.exp(tensors["scales"] + math.log(frame.scale)),
             "opacities": torch.sigmoid(tensors["opacities"]),
