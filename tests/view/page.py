@@ -63,19 +63,11 @@ def text(page):
     return page.run("document.body.innerText")
 
 
-def click(page, x, y):
-    for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
-        page.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
-
-
-def click_text(page, words, tag="*"):
-    """Click the middle of the last element that has just these words."""
-    where = page.run(
-        f"(() => {{ const found = [...document.querySelectorAll({tag!r})].filter("
-        f"e => e.innerText === {words!r}); const box = found.at(-1).getBoundingClientRect();"
-        " return [box.x + box.width / 2, box.y + box.height / 2]; })()"
+def click_text(page, words, tag):
+    """Click the last element that has just these words."""
+    page.run(
+        f"[...document.querySelectorAll({tag!r})].filter(e => e.innerText === {words!r}).at(-1).click()"
     )
-    click(page, *where)
 
 
 def toggle(page, label):

@@ -22,7 +22,7 @@ from splatseed.view.shown import open_shown  # noqa: E402
 from splatseed.view.stage import clouds_of  # noqa: E402
 from splatseed.view.viewer import Viewer, free_port, stage_frame  # noqa: E402
 
-from .page import (
+from .page import (  # noqa: E402
     CHROMIUM,
     click_text,
     go,
