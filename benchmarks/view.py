@@ -110,7 +110,9 @@ def main(options: Options) -> None:
     used = os.times()
     cpu = used.user + used.system - began.user - began.system
     first, full = (np.median([each[i] for each in firsts]) for i in (0, 1))
-    print(f"{describe()}\n\n{options.gaussians:,} Gaussians, {options.size[0]} x {options.size[1]}\n")
+    print(
+        f"{describe()}\n\n{options.gaussians:,} Gaussians, {options.size[0]} x {options.size[1]}\n"
+    )
     rows = [
         ("first picture, s", f"{first:.2f}"),
         ("first full picture, s", f"{full:.2f}"),

@@ -58,7 +58,9 @@ def run(arguments: list[str]) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         opened = _opened(options)
-    viewer = Viewer(opened, options.host, port, pick_device(options.backend))
+        viewer = Viewer(opened, options.host, port, pick_device(options.backend))
+        clock("prepare", 0.0)
+        viewer.entries[0].warm_up()
     _announce(options, port, opened)
     try:
         while True:

@@ -70,6 +70,11 @@ class Entry:
         return ModelRenderer(self.shown.gaussians, self.frame, self._device)
 
     @property
+    def has_model(self) -> bool:
+        """Whether there are Gaussians to render."""
+        return self.shown.gaussians is not None
+
+    @property
     def kinds(self) -> tuple[str, ...]:
         """The pictures that can be asked for."""
         return tuple(self._painters)
@@ -82,14 +87,21 @@ class Entry:
             except SplatseedError as error:
                 return None, str(error)
 
+    def warm_up(self) -> None:
+        """Compile what renders need, so that no browser waits for it."""
+        if self.has_model:
+            K = np.array([[32.0, 0, 16], [0, 32.0, 12], [0, 0, 1]])
+            view = View("", np.empty((0, 0, 3), np.uint8), K, 32, 24, np.eye(4))
+            self.draw("Gaussians", view, None)
+
     def _available(self) -> dict[str, Callable[[View, Image | None], Found]]:
         found: dict[str, Callable[[View, Image | None], Found]] = {}
         scene = self.shown.scene
-        if self.shown.gaussians is not None:
+        if self.has_model:
             found |= {"Gaussians": self._gaussians, "depth": self._depth}
         if scene is not None and scene.has_photographs:
             found["photograph"] = self._photograph
-            if self.shown.gaussians is not None:
+            if self.has_model:
                 found["error"] = self._error
         if scene is not None and scene.depths is not None:
             found["depth map"] = self._depth_map

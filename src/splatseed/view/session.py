@@ -63,6 +63,11 @@ class Session:
         self._closed = True
         self._loop.close()
 
+    @property
+    def gui(self) -> Any:
+        """The browser's controls, for whoever has some to add."""
+        return self._client.gui
+
     def refresh(self) -> None:
         """What is shown has changed."""
         self._loop.change()
@@ -74,21 +79,21 @@ class Session:
         first = self._entries[names[0]]
         self._what = gui.add_dropdown("Show", names, visible=len(names) > 1)
         kinds = self._kinds(first)
-        self._kind = gui.add_dropdown("Picture", kinds, initial_value=kinds[1 if first.shown.gaussians else 0])  # fmt: skip
+        self._kind = gui.add_dropdown("Picture", kinds, initial_value=kinds[1 if first.has_model else 0])  # fmt: skip
         seconds = self._second_choices()
         self._second = gui.add_dropdown("Beside it", seconds)
         self._split = gui.add_slider("Border at", 0.05, 0.95, 0.01, 0.5, visible=False)
         self._note = gui.add_markdown("", visible=False)
         shot = gui.add_button("Screenshot")
         with gui.add_folder("Points"):
-            self._points_on = gui.add_checkbox("Show points", not first.shown.gaussians)
+            self._points_on = gui.add_checkbox("Show points", not first.has_model)
             self._by_origin = gui.add_checkbox("By origin", initial_value=False)
             self._size = gui.add_slider("Size", 0.2, 5.0, 0.1, 1.0)
             self._legend = gui.add_html("")
             self._origins: dict[str, Any] = {}
             self._origin_folder = gui.add_folder("Origins", expand_by_default=False)
         with gui.add_folder("Cameras"):
-            self._cameras_on = gui.add_checkbox("Show cameras", not first.shown.gaussians)
+            self._cameras_on = gui.add_checkbox("Show cameras", not first.has_model)
             self._go = gui.add_dropdown("Fly to", ("-",))
         for each in (self._kind, self._second, self._split):
             each.on_update(lambda _: self._changed())
@@ -120,7 +125,7 @@ class Session:
         kinds = self._kinds(self._entry)
         self._kind.options = kinds
         if self._kind.value not in kinds:
-            self._kind.value = kinds[-1] if self._entry.shown.gaussians is None else kinds[1]
+            self._kind.value = kinds[-1] if not self._entry.has_model else kinds[1]
         self._goal = None
         self._fill_stage()
         self._loop.change()

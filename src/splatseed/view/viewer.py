@@ -63,19 +63,25 @@ class Viewer:
         host: The address to listen at.
         port: As ``free_port`` found it.
         device: Where to render; the CPU when left out.
+        entries: What to show of it, if it is not simply that.
 
     Raises:
         MissingDependencyError: viser is absent.
     """
 
     def __init__(
-        self, opened: list[Shown], host: str, port: int, device: torch.device | None = None
+        self,
+        opened: list[Shown],
+        host: str,
+        port: int,
+        device: torch.device | None = None,
+        entries: list[Entry] | None = None,
     ) -> None:
         require("viser")
         import viser  # noqa: PLC0415  (of the extra view)
 
         self.frame = stage_frame(opened[0])
-        self.entries = [Entry(shown, self.frame, device) for shown in opened]
+        self.entries = entries or [Entry(shown, self.frame, device) for shown in opened]
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         # A browser may go at any moment; it is no news that it does not hear the rest.
@@ -91,17 +97,28 @@ class Viewer:
 
     def refresh(self) -> None:
         """Have every browser draw again."""
-        for session in list(self._sessions.values()):
+        for session in self.sessions:
             session.refresh()
 
     def stop(self) -> None:
         """Close all connections."""
-        for session in list(self._sessions.values()):
+        for session in self.sessions:
             session.close()
-        self.server.stop()
+        with redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    @property
+    def sessions(self) -> list[Session]:
+        """Of the browsers that look on."""
+        with self._lock:
+            return list(self._sessions.values())
+
+    def greet(self, session: Session) -> None:
+        """A browser has come: the place to add controls."""
 
     def _welcome(self, client: Any) -> None:
         session = Session(client, self.entries)
+        self.greet(session)
         with self._lock:
             self._sessions[client.client_id] = session
 
