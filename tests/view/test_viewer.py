@@ -16,6 +16,7 @@ from splatseed.cli import main  # noqa: E402
 from splatseed.errors import ParameterError  # noqa: E402
 from splatseed.pointcloud import PointCloud  # noqa: E402
 from splatseed.train.frame import TrainingFrame  # noqa: E402
+from splatseed.view import pictures  # noqa: E402
 from splatseed.view.canvas import canvas_view, fitted_fov, laid_onto, stage_pose  # noqa: E402
 from splatseed.view.pictures import Entry  # noqa: E402
 from splatseed.view.shown import open_shown  # noqa: E402
@@ -165,17 +166,28 @@ def test_every_picture_is_drawn_and_differs(entry):
     canvas = _canvas_at(entry, image, (160, 120))
     kinds = ("Gaussians", "depth", "photograph", "error", "points", "origins", "uncovered cells")
     assert entry.kinds == kinds
-    pictures = {}
+    drawn = {}
     for kind in kinds:
         picture, why = entry.draw(kind, canvas, image)
         assert why == ""
         assert picture.shape == (120, 160, 3)
         assert picture.std() > 3
-        pictures[kind] = picture
+        drawn[kind] = picture
     # What is drawn is what was photographed, as far as Gaussians nobody trained can be.
-    close = np.abs(pictures["photograph"].astype(int) - pictures["Gaussians"]).mean()
-    mirrored = np.abs(pictures["photograph"][:, ::-1].astype(int) - pictures["Gaussians"]).mean()
+    close = np.abs(drawn["photograph"].astype(int) - drawn["Gaussians"]).mean()
+    mirrored = np.abs(drawn["photograph"][:, ::-1].astype(int) - drawn["Gaussians"]).mean()
     assert close < mirrored
+
+
+def test_a_moving_picture_keeps_what_shows_most(entry, monkeypatch):
+    image = entry.shown.scene.images[0]
+    canvas = _canvas_at(entry, image, (160, 120))
+    count = len(entry.shown.gaussians)
+    monkeypatch.setattr(pictures, "MOST_MOVING", count // 2)
+    full, _ = entry.draw("Gaussians", canvas, image)
+    quick, _ = entry.draw("Gaussians", canvas, image, quick=True)
+    assert entry.quick_renderer.count == count // 2
+    assert np.abs(full.astype(int) - quick).mean() < 0.6 * full.std()
 
 
 def test_what_needs_a_camera_says_so(entry):

@@ -19,6 +19,8 @@ MOVING_SECONDS = 0.12
 STILL_AFTER = 0.2
 """Seconds without a movement after which the full picture is drawn."""
 LEAST_SCALE, FIRST_SCALE = 0.12, 0.3
+CLOSE_SECONDS = 2.0
+"""How long a frame in hand is waited for."""
 MEMORY = 0.5
 """How much of what a pixel took is believed of the latest frame."""
 
@@ -48,6 +50,7 @@ class FrameLoop:
         """End; a frame in hand is finished."""
         self._closed = True
         self._changed.set()
+        self._thread.join(CLOSE_SECONDS)
 
     def _run(self) -> None:
         while True:
@@ -58,7 +61,7 @@ class FrameLoop:
             scale = self._scale()
             self._frame(scale)
             if scale < 1 and not self._changed.wait(STILL_AFTER):
-                self._frame(1.0)
+                self._frame(1.0, learn=False)
 
     def _scale(self) -> float:
         """The size at which a frame takes as long as it may."""
@@ -67,13 +70,15 @@ class FrameLoop:
         affordable = MOVING_SECONDS / self._pixel_seconds / self._full_pixels
         return float(np.clip(np.sqrt(affordable), LEAST_SCALE, 1.0))
 
-    def _frame(self, scale: float) -> None:
+    def _frame(self, scale: float, *, learn: bool = True) -> None:
         began = time.perf_counter()
         pixels = self._draw(scale)
         if not pixels:
             return
         self.frames += 1
         self._full_pixels = pixels / scale**2
+        if not learn:  # all Gaussians were drawn, not those alone that show most
+            return
         took = (time.perf_counter() - began) / pixels
         before = took if self._pixel_seconds is None else self._pixel_seconds
         self._pixel_seconds = MEMORY * took + (1 - MEMORY) * before

@@ -24,6 +24,7 @@ from splatseed.preview.points import render_points
 from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import covered_cells
 from splatseed.train.frame import TrainingFrame
+from splatseed.train.gaussians import Gaussians
 from splatseed.train.pictures import error_map
 from splatseed.view.canvas import laid_onto
 from splatseed.view.frames import as_bytes, depth_colors
@@ -36,6 +37,8 @@ __all__ = ["NOTHING", "Entry", "Found"]
 Found = tuple[UInt8[np.ndarray, "H W 3"] | None, str]
 """A picture, or None and why there is none."""
 NOTHING = "points only"
+MOST_MOVING = 250_000
+"""Gaussians that are rendered while a camera moves: projecting a million takes longer than all pixels."""
 CELL = 8
 """Pixels a side of the cells that hold a seed or none."""
 PHOTOGRAPH_SIDE = 1600
@@ -69,6 +72,14 @@ class Entry:
         assert self.shown.gaussians is not None  # noqa: S101  (kinds says so)
         return ModelRenderer(self.shown.gaussians, self.frame, self._device)
 
+    @cached_property
+    def quick_renderer(self) -> ModelRenderer:
+        """Of the Gaussians that show most, for pictures of a moving camera; of all, if they are few."""
+        gaussians = self.shown.gaussians
+        if gaussians is None or len(gaussians) <= MOST_MOVING:
+            return self.renderer
+        return ModelRenderer(most_seen(gaussians, MOST_MOVING), self.frame, self._device)
+
     @property
     def has_model(self) -> bool:
         """Whether there are Gaussians to render."""
@@ -79,8 +90,11 @@ class Entry:
         """The pictures that can be asked for."""
         return tuple(self._painters)
 
-    def draw(self, kind: str, canvas: View, at: Image | None) -> Found:
-        """A picture of a kind, as large as the canvas."""
+    def draw(self, kind: str, canvas: View, at: Image | None, *, quick: bool = False) -> Found:
+        """A picture of a kind, as large as the canvas; a quick one may leave out what shows least."""
+        if quick and kind == "Gaussians" and self.has_model:
+            with _DRAWING:
+                return as_bytes(self.quick_renderer.color(canvas)), ""
         with _DRAWING:
             try:
                 return self._painters[kind](canvas, at)
@@ -92,7 +106,8 @@ class Entry:
         if self.has_model:
             K = np.array([[32.0, 0, 16], [0, 32.0, 12], [0, 0, 1]])
             view = View("", np.empty((0, 0, 3), np.uint8), K, 32, 24, np.eye(4))
-            self.draw("Gaussians", view, None)
+            for quick in (True, False):
+                self.draw("Gaussians", view, None, quick=quick)
 
     def _available(self) -> dict[str, Callable[[View, Image | None], Found]]:
         found: dict[str, Callable[[View, Image | None], Found]] = {}
@@ -166,6 +181,14 @@ class Entry:
     def _scene(self) -> Scene:
         assert self.shown.scene is not None  # noqa: S101  (kinds says so)
         return self.shown.scene
+
+
+def most_seen(gaussians: Gaussians, count: int) -> Gaussians:
+    """The Gaussians of greatest opacity times area, in their order."""
+    wide = np.sort(gaussians.scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+    weight = wide - np.logaddexp(0, -gaussians.opacities.astype(np.float64))
+    keep = np.sort(np.argpartition(-weight, count)[:count])
+    return Gaussians(**{name: array[keep] for name, array in gaussians.arrays().items()})
 
 
 def _camera_of(canvas: View) -> Camera:

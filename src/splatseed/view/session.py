@@ -260,9 +260,9 @@ class Session:
         at = self.at
         found: list[Found] = [(None, "")]
         if kind != NOTHING:
-            found = [self._entry.draw(kind, canvas, at)]
+            found = [self._entry.draw(kind, canvas, at, quick=scale < 1)]
         if second is not None:
-            found.append(second[0].draw(second[1], canvas, at))
+            found.append(second[0].draw(second[1], canvas, at, quick=scale < 1))
         self._say(" ".join(dict.fromkeys(why for _, why in found if why)))
         picture = self._joined(found, canvas, named=scale == 1)
         self._show(picture, JPEG_STILL if scale == 1 else JPEG_MOVING)

@@ -25,9 +25,9 @@ MOST_POINTS = 5_000_000
 """More are thinned evenly for the browser."""
 MOST_CAMERAS = 400
 """More are thinned evenly."""
-FRUSTUM = 0.04
-"""Height of a camera's picture over the distance of the cameras from their middle."""
-POINT_PIXELS = 2.2
+FRUSTUM, LEAST_FRUSTUM, MOST_FRUSTUM = 0.5, 0.008, 0.05
+"""Size of a camera over the distance to the next one, and its bounds on the stage."""
+POINT_PIXELS = 1.4
 """Diameter of a point as the first camera sees it, of a picture 1000 pixels high."""
 TEST_COLOR, TRAIN_COLOR = (213, 94, 0), (0, 114, 178)
 
@@ -102,6 +102,7 @@ def add_cameras(
     """
     tested = {image.name for image in scene.split(every)[1]}
     images = scene.images[:: max(1, -(-len(scene.images) // MOST_CAMERAS))]
+    size = _frustum_size(images, frame)
     handles = []
     for i, image in enumerate(images):
         camera = image.camera
@@ -110,7 +111,7 @@ def add_cameras(
             f"/cameras/{i}",
             fov=2 * float(np.arctan(camera.height / 2 / camera.K[1, 1])),
             aspect=camera.width / camera.height,
-            scale=FRUSTUM,
+            scale=size,
             thickness=1.5,
             thickness_units="screen",
             color=TEST_COLOR if image.name in tested else TRAIN_COLOR,
@@ -120,3 +121,13 @@ def add_cameras(
         handle.on_click(lambda _, image=image: fly(image))
         handles.append((image, handle))
     return handles
+
+
+def _frustum_size(images: Sequence[Image], frame: TrainingFrame) -> float:
+    """As large as cameras can be drawn that stand so close to each other."""
+    centers = np.array([stage_pose(image.camera, frame)[1] for image in images])
+    if len(centers) < 2:
+        return MOST_FRUSTUM
+    gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    np.fill_diagonal(gaps, np.inf)
+    return float(np.clip(FRUSTUM * np.median(gaps.min(axis=1)), LEAST_FRUSTUM, MOST_FRUSTUM))

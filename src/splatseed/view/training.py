@@ -61,8 +61,9 @@ class _LiveEntry(Entry):
     def has_model(self) -> bool:
         return True
 
-    def draw(self, kind: str, canvas: View, at: Image | None) -> Found:
+    def draw(self, kind: str, canvas: View, at: Image | None, *, quick: bool = False) -> Found:
         """Have the training thread draw, and wait for it."""
+        del quick  # they change from step to step
         if not self._open:
             return None, ENDED
         future: Future[Found] = Future()
