@@ -214,10 +214,12 @@ def test_points_of_several_origins_are_switched_apart(rng):
     source = np.repeat(np.array([0, 2, 9], np.uint8), 50)
     rgb = rng.integers(0, 255, (150, 3), dtype=np.uint8)
     cloud = PointCloud(rng.random((150, 3)), rgb, source)
-    clouds = clouds_of(cloud, TrainingFrame(np.zeros(3), 2.0))
+    clouds = clouds_of(cloud, TrainingFrame(np.zeros(3), 2.0), 1000)
     assert [each.count for each in clouds] == [50, 50, 50]
     assert len({each.color for each in clouds}) == 3
     np.testing.assert_allclose(clouds[0].xyz, 2 * cloud.xyz[:50], rtol=1e-6)
+    thinned = clouds_of(cloud, TrainingFrame(np.zeros(3), 2.0), 75)
+    assert [(each.count, len(each.xyz)) for each in thinned] == [(50, 25)] * 3
 
 
 # The command -------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import tyro
 
 from splatseed.commands._options import parse_options
 from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
-from splatseed.errors import SceneNotFoundError, SplatseedError
+from splatseed.errors import ParameterError, SceneNotFoundError, SplatseedError
 from splatseed.requirements import require
 from splatseed.train.run_folder import RunFolder
 from splatseed.train.settings import Backend
@@ -41,6 +41,8 @@ class Options:
     """The address to listen at: this machine alone, or 0.0.0.0 for all that can reach it."""
     port: int = 8080
     """The port to listen at; 0 for any that is free."""
+    max_points: int = 5_000_000
+    """Most points that the browser gets to draw; fewer for one without a GPU."""
     browser: bool = False
     """Open this machine's browser."""
     backend: Backend = "auto"
@@ -54,11 +56,16 @@ def run(arguments: list[str]) -> None:
     from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
     from splatseed.view.viewer import Viewer, free_port  # noqa: PLC0415  (likewise)
 
+    if options.max_points < 1:
+        raise ParameterError(
+            "--max-points of 1 or more", found=f"{options.max_points}", fix="Try 1000000."
+        )
     port = free_port(options.host, options.port)
     with stage_display() as clock:
         clock("read", 0.0)
         opened = _opened(options)
-        viewer = Viewer(opened, options.host, port, pick_device(options.backend))
+        device = pick_device(options.backend)
+        viewer = Viewer(opened, options.host, port, device, most_points=options.max_points)
         clock("prepare", 0.0)
         viewer.entries[0].warm_up()
     _announce(options, port, opened)

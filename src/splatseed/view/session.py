@@ -24,11 +24,13 @@ from splatseed.view.pictures import NOTHING, Entry, Found
 from splatseed.view.stage import add_cameras, add_clouds, clouds_of, point_size
 from splatseed.views.view import View
 
-__all__ = ["Session"]
+__all__ = ["MOST_POINTS", "Session"]
 
 MOST_PIXELS = 1_600_000
 """Of a full picture; larger canvases are drawn smaller and stretched."""
 THUMBNAIL = 96
+MOST_POINTS = 5_000_000
+"""For a browser to draw; more are thinned evenly."""
 FLIGHT_SECONDS, FLIGHT_STEPS = 0.5, 15
 _LOG = logging.getLogger(__name__)
 ARRIVED = 1e-3
@@ -42,9 +44,11 @@ class Session:
     Args:
         client: viser's handle of the browser.
         entries: What was opened; at least one.
+        most_points: Most points that the browser gets to draw.
     """
 
-    def __init__(self, client: Any, entries: list[Entry]) -> None:
+    def __init__(self, client: Any, entries: list[Entry], most_points: int = MOST_POINTS) -> None:
+        self._most_points = most_points
         self._client = client
         self._entries = {entry.name: entry for entry in entries}
         self._goal: Image | None = None
@@ -149,7 +153,7 @@ class Session:
             every = self._entry.shown.test_every
             self._cameras = add_cameras(self._client.scene, scene, frame, self._fly, every)
             self._go.options = ("-", *(image.name for image, _ in self._cameras))
-        clouds = clouds_of(scene.points, frame)
+        clouds = clouds_of(scene.points, frame, self._most_points)
         if clouds:
             self._clouds = {cloud.name: cloud for cloud in clouds}
             self._base_size = point_size(clouds, scene.images, frame)

@@ -21,8 +21,6 @@ from splatseed.view.canvas import stage_pose
 
 __all__ = ["Cloud", "add_cameras", "add_clouds", "clouds_of", "point_size"]
 
-MOST_POINTS = 5_000_000
-"""More are thinned evenly for the browser."""
 MOST_CAMERAS = 400
 """More are thinned evenly."""
 FRUSTUM, LEAST_FRUSTUM, MOST_FRUSTUM = 0.5, 0.008, 0.05
@@ -51,9 +49,9 @@ class Cloud:
     count: int
 
 
-def clouds_of(points: PointCloud, frame: TrainingFrame) -> list[Cloud]:
-    """A cloud's finite points by origin, moved onto the stage."""
-    every = max(1, -(-len(points) // MOST_POINTS))
+def clouds_of(points: PointCloud, frame: TrainingFrame, most: int) -> list[Cloud]:
+    """A cloud's finite points by origin, moved onto the stage; of more than so many, some evenly."""
+    every = max(1, -(-len(points) // most))
     finite = points.select(points.finite)
     codes, counts = np.unique(finite.source, return_counts=True)
     clouds = []

@@ -24,7 +24,7 @@ from splatseed.view.canvas import fitted_fov, stage_pose
 from splatseed.view.paths import orbit
 from splatseed.view.pictures import Entry
 from splatseed.view.renderer import model_frame
-from splatseed.view.session import Session
+from splatseed.view.session import MOST_POINTS, Session
 from splatseed.view.shown import Shown
 from splatseed.viewpoint import choose_camera, choose_image
 from splatseed.views.view import poses_of
@@ -64,6 +64,7 @@ class Viewer:
         port: As ``free_port`` found it.
         device: Where to render; the CPU when left out.
         entries: What to show of it, if it is not simply that.
+        most_points: Most points that a browser gets to draw.
 
     Raises:
         MissingDependencyError: viser is absent.
@@ -76,12 +77,14 @@ class Viewer:
         port: int,
         device: torch.device | None = None,
         entries: list[Entry] | None = None,
+        most_points: int = MOST_POINTS,
     ) -> None:
         require("viser")
         import viser  # noqa: PLC0415  (of the extra view)
 
         self.frame = stage_frame(opened[0])
         self.entries = entries or [Entry(shown, self.frame, device) for shown in opened]
+        self._most_points = most_points
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         # A browser may go at any moment; it is no news that it does not hear the rest.
@@ -117,7 +120,7 @@ class Viewer:
         """A browser has come: the place to add controls."""
 
     def _welcome(self, client: Any) -> None:
-        session = Session(client, self.entries)
+        session = Session(client, self.entries, self._most_points)
         self.greet(session)
         with self._lock:
             self._sessions[client.client_id] = session
