@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from splatseed.commands.info.as_json import print_json
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
 from splatseed.depthmap import DepthKind
@@ -62,6 +63,8 @@ class Options:
     """Write a PNG of depth beside photographs, and of where the two disagree."""
     list_all: Annotated[bool, tyro.conf.arg(name="all")] = False
     """List the depth of all images, not of the worst alone."""
+    json: bool = False
+    """Print one JSON object instead, for scripts."""
 
 
 def run(arguments: list[str]) -> None:
@@ -74,6 +77,9 @@ def run(arguments: list[str]) -> None:
         tracks = track_statistics(scene)
         regions = empty_regions(scene, clock)
         alignments = _alignments(options, scene, clock)
+    if options.json:
+        print_json(scene, cloud, tracks, regions, alignments, find_problems(scene, cloud, regions))
+        return
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
     rows += _method_rows(options, scene)
     print_pairs(str(options.scene), rows)

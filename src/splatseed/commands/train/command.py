@@ -20,7 +20,9 @@ from rich.progress import (
 )
 from rich.table import Column
 
-from splatseed.commands.options import parse_options
+from splatseed.commands.options import known_options, parse_options
+from splatseed.commands.train.config import with_config
+from splatseed.commands.train.live import view_port, watched
 from splatseed.console import (
     ERR,
     OUT,
@@ -103,6 +105,14 @@ class Options:
     """Go on with the run in the output folder, with its own settings."""
     tensorboard: bool = False
     """Also write a log for TensorBoard."""
+    view: bool = False
+    """Watch it learn in the browser, pause it, stop it and keep what there is (extra view)."""
+    view_port: int = 8080
+    """The port of this machine that the browser is served at; 0 for any that is free."""
+    config: Annotated[
+        Path | None, tyro.conf.arg(constructor=Path, metavar="FILE", help_behavior_hint="")
+    ] = None
+    """A .toml with these options, or the config.json of a run; what the command line says wins."""
     overwrite: bool = False
     """Replace an earlier run in the output folder."""
 
@@ -123,16 +133,19 @@ class Options:
 
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
+    if any(word.partition("=")[0] == "--config" for word in arguments):
+        arguments = with_config(arguments, known_options(Options))
     options = parse_options(Options, "train", arguments)
     settings = options.settings
     require("torch", "gsplat")
+    port = view_port(options.view_port) if options.view else None
     notes: list[str] = []
     with stage_display() as clock:
         training = _prepare(options, settings, notes.append, clock)
     _announce(options, training, notes)
-    with _training_bar(training) as show:
-        done = training.train(show)
-    if not done:
+    with watched(training, options.scene, port) as watch, _training_bar(training) as show:
+        done = training.train(watch.also(show))
+    if not done and not watch.kept:
         _say_how_to_go_on(options, training)
         sys.exit(exit_code())
     with stage_display(clock):
