@@ -10,12 +10,14 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from splatseed.console import OUT
-from splatseed.depth import Alignment
 from splatseed.diagnostics.scene import CloudStatistics, EmptyRegions, TrackStatistics
 from splatseed.scene import Scene
+
+if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
+    from splatseed.depth import Alignment
 
 __all__ = ["print_json"]
 
