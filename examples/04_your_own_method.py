@@ -12,14 +12,14 @@ its fields as flags, let your package register it in its pyproject.toml:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 import splatseed as ss
 from splatseed.progress import Progress
+from splatseed.scene import Scene
 from splatseed.upsample import NewPoints
-from splatseed.upsample.neighbors import PreparedCloud
+from splatseed.upsample.neighbors import prepare_scene
 
 
 @dataclass(frozen=True)
@@ -29,15 +29,11 @@ class Jitter:
     sigma: float = 0.5
     """Standard deviation of the step, in units of the point's spacing."""
 
-    @classmethod
-    def paper(cls) -> Self:
-        """The paper has no such method; its profile is the default."""
-        return cls()
-
     def __call__(
-        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
-        """Make ``num_new`` points; ``cloud`` is centred, its neighbours are one query away."""
+        """Make ``num_new`` points."""
+        cloud = prepare_scene(scene, progress)  # the originals: clean, centred, with neighbours
         progress("jitter", 0.0)
         h = cloud.neighbors(6).spacing
         base = rng.integers(len(cloud), size=num_new)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace as dataclass_replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64, UInt32
@@ -20,7 +20,16 @@ from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.depthmap import DepthMaps
 from splatseed.pointcloud import PointCloud
 
-__all__ = ["Image", "Observations", "Scene", "SceneFormat", "SceneSource", "Split", "Tracks"]
+__all__ = [
+    "Image",
+    "LeftOut",
+    "Observations",
+    "Scene",
+    "SceneFormat",
+    "SceneSource",
+    "Split",
+    "Tracks",
+]
 
 SceneFormat = Literal["colmap", "transforms", "ply", "rgbd"]
 
@@ -151,6 +160,18 @@ class Split:
         return f"The scene's {self.origin} is followed: {count}, whatever --test-every says."
 
 
+class LeftOut(NamedTuple):
+    """How many points of its files a scene does without.
+
+    Args:
+        non_finite: Points without three finite coordinates, or beyond 1e15.
+        duplicates: Points at exactly the position of an earlier one.
+    """
+
+    non_finite: int = 0
+    duplicates: int = 0
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """A capture: points, and the images and cameras that saw them.
@@ -165,6 +186,7 @@ class Scene:
         depths: Depth maps of some of the images; None where there are none. They are read when asked
             for.
         listed: The split that lists beside the scene give; None where there are none.
+        left_out: How many points of its files it does without.
     """
 
     points: PointCloud
@@ -175,6 +197,7 @@ class Scene:
     warnings: tuple[str, ...] = field(default=())
     depths: DepthMaps | None = None
     listed: Split | None = None
+    left_out: LeftOut = field(default_factory=LeftOut)
 
     def replace(self, **changes: Any) -> Scene:
         """A copy with some fields replaced.

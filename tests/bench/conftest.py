@@ -13,6 +13,7 @@ import pytest
 
 from splatseed.bench.planning.plan import Plan, PlannedScene
 from splatseed.synthetic import make_capture, write_capture
+from splatseed.train.settings import TrainSettings
 
 
 @pytest.fixture(scope="session")
@@ -37,8 +38,5 @@ def small_plan(room_path):
         ratios=(2,),
         strategies=("none",),
         repeats=2,
-        max_steps=3,
-        test_every=4,
-        sh_degree=0,
-        backend="cpu",
+        training=TrainSettings(max_steps=3, test_every=4, sh_degree=0, backend="cpu"),
     )

@@ -8,6 +8,7 @@ import numpy as np
 
 from splatseed.bench.planning.records import (
     SFM,
+    SHARED,
     Arm,
     CurvePoint,
     ImageScore,
@@ -15,6 +16,7 @@ from splatseed.bench.planning.records import (
     RunRow,
     RunSpec,
 )
+from splatseed.train.settings import TrainSettings
 
 SCENES = ("bonsai", "fox", "room0", "treehill")
 GAINS = {(SFM, 1): 0.0, ("linear", 8): 0.3, ("mls", 4): 0.2, ("mls", 8): 0.5, ("random", 8): -0.4}
@@ -50,9 +52,10 @@ def result(psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, **chan
 
 
 def spec(scene, method, ratio, *, strategy="none", repeat=0, profile="default", **changes):
-    values = {"max_steps": 1000, "backend": "cpu", "version": "0.1.0", "data_factor": 4}
-    arm = Arm(method, profile, ratio, strategy)
-    return RunSpec(scene, f"{scene}0123", arm, repeat, **{**values, **changes})
+    values = {"max_steps": 1000, "backend": "cpu", "data_factor": 4, **changes}
+    own = {name: values.pop(name) for name in set(values) - set(SHARED)}
+    arm, training = Arm(method, profile, ratio, strategy), TrainSettings(**values)
+    return RunSpec(scene, f"{scene}0123", arm, repeat, training, **{"version": "0.1.0", **own})
 
 
 def rows(

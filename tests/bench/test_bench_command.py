@@ -33,9 +33,10 @@ COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()", "benc
 def plan_path(small_plan, tmp_path):
     """Writes a plan of the small room; ``plan_path(methods=..., ...)``."""
 
-    def write(**changes):
+    def write(*, max_steps=small_plan.training.max_steps, **changes):
         path = tmp_path / "plan.toml"
-        path.write_text(plan_text(dataclasses.replace(small_plan, **changes)))
+        training = dataclasses.replace(small_plan.training, max_steps=max_steps)
+        path.write_text(plan_text(dataclasses.replace(small_plan, training=training, **changes)))
         return path
 
     return write
@@ -179,7 +180,8 @@ def test_presets_leave_out_what_is_not_there(bench, own_room, tmp_path):
         PlannedScene(str(data / "bonsai"), "bonsai", "images_2"),
         PlannedScene(str(data / "garden"), "garden", "images_4"),
     )
-    assert (plan.max_steps, plan.ratios, plan.test_every) == (30_000, (4, 8, 16), 8)
+    assert (plan.training.max_steps, plan.training.test_every) == (30_000, 8)
+    assert plan.ratios == (4, 8, 16)
 
 
 def test_captures_of_replica_are_left_out_with_what_they_lack(bench, own_room, tmp_path):

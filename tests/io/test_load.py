@@ -17,6 +17,7 @@ from splatseed.io import load_scene
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
+from splatseed.scene import LeftOut
 
 from .colmap import text_form
 
@@ -141,10 +142,10 @@ def test_lens_distortion_is_told(scene_dir):
     assert "undistort" in warnings_of(scene_dir)
 
 
-def test_duplicates_and_nonfinite_points_are_counted_and_kept(scene_dir):
+def test_duplicates_and_nonfinite_points_are_left_out_and_counted(scene_dir):
     rewrite_points(scene_dir, [[0, 0, 0], [-0.0, 0, 0], [1, 2, 3], [np.nan, 0, 0], [np.inf, 0, 0]])
     scene = load_scene(scene_dir)
-    assert len(scene.points) == 5
+    assert (len(scene.points), scene.left_out) == (2, LeftOut(2, 1))
     text = " ".join(scene.warnings)
     assert "2 points are not finite" in text
     assert "1 point repeats" in text
@@ -236,14 +237,15 @@ def test_real_captures_have_what_their_info_says(scenes):
         scene = load_scene(scenes / name)
         info = json.loads((scenes / name / "info.json").read_text())
         assert len(scene.images) == info["reg"]
-        assert len(scene.points) == info["pts"]
+        assert len(scene.points) + sum(scene.left_out) == info["pts"]
         assert not any("missing" in text for text in scene.warnings)
 
 
 def test_official_clouds_of_points_alone(scenes):
     bicycle = load_scene(scenes / "mipnerf360_sfm/bicycle")
     stump = load_scene(scenes / "mipnerf360_sfm/stump")
-    assert (len(bicycle.points), len(stump.points)) == (54_275, 32_049)
+    counts = [len(each.points) + each.left_out.duplicates for each in (bicycle, stump)]
+    assert counts == [54_275, 32_049]
     assert stump.tracks is None
     assert bicycle.intrinsics
 

@@ -12,9 +12,10 @@ from splatseed.depth.alignment import align_map
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene
-from splatseed.io.cloud import cloud_warnings, find_usable
+from splatseed.io.cloud import clean_scene, cloud_warnings
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
 from splatseed.upsample import upsample
 from splatseed.views.sightings import camera_points
 
@@ -78,7 +79,8 @@ def test_one_point_far_out_is_not_the_coordinates_fault(rng):
 @pytest.mark.parametrize("method", ["mls", "linear", "spline", "voronoi", "triangle"])
 def test_a_point_beyond_all_distances_is_left_out(method, rng):
     cloud = _cloud(rng, 1e30)
-    assert cloud_warnings(cloud) == ("1 point is beyond 1e15, and left out when written.",)
-    assert find_usable(cloud).keep.sum() == 499
+    clean = clean_scene(Scene(cloud))
+    assert clean.warnings == ("1 point is beyond 1e15, and left out.",)
+    assert len(clean.points) == 499
     new = upsample(cloud, method, num_points=800).xyz[500:]
     assert np.abs(new).max() < 10

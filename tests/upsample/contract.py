@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 import splatseed as ss
 from splatseed.upsample.method import NewPoints
+from splatseed.upsample.neighbors import prepare_scene
 
 from .surroundings import scene_around
 
@@ -19,12 +19,9 @@ __all__ = ["KINDS", "Copies", "Kind", "named"]
 class Copies:
     """A third party's method: copies of random originals."""
 
-    @classmethod
-    def paper(cls) -> Self:
-        return cls()
-
-    def __call__(self, cloud, num_new, rng, progress):
+    def __call__(self, scene, num_new, rng, progress):
         progress("copies", 0.0)
+        cloud = prepare_scene(scene)
         row_of_rank = np.argsort(cloud.rank)
         rows = row_of_rank[rng.integers(0, len(cloud), num_new)]
         return NewPoints((cloud.xyz[rows] + cloud.center).astype(np.float32), cloud.rgb[rows])

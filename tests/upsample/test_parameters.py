@@ -128,7 +128,7 @@ def test_source_says_which_method_made_a_point(method, wavy):
 def test_an_instance_and_its_name_do_the_same(method, wavy):
     scene = scene_around(wavy)
     by_name = ss.upsample(scene, method, seed=3, profile="paper")
-    by_instance = ss.upsample(scene, METHODS[method].paper(), seed=3)
+    by_instance = ss.upsample(scene, configure(method, "paper"), seed=3)
     np.testing.assert_array_equal(by_name.xyz, by_instance.xyz)
 
 

@@ -30,21 +30,25 @@ TRIED = "Got errors:"
 """What follows lists tyro's attempts to read a value, for its own developers."""
 
 
-def parse_options(kind: type[Options], verb: str, arguments: Sequence[str]) -> Options:
+def parse_options(
+    kind: type[Options], verb: str, arguments: Sequence[str], default: Options | None = None
+) -> Options:
     """The options in ``arguments``.
 
     Args:
         kind: The dataclass that holds them.
         verb: Whose they are.
         arguments: The words after the verb.
+        default: What holds where an option is not given; the dataclass's own defaults if left out.
 
     Raises:
         ParameterError: An option is unknown, missing, or has a value that is none.
     """
     said = io.StringIO()
+    given: dict[str, Any] = {} if default is None else {"default": default}
     try:
         with redirect_stderr(said):
-            return tyro.cli(kind, prog=f"splatseed {verb}", args=arguments)
+            options: Options = tyro.cli(kind, prog=f"splatseed {verb}", args=arguments, **given)
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -53,6 +57,7 @@ def parse_options(kind: type[Options], verb: str, arguments: Sequence[str]) -> O
             found=_sentence(said.getvalue()),
             fix=f"{_suggestion(kind, said.getvalue(), arguments)}Run splatseed {verb} --help to see them.",
         ) from None
+    return options
 
 
 def known_options(kind: type[Any]) -> list[str]:

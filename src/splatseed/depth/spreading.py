@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from splatseed.kernels.hashing import scramble
 from splatseed.kernels.jit import inline, kernel, parallel_range
 
 __all__ = ["spread_points"]
@@ -138,16 +139,7 @@ def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]
             place = np.floor((np.float64(xyz[k, axis]) - low[axis]) / side)
             inside = min(max(place, -1.0), OUTSIDE)
             key = (key << np.uint64(BITS)) | np.uint64(inside + 1.0)
-        out[k] = _mix(key)
-
-
-@inline
-def _mix(x):  # type: ignore[no-untyped-def]
-    """Scramble, one to one: the finaliser of splitmix64 (Steele, Lea and Flood, 2014)."""
-    x += np.uint64(0x9E3779B97F4A7C15)
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
+        out[k] = scramble(key)
 
 
 @kernel

@@ -81,9 +81,18 @@ def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatisti
     xyz = scene.points.xyz
     finite = xyz[scene.points.finite].astype(np.float64)
     nothing = (np.nan,) * 3
+    left = scene.left_out
+    total = len(xyz) + sum(left)
     if len(finite) == 0:
         return CloudStatistics(
-            len(xyz), len(xyz), 0, 0, (np.nan,) * len(PERCENTILES), nothing, nothing, np.nan
+            total,
+            total - left.duplicates,
+            left.duplicates,
+            0,
+            (np.nan,) * len(PERCENTILES),
+            nothing,
+            nothing,
+            np.nan,
         )
     cloud = prepare(scene.points.replace(source=np.zeros(len(xyz), np.uint8)), progress=progress)
     spacing, isolated = np.array([np.nan]), 0
@@ -93,9 +102,9 @@ def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatisti
         isolated = int((sound_bases(cloud, neighbors) == 0).sum())
     greatest = np.abs(finite).max().astype(np.float32)
     return CloudStatistics(
-        num_points=len(xyz),
-        non_finite=len(xyz) - len(finite),
-        duplicates=len(finite) - len(cloud),
+        num_points=total,
+        non_finite=len(xyz) - len(finite) + left.non_finite,
+        duplicates=len(finite) - len(cloud) + left.duplicates,
         isolated=isolated,
         spacing=_percentiles(spacing),
         low=tuple(finite.min(axis=0).tolist()),

@@ -1,11 +1,11 @@
 """Reading scenes and writing them, one file a format.
 
 ``load_scene`` finds out what a path holds; ``write_scene`` makes a folder that every 3D Gaussian
-Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a scene's images. Promise: malformed input and failing output raise one error from
-``splatseed.errors``; importing this package loads neither Numba nor SciPy.
+Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a scene's images.
+Promise: malformed input and failing output raise one error from ``splatseed.errors``; importing this package loads neither Numba nor SciPy.
 """
 
-from splatseed.io.cloud import UsablePoints, find_usable
+from splatseed.io.cloud import clean_scene
 from splatseed.io.depth.files import DepthFiles
 from splatseed.io.depth.folder import DepthWriter, depth_folder
 from splatseed.io.depth_search import find_depths
@@ -15,11 +15,10 @@ from splatseed.io.write import WriteReport, write_scene
 __all__ = [
     "DepthFiles",
     "DepthWriter",
-    "UsablePoints",
     "WriteReport",
+    "clean_scene",
     "depth_folder",
     "find_depths",
-    "find_usable",
     "load_scene",
     "write_scene",
 ]

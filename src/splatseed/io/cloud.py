@@ -1,18 +1,21 @@
-"""Which points of a cloud can be used, and what a user should know of it.
+"""The points of a scene, clean: distinct and finite, and what a user should know of them.
 
-Notation: a duplicate has the float32 position of an earlier point. Promise: the counts are exact.
+Notation: a duplicate has the float32 position of an earlier point. Promise: the counts are exact;
+what is clean is handed back as it is.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool
 
+from splatseed.io.colmap.ids import without_points
 from splatseed.pointcloud import PointCloud
+from splatseed.scene import LeftOut, Scene
 
-__all__ = ["UsablePoints", "cloud_warnings", "find_usable"]
+__all__ = ["clean_scene", "cloud_warnings"]
 
 _FAR_OUT = (
     1e4  # times the inner half of the points: the sky of outdoor scenes is at some hundred times
@@ -21,35 +24,40 @@ _FEW = 0.01  # of the points at most can be so far
 _RESOLUTION = 1e-4  # float32 steps coarser than this share of the cloud's extent show in renders
 
 
-class UsablePoints(NamedTuple):
-    """Which points are kept, and how many are not for which reason."""
+def clean_scene(scene: Scene) -> Scene:
+    """The scene with its distinct finite points alone, and with their tracks and observations.
 
-    keep: Bool[np.ndarray, " N"]
-    num_nonfinite: int
-    num_duplicates: int
-
-
-def find_usable(points: PointCloud) -> UsablePoints:
-    """The finite points, and of those at one position the first."""
+    ``left_out`` counts the others, and ``warnings`` tells of them.
+    """
+    points = scene.points
     keep = points.distinct
+    if keep.all():
+        return scene
     num_finite = int(np.count_nonzero(points.finite))
-    num_duplicates = num_finite - int(np.count_nonzero(keep))
-    return UsablePoints(keep, len(points) - num_finite, num_duplicates)
+    left = LeftOut(len(points) - num_finite, num_finite - int(np.count_nonzero(keep)))
+    known = scene.left_out
+    return replace(
+        without_points(scene, keep),
+        warnings=(*scene.warnings, *_left_out_notes(points, left)),
+        left_out=LeftOut(known.non_finite + left.non_finite, known.duplicates + left.duplicates),
+    )
+
+
+def _left_out_notes(points: PointCloud, left: LeftOut) -> list[str]:
+    notes = []
+    if left.non_finite:
+        what = "point is" if left.non_finite == 1 else "points are"
+        which = "beyond 1e15" if np.isfinite(points.xyz).all() else "not finite"
+        notes.append(f"{left.non_finite:,} {what} {which}, and left out.")
+    if left.duplicates:
+        what = "point repeats" if left.duplicates == 1 else "points repeat"
+        notes.append(f"{left.duplicates:,} {what} the position of another, and left out.")
+    return notes
 
 
 def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
     """A sentence on each thing that is wrong with the cloud as a whole."""
-    _, num_nonfinite, num_duplicates = find_usable(points)
     warnings = []
-    if num_nonfinite:
-        what = "point is" if num_nonfinite == 1 else "points are"
-        which = "beyond 1e15" if np.isfinite(points.xyz).all() else "not finite"
-        warnings.append(f"{num_nonfinite:,} {what} {which}, and left out when written.")
-    if num_duplicates:
-        what = "point repeats" if num_duplicates == 1 else "points repeat"
-        warnings.append(
-            f"{num_duplicates:,} {what} the position of another, and will be left out when written."
-        )
     far, distance = _far_points(points)
     if far.any():
         what = "point lies" if far.sum() == 1 else "points lie"

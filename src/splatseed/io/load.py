@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.cloud import cloud_warnings
+from splatseed.io.cloud import clean_scene, cloud_warnings
 from splatseed.io.colmap.scene import find_model, read_colmap_scene, scene_root
 from splatseed.io.nerfstudio.blender import is_blender, read_blender
 from splatseed.io.nerfstudio.scene import read_transforms_scene
@@ -35,16 +35,16 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     Args:
         path: A folder with a COLMAP model (``sparse/0``, ``sparse``, ``colmap/sparse/0``, itself
             the model, or ``0`` in it), with ``transforms.json``, with ``transforms_train.json`` and
-            ``transforms_test.json``, or with an RGB-D capture (``traj.txt``, or
-            ``rgb.txt`` and ``groundtruth.txt``); or a ``.json`` or ``.ply`` file. Where there are several, ``sparse`` goes before
-            ``transforms.json``, and that before ``colmap/sparse/0``.
+            ``transforms_test.json``, or with an RGB-D capture (``traj.txt``, or ``rgb.txt`` and
+            ``groundtruth.txt``); or a ``.json`` or ``.ply`` file. Where there are several,
+            ``sparse`` goes before ``transforms.json``, and that before ``colmap/sparse/0``.
         require_points: Whether a scene without points is an error; else its cloud is empty.
 
     Returns:
-        The scene in the world of its files, cameras in OpenCV axes. Points are as in the file,
-        non-finite ones and duplicates included; ``warnings`` tells of them. Points that splatseed
-        added before have no tracks, and the ``source`` and attributes that ``seeds.npz`` says, or
-        else ``source`` 255 (``GENERATED``).
+        The scene in the world of its files, cameras in OpenCV axes. Points are finite
+        and no two coincide: ``left_out`` counts those of the files that are not, and ``warnings``
+        tells of them. Points that splatseed added before have no tracks, and the ``source`` and
+        attributes that ``seeds.npz`` says, or else ``source`` 255 (``GENERATED``).
 
     Raises:
         SceneNotFoundError: There is no scene, or it has no points.
@@ -62,7 +62,8 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     if require_points and not len(scene.points):
         fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
-    scene = follow_lists(recall_seeds(scene))
+    # What seeds.npz and the manifest say goes by the points as the files have them.
+    scene = clean_scene(follow_lists(recall_seeds(scene)))
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
 
 

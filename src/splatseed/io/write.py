@@ -18,7 +18,7 @@ from pathlib import Path, PurePath
 from typing import Literal
 
 from splatseed.errors import OutputError, PointCloudError
-from splatseed.io.cloud import find_usable
+from splatseed.io.cloud import clean_scene
 from splatseed.io.output.image_folders import bring
 from splatseed.io.output.layouts import write_colmap, write_json, write_transforms
 from splatseed.io.output.staging import MANIFEST, output_folder
@@ -42,8 +42,8 @@ class WriteReport:
         layout: Which set of files it holds.
         num_points: Points written.
         num_original: How many of them were in the input.
-        dropped_nonfinite: Points left out because a coordinate is not finite.
-        dropped_duplicates: Points left out because an earlier one has the same position.
+        dropped_nonfinite: Points left out, on reading or here, because a coordinate is not finite.
+        dropped_duplicates: Likewise, because an earlier one has the same position.
         files: Paths inside the folder; an image folder is named, not listed.
         notes: What the user should know, one sentence each.
     """
@@ -87,27 +87,26 @@ def write_scene(
         PointCloudError: No point is finite.
     """
     layout = _choose_layout(scene, format)
-    usable = find_usable(scene.points)
-    points = scene.points.select(usable.keep)
-    if not len(points):
+    clean = clean_scene(scene)  # one that load_scene handed out is clean already
+    if not len(clean.points):
         raise PointCloudError(
             "at least one point with finite coordinates",
-            found=f"{len(scene.points)} points, {usable.num_nonfinite} of them not finite",
+            found=f"{len(scene.points)} points, none of them finite",
             fix="Check the cloud.",
         )
     path = Path(path)
     kind = str((provenance or {}).get("command", _KIND))
     with output_folder(path, kind=kind, overwrite=overwrite, protect=_inputs(scene)) as folder:
         write_layout = write_colmap if layout == "colmap" else write_transforms
-        notes, image_sources = write_layout(scene, points, usable.keep, folder)
+        notes, image_sources = write_layout(clean, folder)
         linked = bring(image_sources, folder, copy=copy_images)
         report = WriteReport(
             path=path,
             layout=layout,
-            num_points=len(points),
-            num_original=points.num_original,
-            dropped_nonfinite=usable.num_nonfinite,
-            dropped_duplicates=usable.num_duplicates,
+            num_points=len(clean.points),
+            num_original=clean.points.num_original,
+            dropped_nonfinite=clean.left_out.non_finite,
+            dropped_duplicates=clean.left_out.duplicates,
             files=_listing(folder, linked),
             notes=tuple(notes),
         )

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
+from splatseed.kernels.hashing import scramble
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.seeding.coverage import check_points, grid_from_world, project_block
 from splatseed.views.view import View
@@ -283,19 +284,10 @@ def _mark_cells(group, place, spacing, table):  # type: ignore[no-untyped-def]
 @inline
 def _key(group, place, spacing):  # type: ignore[no-untyped-def]
     """A number of 64 bits for a cell of a view; that two share one is not to be expected."""
-    key = _mix(np.uint64(group))
+    key = scramble(np.uint64(group))
     for axis in range(3):
-        key = _mix(key ^ np.uint64(np.int64(np.floor(place[axis] / spacing))))
+        key = scramble(key ^ np.uint64(np.int64(np.floor(place[axis] / spacing))))
     return max(key, np.uint64(1))  # 0 is a free slot
-
-
-@inline
-def _mix(x):  # type: ignore[no-untyped-def]
-    """Scramble, one to one: the finaliser of splitmix64 (Steele, Lea and Flood, 2014)."""
-    x += np.uint64(0x9E3779B97F4A7C15)
-    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return x ^ (x >> np.uint64(31))
 
 
 @inline

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, Self
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -17,13 +17,12 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.pointcloud import ATTRIBUTES, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
-from splatseed.upsample.method import NewPoints, check_fields, require
+from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
     from splatseed.stereo.maps import StereoMap
     from splatseed.stereo.result import Stereo as FoundStereo
-    from splatseed.upsample.neighbors import PreparedCloud
     from splatseed.views.view import View
 
 __all__ = [
@@ -64,9 +63,7 @@ class PhotographMethod:
     """Leave out every so many-th image by name, as trainers do for the test (8); 0 = use all."""
 
     name: ClassVar[str]
-    needs_points: ClassVar[bool] = False
-    needs_photographs: ClassVar[bool] = True
-    chooses_number: ClassVar[bool] = True
+    traits: ClassVar[Traits] = Traits(frozenset({"photographs"}), chooses_number=True)
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -81,26 +78,21 @@ class PhotographMethod:
                 value = getattr(self, field.name)
                 require(1 <= value <= 256, f"{self.name}.{field.name} from 1 to 256", value)
 
-    @classmethod
-    def paper(cls) -> Self:
-        """The defaults: the paper has no such method."""
-        return cls()
-
     def __call__(
         self,
-        cloud: PreparedCloud,
+        scene: Scene,
         num_new: int,  # noqa: ARG002  (the photographs say how many)
         rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
         """Look at a scene's photographs and make seeds."""
-        if cloud.scene is None:
+        if scene.source is None and not scene.images:
             raise SceneNotFoundError(
                 f"a scene with photographs for the method {self.name}",
                 found="a cloud of points alone",
                 fix="Load the scene they were made from.",
             )
-        return self.seed(cloud.scene, rng, progress)
+        return self.seed(scene, rng, progress)
 
     def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
         """The new points of a scene."""

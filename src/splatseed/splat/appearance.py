@@ -41,7 +41,7 @@ LEAST_VIEWS = 16
 class _Shown(NamedTuple):
     """The M seeds that a view shows."""
 
-    seed: Int64[np.ndarray, " M"]
+    seed_idx: Int64[np.ndarray, " M"]
     column: Int64[np.ndarray, " M"]
     row: Int64[np.ndarray, " M"]
 
@@ -67,10 +67,10 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
     right[:, 0] += OWN * SH_C0 * own
     for view in _asked(views, len(xyz)):
         shown = _shown(xyz, view)
-        basis = _harmonics(xyz[shown.seed], view)
-        normal[shown.seed] += basis[:, :, None] * basis[:, None, :]
+        basis = _harmonics(xyz[shown.seed_idx], view)
+        normal[shown.seed_idx] += basis[:, :, None] * basis[:, None, :]
         colors = _colors(view.image, shown) - 0.5
-        right[shown.seed] += basis[:, :, None] * colors[:, None, :]
+        right[shown.seed_idx] += basis[:, :, None] * colors[:, None, :]
     return np.linalg.solve(normal, right).astype(np.float32)
 
 
@@ -115,7 +115,7 @@ def _harmonics(xyz: Float[np.ndarray, "M 3"], view: View) -> Float64[np.ndarray,
 def _colors(image: UInt8[np.ndarray, "H W 3"], shown: _Shown) -> Float64[np.ndarray, "M 3"]:
     """Mean colours of the 3 x 3 pixels around, 0 to 1; at the border the outermost count again."""
     height, width = image.shape[:2]
-    total = np.zeros((len(shown.seed), 3))
+    total = np.zeros((len(shown.seed_idx), 3))
     for down in (-1, 0, 1):
         for right in (-1, 0, 1):
             rows = np.clip(shown.row + down, 0, height - 1)

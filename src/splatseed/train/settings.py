@@ -7,7 +7,9 @@ conventions, as gsplat's trainer has them, to compare with published numbers; se
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, cast
+from typing import Annotated, Literal, cast, get_args
+
+import tyro
 
 from splatseed.errors import ParameterError
 from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule
@@ -31,40 +33,52 @@ much again for the rasteriser's lists and for copies while Gaussians are added."
 class TrainSettings:
     """How to train.
 
+    The one place of a setting beside the code that heeds it: the options of ``train`` and ``bench``,
+    plans, ledgers and ``config.json`` take these fields, their defaults and docstrings as they are.
+
     Raises:
         ParameterError: A value is out of its range.
     """
 
     strategy: StrategyName = "default"
-    """How Gaussians are added and removed: 3DGS's densification, growth within a budget where the
-    photographs are wrong, MCMC up to a cap, or not at all; with ``-3dgs`` also in 3DGS's own conventions of rates, sizes and schedules."""
+    """Densify as 3DGS does, grow within a budget where renders are wrong, densify as MCMC does up to
+    a cap, or keep the number of seeds; -3dgs: in 3DGS's own conventions of rates, sizes and
+    schedules, to compare with published numbers."""
     max_steps: int = FULL_RUN
     """Training steps; schedules and learning rates are adapted to them."""
     data_factor: int = 1
-    """By how much the photographs are made smaller, a whole number."""
+    """Divide the width and height of the photographs by this whole number."""
     seed: int = 0
     """On the CPU the same seed gives the same bytes."""
-    cap_max: int | None = None
-    """Most Gaussians: more seeds are thinned (default: 1,000,000 for grow and mcmc, else no limit)."""
+    cap_max: Annotated[
+        int | None,
+        tyro.conf.arg(
+            constructor=int, metavar="INT", help_behavior_hint="(default: 1000000 for grow, mcmc)"
+        ),
+    ] = None
+    """Most Gaussians; more seeds than that are thinned."""
     backend: Backend = "auto"
     """Where to train; auto takes a GPU if PyTorch sees one."""
     sh_degree: int = 3
-    """Degree of the spherical harmonics that colours depend on the direction by, 0 to 3."""
+    """Degree of the spherical harmonics: how finely colours depend on the direction, 0 to 3."""
     test_every: int = 8
-    """Of the images sorted by name, every so many-th is kept for the test."""
+    """Keep every n-th image, sorted by name, for the test."""
     opacity_reset: bool = False
-    """With strategy default, lower all opacities at times as 3DGS does; gsplat 1.5.3 does not."""
+    """Lower all opacities from time to time, as 3DGS does (strategy default; gsplat 1.5.3 does not)."""
     seed_sizes: bool = False
-    """Begin with the sizes that ``seeds.npz`` knows, else with those of the gaps between seeds."""
+    """Begin with the sizes in the scene's seeds.npz, not those of the gaps between seeds."""
     seed_normals: bool = False
-    """Begin with flat discs where ``seeds.npz`` knows the normals, else with balls alone."""
+    """Begin with flat discs where the scene's seeds.npz has normals."""
     seed_colors: bool = False
-    """Begin with the colours that the training photographs show a seed in, by direction, not its own."""
-    seeding: Seeding = "scene"
+    """Begin with the colours that the training photographs show each seed in, by direction."""
+    seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds: its default is "auto"
     """Begin with the scene's points as they are, or let method ``auto`` add to them what the training
     photographs ask for. Points that splatseed has added already, and 3DGS's conventions, are left alone."""
 
     def __post_init__(self) -> None:
+        for name, kind in (("backend", Backend), ("seeding", Seeding)):
+            known = get_args(kind)
+            self._require(name, getattr(self, name) in known, f"one of {', '.join(known)}")
         for name, least in (("max_steps", 1), ("data_factor", 1), ("seed", 0), ("test_every", 2)):
             self._require(name, getattr(self, name) >= least, f"{least} or more")
         self._require("cap_max", self.cap_max is None or self.cap_max >= 2, "2 or more")
@@ -73,7 +87,7 @@ class TrainSettings:
     def _require(self, name: str, fits: bool, expected: str) -> None:
         if not fits:
             raise ParameterError(
-                f"--{name.replace('_', '-')} of {expected}",
+                f"--{name.replace('_', '-')} of {expected}".replace("of one of", "among"),
                 found=f"{getattr(self, name)}",
                 fix="See splatseed train --help.",
             )

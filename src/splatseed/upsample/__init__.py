@@ -20,7 +20,7 @@ from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.upsample.method import NewPoints, Upsampler
+from splatseed.upsample.method import Need, NewPoints, Traits, Upsampler, traits_of
 from splatseed.upsample.registry import METHODS, source_code
 
 __all__ = [
@@ -28,12 +28,14 @@ __all__ = [
     "METHODS",
     "NewPoints",
     "Profile",
+    "Traits",
     "Upsampler",
     "chooses_number",
     "configure",
     "methods_for",
     "number_of_new",
     "planned_size",
+    "traits_of",
     "upsample",
     "upsample_points",
 ]
@@ -66,8 +68,8 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
         raise ParameterError(
             "the profile 'default' or 'paper'", found=repr(profile), fix="Choose one of these."
         )
-    chosen = kind.paper() if profile == "paper" else kind()
-    known = [f.name for f in dataclasses.fields(chosen)]  # type: ignore[arg-type]
+    chosen: Any = getattr(kind, "paper", kind)() if profile == "paper" else kind()
+    known = [f.name for f in dataclasses.fields(chosen)]
     for name in parameters:
         if name not in known:
             raise ParameterError(
@@ -75,13 +77,13 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
                 found=repr(name),
                 fix="Check its spelling.",
             )
-    return dataclasses.replace(chosen, **parameters)  # type: ignore[type-var]
+    configured: Upsampler = dataclasses.replace(chosen, **parameters)
+    return configured
 
 
 def chooses_number(method: str | Upsampler) -> bool:
     """Whether a method makes as many points as the photographs need, rather than a number asked for."""
-    chosen: Any = METHODS[method] if isinstance(method, str) else method
-    return bool(getattr(chosen, "chooses_number", False))
+    return traits_of(configure(method) if isinstance(method, str) else method).chooses_number
 
 
 def methods_for(scene: Scene | PointCloud) -> tuple[str, ...]:
@@ -92,14 +94,12 @@ def methods_for(scene: Scene | PointCloud) -> tuple[str, ...]:
         >>> "depth" in METHODS, "depth" in methods_for(cloud)
         (True, False)
     """
-    lacking = set()
-    if not isinstance(scene, Scene) or scene.depths is None:
-        lacking.add("needs_depth")
-    if not isinstance(scene, Scene) or not scene.has_photographs:
-        lacking.add("needs_photographs")
-    return tuple(
-        name for name in METHODS if not any(getattr(METHODS[name], need, False) for need in lacking)
-    )
+    there: set[Need] = {"points"}
+    if isinstance(scene, Scene) and scene.depths is not None:
+        there.add("depth")
+    if isinstance(scene, Scene) and scene.has_photographs:
+        there.add("photographs")
+    return tuple(name for name in METHODS if traits_of(configure(name)).needs <= there)
 
 
 def upsample(
@@ -114,37 +114,35 @@ def upsample(
     note: Callable[[str], None] = lambda _: None,
     **parameters: Any,
 ) -> PointCloud:
-    """The originals of a scene, then the new points of one method: the first step of ``splatseed.upsample``.
+    """The originals of a scene, then the new points of one method: step one of ``splatseed.upsample``.
 
-    That function's arguments of the same names say what these are, its errors and its promises are this one's; here
-    the method is ``mls`` when none is given.
+    Arguments, errors and promises are those of that function; here the default method is ``mls``.
 
     Returns:
         The N originals, first and unchanged, then the new points; ``source`` tells them apart, and
         their attributes are those that the method knows.
     """
-    from splatseed.upsample.neighbors import prepare  # noqa: PLC0415  (loads SciPy and Numba)
-    from splatseed.upsample.trust import trusted_originals  # noqa: PLC0415  (likewise)
-
-    points = scene.points if isinstance(scene, Scene) else scene
-    originals = points.originals
+    whole = scene if isinstance(scene, Scene) else Scene(scene)
+    originals = whole.points.originals
     chosen = _choose(method, profile, parameters)
     name = method if isinstance(method, str) else _name_of(chosen)
     num_new = number_of_new(chosen, name, len(originals), ratio, num_points)
     rng = _generator(seed)
     if num_new == 0 and len(originals) > 0:
         return originals
-    whole = scene if isinstance(scene, Scene) else None
-    trusted = None if whole is None else trusted_originals(whole)
-    allow_none = not getattr(chosen, "needs_points", True)
-    cloud = prepare(originals, trusted, progress, whole, allow_none=allow_none)
+    if "points" in traits_of(chosen).needs and not originals.finite.any():
+        raise PointCloudError(
+            "at least one original point with finite coordinates",
+            found=f"{len(originals)} points, none of them finite and original",
+            fix="Check that the scene holds the point cloud you meant.",
+        )
     if num_new == 0:  # and no originals, of which a ratio could be
         raise ParameterError(
             "a number of points where there are no originals",
             found="a ratio, or 0",
             fix="Give --num-points.",
         )
-    new = NewPoints(*chosen(cloud, num_new or 0, rng, progress))  # a plain tuple will do
+    new = NewPoints(*chosen(whole, num_new or 0, rng, progress))  # a plain tuple will do
     _check_finite(new)
     for sentence in new.notes:
         note(sentence)

@@ -1,8 +1,9 @@
 """What every upsampling method is: a frozen dataclass of parameters that can be called.
 
-A method gets the prepared originals, the number of points to make and a random generator, and
-returns positions in the world and colours. All else (masking, de-duplication, putting originals
-first) is done once, around it.
+A method gets the scene, the number of points to make and a random generator, and returns positions
+in the world and colours. Methods that begin with the originals get them clean, centred and with
+their neighbours from ``neighbors.prepare_scene``. Putting originals first, counting and the origin
+of points are done once, around the method.
 """
 
 from __future__ import annotations
@@ -11,12 +12,10 @@ import dataclasses
 import math
 import types
 from typing import (
-    TYPE_CHECKING,
     Any,
     Literal,
     NamedTuple,
     Protocol,
-    Self,
     Union,
     get_args,
     get_origin,
@@ -29,11 +28,9 @@ from jaxtyping import Float32, UInt8
 
 from splatseed.errors import ParameterError
 from splatseed.progress import Progress
+from splatseed.scene import Scene
 
-if TYPE_CHECKING:  # SciPy and Numba load with the first method, not with the package
-    from splatseed.upsample.neighbors import PreparedCloud
-
-__all__ = ["NewPoints", "Upsampler", "check_fields", "require"]
+__all__ = ["Need", "NewPoints", "Traits", "Upsampler", "check_fields", "require", "traits_of"]
 
 
 class NewPoints(NamedTuple):
@@ -55,23 +52,46 @@ class NewPoints(NamedTuple):
     """Codes of the methods that made them, uint8 [M], never 0; the method's own when left out."""
 
 
+Need = Literal["points", "depth", "photographs"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Traits:
+    """What a method needs of a scene, and who says how many points it makes.
+
+    Args:
+        needs: What it cannot do without.
+        chooses_number: Whether it makes as many points as the photographs need, not a number
+            asked for; it is then called with 0.
+    """
+
+    needs: frozenset[Need] = frozenset({"points"})
+    chooses_number: bool = False
+
+
 @runtime_checkable
 class Upsampler(Protocol):
-    """An upsampling method. Third parties register classes under ``splatseed.methods``."""
+    """An upsampling method. Third parties register classes under ``splatseed.methods``.
+
+    Two members are optional. ``traits`` (``Traits``) is for a method that does not make a number of
+    points that it is asked for from points alone. ``paper()``, a class method, gives the parameters
+    that follow a paper to the letter; without it both profiles are the same.
+    """
 
     def __call__(
-        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
-        """Make exactly ``num_new`` finite points from the prepared originals.
+        """Make exactly ``num_new`` finite points for a scene.
 
         Every random number comes from ``rng``; ``progress`` is told the stages.
         """
         ...
 
-    @classmethod
-    def paper(cls) -> Self:
-        """The parameters that follow the paper to the letter."""
-        ...
+
+def traits_of(method: Upsampler) -> Traits:
+    """The method's traits, or the default ones."""
+    traits: Traits = getattr(method, "traits", Traits())
+    return traits
 
 
 def require(condition: bool, expected: str, found: object) -> None:

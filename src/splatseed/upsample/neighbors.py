@@ -18,13 +18,21 @@ from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
-from splatseed.io import find_usable
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
+from splatseed.upsample.trust import trusted_originals
 
-__all__ = ["Bases", "Neighbors", "PreparedCloud", "draw_bases", "prepare", "sound_bases"]
+__all__ = [
+    "Bases",
+    "Neighbors",
+    "PreparedCloud",
+    "draw_bases",
+    "prepare",
+    "prepare_scene",
+    "sound_bases",
+]
 
 SPACING_NEIGHBORS = 6
 OUTLIER_NEIGHBORS = 16
@@ -75,8 +83,6 @@ class PreparedCloud:
         center: Centroid in the world, float64 [3].
         tree: kd-tree over the positions in file order.
         progress: Told how far the neighbour query is.
-        scene: Where the originals come from, for methods that look at more than points; None for a
-            bare cloud.
     """
 
     xyz: Float64[np.ndarray, "n 3"]
@@ -86,7 +92,6 @@ class PreparedCloud:
     center: Float64[np.ndarray, " 3"]
     tree: cKDTree
     progress: Progress = silent
-    scene: Scene | None = None
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -125,9 +130,6 @@ def prepare(
     points: PointCloud,
     trusted: Bool[np.ndarray, " N"] | None = None,
     progress: Progress = silent,
-    scene: Scene | None = None,
-    *,
-    allow_none: bool = False,
 ) -> PreparedCloud:
     """Mask, de-duplicate, centre and sort the originals of a cloud.
 
@@ -135,29 +137,38 @@ def prepare(
         points: The cloud; only points with ``source`` 0 take part.
         trusted: Which of the N points may serve as bases; all when left out.
         progress: Called with the stage "neighbours" while neighbours are sought.
-        scene: The scene that the points belong to, if any.
-        allow_none: Whether the cloud may be empty; it then has no neighbours, and the center 0.
 
     Raises:
         PointCloudError: No finite original is left.
     """
     originals = np.flatnonzero(points.source == ORIGINAL)
-    keep_idx = originals[find_usable(points.select(originals)).keep]
-    if len(keep_idx) == 0 and not allow_none:
+    keep_idx = originals[points.select(originals).distinct]
+    if len(keep_idx) == 0:
         raise PointCloudError(
             "at least one original point with finite coordinates",
             found=f"{len(points)} points, none of them finite and original",
             fix="Check that the scene holds the point cloud you meant.",
         )
-    center = points.xyz[keep_idx].sum(axis=0, dtype=np.float64) / max(len(keep_idx), 1)
+    center = points.xyz[keep_idx].sum(axis=0, dtype=np.float64) / len(keep_idx)
     xyz = points.xyz[keep_idx].astype(np.float64) - center
     tree = cKDTree(xyz, balanced_tree=False)
     rank = np.asarray(tree.indices, np.int64)
     rows = keep_idx[rank]
     trusted_rows = np.ones(len(rows), bool) if trusted is None else trusted[rows]
-    return PreparedCloud(
-        xyz[rank], points.rgb[rows], rank, trusted_rows, center, tree, progress, scene
-    )
+    return PreparedCloud(xyz[rank], points.rgb[rows], rank, trusted_rows, center, tree, progress)
+
+
+def prepare_scene(scene: Scene, progress: Progress = silent) -> PreparedCloud:
+    """The originals of a scene, prepared; only those that are trusted may serve as bases.
+
+    Args:
+        scene: The scene; its tracks say which originals are trusted.
+        progress: Called with the stage "neighbours" while neighbours are sought.
+
+    Raises:
+        PointCloudError: No finite original is left.
+    """
+    return prepare(scene.points.originals, trusted_originals(scene), progress)
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,11 @@ import pytest
 from splatseed.bench.planning.estimate import Estimator
 from splatseed.bench.planning.records import SFM, Arm, ImageScore, RunResult, RunRow, RunSpec
 from splatseed.bench.planning.scenes import SceneFacts
+from splatseed.train.settings import TrainSettings
 
 FACTS = SceneFacts("room", "", "ab12", num_points=10_000, num_images=80, pixels=800 * 600)
-SPEC = RunSpec("room", "ab12", Arm("mls", "default", 8, "none"), repeat=0, max_steps=1000)
+TRAINING = TrainSettings(max_steps=1000, backend="cpu")
+SPEC = RunSpec("room", "ab12", Arm("mls", "default", 8, "none"), repeat=0, training=TRAINING)
 SCORES = (ImageScore("a.png", 21.5, 0.8, None),)
 RESULT = RunResult(
     21.5, 0.8, None, SCORES, (), 80_000, 80_000, 1888, 0.2, 500.0, 0.01, 10**9, "CPU"
@@ -24,7 +26,8 @@ def _row(spec=SPEC, seconds=530.0, **changes):
 
 
 def _spec(**changes):
-    return dataclasses.replace(SPEC, **changes)
+    own = {name: changes.pop(name) for name in ("arm", "scene_digest") if name in changes}
+    return dataclasses.replace(SPEC, training=dataclasses.replace(TRAINING, **changes), **own)
 
 
 def test_more_work_takes_longer():

@@ -13,11 +13,11 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene, plan_runs
 from splatseed.bench.planning.plan_file import KINDS, plan_text, read_plan
-from splatseed.bench.planning.records import SFM, Arm
+from splatseed.bench.planning.records import SFM, SHARED, Arm
 from splatseed.bench.planning.scenes import survey
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
-from splatseed.train.settings import StrategyName
+from splatseed.train.settings import StrategyName, TrainSettings
 
 TEXTS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20)
 RATIOS = st.floats(1, 1e6, exclude_min=True)
@@ -40,7 +40,12 @@ PLANS = st.builds(
     strategies=_some(st.sampled_from(get_args(StrategyName))),
     profiles=_some(st.sampled_from(["default", "paper"])),
     repeats=st.integers(1, 9),
-    cap_max=st.none() | st.integers(2, 10**9),
+    training=st.builds(
+        TrainSettings,
+        cap_max=st.none() | st.integers(2, 10**9),
+        seed_sizes=st.booleans(),
+        backend=st.sampled_from(["auto", "cpu"]),
+    ),
     lpips=st.booleans(),
     scenes=st.lists(
         st.builds(
@@ -68,8 +73,10 @@ def test_a_plan_survives_its_file(tmp_path_factory, plan):
 
 
 def test_a_file_has_a_key_for_each_field():
-    assert set(KINDS) == {each.name for each in dataclasses.fields(Plan)}
-    assert set(tomllib.loads(plan_text(Plan(cap_max=5)))) == set(KINDS) - {"scenes", "parameters"}
+    own = {each.name for each in dataclasses.fields(Plan)} - {"training"}
+    assert set(KINDS) == own | set(SHARED)
+    text = plan_text(Plan(training=TrainSettings(cap_max=5)))
+    assert set(tomllib.loads(text)) == set(KINDS) - {"scenes", "parameters"}
 
 
 def test_paths_in_a_file_are_beside_it(tmp_path):
@@ -148,7 +155,7 @@ def test_depth_needs_maps_and_never_sees_the_test_photographs(small_plan, room_p
     facts = survey(room_path, "room", with_depth=True)
     assert facts.depth_path == str(room_path)
     _, depth = plan_runs(plan, [facts], "cpu", "1")
-    assert depth.parameters == {"hold_out": plan.test_every}
+    assert depth.parameters == {"hold_out": plan.training.test_every}
     assert depth.depth_digest == facts.depth_digest
     with pytest.raises(SceneNotFoundError, match="folder of depth maps"):
         survey(room_path, "room", depth=tmp_path / "none", with_depth=True)
@@ -215,5 +222,5 @@ def test_the_plan_of_the_published_results_is_the_one_they_tell_of():
     scenes, kinds, strategies = len(plan.scenes), len(plan.methods), len(plan.strategies)
     runs = scenes * kinds * strategies * plan.repeats
     assert f"{scenes} x {kinds} x {strategies} x {plan.repeats} = {runs} runs" in told
-    assert f"{plan.max_steps} steps" in told
-    assert f"{plan.cap_max:,} Gaussians" in told
+    assert f"{plan.training.max_steps} steps" in told
+    assert f"{plan.training.cap_max:,} Gaussians" in told

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import json
 
 import pytest
 
 from splatseed.bench.planning.records import SFM, Arm, CurvePoint, ImageScore, RunResult, RunSpec
+from splatseed.train.settings import TrainSettings
 
 ARM = Arm("mls", "default", 8, "none")
-SPEC = RunSpec("room", "ab12", ARM, repeat=0, max_steps=100, parameters={"k": 12}, version="1")
+TRAINING = TrainSettings(max_steps=100, backend="cpu")
+SPEC = RunSpec("room", "ab12", ARM, repeat=0, training=TRAINING, parameters={"k": 12}, version="1")
 
 
 def test_specs_survive_json():
@@ -36,14 +40,36 @@ def test_a_whole_ratio_may_be_written_either_way():
 
 @pytest.mark.parametrize(
     "change",
-    [{"scene": "x"}, {"scene_digest": "x"}, {"repeat": 1}, {"max_steps": 101}, {"data_factor": 2},
-     {"test_every": 4}, {"cap_max": 9}, {"sh_degree": 0}, {"backend": "cuda"}, {"version": "2"},
-     {"opacity_reset": True}, {"parameters": {"k": 13}}, {"depth_digest": "x"},
+    [{"scene": "x"}, {"scene_digest": "x"}, {"repeat": 1}, {"version": "2"},
+     {"parameters": {"k": 13}}, {"depth_digest": "x"},
      {"arm": Arm("mls", "default", 4, "none")}, {"arm": Arm("mls", "paper", 8, "none")},
      {"arm": Arm("mls", "default", 8, "mcmc")}, {"arm": Arm("linear", "default", 8, "none")}],
 )  # fmt: skip
 def test_all_else_is(change):
     assert dataclasses.replace(SPEC, **change).key != SPEC.key
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"max_steps": 101}, {"data_factor": 2}, {"test_every": 4}, {"cap_max": 9}, {"sh_degree": 0},
+     {"backend": "cuda"}, {"opacity_reset": True}, {"seed_sizes": True}, {"seed_colors": True}],
+)  # fmt: skip
+def test_so_is_every_setting_of_training(change):
+    changed = dataclasses.replace(SPEC, training=dataclasses.replace(TRAINING, **change))
+    assert changed.key != SPEC.key
+    assert RunSpec.from_json(changed.to_json()) == changed
+
+
+def test_an_older_ledger_keeps_its_keys():
+    """Its runs have fewer settings, and must not be run again for that."""
+    old = json.loads(SPEC.to_json())
+    for later in ("seed_sizes", "seed_normals", "seed_colors"):
+        del old[later]
+    assert RunSpec.from_json(json.dumps(old)) == SPEC
+    where = {"scene_path", "depth_path", "images"}
+    told = {name: value for name, value in old.items() if name not in where}
+    text = json.dumps(told, sort_keys=True, separators=(",", ":"))
+    assert SPEC.key == hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def test_settings_and_labels():

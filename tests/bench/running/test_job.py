@@ -26,11 +26,18 @@ from splatseed.process.peak import peak_bytes
 from splatseed.train.seeds import seeds_digest
 
 
+def with_steps(plan, steps):
+    return dataclasses.replace(plan.training, max_steps=steps)
+
+
 @pytest.fixture
 def specs(small_plan, room_path):
     """By method."""
     plan = dataclasses.replace(
-        small_plan, methods=("sfm", "linear", "depth"), repeats=1, max_steps=20
+        small_plan,
+        methods=("sfm", "linear", "depth"),
+        repeats=1,
+        training=with_steps(small_plan, 20),
     )
     runs = plan_runs(plan, [survey(room_path, "room", with_depth=True)], "cpu", "1")
     return {run.arm.method: run for run in runs}

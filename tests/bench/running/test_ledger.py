@@ -19,9 +19,12 @@ from splatseed.bench.running import ledger as ledger_module, worker as worker_mo
 from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.worker import STALE_SECONDS, worker_name
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.train.settings import TrainSettings
 
 ARM = Arm("mls", "default", 8, "none")
-SPECS = [RunSpec("room", "ab12", ARM, repeat=r, max_steps=100) for r in range(5)]
+SPECS = [
+    RunSpec("room", "ab12", ARM, repeat=r, training=TrainSettings(max_steps=100)) for r in range(5)
+]
 SCORES = (ImageScore("a.png", 21.5, 0.8, None),)
 RESULT = RunResult(21.5, 0.8, None, SCORES, (), 7, 8, 1888, 0.2, 1.5, 0.01, 10**9, "CPU")
 ME = worker_name()

@@ -21,9 +21,12 @@ from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.local import LocalExecutor, slot_environment
 from splatseed.bench.running.watcher import Watcher
 from splatseed.errors import OutputError
+from splatseed.train.settings import TrainSettings
 
 ARM = Arm("mls", "default", 8, "none")
-SPECS = [RunSpec("room", "ab12", ARM, repeat=r, max_steps=100) for r in range(4)]
+SPECS = [
+    RunSpec("room", "ab12", ARM, repeat=r, training=TrainSettings(max_steps=100)) for r in range(4)
+]
 KEYS = {spec.key for spec in SPECS}
 SCORES = (ImageScore("a.png", 21.5, 0.8, None),)
 RESULT = RunResult(21.5, 0.8, None, SCORES, (), 7, 8, 1888, 0.2, 1.5, 0.01, 10**9, "CPU")
@@ -204,7 +207,7 @@ def wait(spec):
     time.sleep(60)
 job.scene_of = wait
 ''' + child.PROGRAM
-spec = RunSpec("room", "ab12", Arm("mls", "default", 8, "none"), 0, 100)
+spec = RunSpec("room", "ab12", Arm("mls", "default", 8, "none"), 0)
 one = child.Child(spec, Path({str(tmp_path)!r}) / "one", Path({str(tmp_path)!r}) / "kept", JobOptions(), {{}})
 one.wait(lambda stage, part: None)
 """

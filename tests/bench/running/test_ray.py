@@ -55,8 +55,9 @@ def specs(small_plan, room_path):
 
 
 def test_all_runs_end_up_done_once_although_a_node_is_lost(cluster, small_plan, tmp_path):
+    training = dataclasses.replace(small_plan.training, max_steps=250)
     plan = dataclasses.replace(
-        small_plan, methods=("sfm", "linear", "mls"), repeats=1, max_steps=250
+        small_plan, methods=("sfm", "linear", "mls"), repeats=1, training=training
     )
     (tmp_path / "plan.toml").write_text(plan_text(plan))
     folder = tmp_path / "B"

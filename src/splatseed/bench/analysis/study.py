@@ -15,22 +15,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import get_args
 
-from splatseed.bench.planning.records import SFM, RunResult, RunRow, RunSpec
+from splatseed.bench.planning.records import SFM, SHARED, RunResult, RunRow, RunSpec
 from splatseed.train.settings import StrategyName
 from splatseed.upsample import METHODS
 
 __all__ = ["BASELINE", "Cell", "Study", "Variant", "studies", "variant_of"]
 
-SETTINGS = (
-    "max_steps",
-    "test_every",
-    "cap_max",
-    "sh_degree",
-    "backend",
-    "opacity_reset",
-    "version",
-)
-"""Fields of a specification that are the same for all runs of a study."""
 STRATEGIES: tuple[StrategyName, ...] = get_args(StrategyName)
 
 Cell = Mapping[int, RunResult]
@@ -82,7 +72,9 @@ def variant_of(spec: RunSpec) -> Variant:
     if spec.arm.method == SFM:
         return BASELINE
     told = dict(spec.parameters)
-    if told.get("hold_out") == spec.test_every:  # what a plan always asks of the method depth
+    if (
+        told.get("hold_out") == spec.training.test_every
+    ):  # what a plan always asks of the method depth
         del told["hold_out"]
     words = tuple(f"{name}={value}" for name, value in sorted(told.items()))
     return Variant(spec.arm.method, spec.arm.profile, float(spec.arm.ratio), words)
@@ -93,7 +85,7 @@ class Study:
     """Runs that can be compared.
 
     Args:
-        settings: What they have in common, by the names of ``RunSpec``.
+        settings: What they have in common: training settings by name, and the version.
         cells: By strategy, scene and variant.
         rows: The runs that the cells are made of, by scene.
         variant_of_key: The variant of each of these runs.
@@ -161,6 +153,7 @@ class Study:
             f"at most {told['cap_max']:,} Gaussians" if told["cap_max"] else "",
             f"spherical harmonics of degree {told['sh_degree']}" if told["sh_degree"] != 3 else "",
             "opacities reset" if told["opacity_reset"] else "",
+            *(name.replace("_", " ") for name in SHARED if name.startswith("seed_") and told[name]),
             f"backend {told['backend']}",
             f"splatseed {told['version']}" if told["version"] else "",
             self._repeats,
@@ -200,16 +193,18 @@ def studies(rows: Iterable[RunRow]) -> tuple[Study, ...]:
     Args:
         rows: As the ledger has them; those not done are passed over.
     """
-    groups: dict[tuple[object, ...], list[RunRow]] = defaultdict(list)
+    groups: dict[tuple[tuple[str, object], ...], list[RunRow]] = defaultdict(list)
     for row in rows:
         if row.status == "done" and row.result is not None:
-            groups[tuple(getattr(row.spec, name) for name in SETTINGS)].append(row)
-    found = [
-        _study(dict(zip(SETTINGS, key, strict=True)), part)
-        for key, group in groups.items()
-        for part in _by_factor(group)
-    ]
+            groups[tuple(_common(row.spec).items())].append(row)
+    found = [_study(dict(key), part) for key, group in groups.items() for part in _by_factor(group)]
     return tuple(sorted(found, key=lambda study: -sum(map(len, study.cells.values()))))
+
+
+def _common(spec: RunSpec) -> dict[str, object]:
+    """What is the same for all runs of a study; their size may differ from scene to scene."""
+    settings = {name: getattr(spec.training, name) for name in SHARED if name != "data_factor"}
+    return {**settings, "version": spec.version}
 
 
 def _by_factor(rows: Sequence[RunRow]) -> list[list[RunRow]]:
@@ -217,8 +212,8 @@ def _by_factor(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     factors: dict[str, set[int]] = defaultdict(set)
     groups: dict[int, list[RunRow]] = defaultdict(list)
     for row in rows:
-        factors[row.spec.scene_digest].add(row.spec.data_factor)
-        groups[row.spec.data_factor].append(row)
+        factors[row.spec.scene_digest].add(row.spec.training.data_factor)
+        groups[row.spec.training.data_factor].append(row)
     several = any(len(each) > 1 for each in factors.values())
     return list(groups.values()) if several else [list(rows)]
 
@@ -235,7 +230,9 @@ def _study(settings: Mapping[str, object], rows: Sequence[RunRow]) -> Study:
             continue
         cells[row.spec.arm.strategy, scene, variant[row.spec.key]][row.spec.repeat] = result
         scenes[scene].append(row)
-    by_factor = {scene: {row.spec.data_factor for row in part} for scene, part in scenes.items()}
+    by_factor = {
+        scene: {row.spec.training.data_factor for row in part} for scene, part in scenes.items()
+    }
     factors = {scene: min(each) for scene, each in sorted(by_factor.items())}
     common = set(factors.values())
     told = {**settings, "data_factor": common.pop() if len(common) == 1 else factors}

@@ -84,10 +84,10 @@ class Estimator:
         seeds, final = self._counts(spec)
         step = self._pace * self._step(spec, (seeds + final) / 2)
         if self._around is not None:
-            return step * spec.max_steps + self._around
-        tests = -(-self._scenes[spec.scene_digest].num_images // spec.test_every)
+            return step * spec.training.max_steps + self._around
+        tests = -(-self._scenes[spec.scene_digest].num_images // spec.training.test_every)
         around = self._speed(spec).around + TESTS * tests * RENDER_SHARE * step
-        return step * spec.max_steps + around
+        return step * spec.training.max_steps + around
 
     def seeds(self, spec: RunSpec) -> int:
         """Gaussians that a run begins with."""
@@ -113,20 +113,20 @@ class Estimator:
         return seeds, min(seeds * (alike or GROWTH[spec.settings.densification]), most)
 
     def _pixels(self, spec: RunSpec) -> float:
-        return self._scenes[spec.scene_digest].pixels / spec.data_factor**2
+        return self._scenes[spec.scene_digest].pixels / spec.training.data_factor**2
 
     def _speed(self, spec: RunSpec) -> _Speed:
-        return SPEEDS["cuda" if spec.backend == "cuda" else "cpu"]
+        return SPEEDS["cuda" if spec.training.backend == "cuda" else "cpu"]
 
     def _step(self, spec: RunSpec, gaussians: float) -> float:
-        cores = 1.0 if spec.backend == "cuda" else CORES_MEASURED / self._threads
+        cores = 1.0 if spec.training.backend == "cuda" else CORES_MEASURED / self._threads
         return cores * self._speed(spec).step(gaussians, self._pixels(spec))
 
     def _pace_of(self, spec: RunSpec, result: RunResult | None) -> float:
         """How many times as long as the model says a finished run took."""
         assert result is not None  # noqa: S101  (only finished runs are asked about)
         modelled = self._step(spec, (result.num_seeds + result.num_gaussians) / 2)
-        return result.train_seconds / spec.max_steps / modelled
+        return result.train_seconds / spec.training.max_steps / modelled
 
 
 def _measured_growth(done: Sequence[RunRow]) -> dict[tuple[str, float | None], float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, get_args
@@ -17,7 +17,6 @@ from typing import Any, get_args
 from splatseed.bench.planning.records import ANY_RATIO, SFM, Arm, RunSpec
 from splatseed.bench.planning.scenes import SceneFacts
 from splatseed.errors import ParameterError
-from splatseed.train.schedule import FULL_RUN
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, configure
 
@@ -75,20 +74,8 @@ class Plan:
     """Parameters of the methods: improved ones, and those of the paper's text."""
     repeats: int = 3
     """How often each is run, with another seed each time."""
-    max_steps: int = FULL_RUN
-    """Training steps."""
-    data_factor: int = 1
-    """By how much photographs are made smaller."""
-    test_every: int = 8
-    """Every so many-th image is kept for the test."""
-    cap_max: int | None = None
-    """Most Gaussians; None for the strategy's own."""
-    sh_degree: int = 3
-    """Degree of spherical harmonics."""
-    backend: Backend = "auto"
-    """Where to train."""
-    opacity_reset: bool = False
-    """Whether strategy default resets opacities."""
+    training: TrainSettings = field(default_factory=TrainSettings)
+    """How each run is trained; strategy and seed are those of its arm and its repeat."""
     keep_models: bool = False
     """Whether trained models are kept."""
     lpips: bool = False
@@ -107,30 +94,17 @@ class Plan:
                 raise _out_of_range("ratios", "above 1 (points in all, per original)", ratio)
         if self.repeats < 1:
             raise _out_of_range("repeats", "of 1 or more", self.repeats)
-        if self.backend not in get_args(Backend):
-            raise _out_of_range("backend", f"of {', '.join(get_args(Backend))}", self.backend)
         _check_distinct("scenes", [each.label for each in self.scenes])
         for scene in self.scenes:
             _check_text(scene)
         for method in self.parameters:
             _check_choices("parameters", (method,), tuple(METHODS))
             configure(method, **self.parameters[method])
-        self._settings()
-
-    def _settings(self) -> TrainSettings:
-        """Whose making checks what training depends on."""
-        return TrainSettings(
-            max_steps=self.max_steps,
-            data_factor=self.data_factor,
-            test_every=self.test_every,
-            cap_max=self.cap_max,
-            sh_degree=self.sh_degree,
-        )
 
     def parameters_of(self, method: str) -> Mapping[str, Any]:
         """What differs from the profile's; no method sees the photographs kept for the test."""
         looks = hasattr(METHODS[method], "hold_out")
-        held = {"hold_out": self.test_every} if looks else {}
+        held = {"hold_out": self.training.test_every} if looks else {}
         return MappingProxyType({**held, **self.parameters.get(method, {})})
 
     def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:
@@ -184,14 +158,8 @@ def plan_runs(
             depth_path=scene.depth_path if arm.method == DEPTH else "",
             scene_path=scene.path,
             images=scene.images,
-            backend=backend,
+            training=replace(plan.training, backend=backend),
             version=version,
-            max_steps=plan.max_steps,
-            data_factor=plan.data_factor,
-            test_every=plan.test_every,
-            cap_max=plan.cap_max,
-            sh_degree=plan.sh_degree,
-            opacity_reset=plan.opacity_reset,
         )
         for repeat in range(plan.repeats)
         for scene, arm in _scene_arms(plan, scenes)

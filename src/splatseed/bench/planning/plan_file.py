@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
+from splatseed.bench.planning.records import SHARED
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.train.settings import TrainSettings
 
 __all__ = ["plan_text", "read_plan"]
 
@@ -51,25 +53,27 @@ TRUTH = _Kind("true or false", lambda value: isinstance(value, bool))
 TABLE = _Kind("a table", lambda value: isinstance(value, dict))
 TABLES = _Kind("tables, each headed [[scenes]]", _all(dict))
 
+
+def _kind_of(default: object) -> _Kind:
+    """The kind of a training setting; the one that has no default is a number."""
+    if isinstance(default, bool):
+        return TRUTH
+    return TEXT if isinstance(default, str) else WHOLE
+
+
 KINDS: Mapping[str, _Kind] = {
     "methods": TEXTS,
     "ratios": NUMBERS,
     "strategies": TEXTS,
     "profiles": TEXTS,
     "repeats": WHOLE,
-    "max_steps": WHOLE,
-    "data_factor": WHOLE,
-    "test_every": WHOLE,
-    "cap_max": WHOLE,
-    "sh_degree": WHOLE,
-    "backend": TEXT,
-    "opacity_reset": TRUTH,
+    **{name: _kind_of(getattr(TrainSettings, name)) for name in SHARED},
     "keep_models": TRUTH,
     "lpips": TRUTH,
     SCENES: TABLES,
     PARAMETERS: TABLE,
 }
-"""What each key of a plan takes; there is one for each field of ``Plan``."""
+"""What each key of a plan takes: there is one for each field of ``Plan``, but ``training`` is flat."""
 
 
 def read_plan(path: Path) -> Plan:
@@ -93,7 +97,8 @@ def read_plan(path: Path) -> Plan:
     for method, parameters in content.get(PARAMETERS, {}).items():
         _check(path, f"{PARAMETERS}.{method}", parameters, {f"{PARAMETERS}.{method}": TABLE})
     try:
-        return Plan(**values)
+        training = TrainSettings(**{name: values.pop(name) for name in SHARED if name in values})
+        return Plan(**values, training=training)
     except ParameterError as error:
         raise SceneFormatError(
             f"{error.expected} in {path}", found=error.found, fix="Correct the plan."
@@ -104,7 +109,7 @@ def plan_text(plan: Plan) -> str:
     """A plan as TOML; its paths are made absolute, so that the text can be kept anywhere."""
     lines = []
     for key in KINDS:
-        value = getattr(plan, key)
+        value = getattr(plan.training if key in SHARED else plan, key)
         if key not in {SCENES, PARAMETERS} and value is not None:
             lines.append(f"{key} = {_value(value)}")
     for scene in plan.scenes:

@@ -14,6 +14,7 @@ from typing import Literal
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
 from splatseed.bench.planning.records import SFM
 from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.train.settings import TrainSettings
 
 __all__ = ["PRESETS", "PresetName", "preset_plan"]
 
@@ -82,6 +83,5 @@ def _quick() -> Plan:
         ratios=(8,),
         strategies=("none", "default"),
         repeats=2,
-        max_steps=500,
-        data_factor=2,
+        training=TrainSettings(max_steps=500, data_factor=2),
     )

@@ -10,15 +10,16 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal, Self
 
-from splatseed.train.settings import Backend, StrategyName, TrainSettings
+from splatseed.train.settings import StrategyName, TrainSettings
 from splatseed.upsample import Profile
 
 __all__ = [
     "ANY_RATIO",
     "SFM",
+    "SHARED",
     "Arm",
     "CurvePoint",
     "ImageScore",
@@ -35,6 +36,17 @@ ANY_RATIO = 0.0
 """The ratio of methods that make as many seeds as the photographs need."""
 
 RunStatus = Literal["pending", "running", "done", "failed"]
+
+DEFAULT = TrainSettings()
+SHARED = tuple(
+    each.name for each in fields(TrainSettings) if each.name not in {"strategy", "seed", "seeding"}
+)
+"""Settings that all runs of a plan share; its arms and repeats decide the others."""
+
+EARLY = {
+    "max_steps", "data_factor", "test_every", "cap_max", "sh_degree", "backend", "opacity_reset",
+}  # fmt: skip
+"""Settings that every key tells, default or not: older ledgers' keys have them, and no others."""
 
 WHERE = {"scene_path", "depth_path", "images"}
 """Fields of a specification that say where things lie, and nothing about what they are."""
@@ -79,13 +91,7 @@ class RunSpec:
         arm: How it is seeded and trained.
         parameters: The method's parameters that differ from its profile's.
         repeat: From 0; seeds both upsampling and training.
-        max_steps: Training steps.
-        data_factor: By how much photographs are made smaller.
-        test_every: Every so many-th image is kept for the test.
-        cap_max: Most Gaussians; None for the strategy's own.
-        sh_degree: Degree of spherical harmonics.
-        backend: Where it is trained: results differ in their last digits.
-        opacity_reset: Whether strategy default resets opacities.
+        training: How it is trained; the arm says by which strategy, the repeat by which seed.
         depth_digest: Fingerprint of the depth maps, for the method depth; empty without.
         version: The package's version.
         scene_path: Where the scene lies; not part of the key.
@@ -98,13 +104,7 @@ class RunSpec:
     scene_digest: str
     arm: Arm
     repeat: int
-    max_steps: int
-    data_factor: int = 1
-    test_every: int = 8
-    cap_max: int | None = None
-    sh_degree: int = 3
-    backend: Backend = "cpu"
-    opacity_reset: bool = False
+    training: TrainSettings = DEFAULT
     parameters: Mapping[str, Any] = field(default_factory=dict)
     depth_digest: str = ""
     version: str = ""
@@ -115,34 +115,36 @@ class RunSpec:
     @property
     def key(self) -> str:
         """Fingerprint of what determines the result: 32 hexadecimal digits."""
-        told = {k: v for k, v in asdict(self).items() if k not in WHERE}
+        told = {k: v for k, v in self._flat().items() if k not in WHERE and self._is_told(k, v)}
         text = json.dumps(told, sort_keys=True, separators=(",", ":"))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     @property
     def settings(self) -> TrainSettings:
-        """How to train."""
-        return TrainSettings(
-            strategy=self.arm.strategy,
-            max_steps=self.max_steps,
-            data_factor=self.data_factor,
-            seed=self.repeat,
-            cap_max=self.cap_max,
-            backend=self.backend,
-            sh_degree=self.sh_degree,
-            test_every=self.test_every,
-            opacity_reset=self.opacity_reset,
-        )
+        """How to train, with the arm's strategy and the repeat's seed."""
+        return replace(self.training, strategy=self.arm.strategy, seed=self.repeat)
 
     def to_json(self) -> str:
         """As one line of JSON."""
-        return json.dumps(asdict(self), sort_keys=True)
+        return json.dumps(self._flat(), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """What ``to_json`` wrote."""
+        """What ``to_json`` wrote; settings that a ledger is too old to have are at their defaults."""
         values = json.loads(text)
-        return cls(**{**values, "arm": Arm(**values["arm"])})
+        training = TrainSettings(**{k: values.pop(k) for k in SHARED if k in values})
+        return cls(**{**values, "arm": Arm(**values["arm"]), "training": training})
+
+    def _flat(self) -> dict[str, Any]:
+        """The fields, with those of ``training`` among them."""
+        values = asdict(self)
+        training = values.pop("training")
+        return {**values, **{name: training[name] for name in SHARED}}
+
+    @staticmethod
+    def _is_told(name: str, value: object) -> bool:
+        """Whether a field is part of the key: later settings are not while they change nothing."""
+        return name not in SHARED or name in EARLY or value != getattr(DEFAULT, name)
 
 
 @dataclass(frozen=True)

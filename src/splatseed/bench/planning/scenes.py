@@ -12,7 +12,7 @@ from pathlib import Path
 
 from splatseed.bench.planning.digest import depth_digest, scene_digest
 from splatseed.errors import SceneNotFoundError
-from splatseed.io import find_depths, find_usable, load_scene
+from splatseed.io import find_depths, load_scene
 from splatseed.io.depth_search import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
 from splatseed.progress import Progress, silent
@@ -105,7 +105,7 @@ def survey(
         name=name,
         path=str(path.resolve()),
         digest=scene_digest(scene, folder, progress),
-        num_points=int(find_usable(scene.points).keep.sum()),
+        num_points=len(scene.points),
         num_images=len(scene.images),
         pixels=size[0] * size[1],
         images=images,

@@ -124,7 +124,7 @@ def _train(
     lpips = _load_lpips() if options.lpips else None
     seeds, seconds = make_seeds(scene, spec, progress)
     run = _prepare(scene.replace(points=seeds), work, spec, progress)
-    if not run.train(lambda step: progress(TRAIN, step / spec.max_steps)):
+    if not run.train(lambda step: progress(TRAIN, step / spec.training.max_steps)):
         return None
     with interruption():
         metrics = _finish(run, lpips, progress)

@@ -14,12 +14,11 @@ from pathlib import Path
 
 from splatseed.bench.planning.records import SFM, RunSpec
 from splatseed.bench.planning.scenes import open_scene
-from splatseed.io import find_usable
 from splatseed.kernels.compilation import watched
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.upsample import chooses_number, configure, planned_size, upsample
+from splatseed.upsample import chooses_number, configure, upsample
 
 __all__ = ["make_seeds", "scene_of"]
 
@@ -48,20 +47,15 @@ def make_seeds(
     Raises:
         SplatseedError: As ``splatseed.upsample``.
     """
-    usable = find_usable(scene.points)
     if spec.arm.method == SFM:
-        return scene.points.select(usable.keep), 0.0
+        return scene.points, 0.0
     method = configure(spec.arm.method, spec.arm.profile, **spec.parameters)
-    asked = None
-    if not chooses_number(spec.arm.method):
-        # As the command does: what will be left out is asked for on top.
-        total = planned_size(int(usable.keep.sum()), spec.arm.ratio, None)
-        asked = total + usable.num_nonfinite + usable.num_duplicates
+    ratio = None if chooses_number(spec.arm.method) else spec.arm.ratio
     with _compilation() as compiling:
         start = time.perf_counter()
-        seeds = upsample(scene, method, num_points=asked, seed=spec.repeat, progress=progress)
+        seeds = upsample(scene, method, ratio=ratio, seed=spec.repeat, progress=progress)
         seconds = time.perf_counter() - start
-    return seeds.select(find_usable(seeds).keep), seconds - sum(compiling)
+    return seeds.select(seeds.distinct), seconds - sum(compiling)
 
 
 @contextmanager

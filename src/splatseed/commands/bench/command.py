@@ -18,10 +18,9 @@ from splatseed.bench.running.job import JobOptions
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.commands.bench.display import run_display, spoken_time
 from splatseed.commands.bench.machine import Machine, check_machine, open_machine
-from splatseed.commands.bench.options import PLAN, Asked, Options, asked_plan
+from splatseed.commands.bench.options import PLAN, Asked, Options, parse_plan
 from splatseed.commands.bench.prepare import Prepared, prepare
 from splatseed.commands.bench.summary import print_summary
-from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_note, stage_display
 from splatseed.io.output.staging import atomic_file
 from splatseed.literal import visible
@@ -39,8 +38,7 @@ def run(arguments: list[str]) -> None:
         reporting = import_module("splatseed.commands.bench.report")
         getattr(reporting, REPORTING[arguments[0]])(arguments[1:])
         return
-    options = parse_options(Options, "bench", arguments)
-    asked = asked_plan(options)
+    options, asked = parse_plan(arguments)
     if options.dry_run or options.output is None:
         _dry_run(options, asked)
     else:
@@ -49,7 +47,7 @@ def run(arguments: list[str]) -> None:
 
 def _run(options: Options, asked: Asked, bench: Path, arguments: Sequence[str]) -> None:
     check_bench_folder(bench, _folders(asked.plan))
-    with open_machine(options, asked.plan.backend) as machine:
+    with open_machine(options, asked.plan.training.backend) as machine:
         job_options = _job_options(asked.plan)
         with stage_display() as clock:
             prepared = prepare(asked, machine.backend, bench / "scenes", clock)
@@ -168,7 +166,7 @@ def _size(count: float) -> str:
 def _dry_run(options: Options, asked: Asked) -> None:
     """Print the plan as TOML, and the rest as comments in it, so that all can be kept as one."""
     with (
-        open_machine(options, asked.plan.backend) as machine,
+        open_machine(options, asked.plan.training.backend) as machine,
         stage_display() as clock,
     ):
         kept = options.output / "scenes" if options.output else None

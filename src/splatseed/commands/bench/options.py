@@ -11,18 +11,19 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import tyro
 
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
 from splatseed.bench.planning.plan_file import read_plan
 from splatseed.bench.planning.presets import PresetName, preset_plan
+from splatseed.commands.options import parse_options
 from splatseed.errors import ParameterError
-from splatseed.train.settings import Backend, StrategyName
+from splatseed.train.settings import StrategyName, TrainSettings
 from splatseed.upsample import Profile
 
-__all__ = ["PLAN", "Asked", "Options", "asked_plan"]
+__all__ = ["PLAN", "Asked", "Options", "parse_plan"]
 
 PLAN = "plan.toml"
 """The name of the plan in the folder of a benchmark."""
@@ -48,6 +49,24 @@ def _listed(values: Sequence[object]) -> str:
 
 
 @dataclass(frozen=True)
+class PlanTraining(TrainSettings):
+    """What all runs of a plan share; the options --strategies and --repeats say the rest."""
+
+    strategy: tyro.conf.Suppress[StrategyName] = "default"
+    seed: tyro.conf.Suppress[int] = 0
+
+    @classmethod
+    def of(cls, settings: TrainSettings) -> Self:
+        """The same settings as options."""
+        return cls(**vars(settings))
+
+    @property
+    def settings(self) -> TrainSettings:
+        """The settings as a plan has them."""
+        return TrainSettings(**vars(self))
+
+
+@dataclass(frozen=True)
 class Options:
     """Train from every method's seeds, several times each, on one machine or many, and compare.
 
@@ -69,20 +88,8 @@ class Options:
     """Improved parameters of the methods, and those of the paper's text."""
     repeats: Annotated[int | None, _one(int, f"{DEFAULT.repeats}")] = None
     """How often, with another seed each time; error bars need at least 3."""
-    max_steps: Annotated[int | None, _one(int, f"{DEFAULT.max_steps}")] = None
-    """Training steps; schedules and learning rates are adapted to them."""
-    data_factor: Annotated[int | None, _one(int, f"{DEFAULT.data_factor}")] = None
-    """By how much the photographs are made smaller."""
-    test_every: Annotated[int | None, _one(int, f"{DEFAULT.test_every}")] = None
-    """Of the images sorted by name, every so many-th is kept for the test."""
-    cap_max: Annotated[int | None, _one(int, "1000000 for mcmc")] = None
-    """Most Gaussians, which makes arms equal in number with mcmc."""
-    sh_degree: Annotated[int | None, _one(int, f"{DEFAULT.sh_degree}")] = None
-    """How finely colours depend on the direction, 0 to 3."""
-    backend: Annotated[Backend | None, _hint(DEFAULT.backend)] = None
-    """Where to train; auto takes a GPU if there is one."""
-    opacity_reset: bool = False
-    """Lower all opacities at times, as 3DGS does (strategy default)."""
+    training: Annotated[PlanTraining, tyro.conf.arg(name="")] = PlanTraining()
+    """How each run is trained: its fields are options of their own."""
     depth: Annotated[tuple[Path, ...], _hint("the scene's")] = ()
     """For method depth: a folder of maps a scene, or one folder with a subfolder of each one's name."""
     preset: Annotated[PresetName | None, _hint("none")] = None
@@ -124,16 +131,22 @@ class Asked:
     lenient: bool = False
 
 
-def asked_plan(options: Options) -> Asked:
-    """The plan that the options ask for.
+def parse_plan(arguments: Sequence[str]) -> tuple[Options, Asked]:
+    """The options of a command line, and the plan that they ask for.
+
+    The options are read twice: only the first reading says which plan there is to change, and only
+    with that plan's training as defaults does the second tell what the user wants otherwise.
 
     Raises:
         ParameterError: Options contradict each other, or a value is out of its range.
         SceneNotFoundError: A plan or a preset's scenes are not there.
         SceneFormatError: The plan's file is not one.
     """
+    options = parse_options(Options, "bench", arguments)
     _check(options)
     asked = _base(options)
+    begun = Options(training=PlanTraining.of(asked.plan.training))
+    options = parse_options(Options, "bench", arguments, begun)
     plan = dataclasses.replace(asked.plan, **_changes(options))
     if options.depth:
         plan = dataclasses.replace(plan, scenes=_with_depth(plan.scenes, options.depth))
@@ -143,7 +156,7 @@ def asked_plan(options: Options) -> Asked:
             found="none of them",
             fix="splatseed bench --preset quick -o BENCH tries it on a made-up room.",
         )
-    return dataclasses.replace(asked, plan=plan)
+    return options, dataclasses.replace(asked, plan=plan)
 
 
 def _check(options: Options) -> None:
@@ -185,9 +198,10 @@ def _base(options: Options) -> Asked:
 
 def _changes(options: Options) -> dict[str, Any]:
     """The fields of the plan that are given as options."""
-    names = {each.name for each in dataclasses.fields(Plan)} - {"scenes", "parameters"}
+    names = {each.name for each in dataclasses.fields(Plan)} - {"scenes", "parameters", "training"}
     given = {name: getattr(options, name) for name in names}
     changes = {name: value for name, value in given.items() if value not in (None, (), False)}
+    changes["training"] = options.training.settings
     if options.scenes:
         changes["scenes"] = _scenes(options.scenes)
     return changes

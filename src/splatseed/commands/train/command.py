@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,7 +39,7 @@ from splatseed.process.interruption import exit_code
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.train.record.folder import RunFolder
-from splatseed.train.settings import Backend, Seeding, StrategyName, TrainSettings
+from splatseed.train.settings import Seeding, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 from splatseed.views.view import poses_of
 
@@ -60,47 +60,19 @@ class Options:
     """A scene with photographs, as splatseed upsample writes it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The folder of the run."""
-    backend: Backend = DEFAULT.backend
-    """Where to train; auto takes a GPU if PyTorch sees one."""
-    strategy: StrategyName = DEFAULT.strategy
-    """Densify as 3DGS does, as MCMC up to a cap, or keep the seeds' number; -3dgs: in 3DGS's own
-    conventions of rates and schedules, to compare with published numbers."""
-    max_steps: int = DEFAULT.max_steps
-    """Steps; schedules and learning rates are adapted to them."""
-    data_factor: int = DEFAULT.data_factor
-    """By how much the photographs are made smaller."""
-    seed: int = DEFAULT.seed
-    """On the CPU the same seed gives the same bytes."""
-    cap_max: Annotated[
-        int | None,
-        tyro.conf.arg(
-            constructor=int, metavar="INT", help_behavior_hint="(default: 1000000 for grow, mcmc)"
-        ),
-    ] = None
-    """Most Gaussians; more seeds than that are thinned."""
+    training: Annotated[TrainSettings, tyro.conf.arg(name="")] = DEFAULT
+    """How to train: its fields are options of their own."""
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
-    """The same, as upsample has it: a number, or Gaussians per pixel of a photograph as it is trained, such as
-    0.25rho."""
-    sh_degree: int = DEFAULT.sh_degree
-    """How finely colours depend on the direction, 0 to 3."""
-    test_every: int = DEFAULT.test_every
-    """Of the images sorted by name, every so many-th is kept for the test."""
-    opacity_reset: bool = DEFAULT.opacity_reset
-    """Lower all opacities at times, as 3DGS does (strategy default; gsplat 1.5.3 does not)."""
-    seed_sizes: bool = DEFAULT.seed_sizes
-    """Begin with the sizes that the scene's seeds.npz knows, not those of the gaps between seeds."""
-    seed_normals: bool = DEFAULT.seed_normals
-    """Begin with flat discs where the scene's seeds.npz knows the normals."""
-    seed_colors: bool = DEFAULT.seed_colors
-    """Begin with the colours that the training photographs show each seed in, by direction."""
+    """The same, as upsample has it: a number, or Gaussians per pixel of a photograph at its training
+    size, such as 0.25rho."""
     seeds: Annotated[
         Seeding | None,
         tyro.conf.arg(
             help_behavior_hint="(default: auto, for points that splatseed has not added to)"
         ),
     ] = None
-    """Begin with what method auto makes of the scene, looking at the training photographs alone, or with the
-    scene's points as they are."""
+    """Begin with what method auto makes of the scene, looking at the training photographs alone, or
+    with the scene's points as they are."""
     resume: bool = False
     """Go on with the run in the output folder, with its own settings."""
     tensorboard: bool = False
@@ -119,16 +91,10 @@ class Options:
     @property
     def settings(self) -> TrainSettings:
         """Those of the options that say how to train."""
-        named = {
-            each.name: getattr(self, each.name)
-            for each in fields(DEFAULT)
-            if each.name != "seeding"
-        }
         # A run that goes on says itself what it began with.
         goes_on = self.resume and RunFolder(self.output).is_run
-        return TrainSettings(
-            **named, seeding=self.seeds or (DEFAULT.seeding if goes_on else "auto")
-        )
+        seeding = self.seeds or (DEFAULT.seeding if goes_on else "auto")
+        return replace(self.training, seeding=seeding)
 
 
 def run(arguments: list[str]) -> None:
@@ -178,11 +144,11 @@ def _within_budget(options: Options, settings: TrainSettings, scene: Scene) -> T
     """The settings, with the number of Gaussians that the budget is in this scene as their cap."""
     if options.budget is None:
         return settings
-    if options.cap_max is not None:
+    if settings.cap_max is not None:
         raise ParameterError("--budget or --cap-max", found="both", fix="Leave one out.")
     from splatseed.seeding.budget import median_pixels, parse_budget  # noqa: PLC0415  (loads Numba)
 
-    views = poses_of(scene.images, options.data_factor)
+    views = poses_of(scene.images, settings.data_factor)
     return replace(
         settings, cap_max=parse_budget(options.budget, median_pixels(views) if views else 0)
     )

@@ -24,14 +24,7 @@ from splatseed.console import (
 from splatseed.depthmap import DepthKind
 from splatseed.diagnostics.geometry import far_share
 from splatseed.errors import ParameterError
-from splatseed.io import (
-    UsablePoints,
-    WriteReport,
-    find_depths,
-    find_usable,
-    load_scene,
-    write_scene,
-)
+from splatseed.io import WriteReport, find_depths, load_scene, write_scene
 from splatseed.io.output.staging import check_output
 from splatseed.literal import visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
@@ -46,6 +39,7 @@ from splatseed.upsample import (
     configure,
     number_of_new,
     planned_size,
+    traits_of,
 )
 
 __all__ = ["Options", "parse", "run"]
@@ -142,10 +136,10 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     if {"-h", "--help"} & set(arguments):
         _help(arguments)
     arguments = ["--help" if word == HELP_ALL else word for word in arguments]
-    options = _parse_with({name: METHODS[name]() for name in METHODS}, arguments)
+    options = _parse_with({name: configure(name) for name in METHODS}, arguments)
     if options.profile == "paper":
         # The profile sets the defaults of other flags, so it must be known before they are read.
-        options = _parse_with({name: METHODS[name].paper() for name in METHODS}, arguments)
+        options = _parse_with({name: configure(name, "paper") for name in METHODS}, arguments)
     methods = {name: getattr(options, name) for name in METHODS}
     if not options.align:
         methods["depth"] = dataclasses.replace(methods["depth"], align=False)
@@ -156,7 +150,7 @@ def _help(arguments: list[str]) -> None:
     """Show the common options, those of the method that is named too, and how to see all."""
     named = [name for name in METHODS if name in arguments or f"--method={name}" in arguments]
     with suppress(SystemExit):
-        _parse_with({name: METHODS[name]() for name in named}, ["--help"])
+        _parse_with({name: configure(name) for name in named}, ["--help"])
     OUT.print(
         f"\nsplatseed upsample {HELP_ALL} shows the flags of all methods,"
         " --method mls --help those of one."
@@ -196,22 +190,20 @@ def run(arguments: list[str]) -> None:
             photographed(scene)  # raises without any: their sizes are bounded by what views show
         options = _settle(options, scene, notes)
         method = methods[options.method]
-        usable = find_usable(scene.points)
-        total = _planned(options, method, usable)
+        total = _planned(options, method, len(scene.points))
     _announce(options, scene, method, total, _idle(options, methods))
     with stage_display(clock):
-        seeds = _make(options, scene, method, total, usable, clock, notes)
+        seeds = _make(options, scene, method, total, clock, notes)
         clock("check", 0.0)
-        found = _check(scene, seeds, method, usable)
+        found = _check(scene, seeds, method)
         clock("write", 0.0)
         report = _write(options, scene.replace(points=seeds), method)
         if options.gaussians is not None:
             write_start(options.gaussians, scene.replace(points=seeds), method, clock)
             notes.append(f"The Gaussians to begin with are in {visible(options.gaussians)}.")
         if options.preview:
-            shown = scene.replace(points=scene.points.select(usable.keep), tracks=None)
             write_previews(
-                shown, seeds, total, methods, options.method, options.seed, options.output, clock
+                scene, seeds, total, methods, options.method, options.seed, options.output, clock
             )
             write_map_preview(scene, method, options.seed, options.output, clock)
         seconds = clock.seconds()
@@ -228,9 +220,8 @@ def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
     return dataclasses.replace(options, method=str(method))
 
 
-def _planned(options: Options, method: Upsampler, usable: UsablePoints) -> int | None:
+def _planned(options: Options, method: Upsampler, count: int) -> int | None:
     """Points in all; None where the photographs say how many."""
-    count = int(usable.keep.sum())
     new = number_of_new(method, options.method, count, options.ratio, options.num_points)
     return None if new is None else count + new
 
@@ -240,26 +231,21 @@ def _make(
     scene: Scene,
     method: Upsampler,
     total: int | None,
-    usable: UsablePoints,
     clock: StageClock,
     notes: list[str],
 ) -> PointCloud:
     """The originals and the new points."""
-    # Points that writing leaves out are asked for on top, so that the output has ``total``.
-    asked = None if total is None else total + int((~usable.keep).sum())
     return upsample(
-        scene, method, num_points=asked, budget=options.budget, cover=options.cover_cell, verify=options.verify, seed=options.seed,
-        progress=clock, note=notes.append,
+        scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
+        verify=options.verify, seed=options.seed, progress=clock, note=notes.append,
     )  # fmt: skip
 
 
-def _check(
-    scene: Scene, seeds: PointCloud, method: Upsampler, usable: UsablePoints
-) -> dict[str, float]:
+def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, float]:
     """What can be said of the points: how far off they are, or how much of the pictures they cover."""
     found = {}
     new = seeds.xyz[seeds.source != ORIGINAL]
-    if usable.keep.any() and not chooses_number(method):
+    if len(scene.points) and not chooses_number(method):
         found["far"] = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
     if scene.images:
         found["before"] = share_covered(scene, scene.points)
@@ -269,7 +255,7 @@ def _check(
 
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
-    scene = load_scene(options.scene, require_points=getattr(method, "needs_points", True))
+    scene = load_scene(options.scene, require_points="points" in traits_of(method).needs)
     scene = scene.replace(points=scene.points.originals)
     if options.depth_maps is not None:
         maps = find_depths(

@@ -18,18 +18,18 @@ from splatseed.errors import PointCloudError
 from splatseed.io.colmap.model import NO_POINT
 from splatseed.scene import Image, Observations, Scene, Tracks
 
-__all__ = ["Renumbered", "renumber"]
+__all__ = ["Renumbered", "renumber", "without_points"]
 
 
 @dataclass(frozen=True, eq=False)
 class Renumbered:
-    """The tracks and images of the points that are kept, under their new ids.
+    """The tracks and images of a scene under the new ids of its points.
 
     Args:
-        tracks: Of the kept originals; None if the scene has none.
+        tracks: Of the originals; None if the scene has none.
         images: With the features' point ids renewed.
         num_broken: References between points and features that were removed because one side
-            did not confirm them (those of dropped points aside).
+            did not confirm them.
     """
 
     tracks: Tracks | None
@@ -37,12 +37,33 @@ class Renumbered:
     num_broken: int
 
 
-def renumber(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Renumbered:
-    """Number the kept points 1, 2, ... in their order.
+def without_points(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Scene:
+    """The scene with some of its points alone; features of the others belong to no point.
 
     Args:
         scene: Its tracks belong to the first ``len(scene.tracks)`` points.
         keep: Which of the scene's points are kept.
+
+    Raises:
+        PointCloudError: There are more tracks than points.
+    """
+    points, tracks = scene.points.select(keep), scene.tracks
+    if tracks is None:
+        return replace(scene, points=points)
+    _check_tracks(scene, tracks)
+    keep = keep[: len(tracks)]
+    point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
+    ids = _feature_ids(scene.images)
+    ids[np.isin(ids, tracks.point_ids[~keep])] = NO_POINT
+    kept = _selected(tracks, keep, keep[point_idx], point_idx)
+    return replace(scene, points=points, tracks=kept, images=_with_point_ids(scene.images, ids))
+
+
+def renumber(scene: Scene) -> Renumbered:
+    """Number the points 1, 2, ... in their order.
+
+    Args:
+        scene: Its tracks belong to the first ``len(scene.tracks)`` points.
 
     Raises:
         PointCloudError: There are more tracks than points.
@@ -53,28 +74,33 @@ def renumber(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Renumbered:
         num_broken = int(np.count_nonzero(old_ids != NO_POINT))
         return Renumbered(None, _with_point_ids(scene.images, unset), num_broken)
     tracks = scene.tracks
-    if len(tracks) > len(keep):
-        raise PointCloudError(
-            "at most one track a point",
-            found=f"{len(tracks)} tracks for {len(keep)} points",
-            fix="Replace the points by Scene.replace, which drops tracks that do not fit.",
-        )
-    keep = keep[: len(tracks)]
+    _check_tracks(scene, tracks)
     point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
     slots = _slots(scene.images, tracks)
     agreed = slots >= 0
     agreed[agreed] = old_ids[slots[agreed]] == tracks.point_ids[point_idx[agreed]]
-    kept = agreed & keep[point_idx]
     new_ids = np.full(len(old_ids), NO_POINT, np.int64)
-    new_ids[slots[kept]] = np.cumsum(keep)[point_idx[kept]]
+    new_ids[slots[agreed]] = point_idx[agreed] + 1
     confirmed = np.zeros(len(old_ids), bool)
     confirmed[slots[agreed]] = True
     unconfirmed = (old_ids != NO_POINT) & ~confirmed
     return Renumbered(
-        _selected(tracks, keep, kept, point_idx),
+        replace(
+            _selected(tracks, np.ones(len(tracks), bool), agreed, point_idx),
+            point_ids=np.arange(1, len(tracks) + 1, dtype=np.int64),
+        ),
         _with_point_ids(scene.images, new_ids),
         int(np.count_nonzero(~agreed) + np.count_nonzero(unconfirmed)),
     )
+
+
+def _check_tracks(scene: Scene, tracks: Tracks) -> None:
+    if len(tracks) > len(scene.points):
+        raise PointCloudError(
+            "at most one track per point",
+            found=f"{len(tracks)} tracks for {len(scene.points)} points",
+            fix="Replace the points by Scene.replace, which drops tracks that do not fit.",
+        )
 
 
 def _feature_ids(images: Sequence[Image]) -> Int64[np.ndarray, " S"]:
@@ -109,9 +135,8 @@ def _selected(
     point_idx: Int64[np.ndarray, " T"],
 ) -> Tracks:
     lengths = np.bincount(point_idx[kept_elements], minlength=len(tracks))[keep]
-    num_kept = len(lengths)
     return Tracks(
-        point_ids=np.arange(1, num_kept + 1, dtype=np.int64),
+        point_ids=tracks.point_ids[keep],
         xyz=tracks.xyz[keep],
         errors=tracks.errors[keep],
         offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import Camera, Intrinsics
-from splatseed.io.cloud import find_usable
+from splatseed.io.cloud import clean_scene
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.io.colmap.ids import Renumbered, renumber
 from splatseed.io.dense.maps import scaled_K
@@ -77,9 +77,8 @@ class SparseModel:
         """The finite, distinct points that have tracks; points that were added have none."""
         num_tracked = len(self.scene.tracks or ())
         points = self.scene.points.select(slice(0, num_tracked))
-        keep = find_usable(points).keep
-        scene = replace(self.scene, points=points, images=self.images)
-        return points.select(keep), renumber(scene, keep)
+        scene = clean_scene(replace(self.scene, points=points, images=self.images))
+        return scene.points, renumber(scene)
 
 
 def photograph_model(scene: Scene, sizes: Mapping[str, Size]) -> SparseModel:

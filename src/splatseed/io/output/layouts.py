@@ -1,8 +1,8 @@
 """The two sets of files that trainers look for: COLMAP's, and nerfstudio's ``transforms.json``.
 
-Notation: ``keep`` [N] marks the scene's points that ``points`` is made of. Promise: every point
-file in a layout holds the same points in the same order, ``seeds.npz`` too; COLMAP's root holds no PLY, for Brush
-takes any it finds there. Writers write straight into ``folder`` and let ``OSError`` pass.
+Promise: every point file in a layout holds the scene's points in their order, ``seeds.npz`` too;
+COLMAP's root holds no PLY, for Brush takes any it finds there. Writers write straight into
+``folder`` and let ``OSError`` pass.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 
 from splatseed.camera import Intrinsics
 from splatseed.io.colmap import binary as colmap_binary
@@ -41,28 +40,24 @@ _MODEL_EXTRAS = ("depth_params.json", *MODEL_LISTS)  # graphdeco's trainer reads
 _RIG_FILES = ("rigs", "frames")
 
 
-def write_colmap(
-    scene: Scene, points: PointCloud, keep: Bool[np.ndarray, " N"], folder: Path
-) -> tuple[list[str], dict[str, Path]]:
+def write_colmap(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path]]:
     """Write ``sparse/0``; returns notes for the user and the image folders that belong to it."""
     model_dir = folder / "sparse" / "0"
     model_dir.mkdir(parents=True)
-    model = renumber(scene, keep)
+    model = renumber(scene)
     colmap_binary.write_cameras(model_dir / "cameras.bin", _all_cameras(scene))
     colmap_binary.write_images(model_dir / "images.bin", model.images)
-    colmap_binary.write_points3d(model_dir / "points3D.bin", points, model.tracks)
-    write_ply(model_dir / "points3D.ply", points)
-    write_seeds(folder, points)
+    colmap_binary.write_points3d(model_dir / "points3D.bin", scene.points, model.tracks)
+    write_ply(model_dir / "points3D.ply", scene.points)
+    write_seeds(folder, scene.points)
     notes = [*_copy_extras(scene, folder, model_dir), *_model_notes(scene, model)]
     _write_lists(scene, folder)
     return notes, image_folders(scene)
 
 
-def write_transforms(
-    scene: Scene, points: PointCloud, _keep: Bool[np.ndarray, " N"], folder: Path
-) -> tuple[list[str], dict[str, Path]]:
+def write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path]]:
     """Write ``transforms.json`` and its PLY; returns notes and the image folders it names."""
-    source = scene.source
+    source, points = scene.source, scene.points
     if source is not None and source.transforms_path is not None:
         names = {image.name for image in scene.images}
         content = kept_json(read_transforms(source.transforms_path), names)

@@ -56,19 +56,22 @@ def resumed_settings(begun: Mapping[str, Any] | None, asked: TrainSettings) -> T
 
     Raises:
         ParameterError: A setting is neither the run's nor the default.
-        SceneFormatError: The config is not of this version.
+        SceneFormatError: The config has none of a run's settings.
+
+    A setting that the run's version did not have yet is as that version trained: at its default.
     """
     if begun is None:
         return asked
     default, changes = TrainSettings(), {}
+    if "strategy" not in begun:
+        raise SceneFormatError(
+            "strategy in the config.json of the run",
+            found="none",
+            fix="Start again with --overwrite.",
+        )
     for field in dataclasses.fields(TrainSettings):
-        if field.name not in begun:
-            raise SceneFormatError(
-                f"{field.name} in the config.json of the run",
-                found="none",
-                fix="Start again with --overwrite.",
-            )
-        now, then = getattr(asked, field.name), begun[field.name]
+        now = getattr(asked, field.name)
+        then = begun.get(field.name, getattr(default, field.name))
         if field.name in WHERE or now == then:
             continue
         if now != getattr(default, field.name):

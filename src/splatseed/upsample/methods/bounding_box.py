@@ -6,13 +6,13 @@ xyz uniform in the axis-aligned bounding box of the originals, rgb drawn from th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 from splatseed.progress import Progress
+from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints
-from splatseed.upsample.neighbors import PreparedCloud
+from splatseed.upsample.neighbors import prepare_scene
 
 __all__ = ["BoundingBox"]
 
@@ -31,15 +31,11 @@ class BoundingBox:
         True
     """
 
-    @classmethod
-    def paper(cls) -> Self:
-        """The parameters that follow the paper to the letter: there is nothing to choose."""
-        return cls()
-
     def __call__(
-        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Make ``num_new`` points."""
+        cloud = prepare_scene(scene, progress)
         low, high = cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)
         progress("random", 0.0)
         xyz = rng.random((num_new, 3), dtype=np.float32)

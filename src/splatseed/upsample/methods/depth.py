@@ -15,8 +15,8 @@ import numpy as np
 from splatseed.depth.settings import Settings
 from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress
-from splatseed.upsample.method import NewPoints, check_fields, require
-from splatseed.upsample.neighbors import PreparedCloud
+from splatseed.scene import Scene
+from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 
 __all__ = ["Depth"]
 
@@ -28,7 +28,6 @@ class Depth(Settings):
     """Pixels lifted by depth maps (eqs. 7-9), which fills what has no texture."""
 
     name: ClassVar[str] = "depth"
-    needs_depth: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -53,9 +52,9 @@ class Depth(Settings):
         )
 
     @property
-    def needs_points(self) -> bool:
-        """Whether there must be originals: maps in scene units need none."""
-        return self.align
+    def traits(self) -> Traits:
+        """Maps in scene units need no originals to be aligned with."""
+        return Traits(frozenset({"points", "depth"} if self.align else {"depth"}))
 
     @classmethod
     def paper(cls) -> Self:
@@ -76,15 +75,15 @@ class Depth(Settings):
         )
 
     def __call__(
-        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Lift ``num_new`` pixels."""
         from splatseed.depth.lifting import lift  # noqa: PLC0415  (its kernels load with its use)
 
-        if cloud.scene is None:
+        if scene.source is None and not scene.images:
             raise SceneNotFoundError(
                 "a scene with images and depth maps for the method depth",
                 found="a cloud of points alone",
                 fix="Load the scene, and name its maps with --depth DIR.",
             )
-        return NewPoints(*lift(cloud.scene, num_new, self, rng, progress))
+        return NewPoints(*lift(scene, num_new, self, rng, progress))

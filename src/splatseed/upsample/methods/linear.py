@@ -12,9 +12,10 @@ import numpy as np
 
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress
+from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints
 from splatseed.upsample.nearest import NearestMethod
-from splatseed.upsample.neighbors import PreparedCloud, draw_bases
+from splatseed.upsample.neighbors import draw_bases, prepare_scene
 
 __all__ = ["Linear"]
 
@@ -33,9 +34,10 @@ class Linear(NearestMethod):
     """
 
     def __call__(
-        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Make ``num_new`` points."""
+        cloud = prepare_scene(scene, progress)
         neighbors, weight = self.neighborhoods(cloud, 1)
         bases = draw_bases(cloud, num_new, rng, weight=weight)
         alpha = rng.random(num_new, dtype=np.float32)

@@ -21,11 +21,12 @@ from jaxtyping import Float64
 
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress, blocks
+from splatseed.scene import Scene
 from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
 from splatseed.upsample.colors import interpolate_colors
 from splatseed.upsample.method import NewPoints, require
 from splatseed.upsample.nearest import NearestMethod
-from splatseed.upsample.neighbors import Neighbors, PreparedCloud, draw_bases
+from splatseed.upsample.neighbors import Neighbors, PreparedCloud, draw_bases, prepare_scene
 from splatseed.upsample.surfaces.frames import local_frames
 
 __all__ = ["Voronoi"]
@@ -71,9 +72,10 @@ class Voronoi(NearestMethod):
         return cls(cells="box", reject_isolated=False)
 
     def __call__(
-        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Build every cell, draw by volume, and put ``num_new`` points in the cells' balls."""
+        cloud = prepare_scene(scene, progress)
         neighbors, weight = self.neighborhoods(cloud, self.k)
         neighbors = neighbors.nearest(self.k)
         frames, _ = local_frames(cloud.xyz, neighbors.idx)

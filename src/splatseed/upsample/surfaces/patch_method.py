@@ -10,10 +10,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.progress import Progress, blocks
+from splatseed.scene import Scene
 from splatseed.upsample.colors import interpolate_colors
 from splatseed.upsample.method import NewPoints, require
 from splatseed.upsample.nearest import NearestMethod
-from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud, draw_bases
+from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud, draw_bases, prepare_scene
 from splatseed.upsample.surfaces.frames import local_frames, world_frames
 from splatseed.upsample.surfaces.patches import Patches, lift
 from splatseed.upsample.surfaces.placement import place_in_box, place_in_triangle, place_on_disc
@@ -57,9 +58,10 @@ class PatchMethod(NearestMethod, ABC):
         """Fit rows ``first:last`` and write S(u, v) of all their outputs into ``out`` [M]."""
 
     def __call__(
-        self, cloud: PreparedCloud, num_new: int, rng: np.random.Generator, progress: Progress
+        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
     ) -> NewPoints:
         """Fit a patch to every base and put ``num_new`` points on them."""
+        cloud = prepare_scene(scene, progress)
         neighbors, weight = self.neighborhoods(cloud, self.k)
         neighbors = neighbors.nearest(self.k)
         bases = draw_bases(cloud, num_new, rng, weight=weight)
