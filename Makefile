@@ -1,30 +1,51 @@
-# `make demo` and `make test` set up everything they need in .venv.
+# `make demo` and `make test` set up what they need in .venv.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
+# Python compiles what it imports when it imports it: compiling all that is installed takes longer.
+PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
+# What upsampling needs; what training needs besides; what tests need besides.
+BASE := $(VENV)/.base
+TRAIN := $(VENV)/.train
 READY := $(VENV)/.ready
 
-.PHONY: demo test quick coverage lint format bench clean
+.PHONY: demo demo-points test quick coverage lint format bench clean
 .DEFAULT_GOAL := test
 
-$(READY): pyproject.toml constraints.txt
+$(BASE): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "splatseed needs Python 3.11 or newer; set PYTHON=/path/to/python")'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade --constraint constraints.txt --editable '.[dev]'
-	touch $@
+	@echo "Installing splatseed in $(VENV) ..."
+	@$(PIP) --editable .
+	@touch $@
 
-demo: $(READY)
-	$(BIN)/splatseed demo --output demo --overwrite
+# The requirements without splatseed itself, which may be running meanwhile.
+$(TRAIN): $(BASE)
+	@echo "Installing PyTorch in $(VENV) ..."
+	@$(PIP) $$($(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["train"])')
+	@touch $@
+
+$(READY): $(BASE)
+	$(PIP) --upgrade --editable '.[dev]'
+	@touch $@ $(TRAIN)
+
+# PyTorch is installed while the first pictures are made.
+demo: $(BASE)
+	@$(MAKE) --no-print-directory --jobs 2 $(TRAIN) demo-points
+	$(BIN)/splatseed demo --output demo --training only
+
+demo-points: $(BASE)
+	$(BIN)/splatseed demo --output demo --overwrite --training later
 
 # A file's tests share what they make, so a file goes to one process.
 test: $(READY)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
 
-# The tests of the rooms that differ from BASE, without the slow ones: under 90 seconds.
-BASE ?= HEAD
+# The tests of the rooms that differ from SINCE, without the slow ones: under 90 seconds.
+SINCE ?= HEAD
 quick: $(READY)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m 'not slow' \
-	  $$($(BIN)/python tests/changed.py $(BASE))
+	  $$($(BIN)/python tests/changed.py $(SINCE))
 
 coverage: $(READY)
 	$(BIN)/python -m pytest --cov --cov-report=term

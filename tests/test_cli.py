@@ -43,7 +43,8 @@ def test_the_command_is_installed():
 
 def test_from_end_to_end(ply, tmp_path):
     run = _run("upsample", ply, "-o", tmp_path / "out", "--ratio", 2, text=True)
-    assert (run.returncode, run.stderr) == (0, "")
+    said = [line for line in run.stderr.splitlines() if not line.startswith("compiling kernels")]
+    assert (run.returncode, said) == (0, [])
     assert "600" in run.stdout
     assert (tmp_path / "out/sparse/0/points3D.bin").is_file()
     run = _run("info", tmp_path / "out", text=True)

@@ -16,6 +16,7 @@ from splatseed.console import (
     print_table,
     stage_display,
 )
+from splatseed.kernels import compilation
 
 LONG = "/".join(["a_rather_long_folder_name"] * 9)
 
@@ -42,6 +43,24 @@ def test_nothing_is_drawn_where_nobody_looks(capsys):
         clock.end_compilation()
     assert capsys.readouterr() == ("", "")
     assert list(clock.seconds()) == ["read", "compiling kernels"]
+
+
+def test_a_log_is_told_once_of_compilation_that_takes_long(capsys, monkeypatch):
+    now = iter(range(0, 1000, 10))
+    monkeypatch.setattr(console.time, "perf_counter", lambda: float(next(now)))
+    monkeypatch.setattr(console, "TOLD_AFTER", 3.0)
+    with stage_display() as clock:
+        clock("fit", 0.0)
+        for _ in range(2):
+            compilation.tell(begins=True)
+            compilation.tell(begins=False)
+    with stage_display(clock):
+        clock("write", 0.0)
+    out, err = capsys.readouterr()
+    assert out == ""
+    first, last = err.splitlines()
+    assert first.startswith("compiling kernels, ")
+    assert last == "compiling kernels took 20 s; they are kept for the next time"
 
 
 @pytest.fixture

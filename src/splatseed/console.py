@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeEl
 from rich.table import Table
 from rich.text import Text
 
+from splatseed.kernels.compilation import watched
 from splatseed.literal import visible
 
 __all__ = [
@@ -45,6 +46,8 @@ class LiteralConsole(Console):
 OUT = LiteralConsole()
 ERR = LiteralConsole(stderr=True)
 COMPILE = "compiling kernels"
+TOLD_AFTER = 3.0
+"""Seconds of compilation that a log is told of: who reads one wonders only at longer ones."""
 
 
 class StageClock:
@@ -56,6 +59,8 @@ class StageClock:
         self._started: list[tuple[str, float]] = []
         self._compiling = 0
         self._before = COMPILE
+        self._announced = False
+        self._told = 0.0
 
     def __call__(self, stage: str, fraction: float) -> None:
         """Note that ``fraction`` of ``stage`` is done."""
@@ -93,6 +98,19 @@ class StageClock:
             self._started.append((self._before, time.perf_counter()))
             if self._bar is not None and COMPILE in self._tasks:
                 self._bar.remove_task(self._tasks.pop(COMPILE))
+            if self._bar is None and not self._announced and self._compiled() > TOLD_AFTER:
+                self._announced = True
+                ERR.print(f"{COMPILE}, as the first use of each needs ...")
+
+    def tell_compilation(self) -> None:
+        """Say on stderr how long compilation took since this was last said, if it was long."""
+        since = self._compiled() - self._told
+        if since > TOLD_AFTER:
+            self._told += since
+            ERR.print(f"{COMPILE} took {since:.0f} s; they are kept for the next time")
+
+    def _compiled(self) -> float:
+        return self.seconds().get(COMPILE, 0.0)
 
     @contextmanager
     def shown_on(self, bar: Bar) -> Iterator[None]:
@@ -115,6 +133,7 @@ def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
     if not ERR.is_terminal:
         with _compilation_shown(clock):
             yield clock
+        clock.tell_compilation()
         return
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with (
@@ -123,22 +142,12 @@ def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
         _compilation_shown(clock),
     ):
         yield clock
+    clock.tell_compilation()
 
 
-@contextmanager
-def _compilation_shown(clock: StageClock) -> Iterator[None]:
-    """Tell the clock of Numba's compilations, which make a first run slow."""
-    from numba.core import event  # noqa: PLC0415  (only commands that compute pay for Numba)
-
-    class _Listener(event.Listener):
-        def on_start(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
-            clock.begin_compilation()
-
-        def on_end(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
-            clock.end_compilation()
-
-    with event.install_listener("numba:compile", _Listener()):
-        yield
+def _compilation_shown(clock: StageClock) -> AbstractContextManager[None]:
+    """Tell the clock of compilations, which make a first run slow."""
+    return watched(lambda begins: clock.begin_compilation() if begins else clock.end_compilation())
 
 
 def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:

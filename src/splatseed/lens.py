@@ -9,19 +9,37 @@ Promise: float64; pure functions of arrays of any shape.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
+from splatseed.literal import quoted
 
-__all__ = ["distort", "fold_radius", "image_points", "rays_through"]
+__all__ = ["distort", "fold_radius", "image_points", "rays_through", "undistort_first"]
 
 DIRECTIONS, STEPS = 8, 1024
 """Rays along which a fold is looked for, and places on each."""
 TRIES, DIFFERENCE, ARRIVED = 30, 1e-6, 1e-9
 """Newton's method: its steps, the differences that slopes are from, and how near is there."""
+
+
+def undistort_first(scene: Path | None) -> str:
+    """What to tell the user of a scene that must have no distortion.
+
+    Args:
+        scene: Its folder; None if that is not known.
+
+    Example:
+        >>> undistort_first(Path("my scene"))
+        "Undistort the scene first: splatseed undistort 'my scene' -o 'my scene_undistorted'."
+    """
+    if scene is None:
+        return "Undistort the scene first: splatseed undistort SCENE -o OUT."
+    output = scene.with_name(f"{scene.resolve().name}_undistorted")
+    return f"Undistort the scene first: splatseed undistort {quoted(scene)} -o {quoted(output)}."
 
 
 def image_points(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:

@@ -18,6 +18,9 @@ INSTALL = {
     "onnxruntime": "onnxruntime>=1.19",
     "OpenEXR": "OpenEXR>=3.3",
     "ray": "ray>=2.40",
+    "imageio_ffmpeg": "imageio-ffmpeg>=0.6",
+    "viser": "viser>=1.1",
+    "zstandard": "zstandard>=0.22",
 }
 """What to ask pip for, as in pyproject.toml: extras of splatseed itself can only be had from its
 folder."""

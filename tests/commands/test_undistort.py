@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
+import shutil
 
 import numpy as np
 import pytest
@@ -54,6 +56,19 @@ def test_a_distorted_scene_becomes_one_of_pinholes(layout, distorted, tmp_path, 
     again = splatseed("undistort", path, "-o", out)
     assert (again.code, "--overwrite" in again.err) == (2, True)
     assert [each.name for each in tmp_path.iterdir() if each.name.startswith(".")] == []
+
+
+def test_train_prints_the_command_that_mends_the_scene(distorted, tmp_path, splatseed, monkeypatch):
+    pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
+    path = shutil.copytree(distorted, tmp_path / "my scene", symlinks=True)
+    monkeypatch.chdir(tmp_path)
+    run = splatseed("train", "my scene", "-o", "run", "--max-steps", 2)
+    command = "splatseed undistort 'my scene' -o 'my scene_undistorted'"
+    assert (run.code, command in run.err) == (2, True), run.err
+    run = splatseed(*shlex.split(command)[1:])
+    assert run.code == 0, run
+    assert not (tmp_path / "run").exists()
+    assert path.exists()
 
 
 def test_a_missing_photograph_is_named(distorted, tmp_path, splatseed):

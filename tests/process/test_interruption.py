@@ -8,8 +8,8 @@ import signal
 import pytest
 
 from splatseed.cli import main
-from splatseed.commands import train
 from splatseed.commands.bench import command as bench
+from splatseed.commands.train import command as train
 from splatseed.process.interruption import exit_code, interruption
 
 

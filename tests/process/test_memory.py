@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,8 @@ from splatseed.io import load_scene
 from splatseed.monocular import estimate
 from splatseed.pointcloud import PointCloud
 from splatseed.process import memory
+from splatseed.stereo import StereoSettings, stereo_depths
+from splatseed.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.device import BYTES_EACH as BYTES_TRAINED
 from splatseed.upsample import BYTES_EACH, number_of_new, upsample
@@ -48,6 +52,19 @@ def test_photographs_of_a_scene(free, scene):
     with pytest.raises(ParameterError, match=r"found 4 of 60 x 40.*--data-factor"):
         load_views(scene, scene.images)
     assert len(load_views(scene, scene.images, data_factor=2)) == 4
+
+
+def test_what_stereo_holds_beside_photographs(free, scene):
+    views = load_views(scene, scene.images)
+    pixels, threads = 4 * 60 * 40, min(os.cpu_count() or 1, 4)
+    free(pixels + pixels * BYTES_A_DEPTH + threads * 60 * 40 * 4 * 4)
+    check_stereo_memory(views, StereoSettings(grid=1))
+    free(pixels * BYTES_A_DEPTH)
+    with pytest.raises(ParameterError, match=r"found 9,600, at a grid of 1.*larger grid"):
+        check_stereo_memory(views, StereoSettings(grid=1))
+    with pytest.raises(ParameterError, match="at a grid of 1"):
+        stereo_depths(scene, grid=1)
+    check_stereo_memory(views, StereoSettings(grid=4))
 
 
 def test_a_batch_for_a_network(free):

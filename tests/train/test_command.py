@@ -6,12 +6,15 @@ import importlib.util
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
 from splatseed import requirements
 from splatseed.cli import main
+from splatseed.commands.train import Options
 from splatseed.errors import MissingDependencyError
+from splatseed.train.record.config import resumed_settings
 
 
 def _run(*words):
@@ -46,6 +49,26 @@ def test_a_budget_is_gaussians_per_pixel_as_trained(room_path, tmp_path, capsys)
     assert _run(*words, "--budget", "0.25rho") == 0
     assert json.loads((run / "config.json").read_text())["cap_max"] == 48 * 36 // 4
     assert json.loads((run / "metrics.json").read_text())["num_gaussians"] <= 48 * 36 // 4
+
+
+def test_without_a_strategy_the_length_of_the_run_says_which(room_path, tmp_path, capsys):
+    run = tmp_path / "run"
+    words = (room_path, "--max-steps", "3", "--data-factor", "2", "-o", run)
+    assert _run(*words) == 0
+    said = capsys.readouterr().out
+    assert "auto (grow)" in said
+    assert f"At most {48 * 36:,} Gaussians" in said
+    config = json.loads((run / "config.json").read_text())
+    assert (config["strategy"], config["cap_max"]) == ("auto", 48 * 36)
+    for strategy in ("none", "default"):
+        assert _run(*words, "--strategy", strategy, "--overwrite") == 0
+        config = json.loads((run / "config.json").read_text())
+        assert (config["strategy"], config["cap_max"]) == (strategy, None)
+        # Where nothing is named, a run goes on as it began.
+        asked = Options(room_path, run, resume=True).settings
+        assert resumed_settings(config, replace(asked, max_steps=3, data_factor=2)) == replace(
+            asked, strategy=strategy, seeding="auto", max_steps=3, data_factor=2
+        )
 
 
 def test_a_plain_scene_is_seeded_first_unless_it_is_to_stay(room_path, tmp_path, capsys):

@@ -17,7 +17,7 @@ from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
 from splatseed.splat.ply import read_gaussians
-from splatseed.train import device, trainer
+from splatseed.train import device, run as run_module, trainer
 from splatseed.train.averaging import add_to_mean
 from splatseed.train.parameters import gaussians_of
 from splatseed.train.run import RunOptions, prepare_run
@@ -366,3 +366,34 @@ def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(begin, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ParameterError, match="--backend cpu"):
         begin(backend="cuda")
+
+
+def test_a_disk_that_is_full_among_the_results_leaves_none(begin, monkeypatch):
+    run = begin(max_steps=30)
+    run.train()
+    before = sorted(run.folder.path.rglob("*"))
+    write = run_module.write_picture
+
+    def disk_full(path, picture):
+        write(path, picture)
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_module, "write_picture", disk_full)
+        with pytest.raises(OutputError, match=r"No space left.*--resume"):
+            run.finish(_score)
+    assert sorted(run.folder.path.rglob("*")) == before
+    run.finish(_score)
+    assert run.folder.gaussians.is_file()
+
+
+def test_a_run_keeps_a_checkpoint_before_its_first_step(begin, monkeypatch):
+    run = begin(max_steps=30)
+    before = _bytes(run)
+    monkeypatch.delattr(trainer.Trainer, "_advance")  # so that the first step fails
+    with pytest.raises(AttributeError):
+        run.train()
+    assert run.folder.checkpoint.is_file()
+    resumed = begin(options=RESUME, max_steps=30)
+    assert resumed.state.step == 0
+    assert _bytes(resumed) == before

@@ -53,6 +53,14 @@ def test_enough_photographs_are_seen_between_densifications(steps, default, mcmc
     assert make_schedule("mcmc", steps, as_3dgs=False).refine_every == mcmc
 
 
+@pytest.mark.parametrize(("steps", "named"), [(1500, "grow"), (30_000, "mcmc")])
+def test_auto_is_the_best_strategy_for_so_many_steps(steps, named):
+    auto = TrainSettings(strategy="auto", max_steps=steps)
+    assert auto.densification == named
+    assert auto.schedule == TrainSettings(strategy=named, max_steps=steps).schedule
+    assert auto.cap == TrainSettings(strategy=named).cap
+
+
 @pytest.mark.parametrize(
     ("steps", "every"), [(10, 20), (40, 20), (300, 20), (1500, 100), (30_000, 2000)]
 )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from splatseed.commands.models import config_of, model_file
 from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import (
@@ -19,7 +20,6 @@ from splatseed.errors import (
 )
 from splatseed.io.output.staging import atomic_file, check_output, output_folder
 from splatseed.requirements import require
-from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Backend, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 
@@ -41,7 +41,8 @@ class Options:
     """Score a trained model on the test views of its scene: PSNR, SSIM, LPIPS."""
 
     model: Annotated[Path, tyro.conf.Positional]
-    """The folder of a run of splatseed train, or a .ply of Gaussians from any trainer."""
+    """The folder of a run of splatseed train, or a file of Gaussians from any trainer: .ply, .spz,
+    .sog, .splat."""
     scene: PathOrNone = None
     """The scene that the model is of, in the same world; a run knows its own."""
     data_factor: CountOrNone = None
@@ -100,7 +101,7 @@ def run(arguments: list[str]) -> None:
 
 def _task(options: Options) -> _Task:
     """The files and settings, from a run's config where the options do not say."""
-    path, config = options.model, _config(options.model)
+    path, gaussians, config = options.model, model_file(options.model), config_of(options.model)
     scene = options.scene or config.get("scene")
     if not isinstance(scene, str | Path):
         raise ParameterError(
@@ -109,27 +110,10 @@ def _task(options: Options) -> _Task:
             fix="Pass --scene SCENE: the scene that it was trained on.",
         )
     return _Task(
-        gaussians=RunFolder(path).gaussians if path.is_dir() else path,
+        gaussians=gaussians,
         scene=Path(scene),
         data_factor=_whole("data_factor", options.data_factor, config, least=1),
         test_every=_whole("test_every", options.test_every, config, least=2),
-    )
-
-
-def _config(path: Path) -> Mapping[str, Any]:
-    """The config of a run that has finished; nothing for a single file."""
-    if path.is_file():
-        return {}
-    folder = RunFolder(path)
-    if path.is_dir() and folder.is_run and folder.gaussians.is_file():
-        return folder.read_config()
-    found = "nothing there"
-    if path.is_dir():
-        found = "a run that has not finished" if folder.is_run else "a folder that is no run"
-    raise SceneNotFoundError(
-        f"{path} to be a finished run of splatseed train, or a .ply of Gaussians",
-        found=found,
-        fix="Name the .ply itself, or go on with the run: splatseed train SCENE -o RUN --resume.",
     )
 
 

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_commands, print_note, print_pairs, stage_display
+from splatseed.errors import ParameterError
 from splatseed.io import load_scene
+from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
 from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, triangulate
+from splatseed.sfm.video import is_video, pick_frames
 
 __all__ = ["run"]
 
@@ -24,15 +28,20 @@ class Options:
     """Make a scene from photographs: poses and points, undistorted, ready to upsample."""
 
     images: Annotated[Path, tyro.conf.Positional]
-    """The folder of photographs."""
+    """The folder of photographs, or a video, of which sharp and spread frames are taken."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     poses_from: Annotated[
         Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
     ] = None
     """A scene whose poses and intrinsics are kept, so that only points are triangulated."""
-    matcher: MatcherName = "exhaustive"
+    matcher: Annotated[
+        MatcherName | None,
+        tyro.conf.arg(help_behavior_hint="(default: exhaustive; sequential for a video)"),
+    ] = None
     """Compare every pair of images, or (for a video) each with its successors."""
+    frames: int = 150
+    """Most frames that are taken of a video."""
     camera_model: str = "OPENCV"
     """COLMAP's model of the lens; not used with --poses-from."""
     shared_camera: bool = True
@@ -56,13 +65,34 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "sfm", arguments)
     with stage_display() as clock:
         clock("prepare", 0.0)
-        report = _reconstruct(options, clock)
+        if is_video(options.images):
+            report = _of_video(options, clock)
+        else:
+            report = _reconstruct(options, options.images, clock)
     _summarise(options, report)
 
 
-def _reconstruct(options: Options, clock: StageClock) -> SfmReport:
+def _of_video(options: Options, clock: StageClock) -> SfmReport:
+    """Take frames, and go on with them as with photographs; the scene keeps those with a pose."""
+    if options.poses_from is not None:
+        fix = "Leave one out, or name the folder of the photographs that have the poses."
+        raise ParameterError("a video or --poses-from", found="both", fix=fix)
+    check_output(options.output, kind="sfm", overwrite=options.overwrite, protect=[options.images])
+    with TemporaryDirectory(prefix="splatseed-frames-") as name:
+        folder = Path(name)
+        picked = pick_frames(options.images, folder, options.frames, clock)
+        report = _reconstruct(options, folder, clock)
+    print_note(
+        f"{len(picked.numbers)} of the video's {picked.total:,} frames were taken, in which the "
+        "picture moves"
+        f" by {picked.way:.1f} times its width."
+    )
+    return report
+
+
+def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport:
     common: dict[str, Any] = {
-        "matcher": options.matcher,
+        "matcher": options.matcher or ("sequential" if is_video(options.images) else "exhaustive"),
         "device": options.device,
         "max_image_size": options.max_image_size,
         "seed": options.seed,
@@ -73,14 +103,14 @@ def _reconstruct(options: Options, clock: StageClock) -> SfmReport:
     }
     if options.poses_from is None:
         return reconstruct(
-            options.images,
+            images,
             options.output,
             camera_model=options.camera_model,
             shared_camera=options.shared_camera,
             **common,
         )
     poses = load_scene(options.poses_from, require_points=False)
-    return triangulate(options.images, poses, options.output, **common)
+    return triangulate(images, poses, options.output, **common)
 
 
 def _summarise(options: Options, report: SfmReport) -> None:

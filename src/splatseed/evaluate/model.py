@@ -29,13 +29,13 @@ from splatseed.evaluate.world import (
     find_transform,
     view_in,
 )
+from splatseed.export import read_model
 from splatseed.io import load_scene
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.splat.frame import TrainingFrame, training_frame
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.pictures import beside_truth, picture_name, write_picture
-from splatseed.splat.ply import read_gaussians
 from splatseed.splat.rendering import render_view
 from splatseed.views.view import View, load_views, poses_of
 
@@ -78,7 +78,7 @@ def load_model(
     """Read Gaussians that any trainer wrote, and the test views of the scene that they are of.
 
     Args:
-        path: The .ply.
+        path: A file of Gaussians in any format that ``export.read_model`` reads.
         scene_path: The scene.
         data_factor: By how much photographs are made smaller.
         test_every: Every n-th image, sorted by name, is a test view.
@@ -94,7 +94,7 @@ def load_model(
             not where the scene's points are.
         ParameterError: The transform cannot be computed.
     """
-    gaussians = read_gaussians(path)
+    gaussians = read_model(path)
     scene = load_scene(scene_path, require_points=False)
     train, test = scene.split(test_every)
     if not train or not test:

@@ -48,10 +48,10 @@ def _left_out_notes(points: PointCloud, left: LeftOut) -> list[str]:
     if left.non_finite:
         what = "point is" if left.non_finite == 1 else "points are"
         which = "beyond 1e15" if np.isfinite(points.xyz).all() else "not finite"
-        notes.append(f"{left.non_finite:,} {what} {which}, and left out.")
+        notes.append(f"{left.non_finite:,} {what} {which} and were left out.")
     if left.duplicates:
         what = "point repeats" if left.duplicates == 1 else "points repeat"
-        notes.append(f"{left.duplicates:,} {what} the position of another, and left out.")
+        notes.append(f"{left.duplicates:,} {what} the position of another and were left out.")
     return notes
 
 

@@ -17,8 +17,9 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import config
+from numba.core import config, event
 
+from splatseed.kernels.compilation import tell
 from splatseed.kernels.sources import source_digest
 
 __all__ = ["always_inline", "inline", "kernel", "parallel_range"]
@@ -26,6 +27,19 @@ __all__ = ["always_inline", "inline", "kernel", "parallel_range"]
 # TBB, where a distribution ships it, can hang at interpreter exit; a user's own choice stands.
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]  # absent from Numba's stubs
+
+
+class _Teller(event.Listener):
+    """Hands Numba's events on."""
+
+    def on_start(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
+        tell(begins=True)
+
+    def on_end(self, event: object) -> None:  # noqa: ARG002
+        tell(begins=False)
+
+
+event.register("numba:compile", _Teller())  # type: ignore[no-untyped-call]
 
 parallel_range = numba.prange
 

@@ -17,7 +17,7 @@ from jaxtyping import Float32
 from splatseed.errors import SceneFormatError
 from splatseed.io.binary import ByteReader
 from splatseed.io.output.staging import atomic_file
-from splatseed.io.ply.foreign import refuse_foreign, refuse_packed
+from splatseed.io.ply.foreign import refuse_packed
 from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, parse_header
 from splatseed.splat.gaussians import Gaussians
 
@@ -68,7 +68,6 @@ def read_gaussians(path: Path) -> Gaussians:
         SceneNotFoundError: There is no such file.
         SceneFormatError: It is no PLY, is cut short, or does not hold Gaussians.
     """
-    refuse_foreign(path)
     reader = ByteReader(path, EXPORT_PLY_AGAIN)
     header = parse_header(path, reader.data)
     for element in header.elements:

@@ -6,11 +6,13 @@ beforehand and the seed alone: threads take whole views.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
+from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, in_threads
 from splatseed.stereo.consistency import confirm
 from splatseed.stereo.patchmatch import Pictures, begin, sweep
@@ -20,10 +22,36 @@ from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import Hints, first_planes
 from splatseed.views.view import View
 
-__all__ = ["make_pictures", "match_views", "other_from_view"]
+__all__ = ["check_stereo_memory", "make_pictures", "match_views", "other_from_view"]
+
+BYTES_A_DEPTH = 3 * 4 + 4 + 1
+"""A plane, its cost, and who agrees."""
 
 Found = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
 Grey = UInt8[np.ndarray, "H W"]
+
+
+def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None:
+    """Refuse what stereo cannot hold beside the photographs.
+
+    These are: all photographs in grey, what is found at each pixel of the grid, and for each thread
+    the quads (4 bytes a pixel) of the view it is at and of the views that this one is compared
+    with.
+
+    Raises:
+        ParameterError: It does not fit the memory.
+    """
+    grid, sizes = settings.grid, [view.width * view.height for view in views]
+    depths = sum((view.width // grid) * (view.height // grid) for view in views)
+    threads = min(os.cpu_count() or 1, len(views))
+    quads = threads * max(sizes) * 4 * (1 + min(settings.num_sources, len(views) - 1))
+    check_memory(
+        depths,
+        BYTES_A_DEPTH + -(-(sum(sizes) + quads) // max(depths, 1)),
+        "depths found at once",
+        found=f"{depths:,}, at a grid of {grid} in {len(views)} photographs",
+        fix="Choose a larger grid, smaller or fewer photographs, or free some memory.",
+    )
 
 
 def match_views(
@@ -44,6 +72,7 @@ def match_views(
         seed: The same seed gives the same bytes.
         progress: Told how far it is.
     """
+    check_stereo_memory(views, settings)
     greys = [grey_image(view.image) for view in views]
     found: list[Found] = [None] * len(views)  # type: ignore[list-item]  # filled in below
 

@@ -161,7 +161,7 @@ class TrainingRun:
         self._frame = frame
         self._board = board
         self._saved = time.monotonic()
-        self._saved_step: int | None = None
+        self._saved_step = state.step or None
         train, test = ([frame.view(view) for view in part] for part in views)
         self.trainer = Trainer(state, settings, train, test, self._on_record)
 
@@ -188,6 +188,8 @@ class TrainingRun:
             OutputError: The checkpoint or the curve cannot be written.
         """
         with self._told_of_checkpoint():
+            if self._saved_step is None:
+                self._save()  # better now than after hours, if the disk has no room
             done = self.trainer.run(on_step)
             if self._board:
                 self._board.close()
@@ -214,12 +216,13 @@ class TrainingRun:
         progress("score", 0.0)
         scores = score(self.trainer.render, self.trainer.test_views)
         world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
-        write_gaussians(self.folder.gaussians, world)
-        self._write_curve()
-        write_curve_png(self.folder.curve_png, self.state.records)
-        self._write_renders(progress)
         metrics = {**scores, **self._facts()}
-        write_json(self.folder.metrics, metrics)
+        with self.folder.results() as staged:
+            write_gaussians(staged.gaussians, world)
+            write_curve_csv(staged.curve_csv, self.state.records)
+            write_curve_png(staged.curve_png, self.state.records)
+            self._write_renders(staged, progress)
+            write_json(staged.metrics, metrics)
         self.folder.checkpoint.unlink(missing_ok=True)
         return metrics
 
@@ -274,13 +277,13 @@ class TrainingRun:
     def _write_curve(self) -> None:
         write_curve_csv(self.folder.curve_csv, self.state.records)
 
-    def _write_renders(self, progress: Progress) -> None:
+    def _write_renders(self, staged: RunFolder, progress: Progress) -> None:
         views = self.trainer.test_views
-        paths = [self.folder.renders / picture_name(view.name) for view in views]
-        self.folder.claim(paths)
-        for i, (view, path) in enumerate(zip(views, paths, strict=True)):
+        names = [picture_name(view.name) for view in views]
+        self.folder.claim([self.folder.renders / name for name in names])
+        for i, (view, name) in enumerate(zip(views, names, strict=True)):
             picture = beside_truth(view.image, self.trainer.render(view).cpu().numpy())
-            write_picture(path, picture)
+            write_picture(staged.renders / name, picture)
             progress("write", (i + 1) / len(views))
 
 

@@ -16,13 +16,18 @@ from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_sch
 
 __all__ = ["AS_3DGS", "BUDGET", "BYTES_EACH", "Backend", "Seeding", "StrategyName", "TrainSettings"]
 
-StrategyName = Literal["default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"]
+StrategyName = Literal[
+    "auto", "default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"
+]
 Backend = Literal["auto", "cpu", "cuda"]
 Seeding = Literal["auto", "scene"]
 
 BUDGET = 1_000_000
 """Most Gaussians of the strategies that have a budget, where none is given."""
 AS_3DGS = "-3dgs"
+
+LONG_RUN = 4000
+"""Steps from which on strategy ``auto`` is ``mcmc``: its noise pays off late (see benchmarks)."""
 
 BYTES_EACH = 2000
 """Memory of a Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
@@ -42,9 +47,10 @@ class TrainSettings:
     """
 
     strategy: StrategyName = "default"
-    """Densify as 3DGS does, grow within a budget where renders are wrong, densify as MCMC does up
-    to a cap, or keep the number of seeds; -3dgs: in 3DGS's own conventions of rates, sizes and
-    schedules, to compare with published numbers."""
+    """Densify as 3DGS does (default), grow within a budget where renders are wrong, densify as MCMC
+    does up to a cap, keep the number of seeds, or take grow in short runs and mcmc in long ones
+    (auto); -3dgs: in 3DGS's own conventions of rates, sizes and schedules, to compare with
+    published numbers."""
     max_steps: int = FULL_RUN
     """Training steps; schedules and learning rates are adapted to them."""
     data_factor: int = 1
@@ -97,7 +103,9 @@ class TrainSettings:
 
     @property
     def densification(self) -> Densification:
-        """The strategy, whatever the conventions."""
+        """The strategy, whatever the conventions; of ``auto`` the one for so many steps."""
+        if self.strategy == "auto":
+            return "mcmc" if self.max_steps >= LONG_RUN else "grow"
         return cast("Densification", self.strategy.removesuffix(AS_3DGS))
 
     @property

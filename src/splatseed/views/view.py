@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import open_photograph, photograph_bytes
+from splatseed.lens import undistort_first
 from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
@@ -153,7 +154,7 @@ def load_views(
     """
     folder = _image_folder(scene)
     for image in images if not undistort else ():
-        check_lens(image)
+        check_lens(image, scene.source.root if scene.source else None)
     if images:
         _check_memory(folder / images[0].name, len(images), max(data_factor, 1))
     read = partial(
@@ -190,8 +191,12 @@ def _image_folder(scene: Scene) -> Path:
     return folder
 
 
-def check_lens(image: Image) -> None:
+def check_lens(image: Image, scene: Path | None = None) -> None:
     """Refuse an image whose camera has lens distortion.
+
+    Args:
+        image: The image.
+        scene: The folder of its scene, for the command that mends it.
 
     Raises:
         SceneFormatError: It has.
@@ -200,7 +205,7 @@ def check_lens(image: Image) -> None:
         raise SceneFormatError(
             "cameras without lens distortion (PINHOLE), which Gaussians are drawn with",
             found=f"{image.intrinsics.model} for {image.name}",
-            fix="Undistort the scene first: splatseed undistort SCENE -o OUT.",
+            fix=undistort_first(scene),
         )
 
 

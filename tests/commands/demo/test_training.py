@@ -17,18 +17,20 @@ WORDS = ("demo", "--views", "4", "--ratio", "2", "--no-preview")
 def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
     pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
     out = tmp_path / "demo"
-    run = splatseed(*WORDS, "--preview", "-o", out, "--train-steps", "8")
+    run = splatseed(*WORDS, "--preview", "-o", out, "--train-steps", "44")
     assert run.code == 0, run
+    seeded = json.loads((out / "scene_auto/splatseed.json").read_text())
     counts = {}
     for name in ("sfm", "auto"):
         metrics = json.loads((out / f"run_{name}/metrics.json").read_text())
         config = json.loads((out / f"run_{name}/config.json").read_text())
-        assert metrics["steps"] == 8
-        assert config["strategy"] == "none"
+        assert metrics["steps"] == 44
+        assert config["strategy"] == "grow"
+        assert config["cap_max"] == seeded["num_points"]
         counts[name] = metrics["num_gaussians"]
         assert f"{metrics['psnr']:.2f}" in run.out
-    assert counts["auto"] > counts["sfm"]
-    assert "8 steps" in run.out  # when the SfM run reached its own last PSNR
+    assert counts["auto"] == seeded["num_points"]
+    assert seeded["num_original"] < counts["sfm"] <= counts["auto"]  # a round adds half at most
     assert "no error bars" in run.out
     with Image.open(out / "preview_trained.png") as file:
         pixels = np.asarray(file)
@@ -38,6 +40,16 @@ def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
     again = splatseed("evaluate", out / "run_auto")
     assert again.code == 0, again
     assert f"{metrics['psnr']:.2f}" in again.out
+
+
+@pytest.mark.parametrize(("seconds", "psnr"), [(2.4, None), (2.5, 20.0), (9.9, 22.0)])
+def test_psnr_after_some_seconds_counts_those_of_the_seeds(seconds, psnr):
+    training = pytest.importorskip("splatseed.commands.demo.training", reason="needs PyTorch")
+    tests = [{"seconds": 0.5, "psnr": 20.0}, {"seconds": 1.5, "psnr": 22.0}]
+    arm = training.Arm("auto", None, None, seconds=2.0)
+    each = training.TrainedArm(arm, {"tests": tests, "train_seconds": 1.5}, None, None)
+    assert training.psnr_after(seconds, each) == psnr
+    assert training.total_seconds(each) == 3.5
 
 
 def test_without_pytorch_the_demo_says_what_to_install(splatseed, tmp_path, monkeypatch):

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("fcntl")
 
-from splatseed.io.output.staging import output_folder
+from splatseed.io.output.staging import atomic_file, output_folder
 
 
 @pytest.fixture
@@ -63,3 +63,27 @@ def test_what_is_being_written_is_not_removed(tmp_path):
             raise KeyboardInterrupt
         assert (first / "file").exists()
     assert (tmp_path / "out/file").exists()
+
+
+def test_a_leftover_file_is_removed_and_told_of(tmp_path, caplog):
+    leftover = tmp_path / ".curve.csv.partial-0123abcd.csv"
+    leftover.touch()
+    _age(leftover)
+    mine = [tmp_path / ".curve.csv.partial-mine.csv", tmp_path / ".other.csv.partial-0123abcd.csv"]
+    for path in mine:
+        path.touch()
+        _age(path)
+    with caplog.at_level(logging.WARNING), atomic_file(tmp_path / "curve.csv") as partial:
+        partial.write_text("1")
+    assert caplog.messages == [f"Removed {leftover}, which a run left that was killed."]
+    assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "curve.csv", *mine])
+
+
+def test_a_file_that_is_being_written_is_not_removed(tmp_path):
+    with atomic_file(tmp_path / "a.txt") as first:
+        first.write_text("first")
+        _age(first)
+        with atomic_file(tmp_path / "a.txt") as second:
+            second.write_text("second")
+        assert first.exists()
+    assert (tmp_path / "a.txt").read_text() == "first"

@@ -110,13 +110,39 @@ def test_an_output_in_an_output_has_its_own_list(output):
 
 
 @pytest.mark.parametrize(
-    "name", ["images_2_png/left/a.png", ".points.partial-0123abcd", ".a.partial-0123abcd.pt"]
+    "name",
+    [
+        "images_2_png/left/a.png",
+        ".points.partial-0123abcd",
+        ".a.partial-0123abcd.pt",
+        ".results.partial-0123abcd/renders/a.png",
+    ],
 )
 def test_what_can_be_made_again_is_in_nobodys_way(output, name):
     (output / name).parent.mkdir(parents=True, exist_ok=True)
     (output / name).touch()
     overwrite(output)
     assert not (output / name).exists()
+
+
+@pytest.mark.parametrize("copy", [False, True])
+def test_smaller_copies_that_nerfstudio_makes_are_in_nobodys_way(scene_dir, tmp_path, copy):
+    (scene_dir / "images").mkdir(exist_ok=True)
+    scene = load_scene(scene_dir)
+    for image in scene.images:
+        (scene_dir / "images" / image.name).parent.mkdir(parents=True, exist_ok=True)
+        (scene_dir / "images" / image.name).touch()
+    output = write_scene(load_scene(scene_dir), tmp_path / "out", copy_images=copy).path
+    for factor in (2, 4, 8):
+        small = output / f"images_{factor}" / scene.images[0].name
+        small.parent.mkdir(parents=True)
+        small.touch()
+    overwrite(output)
+    assert not (output / "images_2").exists()
+    (output / "images_2").mkdir()
+    (output / "images_2/mine.png").touch()
+    with pytest.raises(OutputError, match=r"images_2/mine\.png"):
+        overwrite(output)
 
 
 def test_files_may_be_listed_later(output):

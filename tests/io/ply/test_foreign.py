@@ -1,4 +1,4 @@
-"""Formats that are not read are named, with what converts them."""
+"""Files of trained Gaussians that are named as a scene are known for what they are."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ end_header
 
 
 @pytest.mark.parametrize("suffix", [".spz", ".splat", ".ksplat", ".sog", ".SPZ"])
-def test_a_format_that_is_not_read_is_named(suffix, tmp_path):
+def test_a_model_that_is_no_scene_is_named(suffix, tmp_path):
     path = tmp_path / f"model{suffix}"
     path.write_bytes(b"\x1f\x8b")
-    with pytest.raises(SceneFormatError, match=r"found Gaussians .*does not read.*splat-transform"):
+    with pytest.raises(SceneFormatError, match=r"found Gaussians .*a trained model. Score it"):
         load_scene(path)
 
 
@@ -32,11 +32,3 @@ def test_a_compressed_ply_is_named(tmp_path):
     path.write_bytes(PACKED.encode() + bytes(4 + 256 * 8))
     with pytest.raises(SceneFormatError, match=r"PlayCanvas's .compressed.ply"):
         read_ply(path)
-
-
-def test_evaluate_names_them_too(tmp_path):
-    ply = pytest.importorskip("splatseed.splat.ply")
-    for name, content in (("a.splat", b""), ("a.ply", PACKED.encode())):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(SceneFormatError, match=r"found Gaussians .*does not read"):
-            ply.read_gaussians(tmp_path / name)

@@ -98,7 +98,7 @@ def survey(
     scene = open_scene(path, images=images)
     folder = _photographs(scene, path)
     for image in scene.images:
-        check_lens(image)
+        check_lens(image, path)
     first = folder / scene.images[0].name
     size = open_photograph(first, photograph_bytes(first)).size
     maps = _depth_folder(scene, depth) if with_depth else None

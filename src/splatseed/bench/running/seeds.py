@@ -14,6 +14,7 @@ from pathlib import Path
 
 from splatseed.bench.planning.records import SFM, RunSpec
 from splatseed.bench.planning.scenes import open_scene
+from splatseed.kernels.compilation import watched
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -60,19 +61,16 @@ def make_seeds(
 @contextmanager
 def _compilation() -> Iterator[list[float]]:
     """A list that gets the seconds of each of Numba's compilations while the block runs."""
-    from numba.core import event  # noqa: PLC0415  (loads with what is compiled)
-
     spans: list[float] = []
     running: list[float] = []
 
-    class _Listener(event.Listener):
-        def on_start(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
+    def watch(begins: bool) -> None:
+        if begins:
             running.append(time.perf_counter())
+            return
+        begun = running.pop()
+        if not running:  # else it is a part of the one that it came into
+            spans.append(time.perf_counter() - begun)
 
-        def on_end(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
-            begun = running.pop()
-            if not running:  # else it is a part of the one that it came into
-                spans.append(time.perf_counter() - begun)
-
-    with event.install_listener("numba:compile", _Listener()):
+    with watched(watch):
         yield spans

@@ -1,60 +1,39 @@
 """``splatseed demo``: the main job from end to end, on a capture whose truth is known.
 
 It photographs a made-up room, finds points as Structure-from-Motion would, writes them as a COLMAP
-scene, reads that back, upsamples it by every method, and measures how far the new points lie from
-the true surfaces and how well they cover them. Then, where PyTorch and gsplat are installed, it
-trains for a short while from the points as found and from the upsampled ones, and compares.
+scene, reads that back, upsamples it and shows the result. Then it does so by every method, and
+measures how far the new points lie from the true surfaces and how well they cover them. Then, where
+PyTorch and gsplat are installed, it trains for a short while from the points as found and from the
+upsampled ones, and compares. What has to be compiled is compiled by a second process ahead of the
+first.
 """
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 import tyro
 
+from splatseed.commands.demo.kernels import TRAINING, KernelsAhead, kernels_ahead, wait
+from splatseed.commands.demo.methods import SHOWN
 from splatseed.commands.options import parse_options
-from splatseed.console import (
-    StageClock,
-    print_commands,
-    print_note,
-    print_pairs,
-    print_table,
-    stage_display,
-)
-from splatseed.diagnostics.geometry import GeometryScore, measure, spacing
-from splatseed.errors import MissingDependencyError, ParameterError
-from splatseed.io import find_depths, load_scene, write_scene
-from splatseed.io.output.staging import add_files, atomic_file, output_folder
+from splatseed.console import print_commands, print_note, print_pairs, print_table, stage_display
+from splatseed.errors import MissingDependencyError, OutputError, ParameterError
+from splatseed.io.output.manifest import MANIFEST, kind_of
+from splatseed.io.output.staging import add_files
 from splatseed.literal import quoted
-from splatseed.pointcloud import PointCloud
-from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
 from splatseed.requirements import require
-from splatseed.scene import Scene
-from splatseed.synthetic import Capture, make_capture, write_capture
-from splatseed.upsample import (
-    METHODS,
-    chooses_number,
-    configure,
-    methods_for,
-    planned_size,
-    upsample,
-)
+from splatseed.upsample import planned_size
 
 if TYPE_CHECKING:  # importing PyTorch takes a while, and it may be absent
     from splatseed.commands.demo.training import TrainedArm
 
 __all__ = ["Options", "run"]
 
-SHOWN = "auto"
-TEST_EVERY = 8
-"""Photographs kept for the test of what is trained: no method looks at them."""
-SAMPLES = 20_000
-"""Places on the surfaces at which coverage is taken."""
 TRAINED_PICTURE = "preview_trained.png"
 
 
@@ -72,6 +51,9 @@ class Options:
     """The same seed gives the same demo."""
     train_steps: int = 500
     """Training steps from each of two sets of seeds; 0 for no training."""
+    training: Literal["now", "later", "only"] = "now"
+    """When to train: now, at the end; later, when PyTorch is being installed meanwhile; only, in a
+    demo folder that was made with later."""
     preview: bool = True
     """Write pictures."""
     overwrite: bool = False
@@ -82,27 +64,16 @@ def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
     options = parse_options(Options, "demo", arguments)
     _check(options)
-    with (
-        stage_display() as clock,
-        output_folder(options.output, kind="demo", overwrite=options.overwrite) as folder,
-    ):
-        clock("photograph", 0.0)
-        capture = make_capture(options.seed, options.views)
-        write_capture(capture, folder / "scene")
-        scene = load_scene(folder / "scene")
-        scene = scene.replace(depths=find_depths(scene, folder / "scene"))
-        clouds = _upsample_all(options, scene, clock)
-        scores = _measure_all(capture, scene, clouds, clock)
-        clock("write", 0.0)
-        # Images are copied: a link would point into the folder's temporary place.
-        seeded = scene.replace(points=clouds[SHOWN])
-        write_scene(seeded, folder / f"scene_{SHOWN}", copy_images=True)
-        _write_table(folder / "geometry.csv", scores)
-        if options.preview:
-            _write_pictures(folder, capture, scene, clouds, clock)
-        seconds = clock.seconds()
-    _summarise(options, scene, scores, seconds)
-    trained = _train(options) if options.train_steps else False
+    with kernels_ahead(training=options.training != "only" and options.train_steps > 0) as ahead:
+        if options.training != "only":
+            from splatseed.commands.demo.points import make_points  # noqa: PLC0415  (loads Numba)
+
+            make_points(options, ahead)
+        if options.training == "later":
+            with stage_display() as clock:
+                wait(ahead, TRAINING, clock)
+            return
+        trained = _train(options, ahead) if options.train_steps else False
     _say_what_next(options, trained=trained)
 
 
@@ -113,103 +84,13 @@ def _check(options: Options) -> None:
         raise ParameterError(
             "--train-steps of 0 or more", found=f"{options.train_steps}", fix="Pass 0 not to train."
         )
+    if options.training == "only" and kind_of(options.output) != "demo":
+        raise OutputError(
+            f"a demo at {options.output}", found="none", fix="Make it first: splatseed demo."
+        )
 
 
-def _upsample_all(options: Options, scene: Scene, clock: StageClock) -> dict[str, PointCloud]:
-    """The scene upsampled by every method."""
-    clouds, methods = {}, methods_for(scene)
-    for done, name in enumerate(methods):
-        clock("upsample", done / len(methods))
-        looks = hasattr(METHODS[name], "hold_out")
-        method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)
-        ratio = None if chooses_number(name) else options.ratio
-        clouds[name] = upsample(scene, method, ratio=ratio, seed=options.seed)
-    clock("upsample", 1.0)
-    return clouds
-
-
-def _measure_all(
-    capture: Capture, scene: Scene, clouds: Mapping[str, PointCloud], clock: StageClock
-) -> dict[str, GeometryScore]:
-    """Scores of the originals by themselves and of every method's new points."""
-    clock("measure", 0.0)
-    originals = scene.points.xyz
-    h = spacing(originals)
-    samples = capture.sample_visible(SAMPLES, np.random.default_rng(0))
-    scores = {"originals": measure(originals, originals, capture.surfaces, samples, h)}
-    for done, (name, cloud) in enumerate(clouds.items()):
-        new = cloud.xyz[len(originals) :]
-        scores[name] = measure(new, cloud.xyz, capture.surfaces, samples, h)
-        clock("measure", (done + 1) / len(clouds))
-    return scores
-
-
-def _write_table(path: Path, scores: Mapping[str, GeometryScore]) -> None:
-    """Scores as CSV, in units of the originals' spacing."""
-    with atomic_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["method", "error_h", "median_h", "p95_h", "coverage_h", "share_far"])
-        for name, s in scores.items():
-            values = (s.error, s.median, s.p95, s.coverage, s.share_far)
-            writer.writerow([name, *(f"{x:.4f}" for x in values)])
-
-
-def _write_pictures(
-    folder: Path,
-    capture: Capture,
-    scene: Scene,
-    clouds: Mapping[str, PointCloud],
-    clock: StageClock,
-) -> None:
-    """Before and after, every method, and every method's errors."""
-    clock("pictures", 0.0)
-    preview_pair(scene, clouds[SHOWN], folder / "preview.png", title=SHOWN)
-    clock("pictures", 0.2)
-    preview_methods(scene, clouds, folder / "preview_methods.png")
-    clock("pictures", 0.6)
-    h = spacing(scene.points.xyz)
-    new = {name: c.select(slice(len(scene.points), None)) for name, c in clouds.items()}
-    errors = {name: capture.surfaces.distance(c.xyz) / h for name, c in new.items()}
-    preview_errors(new, errors, choose_camera(scene), folder / "preview_errors.png")
-    clock("pictures", 1.0)
-
-
-def _summarise(
-    options: Options,
-    scene: Scene,
-    scores: Mapping[str, GeometryScore],
-    seconds: Mapping[str, float],
-) -> None:
-    print_table(
-        f"{len(scene.points):,} points, {options.ratio:g}x where the method has a ratio; distances "
-        "in "
-        "units of the originals' spacing, less is better",
-        ("method", "error", "median", "95%", "coverage", "far"),
-        [
-            (
-                name,
-                *(f"{x:.3f}" for x in (s.error, s.median, s.p95, s.coverage)),
-                f"{s.share_far:.2%}",
-            )
-            for name, s in scores.items()
-        ],
-    )
-    names = ["preview.png", "preview_methods.png", "preview_errors.png"] if options.preview else []
-    rows = [
-        (
-            "error",
-            "mean distance of new points to the true surfaces; its median and 95th percentile",
-        ),
-        ("coverage", "mean distance of the surfaces that cameras see to the nearest point"),
-        ("far", "share of new points over 3 spacings from any original"),
-        ("seconds", ", ".join(f"{stage} {time:.1f}" for stage, time in seconds.items())),
-        ("scene", f"{options.output / 'scene'} (COLMAP, with images and depths)"),
-        *(("pictures" if not i else "", str(options.output / n)) for i, n in enumerate(names)),
-    ]
-    print_pairs("splatseed demo", rows)
-
-
-def _train(options: Options) -> bool:
+def _train(options: Options, ahead: KernelsAhead) -> bool:
     """Train from both sets of seeds and compare, if what it takes is installed."""
     try:
         require("torch", "gsplat")
@@ -223,12 +104,19 @@ def _train(options: Options) -> bool:
     folder = options.output
     runs = [f"run_{name}" for name in ("sfm", SHOWN)]
     add_files(folder, [*runs, TRAINED_PICTURE])
+    seeded = json.loads((folder / f"scene_{SHOWN}" / MANIFEST).read_text(encoding="utf-8"))
     arms = [
         Arm("SfM seeds", folder / "scene", folder / runs[0]),
-        Arm(SHOWN, folder / f"scene_{SHOWN}", folder / runs[1]),
+        Arm(SHOWN, folder / f"scene_{SHOWN}", folder / runs[1], seeded["seconds"]),
     ]
-    settings = TrainSettings(strategy="none", max_steps=options.train_steps, seed=options.seed)
+    settings = TrainSettings(
+        strategy="grow",
+        cap_max=seeded["num_points"],
+        max_steps=options.train_steps,
+        seed=options.seed,
+    )
     with stage_display() as clock:
+        wait(ahead, TRAINING, clock)
         trained = [train_arm(arm, settings, clock) for arm in arms]
         if options.preview:
             write_comparison(trained, folder / TRAINED_PICTURE)
@@ -238,41 +126,40 @@ def _train(options: Options) -> bool:
 
 def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None:
     """Both runs side by side, and what they do and do not show."""
-    base = trained[0].metrics
-    goal = base["tests"][-1]["psnr"]
-    rows = [_row(each, goal) for each in trained]
+    from splatseed.commands.demo.training import total_seconds  # noqa: PLC0415  (as above)
+
+    least = min(total_seconds(each) for each in trained)
     print_table(
-        f"{options.train_steps:,} training steps, {len(base['per_image'])} test views",
-        ("seeds", "Gaussians", "seconds", "PSNR, dB", "SSIM", f"{goal:.2f} dB after"),
-        rows,
+        f"{options.train_steps:,} training steps, "
+        f"{len(trained[0].metrics['per_image'])} test views",
+        ("seeds", "Gaussians", "seconds", "PSNR, dB", "SSIM", f"dB after {least:.0f} s"),
+        [_row(each, least) for each in trained],
     )
     pictures = [("pictures", str(options.output / TRAINED_PICTURE))] if options.preview else []
     print_pairs(
         "what this shows",
         [
-            ("fixed", "no Gaussian is added or removed, so this is the worth of the seeds alone"),
-            ("cost", "a step takes longer with more Gaussians: compare the seconds as well"),
-            (
-                "limits",
-                "a made-up room, one run each, no error bars; a long run with densification",
-            ),
-            ("", "adds Gaussians of its own, and the difference can be smaller or gone"),
+            ("fixed", "strategy grow, and the number of Gaussians that both end with"),
+            ("seconds", "of training, and of making the seeds; the last column is on the way,"),
+            ("", "before the mean that a run ends with"),
+            ("limits", "a made-up room, one run each, no error bars; in a long run growth makes"),
+            ("", "up for much of what seeds give"),
             *pictures,
         ],
     )
 
 
-def _row(each: TrainedArm, goal: float) -> tuple[str, ...]:
-    from splatseed.commands.demo.training import when_reached  # noqa: PLC0415  (as above)
+def _row(each: TrainedArm, least: float) -> tuple[str, ...]:
+    from splatseed.commands.demo.training import psnr_after, total_seconds  # noqa: PLC0415
 
-    metrics, reached = each.metrics, when_reached(goal, each.metrics)
+    metrics, then = each.metrics, psnr_after(least, each)
     return (
         each.arm.label,
         f"{metrics['num_gaussians']:,}",
-        f"{metrics['train_seconds']:.1f}",
+        f"{total_seconds(each):.1f}",
         f"{metrics['psnr']:.2f}",
         f"{metrics['ssim']:.4f}",
-        "not reached" if reached is None else f"{reached[0]:,} steps, {reached[1]:.1f} s",
+        "not begun" if then is None else f"{then:.2f}",
     )
 
 

@@ -1,7 +1,7 @@
 """The demo's training: the same few steps from the SfM seeds and from the upsampled ones.
 
-Promise: the two runs differ in their seeds alone. Gaussians are neither added nor removed, so that
-what is seen is the worth of the seeds; the view that is shown is chosen before any is rendered.
+Promise: the two runs differ in their seeds alone, and end with the same number of Gaussians; the
+seconds that seeds took are counted; the view that is shown is chosen before any is rendered.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
 
-__all__ = ["Arm", "TrainedArm", "train_arm", "when_reached", "write_comparison"]
+__all__ = ["Arm", "TrainedArm", "psnr_after", "total_seconds", "train_arm", "write_comparison"]
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,13 @@ class Arm:
         label: What its seeds are.
         scene: The folder of the scene that holds them.
         output: The folder of the run.
+        seconds: What making its seeds took.
     """
 
     label: str
     scene: Path
     output: Path
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +79,16 @@ def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedAr
     return TrainedArm(arm, metrics, shown.image, render)
 
 
-def when_reached(psnr: float, metrics: Mapping[str, Any]) -> tuple[int, float] | None:
-    """Step and training seconds at which a run's test PSNR first was ``psnr``; None if never."""
-    tests = (test for test in metrics["tests"] if test["psnr"] >= psnr)
-    return next(((test["step"], test["seconds"]) for test in tests), None)
+def total_seconds(each: TrainedArm) -> float:
+    """Of making the seeds and of training from them."""
+    return each.arm.seconds + float(each.metrics["train_seconds"])
+
+
+def psnr_after(seconds: float, each: TrainedArm) -> float | None:
+    """The last test PSNR, in dB, of an arm within so many seconds in all; None before its first."""
+    tests = each.metrics["tests"]
+    known = [test["psnr"] for test in tests if each.arm.seconds + test["seconds"] <= seconds]
+    return known[-1] if known else None
 
 
 def write_comparison(arms: Sequence[TrainedArm], path: Path) -> None:

@@ -6,15 +6,13 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from splatseed.commands.info.depth_numbers import print_depth
-from splatseed.commands.info.depth_picture import write_depth_picture
+from splatseed.commands.info.as_json import print_json
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
-from splatseed.depth import Alignment, align
 from splatseed.depthmap import DepthKind
 from splatseed.diagnostics.scene import (
     CloudStatistics,
@@ -29,6 +27,9 @@ from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
 from splatseed.literal import quoted
 from splatseed.scene import Scene
+
+if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
+    from splatseed.depth import Alignment
 
 __all__ = ["Options", "run"]
 
@@ -63,6 +64,8 @@ class Options:
     """Write a PNG of depth beside photographs, and of where the two disagree."""
     list_all: Annotated[bool, tyro.conf.arg(name="all")] = False
     """List the depth of all images, not of the worst alone."""
+    json: bool = False
+    """Print one JSON object instead, for scripts."""
 
 
 def run(arguments: list[str]) -> None:
@@ -75,10 +78,15 @@ def run(arguments: list[str]) -> None:
         tracks = track_statistics(scene)
         regions = empty_regions(scene, clock)
         alignments = _alignments(options, scene, clock)
+    if options.json:
+        print_json(scene, cloud, tracks, regions, alignments, find_problems(scene, cloud, regions))
+        return
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
     rows += _method_rows(options, scene)
     print_pairs(str(options.scene), rows)
     if alignments is not None:
+        from splatseed.commands.info.depth_numbers import print_depth  # noqa: PLC0415  (loads Numba)
+
         print_depth(str(options.depth or "depth"), scene, alignments, list_all=options.list_all)
     problems = find_problems(scene, cloud, regions)
     OUT.print("\nproblems" if problems else "\nno problems found", style="bold" if problems else "")
@@ -109,8 +117,12 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
     """How each map fits the SfM points, drawn if so asked; None where no maps were named."""
     if options.depth is None:
         return None
+    from splatseed.depth import align  # noqa: PLC0415  (loads Numba)
+
     alignments = align(scene, progress=clock)
     if options.picture is not None:
+        from splatseed.commands.info.depth_picture import write_depth_picture  # noqa: PLC0415
+
         clock("draw picture", 0.0)
         write_depth_picture(scene, alignments, options.picture)
     return alignments

@@ -28,7 +28,7 @@ def held(partial: Path) -> Iterator[Callable[[], None]]:
     """While the block runs, a partial can be held as being written to.
 
     Args:
-        partial: The folder.
+        partial: The file or folder.
 
     Yields:
         What holds it, to be called once it is there.
@@ -46,10 +46,15 @@ def remove_leftovers(target: Path) -> None:
 
     Log it.
     """
-    name = re.compile(re.escape(f".{target.name}.partial-") + "[0-9a-f]{8}")
+    start = re.escape(f".{target.name}.partial-") + "[0-9a-f]{8}"
+    folder, file = re.compile(start), re.compile(start + re.escape(target.suffix))
     with suppress(OSError):
         for path in target.parent.iterdir():
-            if name.fullmatch(path.name) and path.is_dir() and not path.is_symlink():
+            if path.is_symlink():
+                continue
+            if (folder.fullmatch(path.name) and path.is_dir()) or (
+                file.fullmatch(path.name) and path.is_file()
+            ):
                 _remove_unless_held(path)
 
 
@@ -59,14 +64,14 @@ def _remove_unless_held(leftover: Path) -> None:
             return
         for lock in _lock(leftover):
             try:
-                remove_tree(leftover)
+                remove_tree(leftover) if leftover.is_dir() else leftover.unlink()
                 _LOG.warning("Removed %s, which a run left that was killed.", leftover)
             finally:
                 os.close(lock)
 
 
-def _lock(folder: Path) -> list[int]:
-    """A descriptor that locks a folder until it is closed.
+def _lock(path: Path) -> list[int]:
+    """A descriptor that locks a file or folder until it is closed.
 
     None if another process does, or none can.
     """
@@ -74,7 +79,7 @@ def _lock(folder: Path) -> list[int]:
         import fcntl  # noqa: PLC0415  (not on Windows)
     except ImportError:
         return []
-    descriptor = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:

@@ -24,9 +24,11 @@ MANIFEST = "splatseed.json"
 _PICTURES = tuple(  # made after the manifest
     f"preview{which}.png" for which in ("", "_methods", "_maps", "_cells", "_origins")
 )
+_SMALLER = re.compile(r"images_[248]/(.+)")
+"""nerfstudio's smaller copies of the photographs, under their names: it makes them again."""
 _NOBODYS = re.compile(
     r"(.*/)?(\.DS_Store|Thumbs\.db"  # made by looking at the folder
-    r"|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+)?"  # what a killed process of ours left
+    r"|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+|/.*)?"  # what a killed process of ours left
     r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs: it makes them again
     re.IGNORECASE,
 )
@@ -104,7 +106,14 @@ def unlisted_files(folder: Path) -> list[str]:
     """
     ours = {*_files(_read(folder)), MANIFEST, *_PICTURES}
     found = _files_outside(folder, ours)
-    return sorted(name for name in found if not _NOBODYS.fullmatch(name))
+    return sorted(
+        name for name in found if not (_NOBODYS.fullmatch(name) or _is_smaller(folder, name))
+    )
+
+
+def _is_smaller(folder: Path, name: str) -> bool:
+    copy = _SMALLER.fullmatch(name)
+    return copy is not None and (folder / "images" / copy[1]).is_file()
 
 
 def _read(folder: Path) -> dict[str, Any]:

@@ -89,16 +89,16 @@ def check_output(
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """A file name to write to; the file appears at ``path`` when the block ends without an error.
+    """A file to write to; it appears at ``path`` when the block ends without an error.
 
-    The name keeps the suffix, by which image writers choose the format. Missing parents are made,
+    Its name keeps the suffix, by which image writers choose the format. Missing parents are made,
     and a file that is there is replaced.
 
     Args:
         path: Where the file is to be.
 
     Yields:
-        The name of the partial file, which does not exist yet.
+        The name of the partial file, which is empty.
 
     Raises:
         OutputError: ``path`` is a folder or a device, or writing failed.
@@ -108,8 +108,11 @@ def atomic_file(path: Path) -> Iterator[Path]:
         found = "a folder" if target.is_dir() else "a device or a pipe"
         raise OutputError(f"a file name at {target}", found=found, fix="Choose another name.")
     partial = _partial_name(target, target.suffix)
-    with _oserror_as_output_error(target), _parents(target.parent):
+    remove_leftovers(target)
+    with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
         try:
+            partial.touch()
+            hold()
             yield partial
             partial.replace(target)
         except BaseException:

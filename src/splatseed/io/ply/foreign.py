@@ -1,4 +1,4 @@
-"""Formats of trained Gaussians that are not read, so that errors can name what reads them.
+"""Formats of trained Gaussians alone, so that errors can say that a file is a model and no scene.
 
 Promise: only a file's name and, of a PLY, its header are looked at.
 """
@@ -22,7 +22,7 @@ _PACKED = "Gaussians compressed as PlayCanvas's .compressed.ply"
 
 
 def refuse_foreign(path: Path) -> None:
-    """Refuse a file whose name is that of a known format which is not read.
+    """Refuse a file whose name is that of a known format of models.
 
     Raises:
         SceneFormatError: It is.
@@ -48,11 +48,9 @@ def refuse_packed(path: Path, properties: Collection[str]) -> None:
 
 def _foreign(path: Path, found: str) -> SceneFormatError:
     return SceneFormatError(
-        f"{path} to be a .ply as 3DGS writes it, or of points",
-        found=f"{found}, which splatseed does not read",
-        fix="Convert it: PlayCanvas's splat-transform (npx @playcanvas/splat-transform IN "
-        "OUT.ply) and"
-        " SuperSplat write such a .ply. It holds a trained model, not a scene: score it with "
-        "splatseed"
-        " evaluate.",
+        f"{path} to be a scene, or a .ply of points",
+        found=f"{found}: a trained model",
+        fix="Score it with splatseed evaluate MODEL --scene SCENE, look at it with splatseed view "
+        "MODEL; a"
+        " .ply of it, by splatseed export MODEL -o OUT.ply, is read as points too.",
     )

@@ -7,8 +7,10 @@ request, and not before the new one is ready to start.
 from __future__ import annotations
 
 import json
+import secrets
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,6 +125,28 @@ class RunFolder:
         write_json(self.path / MANIFEST, {**mark, "files": [path.name for path in files]})
         write_json(self.config, config)
 
+    @contextmanager
+    def results(self) -> Iterator[RunFolder]:
+        """Where to write results: all are moved into this folder once whole, the metrics last.
+
+        Raises:
+            OutputError: They cannot be put in place.
+        """
+        staged = RunFolder(self.path / f".results.partial-{secrets.token_hex(4)}")
+        try:
+            yield staged
+            each = sorted(staged.path.iterdir(), key=lambda path: path.name == self.metrics.name)
+            for path in each:
+                _move(path, self.path / path.name)
+        except OSError as error:
+            raise OutputError(
+                f"results to be written to {self.path}",
+                found=error.strerror or type(error).__name__,
+                fix="Check the disk and try again.",
+            ) from None
+        finally:
+            shutil.rmtree(staged.path, ignore_errors=True)
+
     def claim(self, paths: Iterable[Path]) -> None:
         """List files in the folder as the run's own, before or after they are written.
 
@@ -152,6 +176,13 @@ class RunFolder:
         if not isinstance(config, dict):
             raise _unreadable(self.config, type(config).__name__)
         return config
+
+
+def _move(path: Path, target: Path) -> None:
+    """Rename a file or folder, in the place of an earlier one."""
+    if target.is_dir() and not target.is_symlink():
+        shutil.rmtree(target)
+    path.replace(target)
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:

@@ -97,7 +97,7 @@ def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]
     a, b, c = xx - 1.0 / 3.0, yy - 1.0 / 3.0, zz - 1.0 / 3.0
     p = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
     if p < 1e-12:
-        frame[:] = np.eye(3)
+        _set_rows(frame, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
         return 1.0
     det = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
     half_det = min(max(det / (2.0 * p * p * p), -1.0), 1.0)
@@ -109,10 +109,17 @@ def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]
     wx, wy, wz = _null_vector(a - first, xy, xz, b - first, yz, c - first)
     major, minor, major_variance = _plane_axes(covariance, wx, wy, wz)
     if largest_is_isolated:
-        frame[0], frame[1], frame[2] = (wx, wy, wz), major, minor
+        _set_rows(frame, (wx, wy, wz), major, minor)
         return major_variance / (largest + 1.0 / 3.0)
-    frame[0], frame[1], frame[2] = major, minor, (wx, wy, wz)
+    _set_rows(frame, major, minor, (wx, wy, wz))
     return (2.0 / 3.0 - major_variance - smallest) / major_variance
+
+
+@inline
+def _set_rows(frame, first, second, third):  # type: ignore[no-untyped-def]
+    # One by one: assigning a tuple to a row compiles 5 s of Numba's own checks and messages.
+    for axis in range(3):
+        frame[0, axis], frame[1, axis], frame[2, axis] = first[axis], second[axis], third[axis]
 
 
 @inline

@@ -20,7 +20,9 @@ from rich.progress import (
 )
 from rich.table import Column
 
-from splatseed.commands.options import parse_options
+from splatseed.commands.options import known_options, parse_options
+from splatseed.commands.train.config import with_config
+from splatseed.commands.train.live import view_port, watched
 from splatseed.console import (
     ERR,
     OUT,
@@ -37,7 +39,7 @@ from splatseed.process.interruption import exit_code
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.train.record.folder import RunFolder
-from splatseed.train.settings import Seeding, TrainSettings
+from splatseed.train.settings import BUDGET, Seeding, StrategyName, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 from splatseed.views.view import poses_of
 
@@ -48,6 +50,9 @@ __all__ = ["bar_columns", "run"]
 
 BAR_WIDTH = 12
 DEFAULT = TrainSettings()
+BEST: StrategyName = "auto"
+"""The strategy where none is named."""
+BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
 
 
 @dataclass(frozen=True)
@@ -58,10 +63,10 @@ class Options:
     """A scene with photographs, as splatseed upsample writes it."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The folder of the run."""
-    training: Annotated[TrainSettings, tyro.conf.arg(name="")] = DEFAULT
+    training: Annotated[TrainSettings, tyro.conf.arg(name="")] = BEST_SETTINGS
     """How to train: its fields are options of their own."""
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
-    """The same, as upsample has it: a number, or Gaussians per pixel of a photograph at its
+    """--cap-max as upsample has it: a number, or Gaussians per pixel of a photograph at its
     training size, such as 0.25rho."""
     seeds: Annotated[
         Seeding | None,
@@ -75,6 +80,14 @@ class Options:
     """Go on with the run in the output folder, with its own settings."""
     tensorboard: bool = False
     """Also write a log for TensorBoard."""
+    view: bool = False
+    """Watch it learn in the browser, pause it, stop it and keep what there is (extra view)."""
+    view_port: int = 8080
+    """The port of this machine that the browser is served at; 0 for any that is free."""
+    config: Annotated[
+        Path | None, tyro.conf.arg(constructor=Path, metavar="FILE", help_behavior_hint="")
+    ] = None
+    """A .toml with these options, or the config.json of a run; what the command line says wins."""
     overwrite: bool = False
     """Replace an earlier run in the output folder."""
 
@@ -84,21 +97,26 @@ class Options:
         # A run that goes on says itself what it began with.
         goes_on = self.resume and RunFolder(self.output).is_run
         seeding = self.seeds or (DEFAULT.seeding if goes_on else "auto")
-        return replace(self.training, seeding=seeding)
+        named = self.training.strategy
+        strategy = DEFAULT.strategy if goes_on and named == BEST else named
+        return replace(self.training, seeding=seeding, strategy=strategy)
 
 
 def run(arguments: list[str]) -> None:
     """Do what the command line asks for."""
+    if any(word.partition("=")[0] == "--config" for word in arguments):
+        arguments = with_config(arguments, known_options(Options))
     options = parse_options(Options, "train", arguments)
     settings = options.settings
     require("torch", "gsplat")
+    port = view_port(options.view_port) if options.view else None
     notes: list[str] = []
     with stage_display() as clock:
         training = _prepare(options, settings, notes.append, clock)
     _announce(options, training, notes)
-    with _training_bar(training) as show:
-        done = training.train(show)
-    if not done:
+    with watched(training, options.scene, port) as watch, _training_bar(training) as show:
+        done = training.train(watch.also(show))
+    if not done and not watch.kept:
         _say_how_to_go_on(options, training)
         sys.exit(exit_code())
     with stage_display(clock):
@@ -117,7 +135,7 @@ def _prepare(
         note(warning)
     if scene.listed is not None:
         note(scene.listed.sentence)
-    settings = _within_budget(options, settings, scene)
+    settings = _within_budget(options, settings, scene, note)
     how = RunOptions(
         resume=options.resume,
         overwrite=options.overwrite,
@@ -127,18 +145,24 @@ def _prepare(
     return prepare_run(scene, options.output, settings, how, note=note, progress=clock)
 
 
-def _within_budget(options: Options, settings: TrainSettings, scene: Scene) -> TrainSettings:
+def _within_budget(
+    options: Options, settings: TrainSettings, scene: Scene, note: Callable[[str], None]
+) -> TrainSettings:
     """The settings, with the number of Gaussians that the budget is in this scene as their cap."""
-    if options.budget is None:
-        return settings
-    if settings.cap_max is not None:
+    if options.budget is not None and settings.cap_max is not None:
         raise ParameterError("--budget or --cap-max", found="both", fix="Leave one out.")
+    chosen = settings.strategy == BEST and settings.cap_max is None
+    if options.budget is None and not (chosen and scene.images):
+        return settings
     from splatseed.seeding.budget import median_pixels, parse_budget  # noqa: PLC0415  (loads Numba)
 
     views = poses_of(scene.images, settings.data_factor)
-    return replace(
-        settings, cap_max=parse_budget(options.budget, median_pixels(views) if views else 0)
-    )
+    pixels = median_pixels(views) if views else 0
+    if options.budget is not None:
+        return replace(settings, cap_max=parse_budget(options.budget, pixels))
+    cap = max(2, min(BUDGET, round(pixels)))
+    note(f"At most {cap:,} Gaussians, one for each pixel of a photograph; --budget sets another.")
+    return replace(settings, cap_max=cap)
 
 
 def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None:
@@ -151,11 +175,17 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
         "test views"
         f" of {views[0].width} x {views[0].height}, {len(training.state.params['means']):,} "
         "Gaussians)\n"
-        f"  -> {settings.strategy}, {settings.max_steps:,} steps, seed {settings.seed},"
+        f"  -> {_strategy(settings)}, {settings.max_steps:,} steps, seed {settings.seed},"
         f" on {training.device}\n"
         f"  -> {visible(options.output)}",
         soft_wrap=True,
     )
+
+
+def _strategy(settings: TrainSettings) -> str:
+    """Its name, and what it is where that depends on the run."""
+    chosen = settings.strategy == BEST
+    return f"{BEST} ({settings.densification})" if chosen else settings.strategy
 
 
 @contextmanager

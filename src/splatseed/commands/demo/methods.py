@@ -1,0 +1,30 @@
+"""How the demo calls a method; the process that compiles ahead of it must call it the same way."""
+
+from __future__ import annotations
+
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+from splatseed.upsample import METHODS, chooses_number, configure, upsample
+
+__all__ = ["SHOWN", "TEST_EVERY", "upsample_by"]
+
+SHOWN = "auto"
+TEST_EVERY = 8
+"""Photographs kept for the test of what is trained: no method looks at them."""
+
+
+def upsample_by(name: str, scene: Scene, ratio: float, seed: int) -> PointCloud:
+    """The scene's points and new ones.
+
+    Args:
+        name: A key of ``METHODS``.
+        scene: With photographs and depth maps.
+        ratio: Points in all over originals; methods that choose their number do not use it.
+        seed: Of the random numbers.
+
+    Raises:
+        SplatseedError: As ``upsample``.
+    """
+    looks = hasattr(METHODS[name], "hold_out")
+    method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)
+    return upsample(scene, method, ratio=None if chooses_number(name) else ratio, seed=seed)

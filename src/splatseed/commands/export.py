@@ -1,0 +1,99 @@
+"""``splatseed export``: trained Gaussians to the files that viewers and engines read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from splatseed.commands.models import model_file
+from splatseed.commands.options import parse_options
+from splatseed.console import print_commands, print_note, print_pairs, stage_display
+from splatseed.errors import OutputError
+from splatseed.export import (
+    FORMATS,
+    format_of_name,
+    keep_gaussians,
+    parse_crop,
+    read_model,
+    write_model,
+)
+from splatseed.literal import quoted
+from splatseed.train.record.folder import RunFolder
+
+if TYPE_CHECKING:
+    from splatseed.splat.gaussians import Gaussians
+
+__all__ = ["run"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write a trained model in another format, cropped and cleaned if so asked."""
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """The folder of a run of splatseed train, or a file of Gaussians: .ply, .compressed.ply,
+    .splat, .spz, .sog."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The file to write; its name's end chooses the format: .ply, .compressed.ply, .splat, .spz,
+    .sog."""
+    crop: Annotated[
+        str | None,
+        tyro.conf.arg(constructor=str, metavar="x0,y0,z0,x1,y1,z1", help_behavior_hint=""),
+    ] = None
+    """Keep the Gaussians whose centres lie in this box of the model's world; write --crop=-1,...
+    where the first number is negative."""
+    min_opacity: float = 0.0
+    """Leave out Gaussians that are less opaque, 0 to 1."""
+    overwrite: bool = False
+    """Replace a file that is there."""
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = parse_options(Options, "export", arguments)
+    name = format_of_name(options.output)
+    crop = None if options.crop is None else parse_crop(options.crop)
+    path = model_file(options.model)
+    _check_output(options, path)
+    with stage_display() as clock:
+        clock("read", 0.0)
+        gaussians = read_model(path)
+        kept = keep_gaussians(gaussians, crop, options.min_opacity)
+        write_model(options.output, kept, clock)
+    _summarise(options, name, path, gaussians, kept)
+
+
+def _check_output(options: Options, source: Path) -> None:
+    """Refuse what must not be replaced before any work is done."""
+    target = options.output
+    if target.exists() and (not options.overwrite or target.samefile(source)):
+        fix = "Choose another name."
+        if not options.overwrite:
+            fix = "Pass --overwrite to replace it, or choose another name."
+        raise OutputError(f"no file at {target}", found="one", fix=fix)
+    if RunFolder(target.resolve().parent).is_run:
+        raise OutputError(
+            f"a file outside of training runs, not {target}",
+            found="the folder of a run",
+            fix="Choose a place beside the run.",
+        )
+
+
+def _summarise(
+    options: Options, name: str, path: Path, gaussians: Gaussians, kept: Gaussians
+) -> None:
+    before, after = path.stat().st_size, options.output.stat().st_size
+    rows = [
+        ("Gaussians", f"{len(kept):,} of {len(gaussians):,}"),
+        ("format", f"{name}: {FORMATS[name].about}"),
+        ("size", f"{after / 1e6:.2f} MB, of {before / 1e6:.2f} MB read"),
+        ("output", str(options.output)),
+    ]
+    print_pairs("splatseed export", rows)
+    if name == "splat" and gaussians.shN.size:
+        print_note("A .splat has no view-dependent colour: what there was is left out.")
+    scene = " --scene SCENE"
+    print_commands("next", [("score it", f"splatseed evaluate {quoted(options.output)}{scene}")])

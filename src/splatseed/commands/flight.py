@@ -1,0 +1,193 @@
+"""``splatseed flight``: a camera's way through a trained model, as a video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from splatseed.commands.models import model_file
+from splatseed.commands.options import parse_options
+from splatseed.console import StageClock, print_pairs, stage_display
+from splatseed.errors import OutputError, ParameterError
+from splatseed.export import keep_gaussians, parse_crop
+from splatseed.requirements import require
+from splatseed.train.settings import Backend
+from splatseed.view.video import check_video_name, even_size, write_video
+
+if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
+    from splatseed.view.renderer import ModelRenderer
+    from splatseed.view.shown import Shown
+    from splatseed.views.view import View
+
+__all__ = ["run"]
+
+MOST_SIDE = 1280
+LEAST_SIDE = 16
+MOST_FRAMES = 20_000
+WITHOUT_CAMERAS = (960, 720)
+
+PathOrNone = Annotated[
+    Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
+]
+TextOrNone = Annotated[str | None, tyro.conf.arg(constructor=str, metavar="TEXT", help_behavior_hint="")]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Options:
+    """Fly through a trained model: a video of a smooth path past its training cameras."""
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """The folder of a run of splatseed train, or a file of Gaussians."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The video to write: .mp4, .mkv or .mov."""
+    scene: PathOrNone = None
+    """The scene that a file of Gaussians is of, for its cameras; a run knows its own."""
+    path: PathOrNone = None
+    """A camera path in nerfstudio's JSON, in the model's world, to follow instead."""
+    orbit: bool = False
+    """Circle around what the cameras look at instead."""
+    compare: PathOrNone = None
+    """Another run or file of the same scene: the left half shows the model, the right half this
+    one."""
+    depth: bool = False
+    """Show depth, near bright and far dark, instead of colour."""
+    seconds: float = 10.0
+    """How long the video is; a path's file says itself."""
+    fps: float = 30.0
+    """Frames per second; a path's file says itself."""
+    size: Annotated[TextOrNone, tyro.conf.arg(metavar="WxH", help_behavior_hint="(default: the photographs', at most 1280 a side)")] = None  # fmt: skip
+    """Pixels of the video; odd numbers become even, as H.264 needs them."""
+    crop: Annotated[TextOrNone, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1", help_behavior_hint="")] = None  # fmt: skip
+    """Show only the Gaussians whose centres lie in this box; write --crop=-1,... where the first is
+    negative."""
+    min_opacity: float = 0.0
+    """Leave out Gaussians that are less opaque, 0 to 1."""
+    backend: Backend = "auto"
+    """Where to render; auto takes a GPU if PyTorch sees one."""
+    overwrite: bool = False
+    """Replace a file that is there."""
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = parse_options(Options, "flight", arguments)
+    _check(options)
+    require("torch", "imageio_ffmpeg")
+    from splatseed.view.frames import flight_frames  # noqa: PLC0415  (imports PyTorch)
+
+    with stage_display() as clock:
+        clock("read", 0.0)
+        shown = _open(options, options.model)
+        models = [shown]
+        if options.compare is not None:
+            models.append(_open(options, options.compare))
+        size = _size(options, shown)
+        views, fps = _views(options, shown, size)
+        renderers = _renderers(options, models, clock)
+        names = [each.name for each in models]
+        frames = flight_frames(renderers, names, views, depth=options.depth, progress=clock)
+        write_video(options.output, frames, size, fps)
+    _summarise(options, views, size, fps, clock)
+
+
+def _check(options: Options) -> None:
+    """Refuse what cannot be done before any work is."""
+    check_video_name(options.output)
+    if options.output.exists() and not options.overwrite:
+        fix = "Pass --overwrite to replace it, or choose another name."
+        raise OutputError(f"no file at {options.output}", found="one", fix=fix)
+    if options.path is not None and options.orbit:
+        raise ParameterError("--path or --orbit", found="both", fix="Leave one out.")
+    frames = options.seconds * options.fps
+    if not (options.fps > 0 and 1 <= frames <= MOST_FRAMES):
+        raise ParameterError(
+            f"--seconds and --fps that make 1 to {MOST_FRAMES:,} frames",
+            found=f"{options.seconds:g} s at {options.fps:g}",
+            fix="Try --seconds 10 --fps 30.",
+        )
+    for each in (options.model, options.compare):
+        if each is not None:
+            model_file(each)
+
+
+def _open(options: Options, path: Path) -> Shown:
+    from splatseed.view.shown import open_shown  # noqa: PLC0415
+
+    shown = open_shown(path, options.scene)
+    if shown.gaussians is None:
+        raise ParameterError(
+            f"{path} to be a trained model",
+            found="a scene or points",
+            fix="Train it first (splatseed train), or look at it with splatseed view.",
+        )
+    return shown
+
+
+def _size(options: Options, shown: Shown) -> tuple[int, int]:
+    """Width and height of the video."""
+    from splatseed.views.view import poses_of  # noqa: PLC0415
+
+    if options.size is not None:
+        words = options.size.lower().split("x")
+        if len(words) != 2 or not all(w.isdigit() and LEAST_SIDE <= int(w) <= 8192 for w in words):
+            raise ParameterError(
+                f"--size WxH of {LEAST_SIDE} to 8192 pixels a side",
+                found=repr(options.size),
+                fix="Try --size 960x540.",
+            )
+        return even_size(int(words[0]), int(words[1]))
+    if shown.scene is None or not shown.scene.images:
+        return WITHOUT_CAMERAS
+    first = poses_of(shown.scene.images, shown.data_factor)[0]
+    return even_size(first.width, first.height, MOST_SIDE)
+
+
+def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Sequence[View], float]:
+    """The cameras, one a frame, and how many a second."""
+    from splatseed.view.paths import orbit, path_of_file, smooth_path  # noqa: PLC0415
+    from splatseed.views.view import poses_of  # noqa: PLC0415
+
+    if options.path is not None:
+        views, fps = path_of_file(options.path, size)
+        return views, fps or options.fps
+    frames = max(1, round(options.seconds * options.fps))
+    images = shown.scene.split(shown.test_every)[0] if shown.scene else ()
+    cameras = poses_of(images, shown.data_factor)
+    assert shown.gaussians is not None  # noqa: S101  (see _open)
+    if options.orbit or len(cameras) < 2:
+        return orbit(cameras, shown.gaussians, frames, size), options.fps
+    return smooth_path(cameras, frames, size), options.fps
+
+
+def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> list[ModelRenderer]:
+    """Of each model, cropped and cleaned; all in the first one's frame."""
+    from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.view.renderer import ModelRenderer, model_frame  # noqa: PLC0415
+
+    clock("prepare", 0.0)
+    crop = None if options.crop is None else parse_crop(options.crop)
+    device = pick_device(options.backend)
+    frame = None
+    renderers = []
+    for shown in models:
+        assert shown.gaussians is not None  # noqa: S101  (see _open)
+        kept = keep_gaussians(shown.gaussians, crop, options.min_opacity)
+        frame = frame or model_frame(kept, shown.scene, shown.test_every)
+        renderers.append(ModelRenderer(kept, frame, device))
+    return renderers
+
+
+def _summarise(
+    options: Options, views: Sequence[View], size: tuple[int, int], fps: float, clock: StageClock
+) -> None:
+    seconds = clock.seconds().get("render", 0.0)
+    rows = [
+        ("frames", f"{len(views):,} of {size[0]} x {size[1]}, {fps:g} a second"),
+        ("rendering", f"{seconds:.1f} s, {1e3 * seconds / len(views):.0f} ms a frame"),
+        ("video", f"{options.output}, {options.output.stat().st_size / 1e6:.1f} MB"),
+    ]
+    print_pairs("splatseed flight", rows)

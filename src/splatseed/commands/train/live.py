@@ -1,0 +1,76 @@
+"""``splatseed train --view``: a run that browsers can look at while it learns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from splatseed.console import OUT
+from splatseed.io import load_scene
+from splatseed.requirements import require
+
+if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
+    from splatseed.train.run import TrainingRun
+    from splatseed.view.training import TrainingViewer
+
+__all__ = ["Watch", "view_port", "watched"]
+
+HOST = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Who looks on, if anybody may."""
+
+    viewer: TrainingViewer | None = None
+
+    @property
+    def kept(self) -> bool:
+        """Whether somebody stopped the run, to keep it as it is."""
+        return self.viewer is not None and self.viewer.kept
+
+    def also(self, show: Callable[[int], None]) -> Callable[[int], None]:
+        """A function that shows the steps done here, and to whoever looks on."""
+        viewer = self.viewer
+        if viewer is None:
+            return show
+
+        def both(step: int) -> None:
+            show(step)
+            viewer.on_step(step)
+
+        return both
+
+
+def view_port(port: int) -> int:
+    """The port to serve at, found free before any work is done.
+
+    Raises:
+        MissingDependencyError: viser is absent.
+        ParameterError: The port is taken.
+    """
+    require("viser")
+    from splatseed.view.viewer import free_port  # noqa: PLC0415  (imports PyTorch)
+
+    return free_port(HOST, port)
+
+
+@contextmanager
+def watched(training: TrainingRun, scene: Path, port: int | None) -> Iterator[Watch]:
+    """Serve the run while the block runs; nothing without a port."""
+    if port is None:
+        yield Watch()
+        return
+    from splatseed.view.training import TrainingViewer  # noqa: PLC0415  (imports PyTorch)
+
+    loaded = load_scene(scene, require_points=False)
+    viewer = TrainingViewer(training, loaded, scene.name or str(scene), HOST, port)
+    OUT.print(f"  -> watch it at http://localhost:{port}")
+    OUT.file.flush()
+    try:
+        yield Watch(viewer)
+    finally:
+        viewer.close()

@@ -1,0 +1,155 @@
+"""``splatseed view``: scenes, seeds and trained models in the browser."""
+
+from __future__ import annotations
+
+import socket
+import time
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from splatseed.commands.options import parse_options
+from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
+from splatseed.errors import ParameterError, SceneNotFoundError, SplatseedError
+from splatseed.requirements import require
+from splatseed.train.record.folder import RunFolder
+from splatseed.train.settings import Backend
+
+if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
+    from splatseed.view.shown import Shown
+
+__all__ = ["run"]
+
+MOST_OPENED = 12
+LOCAL = {"127.0.0.1", "localhost", "::1"}
+
+
+@dataclass(frozen=True)
+class Options:
+    """Look at a scene, its seeds or a trained model in the browser; at two side by side."""
+
+    what: Annotated[Path, tyro.conf.Positional]
+    """A scene, the folder of a run, a file of Gaussians or of points, or a folder that holds
+    several of these."""
+    compare: Annotated[Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")] = None  # fmt: skip
+    """Another to show beside it, from the same camera."""
+    scene: Annotated[Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")] = None  # fmt: skip
+    """The scene that a file of Gaussians is of; a run knows its own."""
+    host: str = "127.0.0.1"
+    """The address to listen at: this machine alone, or 0.0.0.0 for all that can reach it."""
+    port: int = 8080
+    """The port to listen at; 0 for any that is free."""
+    max_points: int = 5_000_000
+    """Most points that the browser gets to draw; fewer for one without a GPU."""
+    browser: bool = False
+    """Open this machine's browser."""
+    backend: Backend = "auto"
+    """Where to render; auto takes a GPU if PyTorch sees one."""
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = parse_options(Options, "view", arguments)
+    require("torch", "viser")
+    from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.view.viewer import Viewer, free_port  # noqa: PLC0415  (likewise)
+
+    if options.max_points < 1:
+        raise ParameterError(
+            "--max-points of 1 or more", found=f"{options.max_points}", fix="Try 1000000."
+        )
+    port = free_port(options.host, options.port)
+    with stage_display() as clock:
+        clock("read", 0.0)
+        opened = _opened(options)
+        device = pick_device(options.backend)
+        viewer = Viewer(opened, options.host, port, device, most_points=options.max_points)
+        clock("prepare", 0.0)
+        viewer.entries[0].warm_up()
+    _announce(options, port, opened)
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        OUT.print("stopped")
+    finally:
+        viewer.stop()
+
+
+def _opened(options: Options) -> list[Shown]:
+    """What to show, under names that tell one from the other."""
+    from dataclasses import replace  # noqa: PLC0415
+
+    from splatseed.view.shown import open_shown  # noqa: PLC0415
+
+    paths = _within(options.what)
+    if options.compare is not None:
+        paths += _within(options.compare)
+    names = [path.name for path in paths]
+    opened = []
+    for path in paths:
+        name = path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}"
+        opened.append(replace(open_shown(path, options.scene), name=name or str(path)))
+    return opened
+
+
+def _within(path: Path) -> list[Path]:
+    """The path itself, or the runs and scenes in a folder that is neither."""
+    from splatseed.io import load_scene  # noqa: PLC0415
+
+    if not path.is_dir() or RunFolder(path).is_run:
+        return [path]
+    try:
+        load_scene(path, require_points=False)
+    except SceneNotFoundError as error:
+        found = [each for each in sorted(path.iterdir()) if _is_shown(each)][:MOST_OPENED]
+        if found:
+            return found
+        raise SceneNotFoundError(
+            f"{path} to be a scene, a run or a folder of these", found=error.found, fix=error.fix
+        ) from None
+    return [path]
+
+
+def _is_shown(path: Path) -> bool:
+    """Whether something in a folder is a finished run, a scene or a model."""
+    from splatseed.export import SUFFIXES  # noqa: PLC0415
+    from splatseed.io import load_scene  # noqa: PLC0415
+
+    if path.is_file():
+        return any(path.name.lower().endswith(suffix) for suffix in SUFFIXES)
+    folder = RunFolder(path)
+    if folder.is_run:
+        return folder.gaussians.is_file()
+    try:
+        load_scene(path, require_points=False)
+    except SplatseedError:
+        return False
+    return True
+
+
+def _announce(options: Options, port: int, opened: list[Shown]) -> None:
+    """Say where to look; flushed, as whoever started us may be waiting for it."""
+    host = "localhost" if options.host in LOCAL | {"0.0.0.0"} else options.host  # noqa: S104
+    url = f"http://{host}:{port}"
+    rows = [(shown.name, _contents(shown)) for shown in opened]
+    print_pairs("splatseed view", rows)
+    commands = [("open in a browser", url)]
+    if options.host in LOCAL:
+        commands.append(("from elsewhere, first", f"ssh -L {port}:localhost:{port} {socket.gethostname()}"))  # fmt: skip
+    print_commands("next", [*commands, ("stop", "Ctrl-C")])
+    OUT.file.flush()
+    if options.browser and not webbrowser.open(url):
+        print_note("No browser was found here: open the address yourself.")
+
+
+def _contents(shown: Shown) -> str:
+    parts = []
+    if shown.gaussians is not None:
+        parts.append(f"{len(shown.gaussians):,} Gaussians")
+    if shown.scene is not None:
+        parts.append(f"{len(shown.scene.points):,} points, {len(shown.scene.images):,} images")
+    return ", ".join(parts)

@@ -1,0 +1,17 @@
+"""Trained Gaussians in the files that viewers and engines read: one module a format."""
+
+from splatseed.export.formats import FORMATS, SUFFIXES, detect_format, format_of_name
+from splatseed.export.model import read_model, write_model
+from splatseed.export.selection import Crop, keep_gaussians, parse_crop
+
+__all__ = [
+    "FORMATS",
+    "SUFFIXES",
+    "Crop",
+    "detect_format",
+    "format_of_name",
+    "keep_gaussians",
+    "parse_crop",
+    "read_model",
+    "write_model",
+]

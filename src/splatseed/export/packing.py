@@ -1,0 +1,81 @@
+"""What the packed formats share: rotations as three numbers, opacities as bytes, an order in space.
+
+Notation: quaternions are wxyz; a rotation's *largest* component, made positive, is left out, as the other
+*three*, each within 1/sqrt(2) of 0, determine it; [N] Gaussians.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float32, Int64, UInt8
+
+__all__ = [
+    "SH_COUNTS",
+    "from_smallest_three",
+    "morton_order",
+    "opacity_bytes",
+    "opacity_logits",
+    "smallest_three",
+    "unit_quats",
+]
+
+SH_COUNTS = (0, 3, 8, 15)
+"""Coefficients beyond the first, by the degree of the spherical harmonics."""
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_MORTON_BITS = 16
+
+
+def unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
+    """Quaternions of length 1; those of no length become no rotation."""
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    known = np.isfinite(norms) & (norms > 0)
+    unit = np.divide(quats, norms, out=np.zeros_like(quats), where=known)
+    unit[~known[:, 0]] = (1, 0, 0, 0)
+    return np.asarray(unit)
+
+
+def smallest_three(
+    quats: Float32[np.ndarray, "N 4"],
+) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N 3"]]:
+    """Which component is the largest, and the other three in their order; see the module."""
+    unit = unit_quats(quats)
+    largest = np.argmax(np.abs(unit), axis=1)
+    rows = np.arange(len(unit))
+    unit *= np.where(unit[rows, largest] < 0, -1, 1).astype(np.float32)[:, None]
+    return largest, unit[rows[:, None], _OTHERS[largest]]
+
+
+def from_smallest_three(
+    largest: Int64[np.ndarray, " N"], three: Float32[np.ndarray, "N 3"]
+) -> Float32[np.ndarray, "N 4"]:
+    """The unit quaternions that ``smallest_three`` took apart."""
+    rows = np.arange(len(three))
+    quats = np.empty((len(three), 4), np.float32)
+    quats[rows[:, None], _OTHERS[largest]] = three
+    quats[rows, largest] = np.sqrt(np.maximum(1 - (three**2).sum(axis=1), 0))
+    return quats
+
+
+def opacity_bytes(logits: Float32[np.ndarray, " N"]) -> UInt8[np.ndarray, " N"]:
+    """Opacities 0 to 1 in steps of 1/255."""
+    with np.errstate(over="ignore"):
+        return np.rint(255 / (1 + np.exp(-logits.astype(np.float64)))).astype(np.uint8)
+
+
+def opacity_logits(values: UInt8[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]:
+    """Logits of opacities in steps of 1/255; the ends, whose logits are infinite, a quarter step inward."""
+    opacity = np.clip(values / 255, 0.25 / 255, 1 - 0.25 / 255)
+    return np.log(opacity / (1 - opacity)).astype(np.float32)
+
+
+def morton_order(xyz: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """The order of points along a Z curve through their bounding box: neighbours in it are near in space."""
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    extent = np.where(high > low, high - low, 1).astype(np.float64)
+    cells = ((xyz - low) / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)
+    code = np.zeros(len(xyz), np.uint64)
+    for bit in range(_MORTON_BITS):
+        for axis in range(3):
+            digit = (cells[:, axis] >> np.uint64(bit)) & np.uint64(1)
+            code |= digit << np.uint64(3 * bit + axis)
+    return np.argsort(code, kind="stable")

@@ -1,0 +1,231 @@
+"""Niantic's .spz: attribute after attribute in few bits, gzipped (versions 1 to 3) or in zstd streams (4).
+
+Notation: the file's axes are right, up, back (RUB), ours right, down, front: y and z change sign. A position
+takes 24 bits a component in units of 2^-f, where f is *fractional_bits*; a log-scale s the byte 16 (s + 10); a
+colour's first coefficient c the byte 255 (0.15 c + 1/2), each further one 128 c + 128. A rotation is its xyz
+with w >= 0 in a byte each (version 2), or 2 bits for the largest component and a sign and 9 bits for each other
+(3 and 4). Source: nianticlabs/spz (load-spz.cc, splat-types.h).
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Int64, UInt8
+
+from splatseed.errors import SceneFormatError
+from splatseed.export.packing import (
+    SH_COUNTS,
+    from_smallest_three,
+    morton_order,
+    opacity_bytes,
+    opacity_logits,
+    smallest_three,
+)
+from splatseed.io.files import read_bytes
+from splatseed.process.memory import check_memory
+from splatseed.requirements import require
+from splatseed.splat.gaussians import Gaussians
+
+__all__ = ["decode", "encode"]
+
+MAGIC = b"NGSP"
+HEADER = struct.Struct("<4sIIBBBB")
+STREAMS = struct.Struct("<I12x")
+"""What follows the header in version 4: where the table of streams lies."""
+SIZES = struct.Struct("<QQ")
+WRITTEN = 3
+"""The version that is written: the last that every reader takes."""
+MOST_FRACTIONAL_BITS = 20
+MOST = 2**23 - 1
+NINE_BITS = 511
+COLOR = 0.15 * 255
+FIX = "Copy the file again, or export it again."
+AXES = np.array([1, -1, -1], np.float32)
+SH_AXES = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+"""Signs of the spherical harmonics of degrees 1 to 3 where y and z are turned round."""
+XYZW = [1, 2, 3, 0]
+STEP = 4
+"""Further coefficients are rounded to this many 128ths, that gzip finds more to save. Niantic's own writer takes
+8 for the first degree and 16 for the others: a quarter smaller, but coefficients of a short run vanish, and with
+them up to 2.8 dB (docs/formats.md)."""
+
+
+@dataclass(frozen=True)
+class _Header:
+    version: int
+    count: int
+    degree: int
+    fractional_bits: int
+
+    @property
+    def sizes(self) -> list[int]:
+        """Bytes a Gaussian takes for its position, opacity, colour, scale, rotation, harmonics."""
+        position = 6 if self.version == 1 else 9
+        rotation = 3 if self.version < 3 else 4
+        return [position, 1, 3, 3, rotation, 3 * SH_COUNTS[self.degree]]
+
+
+def encode(gaussians: Gaussians) -> bytes:
+    """The bytes of a file that holds the Gaussians, in the order of a Z curve, at most of degree 3."""
+    order = morton_order(gaussians.means)
+    rest = gaussians.shN.shape[1]
+    farthest = float(np.abs(gaussians.means).max())
+    bits = int(np.clip(np.floor(np.log2(MOST / max(farthest, 1e-9))), 0, MOST_FRACTIONAL_BITS))
+    fixed = np.rint(gaussians.means[order] * AXES * np.float64(2**bits)).astype("<i4")
+    sh = np.rint(gaussians.shN[order] * SH_AXES[:rest, None] * 128 + 128)
+    parts = [
+        fixed.view(np.uint8).reshape(-1, 4)[:, :3],
+        opacity_bytes(gaussians.opacities[order]),
+        _byte(gaussians.sh0[order, 0] * COLOR + 127.5),
+        _byte((gaussians.scales[order] + 10) * 16),
+        _packed_quats(gaussians.quats[order] * np.append(np.float32(1), AXES)).view(np.uint8),
+        _byte(np.floor((sh + STEP // 2) / STEP) * STEP),
+    ]
+    degree = SH_COUNTS.index(rest)
+    header = HEADER.pack(MAGIC, WRITTEN, len(order), degree, bits, 0, 0)
+    body = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+    return gzip.compress(header + body, 6, mtime=0)
+
+
+def decode(path: Path) -> Gaussians:
+    """The Gaussians of a file.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is damaged, or of a version that is not known.
+        MissingDependencyError: It is of version 4, and zstandard is absent.
+    """
+    data = read_bytes(path)
+    if data.startswith(MAGIC):
+        header = _header(path, data)
+        parts = _zstd_parts(path, data, header)
+    else:
+        content = _unzipped(path, data)
+        header = _header(path, content)
+        parts = _slices(path, content, header)
+    position, opacity, color, scale, rotation, sh = parts
+    return Gaussians(
+        means=_positions(position, header) * AXES,
+        scales=(scale / 16 - 10).astype(np.float32),
+        quats=_quats(rotation, header.version) * np.append(np.float32(1), AXES),
+        opacities=opacity_logits(opacity[:, 0]),
+        sh0=((color - 127.5) / COLOR).astype(np.float32)[:, None],
+        shN=_harmonics(sh, header),
+    )
+
+
+def _byte(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
+    return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
+
+
+def _packed_quats(quats: Float32[np.ndarray, "N 4"]) -> np.ndarray:
+    """From the highest bits down: which of x, y, z, w is the largest, then the others' signs and sizes."""
+    largest, three = smallest_three(quats[:, XYZW])
+    packed = largest.astype(np.uint32)
+    for i in range(3):
+        size = np.rint(np.abs(three[:, i]) * np.float32(NINE_BITS * np.sqrt(2)))
+        part = np.minimum(size, NINE_BITS).astype(np.uint32)
+        packed = (packed << 10) | ((three[:, i] < 0).astype(np.uint32) << 9) | part
+    return np.asarray(packed, "<u4")
+
+
+def _quats(raw: UInt8[np.ndarray, "N B"], version: int) -> Float32[np.ndarray, "N 4"]:
+    if version < 3:
+        xyz = raw / np.float32(127.5) - 1
+        w = np.sqrt(np.maximum(1 - (xyz**2).sum(axis=1, keepdims=True), 0))
+        return np.hstack([w, xyz]).astype(np.float32)
+    packed = np.ascontiguousarray(raw).view("<u4")[:, 0]
+    fields = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
+    size = (fields & NINE_BITS) / np.float32(NINE_BITS * np.sqrt(2))
+    three = np.where(fields >> 9, -size, size).astype(np.float32)
+    xyzw = from_smallest_three((packed >> 30).astype(np.int64), three)
+    return xyzw[:, [3, 0, 1, 2]]
+
+
+def _positions(raw: UInt8[np.ndarray, "N B"], header: _Header) -> Float32[np.ndarray, "N 3"]:
+    if header.version == 1:
+        return np.ascontiguousarray(raw).view("<f2").astype(np.float32)
+    digits = raw.reshape(-1, 3, 3).astype(np.int32)
+    fixed: Int64[np.ndarray, "N 3"] = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16
+    fixed = np.where(fixed > MOST, fixed - 2**24, fixed)
+    return (fixed / 2.0**header.fractional_bits).astype(np.float32)
+
+
+def _harmonics(raw: UInt8[np.ndarray, "N B"], header: _Header) -> Float32[np.ndarray, "N K 3"]:
+    rest = SH_COUNTS[header.degree]
+    values = (raw.reshape(header.count, rest, 3).astype(np.float32) - 128) / 128
+    return np.asarray(values * SH_AXES[:rest, None], np.float32)
+
+
+def _header(path: Path, data: bytes) -> _Header:
+    if len(data) < HEADER.size:
+        raise _damaged(path, f"{len(data)} bytes, not even a header")
+    _, version, count, degree, fractional_bits, _, _ = HEADER.unpack_from(data)
+    if not 1 <= version <= 4:
+        raise _damaged(path, f"version {version}, where 1 to 4 are known")
+    if degree >= len(SH_COUNTS) or count == 0 or fractional_bits > 24:
+        raise _damaged(
+            path, f"{count} Gaussians of degree {degree}, {fractional_bits} fractional bits"
+        )
+    header = _Header(version, count, degree, fractional_bits)
+    check_memory(count, sum(header.sizes), f"Gaussians in {path}", fix=FIX)
+    return header
+
+
+def _unzipped(path: Path, data: bytes) -> bytes:
+    """What the gzip stream holds, no more than its header asks for: a bomb is not unpacked."""
+    stream = zlib.decompressobj(wbits=31)
+    try:
+        head = stream.decompress(data, HEADER.size)
+        header = _header(path, head)
+        body = stream.decompress(stream.unconsumed_tail, header.count * sum(header.sizes))
+        more = stream.decompress(stream.unconsumed_tail, 1)
+    except zlib.error as error:
+        raise _damaged(path, f"a gzip stream that cannot be unpacked ({error})") from None
+    if not stream.eof and not more:
+        raise _damaged(path, f"the end after {len(body):,} bytes unpacked")
+    return head + body
+
+
+def _slices(path: Path, content: bytes, header: _Header) -> list[UInt8[np.ndarray, "N B"]]:
+    """The parts of an unpacked file, one after the other."""
+    wanted = HEADER.size + header.count * sum(header.sizes)
+    if len(content) < wanted:
+        raise _damaged(path, f"{len(content):,} of {wanted:,} bytes")
+    raw = np.frombuffer(content, np.uint8)
+    ends = HEADER.size + header.count * np.cumsum([0, *header.sizes])
+    pairs = zip(ends[:-1], ends[1:], header.sizes, strict=True)
+    return [raw[a:b].reshape(header.count, size) for a, b, size in pairs]
+
+
+def _zstd_parts(path: Path, data: bytes, header: _Header) -> list[UInt8[np.ndarray, "N B"]]:
+    """The parts of a file of version 4; parts without bytes have no stream."""
+    require("zstandard")
+    import zstandard  # noqa: PLC0415  (of the extra view)
+
+    try:
+        (table,) = STREAMS.unpack_from(data, HEADER.size)
+        at = table + SIZES.size * sum(size > 0 for size in header.sizes)
+        parts: list[UInt8[np.ndarray, "N B"]] = []
+        for size in header.sizes:
+            content = b""
+            if size:
+                packed, _ = SIZES.unpack_from(data, table + SIZES.size * len(parts))
+                content = zstandard.ZstdDecompressor().decompress(
+                    data[at : at + packed], max_output_size=header.count * size
+                )
+                at += packed
+            parts.append(np.frombuffer(content, np.uint8).reshape(header.count, size))
+    except (struct.error, zstandard.ZstdError, ValueError, OverflowError) as error:
+        raise _damaged(path, f"streams that cannot be unpacked ({error})") from None
+    return parts
+
+
+def _damaged(path: Path, found: str) -> SceneFormatError:
+    return SceneFormatError(f"{path} to be a whole .spz", found=found, fix=FIX)

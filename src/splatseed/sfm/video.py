@@ -1,0 +1,212 @@
+"""Frames of a video to reconstruct from: sharp ones, spread by how far the picture moves.
+
+Notation: the *way* of a frame is how far the picture has moved up to it, as parts of its width: the
+sum over frames of the median shift of its blocks against the frame before, found by phase
+correlation (Kuglin and Hines 1975). A frame's *sharpness* is the variance of its Laplacian.
+Promise: of each stretch of the way the sharpest frame is taken, so that a camera that stands still
+gives one frame, not hundreds; equal videos give equal frames.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+from scipy.ndimage import laplace
+
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.progress import Progress, silent
+from splatseed.requirements import require
+
+__all__ = ["VIDEO_SUFFIXES", "PickedFrames", "is_video", "pick_frames"]
+
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
+LOOK_WIDTH = 256
+"""Width at which frames are looked at, px."""
+BLOCK = 64
+"""Side of the blocks whose shifts are found, px at that width."""
+LEAST_STEP = 0.02
+"""Parts of the width that the picture moves at least from one frame taken to the next."""
+LEAST_FRAMES = 3
+QUALITY = 95
+
+
+@dataclass(frozen=True)
+class PickedFrames:
+    """Which frames were taken.
+
+    Args:
+        numbers: Theirs, from 0.
+        total: How many the video has.
+        way: How far the picture moves in all, in widths.
+    """
+
+    numbers: tuple[int, ...]
+    total: int
+    way: float
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path is a video file, by its name."""
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+def pick_frames(
+    video: Path, folder: Path, most: int = 150, progress: Progress = silent
+) -> PickedFrames:
+    """Write the best frames of a video as JPEGs.
+
+    Args:
+        video: The file.
+        folder: An existing folder for the frames.
+        most: Most frames to take.
+        progress: Told how far reading is.
+
+    Raises:
+        MissingDependencyError: imageio-ffmpeg is absent.
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It cannot be read, or the picture hardly moves.
+        ParameterError: ``most`` is too small.
+    """
+    if most < LEAST_FRAMES:
+        raise ParameterError(f"--frames of {LEAST_FRAMES} or more", found=f"{most}", fix="Try 150.")
+    if not video.is_file():
+        raise SceneNotFoundError(f"a video {video}", found="none", fix="Check the path.")
+    sharpness, way = _looked_at(video, progress)
+    numbers = choose(sharpness, way, most)
+    if len(numbers) < LEAST_FRAMES:
+        raise SceneFormatError(
+            f"{video} to move, for photographs from several places",
+            found=f"{len(way)} frames whose picture moves by {way[-1] if len(way) else 0:.1%} of "
+            "its width",
+            fix="Film while you walk around the scene.",
+        )
+    _write(video, folder, numbers, len(way), progress)
+    return PickedFrames(tuple(numbers.tolist()), len(way), float(way[-1]))
+
+
+def choose(
+    sharpness: Float64[np.ndarray, " F"], way: Float64[np.ndarray, " F"], most: int
+) -> Int64[np.ndarray, " P"]:
+    """The sharpest frame of each of at most ``most`` equal stretches of the way.
+
+    Args:
+        sharpness: Of each frame.
+        way: Up to each frame, ascending.
+        most: How many stretches at most.
+    """
+    if not len(way):
+        return np.empty(0, np.int64)
+    step = max(way[-1] / most, LEAST_STEP)
+    stretch = np.minimum((way / step).astype(np.int64), max(int(way[-1] / step) - 1, 0))
+    order = np.lexsort((np.arange(len(way)), -sharpness, stretch))
+    first = np.unique(stretch[order], return_index=True)[1]
+    return np.sort(order[first])
+
+
+def _looked_at(
+    video: Path, progress: Progress
+) -> tuple[Float64[np.ndarray, " F"], Float64[np.ndarray, " F"]]:
+    """Every frame's sharpness and way."""
+    sharpness, steps = [], []
+    before: Float32[np.ndarray, "H W"] | None = None
+    for grey, part in _small_frames(video):
+        sharpness.append(float(laplace(grey).var()))
+        steps.append(0.0 if before is None else shift(before, grey) / LOOK_WIDTH)
+        before = grey
+        progress("look at video", part)
+    return np.array(sharpness), np.cumsum(steps)
+
+
+def shift(before: Float32[np.ndarray, "H W"], now: Float32[np.ndarray, "H W"]) -> float:
+    """How far the picture moved: the median over blocks of the length of their shifts, px."""
+    blocks = _blocks(before), _blocks(now)
+    window = np.hanning(BLOCK)[:, None] * np.hanning(BLOCK)
+    spectra = [np.fft.rfft2((b - b.mean(axis=(1, 2), keepdims=True)) * window) for b in blocks]
+    cross = spectra[0] * np.conj(spectra[1])
+    peaks = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-6), s=(BLOCK, BLOCK))
+    at = np.argmax(peaks.reshape(len(peaks), -1), axis=1)
+    dy, dx = ((each + BLOCK // 2) % BLOCK - BLOCK // 2 for each in np.divmod(at, BLOCK))
+    return float(np.median(np.hypot(dx, dy)))
+
+
+def _blocks(grey: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "B S S"]:
+    rows, columns = (max(1, side // BLOCK) for side in grey.shape)
+    padded = np.zeros((max(grey.shape[0], BLOCK), max(grey.shape[1], BLOCK)), np.float32)
+    padded[: grey.shape[0], : grey.shape[1]] = grey
+    return np.stack(
+        [
+            padded[BLOCK * i : BLOCK * (i + 1), BLOCK * j : BLOCK * (j + 1)]
+            for i in range(rows)
+            for j in range(columns)
+        ]
+    )
+
+
+def _small_frames(video: Path) -> Iterator[tuple[Float32[np.ndarray, "H W"], float]]:
+    """Grey frames of ``LOOK_WIDTH``, and how much of the video is read with each."""
+    facts, frames = _frames(video, ["-vf", f"scale={LOOK_WIDTH}:-2"], "gray", 1)
+    total = max(1.0, float(facts.get("duration") or 0) * float(facts.get("fps") or 0))
+    width, height = facts["size"]
+    for i, raw in enumerate(frames):
+        grey = np.frombuffer(raw, np.uint8).reshape(height, width).astype(np.float32)
+        yield grey, min(1.0, (i + 1) / total)
+
+
+def _write(
+    video: Path, folder: Path, numbers: Int64[np.ndarray, " P"], total: int, progress: Progress
+) -> None:
+    from PIL import Image  # noqa: PLC0415  (slow to import)
+
+    wanted = set(numbers.tolist())
+    facts, frames = _frames(video, [], "rgb24", 3)
+    width, height = facts["size"]
+    for number, raw in enumerate(frames):
+        if number in wanted:
+            pixels: UInt8[np.ndarray, "H W 3"] = np.frombuffer(raw, np.uint8).reshape(
+                height, width, 3
+            )
+            name = f"{video.stem}_{number:06}.jpg"
+            Image.fromarray(pixels).save(folder / name, quality=QUALITY, subsampling=0)
+        progress("take frames", (number + 1) / total)
+
+
+def _frames(
+    video: Path, parameters: list[str], pixels: str, channels: int
+) -> tuple[dict[str, Any], Iterator[bytes]]:
+    """The facts of a video, and its frames as bytes."""
+    require("imageio_ffmpeg")
+    import imageio_ffmpeg  # noqa: PLC0415  (of the extras sfm and view)
+
+    # It warns of every video that is read at another size than its own.
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
+    reader = imageio_ffmpeg.read_frames(
+        str(video), pix_fmt=pixels, bits_per_pixel=8 * channels,
+        output_params=["-fps_mode", "passthrough", *parameters],
+    )  # fmt: skip
+    try:
+        facts = dict(next(reader))
+    except (OSError, RuntimeError, StopIteration, IndexError, ValueError) as error:
+        raise _unreadable(video, error) from None
+    return facts, _told(video, reader)
+
+
+def _told(video: Path, reader: Iterator[bytes]) -> Iterator[bytes]:
+    try:
+        yield from reader
+    except (OSError, RuntimeError) as error:
+        raise _unreadable(video, error) from None
+
+
+def _unreadable(video: Path, error: BaseException) -> SceneFormatError:
+    said = " ".join(str(error).split())
+    return SceneFormatError(
+        f"{video} to be a video that ffmpeg reads",
+        found=said[-120:] or type(error).__name__,
+        fix="Convert it to .mp4 (H.264), or pass a folder of photographs.",
+    )

@@ -1,0 +1,105 @@
+"""What a user names to look at: a scene, a run, a file of Gaussians or of points.
+
+Promise: a file's content decides what it is; a model knows its scene where the run or the user says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.export import detect_format, read_model
+from splatseed.io import load_scene
+from splatseed.io.files import read_bytes
+from splatseed.scene import Scene
+from splatseed.splat.gaussians import Gaussians
+from splatseed.train.record.folder import RunFolder
+
+__all__ = ["Shown", "open_shown"]
+
+MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
+_HEADER = 1 << 16
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Something to look at: a scene, a model, or a model and its scene.
+
+    Args:
+        name: What to call it.
+        path: What the user named.
+        scene: Points, cameras and photographs; None for a model alone.
+        gaussians: The model, in the scene's world; None for a scene alone.
+        config: The run's, if it is one.
+    """
+
+    name: str
+    path: Path
+    scene: Scene | None = None
+    gaussians: Gaussians | None = None
+    config: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def data_factor(self) -> int:
+        """By how much the run's photographs were made smaller; 1 where nobody says."""
+        return int(self.config.get("data_factor", 1))
+
+    @property
+    def test_every(self) -> int:
+        """Of the images sorted by name, every so many-th is a test view."""
+        return int(self.config.get("test_every", 8))
+
+
+def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
+    """Read what a user names.
+
+    Args:
+        path: A scene, a run's folder, a file of Gaussians or of points.
+        scene_path: The scene that a model is of; a run's own when left out, if it is still there.
+
+    Raises:
+        SceneNotFoundError: There is nothing, or the scene that the user names is not there.
+        SceneFormatError: It is damaged, or nothing that can be shown.
+    """
+    folder = RunFolder(path)
+    if path.is_dir() and folder.is_run:
+        return _open_run(folder, scene_path)
+    if path.is_file() and _is_model(path):
+        scene = None if scene_path is None else load_scene(scene_path, require_points=False)
+        return Shown(path.name, path, scene, read_model(path))
+    return Shown(path.name, path, load_scene(path, require_points=False))
+
+
+def _open_run(folder: RunFolder, scene_path: Path | None) -> Shown:
+    if not folder.gaussians.is_file():
+        raise SceneNotFoundError(
+            f"{folder.path} to be a finished run of splatseed train",
+            found="a run that has not finished",
+            fix=f"Go on with it: splatseed train SCENE -o {folder.path} --resume.",
+        )
+    config, scene = folder.read_config(), None
+    named = scene_path or config.get("scene")
+    if named is not None:
+        try:
+            scene = load_scene(Path(named), require_points=False)
+        except (SceneNotFoundError, SceneFormatError):
+            if scene_path is not None:
+                raise
+    return Shown(folder.path.name, folder.path, scene, read_model(folder.gaussians), config)
+
+
+def _is_model(path: Path) -> bool:
+    """Whether a file is of Gaussians: a .ply of points is a scene."""
+    if path.suffix.lower() in MODEL_SUFFIXES:
+        return True
+    data = read_bytes(path)
+    if path.suffix.lower() == ".json" and b'"means"' not in data[:_HEADER]:
+        return False
+    try:
+        kind = detect_format(path, data)
+    except SceneFormatError:
+        return False
+    return kind != "ply" or b" rot_0\n" in data[:_HEADER].replace(b"\r", b"")

@@ -1,0 +1,82 @@
+"""``splatseed export``: any model to any format, cropped and cleaned; nothing of the user's is
+replaced."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from splatseed.export import read_model
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.ply import write_gaussians
+
+
+@pytest.fixture
+def model(rng, tmp_path):
+    """A file of 400 Gaussians in a cube from -1 to 1, every other one nearly transparent."""
+    opacities = np.where(np.arange(400) % 2, 3.0, -6.0)
+    arrays = {
+        "means": rng.uniform(-1, 1, (400, 3)),
+        "scales": np.full((400, 3), -3.0),
+        "quats": rng.normal(size=(400, 4)),
+        "opacities": opacities,
+        "sh0": rng.normal(size=(400, 1, 3)),
+        "shN": 0.1 * rng.normal(size=(400, 15, 3)),
+    }
+    path = tmp_path / "model.ply"
+    write_gaussians(path, Gaussians(**{k: a.astype(np.float32) for k, a in arrays.items()}))
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".splat", ".spz", ".sog"])
+def test_a_model_becomes_another_format_and_back(suffix, model, splatseed, tmp_path):
+    assert splatseed("export", model, "-o", tmp_path / f"out{suffix}").code == 0
+    run = splatseed("export", tmp_path / f"out{suffix}", "-o", tmp_path / "back.ply")
+    assert (run.code, run.err) == (0, "")
+    assert "400 of 400" in run.out
+    assert len(read_model(tmp_path / "back.ply")) == 400
+
+
+def test_a_run_is_exported_cropped_and_cleaned(model, splatseed, tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("config.json", "splatseed.json"):
+        (folder / name).write_text(json.dumps({}))
+    model.rename(folder / "point_cloud.ply")
+    out = tmp_path / "out.spz"
+    box = "--crop=-1,-1,0,1,1,1"
+    assert splatseed("export", folder, "-o", out, box, "--min-opacity", 0.05).code == 0
+    kept = read_model(out)
+    assert 70 < len(kept) < 130
+    assert kept.means[:, 2].min() > -0.01
+
+
+def test_nothing_is_replaced_unasked_and_no_run_is_written_into(model, splatseed, tmp_path):
+    (tmp_path / "out.spz").write_bytes(b"mine")
+    run = splatseed("export", model, "-o", tmp_path / "out.spz")
+    assert (run.code, (tmp_path / "out.spz").read_bytes()) == (2, b"mine")
+    assert "--overwrite" in run.err
+    assert splatseed("export", model, "-o", tmp_path / "out.spz", "--overwrite").code == 0
+    before = model.read_bytes()
+    assert splatseed("export", model, "-o", model, "--overwrite").code == 2
+    assert model.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["nowhere", "-o", "a.spz"], "nothing there"),
+        (["MODEL", "-o", "a.glb"], "splat-transform"),
+        (["MODEL", "-o", "a.spz", "--crop", "1,2"], "--crop"),
+        (["MODEL", "-o", "a.spz", "--min-opacity", "2"], "--min-opacity"),
+    ],
+)
+def test_bad_input_is_one_line(words, said, model, splatseed, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = splatseed("export", *(str(model) if word == "MODEL" else word for word in words))
+    assert (run.code, run.out) == (2, "")
+    assert said in run.err
+    assert run.err.count("\n") == 1
+    assert not (tmp_path / "a.spz").exists()

@@ -1,0 +1,307 @@
+"""Models survive each format, agree with the formats' own tools, and damaged files are told from whole ones."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import shutil
+import subprocess
+import zipfile
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError, SplatseedError
+from splatseed.export import (
+    FORMATS,
+    format_of_name,
+    keep_gaussians,
+    parse_crop,
+    read_model,
+    write_model,
+)
+from splatseed.export.codebook import codebook, codes, palette
+from splatseed.export.packing import from_smallest_three, smallest_three
+from splatseed.splat.gaussians import Gaussians
+
+SUFFIXES = [each.suffix for each in FORMATS.values()]
+PACKED = [suffix for suffix in SUFFIXES if suffix != ".ply"]
+LIMITS = {  # of positions, log-scales, degrees of rotation, opacities, first and further coefficients
+    ".compressed.ply": (0.02, 0.01, 0.3, 0.003, 0.02, 0.02),
+    ".splat": (0, 1e-5, 0.8, 0.003, 0.01, None),
+    ".spz": (1e-4, 0.04, 0.3, 0.003, 0.02, 0.02),
+    ".sog": (0.002, 0.04, 1.0, 0.003, 0.03, 0.35),
+}
+"""The palette of .sog has a thousand entries for a thousand Gaussians here, of random colours."""
+
+
+def _gaussians(count=700, rest=15, seed=0):
+    rng = np.random.default_rng(seed)
+    arrays = {
+        "means": 3 * rng.normal(size=(count, 3)),
+        "scales": rng.normal(size=(count, 3)) - 4,
+        "quats": rng.normal(size=(count, 4)),
+        "opacities": 2 * rng.normal(size=count),
+        "sh0": rng.uniform(-1.7, 1.7, (count, 1, 3)),
+        "shN": 0.1 * rng.normal(size=(count, rest, 3)),
+    }
+    return Gaussians(**{name: array.astype(np.float32) for name, array in arrays.items()})
+
+
+def _unit(quats):
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
+def _assert_close(found, truth, limits):
+    """Whatever order the Gaussians came back in: positions tell which is which."""
+    nearest = np.argmin(((found.means[:, None] - truth.means[None]) ** 2).sum(axis=2), axis=1)
+    assert sorted(nearest) == list(range(len(truth)))
+    dots = np.abs((_unit(found.quats) * _unit(truth.quats[nearest])).sum(axis=1))
+    degrees = np.rad2deg(2 * np.arccos(np.clip(dots, 0, 1)))
+    opacity, true_opacity = (1 / (1 + np.exp(-g.opacities)) for g in (found, truth))
+    errors = (
+        np.abs(found.means - truth.means[nearest]).max(),
+        np.abs(found.scales - truth.scales[nearest]).max(),
+        degrees.max() - 0.09,  # what single precision makes of equal rotations
+        np.abs(opacity - true_opacity[nearest]).max(),
+        np.abs(found.sh0 - truth.sh0[nearest]).max(),
+    )
+    assert all(np.array(errors) <= limits[:5]), errors
+    if limits[5] is None:
+        assert found.shN.shape[1] == 0
+    else:
+        assert np.abs(found.shN - truth.shN[nearest]).max(initial=0) <= limits[5]
+
+
+@pytest.mark.parametrize("rest", [0, 3, 8, 15])
+@pytest.mark.parametrize("suffix", PACKED)
+def test_a_model_comes_back_but_for_fine_detail(suffix, rest, tmp_path):
+    truth = _gaussians(rest=rest)
+    write_model(tmp_path / f"m{suffix}", truth)
+    found = read_model(tmp_path / f"m{suffix}")
+    assert all(array.dtype == np.float32 for array in found.arrays().values())
+    _assert_close(found, truth, LIMITS[suffix])
+
+
+def test_a_ply_comes_back_whole(tmp_path):
+    truth = _gaussians()
+    write_model(tmp_path / "m.ply", truth)
+    for name, array in read_model(tmp_path / "m.ply").arrays().items():
+        np.testing.assert_array_equal(array, getattr(truth, name))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_one_gaussian_and_equal_ones_are_models_too(suffix, tmp_path):
+    one = _gaussians(1)
+    write_model(tmp_path / f"one{suffix}", one)
+    assert len(read_model(tmp_path / f"one{suffix}")) == 1
+    same = Gaussians(**{name: np.repeat(a, 300, axis=0) for name, a in one.arrays().items()})
+    write_model(tmp_path / f"same{suffix}", same)
+    found = read_model(tmp_path / f"same{suffix}")
+    assert len(found) == 300
+    np.testing.assert_allclose(found.means, same.means, atol=1e-3)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_equal_models_give_equal_bytes(suffix, tmp_path):
+    for name in "ab":
+        write_model(tmp_path / f"{name}{suffix}", _gaussians())
+    a, b = ((tmp_path / f"{name}{suffix}").read_bytes() for name in "ab")
+    assert a == b
+
+
+@pytest.mark.parametrize("suffix", [s for s in SUFFIXES if s != ".splat"])
+def test_the_content_says_what_a_file_is(suffix, tmp_path):
+    write_model(tmp_path / f"m{suffix}", _gaussians())
+    misnamed = (tmp_path / f"m{suffix}").rename(tmp_path / "model.splat")
+    assert len(read_model(misnamed)) == 700
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_far_off_world_keeps_its_place(suffix, tmp_path):
+    near = _gaussians()
+    far = Gaussians(**{**near.arrays(), "means": near.means + np.float32(1e4)})
+    write_model(tmp_path / f"m{suffix}", far)
+    found = read_model(tmp_path / f"m{suffix}")
+    np.testing.assert_allclose(np.sort(found.means, axis=0), np.sort(far.means, axis=0), atol=0.02)
+
+
+def test_opacities_of_0_and_1_stay_finite(tmp_path):
+    model = _gaussians()
+    sure = Gaussians(**{**model.arrays(), "opacities": np.full(700, np.inf, np.float32)})
+    for suffix in PACKED:
+        write_model(tmp_path / f"m{suffix}", sure)
+        found = read_model(tmp_path / f"m{suffix}").opacities
+        assert np.isfinite(found).all()
+        assert (found > 5).all()
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=20, deadline=None)
+def test_three_components_are_a_rotation(seed):
+    quats = np.random.default_rng(seed).normal(size=(50, 4)).astype(np.float32)
+    back = from_smallest_three(*smallest_three(quats))
+    np.testing.assert_allclose(np.abs((back * _unit(quats)).sum(axis=1)), 1, atol=1e-5)
+
+
+def test_codebooks_and_palettes_err_less_than_even_steps(rng):
+    values = rng.standard_t(3, 20_000).astype(np.float32)
+    centers = codebook(values)
+    error = np.abs(centers[codes(values, centers)] - values)
+    even = np.linspace(values.min(), values.max(), 256)
+    assert error.mean() < np.abs(even[codes(values, even)] - values).mean() / 3
+    vectors = rng.normal(size=(4096, 6)).astype(np.float32)
+    entries, labels = palette(vectors, 8)
+    assert (labels.min(), labels.max(), len(entries)) == (0, 255, 256)
+    some = vectors[rng.integers(0, 4096, 4096)]
+    assert ((entries[labels] - vectors) ** 2).mean() < ((some - vectors) ** 2).mean() / 3
+
+
+# Damage ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A small model in each format, as bytes."""
+    folder = tmp_path_factory.mktemp("models")
+    for suffix in SUFFIXES:
+        write_model(folder / f"m{suffix}", _gaussians(300))
+    return {suffix: (folder / f"m{suffix}").read_bytes() for suffix in SUFFIXES}
+
+
+@given(st.sampled_from(SUFFIXES), st.data())
+@settings(max_examples=150, deadline=None)
+def test_damage_is_told_or_harmless(files, tmp_path_factory, suffix, data):
+    """Cut short or with bytes changed: our error or a model, nothing else."""
+    content = bytearray(files[suffix])
+    if data.draw(st.booleans()):
+        del content[data.draw(st.integers(0, len(content) - 1)) :]
+    for _ in range(data.draw(st.integers(1, 4))):
+        if content:
+            # Headers are where it hurts.
+            at = data.draw(st.integers(0, min(len(content) - 1, data.draw(st.sampled_from([60, 2000, 10**9])))))  # fmt: skip
+            content[at] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.mktemp("damaged") / f"m{suffix}"
+    path.write_bytes(content)
+    with suppress(SplatseedError):
+        assert len(read_model(path)) > 0
+
+
+@pytest.mark.parametrize("suffix", PACKED)
+def test_a_file_cut_short_is_told(suffix, files, tmp_path):
+    path = tmp_path / f"m{suffix}"
+    path.write_bytes(files[suffix][:-7])
+    with pytest.raises(SceneFormatError, match=str(path)):
+        read_model(path)
+
+
+def test_a_count_is_not_believed(files, tmp_path):
+    content = bytearray(gzip.decompress(files[".spz"]))
+    content[8:12] = b"\xff\xff\xff\x7f"
+    (tmp_path / "m.spz").write_bytes(gzip.compress(bytes(content)))
+    with pytest.raises(SplatseedError, match="expected"):
+        read_model(tmp_path / "m.spz")
+
+
+def test_what_is_no_model_is_named(tmp_path):
+    with pytest.raises(SceneNotFoundError):
+        read_model(tmp_path / "none.spz")
+    for name, content, word in (
+        ("a.spz", b"", "an empty file"),
+        ("a.splat", bytes(33), "33 bytes"),
+        ("a.ksplat", bytes(40), "splat-transform IN.ksplat"),
+        ("a.glb", b"glTF\x02\0\0\0", "no glTF"),
+        ("a.json", b"{}", "a whole SOG|version"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(SceneFormatError, match=word):
+            read_model(tmp_path / name)
+
+
+def test_names_choose_the_format_and_others_have_a_tool(tmp_path):
+    assert format_of_name(tmp_path / "A.COMPRESSED.PLY") == "compressed-ply"
+    assert format_of_name(tmp_path / "a.ply") == "ply"
+    for name, word in (("a.glb", "splat-transform"), ("a.sogg", r"Did you mean \.sog"), ("a", "none")):  # fmt: skip
+        with pytest.raises(ParameterError, match=word):
+            format_of_name(tmp_path / name)
+
+
+def test_an_unpacked_sog_is_read(files, tmp_path):
+    (tmp_path / "m.sog").write_bytes(files[".sog"])
+    zipfile.ZipFile(tmp_path / "m.sog").extractall(tmp_path)
+    assert json.loads((tmp_path / "meta.json").read_text())["version"] == 2
+    assert len(read_model(tmp_path / "meta.json")) == 300
+    (tmp_path / "quats.webp").unlink()
+    with pytest.raises(SplatseedError, match=r"quats\.webp"):
+        read_model(tmp_path / "meta.json")
+
+
+# Crop and clean ----------------------------------------------------------------------------------
+
+
+def test_a_box_and_an_opacity_keep_what_they_say():
+    model = _gaussians()
+    kept = keep_gaussians(model, parse_crop("-1,-2,-3,1,2,3"), 0.25)
+    inside = (np.abs(model.means) <= [1, 2, 3]).all(axis=1)
+    opaque = 1 / (1 + np.exp(-model.opacities)) >= 0.25
+    np.testing.assert_array_equal(kept.means, model.means[inside & opaque])
+    assert keep_gaussians(model) is model
+
+
+@pytest.mark.parametrize("text", ["", "1,2,3", "0,0,0,1,1,0", "a,b,c,d,e,f", "0,0,0,1,1,nan"])
+def test_what_is_no_box_is_refused(text):
+    with pytest.raises(ParameterError, match="--crop"):
+        parse_crop(text)
+
+
+def test_nothing_left_is_an_error():
+    with pytest.raises(ParameterError, match="none of 700"):
+        keep_gaussians(_gaussians(), parse_crop("90,90,90,91,91,91"))
+    with pytest.raises(ParameterError, match="min-opacity"):
+        keep_gaussians(_gaussians(), min_opacity=1.0)
+
+
+# The formats' own tool ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def converter():
+    """PlayCanvas's splat-transform: npm install -g @playcanvas/splat-transform."""
+    command = os.environ.get("SPLAT_TRANSFORM") or shutil.which("splat-transform")
+    if command is None:
+        pytest.skip("splat-transform is not installed (npm install -g @playcanvas/splat-transform)")
+
+    def convert(*words):
+        words = [str(word) for word in (command, "-w", "-q", *words)]
+        run = subprocess.run(words, capture_output=True, text=True, check=False, timeout=120)
+        assert run.returncode == 0, run.stdout + run.stderr
+
+    return convert
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_the_formats_own_tool_reads_ours(suffix, converter, tmp_path):
+    truth = _gaussians()
+    write_model(tmp_path / f"ours{suffix}", truth)
+    converter(tmp_path / f"ours{suffix}", tmp_path / "theirs.ply")
+    exact = (1e-6, 1e-6, 0.01, 1e-6, 1e-6, 1e-6)
+    limits = list(LIMITS.get(suffix, exact))
+    limits[2] *= 2  # it takes 127.5 for the middle of a byte, not 128
+    _assert_close(read_model(tmp_path / "theirs.ply"), truth, limits)
+
+
+@pytest.mark.parametrize("suffix", [".compressed.ply", ".spz", ".sog"])
+def test_we_read_what_the_formats_own_tool_writes(suffix, converter, tmp_path):
+    truth = _gaussians()
+    write_model(tmp_path / "ours.ply", truth)
+    converter("-g", "cpu", tmp_path / "ours.ply", tmp_path / f"theirs{suffix}")
+    if suffix == ".spz":
+        pytest.importorskip("zstandard", reason="version 4 needs zstandard")
+    converter(tmp_path / f"theirs{suffix}", tmp_path / "as_they_read_it.ply")
+    same = (1e-5, 1e-5, 0.1, 0.002, 1e-5, 1e-5)
+    theirs = read_model(tmp_path / f"theirs{suffix}")
+    _assert_close(theirs, read_model(tmp_path / "as_they_read_it.ply"), same)
+    assert np.abs(np.sort(theirs.means, axis=0) - np.sort(truth.means, axis=0)).max() < 0.02

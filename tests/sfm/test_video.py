@@ -1,0 +1,101 @@
+"""Frames of a video: sharp, spread by movement, none from standing still."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from splatseed.cli import main
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.sfm.video import choose, is_video, pick_frames, shift
+from splatseed.view.video import write_video
+
+HEIGHT, WIDTH = 120, 160
+STILL = 12
+
+
+@pytest.fixture(scope="module")
+def wall():
+    """A long textured wall to film along."""
+    rng = np.random.default_rng(0)
+    wall = gaussian_filter(rng.random((HEIGHT, 1200, 3)), (1.5, 1.5, 0))
+    wall = (wall - wall.min()) / (wall.max() - wall.min())
+    return (255 * wall).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def video(wall, tmp_path_factory):
+    """Stands still, then moves 4 px a frame; every third frame is blurred."""
+    pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra sfm)")
+    path = tmp_path_factory.mktemp("video") / "walk.mp4"
+
+    def frames():
+        for i in range(60):
+            at = 4 * max(0, i - STILL)
+            frame = wall[:, at : at + WIDTH]
+            yield gaussian_filter(frame, (3, 3, 0)) if i % 3 == 2 else frame
+
+    write_video(path, frames(), (WIDTH, HEIGHT), 30)
+    return path
+
+
+def test_the_shift_of_a_picture_is_found(wall):
+    grey = wall.astype(np.float32).mean(axis=2)
+    pieces = [grey[:, at : at + WIDTH] for at in (100, 100, 107)]
+    assert shift(pieces[0], pieces[1]) == 0
+    assert shift(pieces[0], pieces[2]) == pytest.approx(7, abs=0.5)
+
+
+def test_the_sharpest_of_each_stretch_is_taken():
+    way = np.concatenate([np.zeros(50), np.linspace(0, 1, 101)[1:]])
+    sharpness = np.ones(150)
+    sharpness[[20, 77, 130]] = 2
+    taken = choose(sharpness, way, 4)
+    assert len(taken) == 4
+    assert {20, 77, 130} <= set(taken.tolist())
+    assert np.all(np.diff(taken) > 0)
+    assert len(choose(sharpness, np.zeros(150), 10)) == 1
+    assert len(choose(np.ones(0), np.zeros(0), 10)) == 0
+
+
+def test_frames_are_sharp_spread_and_not_of_standing_still(video, tmp_path):
+    picked = pick_frames(video, tmp_path, 10)
+    assert picked.total == 60
+    # 47 steps of 4 px of 160.
+    assert picked.way == pytest.approx(47 * 4 / 160, rel=0.15)
+    files = sorted(tmp_path.iterdir())
+    assert [f"walk_{number:06}.jpg" for number in picked.numbers] == [f.name for f in files]
+    assert 8 <= len(files) <= 10
+    assert Image.open(files[0]).size == (WIDTH, HEIGHT)
+    assert not any(number % 3 == 2 for number in picked.numbers)  # those are blurred
+    assert sum(number < STILL for number in picked.numbers) <= 1
+    assert pick_frames(video, tmp_path, 10) == picked
+
+
+def test_what_cannot_be_used_is_told(wall, tmp_path):
+    pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra sfm)")
+    write_video(tmp_path / "still.mp4", [wall[:, :WIDTH]] * 20, (WIDTH, HEIGHT), 30)
+    with pytest.raises(SceneFormatError, match="walk around"):
+        pick_frames(tmp_path / "still.mp4", tmp_path, 10)
+    (tmp_path / "broken.mp4").write_bytes(b"\0" * 999)
+    with pytest.raises(SceneFormatError, match="ffmpeg reads"):
+        pick_frames(tmp_path / "broken.mp4", tmp_path, 10)
+    with pytest.raises(SceneNotFoundError):
+        pick_frames(tmp_path / "none.mp4", tmp_path, 10)
+    with pytest.raises(ParameterError, match="--frames"):
+        pick_frames(tmp_path / "still.mp4", tmp_path, 1)
+    assert is_video(tmp_path / "still.mp4")
+    assert not is_video(tmp_path)
+
+
+def test_a_broken_video_is_one_line_and_leaves_nothing(tmp_path, capsys):
+    pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra sfm)")
+    pytest.importorskip("pycolmap", reason="Structure-from-Motion needs pycolmap")
+    (tmp_path / "broken.mp4").write_bytes(b"\0" * 999)
+    with pytest.raises(SystemExit) as stop:
+        main(["sfm", str(tmp_path / "broken.mp4"), "-o", str(tmp_path / "out")])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,91 @@
+"""``splatseed flight`` as a user runs it: videos that can be read, and one line for what cannot be."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
+ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
+
+from splatseed.cli import main
+
+
+def _run(capsys, *words):
+    capsys.readouterr()
+    code = 0
+    try:
+        main([str(word) for word in words])
+    except SystemExit as stop:
+        code = int(stop.code or 0)
+    return code, capsys.readouterr()
+
+
+def _frames(path):
+    """A video's frames, [F, H, W, 3], and its frames per second."""
+    reader = ffmpeg.read_frames(str(path))
+    facts = next(reader)
+    width, height = facts["size"]
+    frames = [np.frombuffer(each, np.uint8).reshape(height, width, 3) for each in reader]
+    return np.stack(frames), facts["fps"]
+
+
+def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, capsys):
+    out = tmp_path / "deep/flight.mp4"
+    code, said = _run(capsys, "flight", run_folder, "-o", out, "--seconds", 0.5, "--fps", 12)
+    assert (code, said.err) == (0, "")
+    frames, fps = _frames(out)
+    assert (frames.shape, fps) == ((6, 90, 120, 3), 12)
+    assert frames.mean() > 20
+    assert np.abs(np.diff(frames.astype(int), axis=0)).mean() > 0.5  # it moves
+
+
+def test_two_models_are_split_and_odd_sizes_become_even(run_folder, tmp_path, capsys):
+    out = tmp_path / "flight.mp4"
+    words = ("--orbit", "--seconds", 0.3, "--fps", 10, "--size", "101x75")
+    ply = run_folder / "point_cloud.ply"
+    code, said = _run(capsys, "flight", run_folder, "-o", out, "--compare", ply, *words)
+    assert code == 0, said.err
+    frames, _ = _frames(out)
+    assert frames.shape == (3, 76, 100, 3)
+    assert (frames[:, 10:60, 49:51].mean(axis=(0, 2, 3)) > 150).all()  # the line between them
+
+
+def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, capsys):
+    frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 60}
+    (tmp_path / "p.json").write_text(json.dumps({"camera_path": 4 * [frame], "fps": 8}))
+    out = tmp_path / "flight.mkv"
+    code, said = _run(capsys, "flight", run_folder, "-o", out, "--path", tmp_path / "p.json", "--depth")  # fmt: skip
+    assert code == 0, said.err
+    frames, fps = _frames(out)
+    assert (len(frames), fps) == (4, 8)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("-o", "a.avi"), ".mp4"),
+        (("-o", "a.mp4", "--size", "0x9"), "--size"),
+        (("-o", "a.mp4", "--fps", "0"), "--fps"),
+        (("-o", "a.mp4", "--orbit", "--path", "p.json"), "both"),
+        (("-o", "a.mp4", "--path", "none.json"), "none.json"),
+        (("-o", "a.mp4", "--compare", "nowhere"), "nowhere"),
+        (("-o", "a.mp4", "--crop=5,5,5,1,1,1"), "--crop"),
+        (("-o", "x" * 300 + ".mp4", "--seconds", "0.1"), "name too long"),
+    ],
+)
+def test_bad_input_is_one_line(words, said, run_folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    code, heard = _run(capsys, "flight", run_folder, *words)
+    assert code == 2
+    assert said in heard.err
+    assert heard.err.count("\n") == 1
+    assert not list(tmp_path.glob("*.mp4"))
+
+
+def test_a_scene_is_no_model(room, tmp_path, capsys):
+    code, heard = _run(capsys, "flight", room, "-o", tmp_path / "a.mp4")
+    assert code == 2
+    assert "no run" in heard.err

@@ -1,0 +1,258 @@
+"""The viewer in a browser: pages are driven, and what they show is looked at."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import socket
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
+pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
+
+from splatseed.cli import main
+from splatseed.errors import ParameterError
+from splatseed.pointcloud import PointCloud
+from splatseed.splat.frame import TrainingFrame
+from splatseed.view import pictures
+from splatseed.view.canvas import canvas_view, fitted_fov, laid_onto, stage_pose
+from splatseed.view.pictures import Entry
+from splatseed.view.shown import open_shown
+from splatseed.view.stage import clouds_of
+from splatseed.view.viewer import Viewer, free_port, stage_frame
+
+from .page import (
+    CHROMIUM,
+    click_text,
+    go,
+    screenshot,
+    served_page,
+    text,
+    toggle,
+    waits_for,
+)
+
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
+
+
+@pytest.fixture
+def viewer(run_folder):
+    """A run, served."""
+    port = free_port("127.0.0.1", 0)
+    served = Viewer([open_shown(run_folder)], "127.0.0.1", port)
+    served.url = f"http://127.0.0.1:{port}"
+    yield served
+    served.stop()
+
+
+def _session(viewer):
+    assert waits_for(lambda: viewer._sessions), "the page does not connect"
+    return list(viewer._sessions.values())[-1]
+
+
+def _settled(session):
+    """Wait for a full picture of what is shown."""
+    canvas = session._client.camera
+    full = (canvas.image_height, canvas.image_width)
+    return waits_for(lambda: session._picture is not None and session._picture.shape[:2] == full)
+
+
+# The page ----------------------------------------------------------------------------------------
+
+
+@needs_browser
+def test_a_run_is_seen_offline_and_a_click_flies(viewer, run_folder, tmp_path):
+    with served_page(tmp_path, viewer.url) as page:
+        session = _session(viewer)
+        assert waits_for(lambda: "original: " in text(page)), text(page)
+        assert _settled(session)
+        render = screenshot(page)[100:, :350]
+        assert render.std() > 15  # not blank
+        outside = [r for r in page.requests if not r.startswith((viewer.url, "data:", "blob:"))]
+        assert not outside
+        assert f"original: {len(open_shown(run_folder).scene.points):,}" in text(page)
+        image = session._cameras[0][0]
+        session._fly(image)
+        assert waits_for(lambda: session.at is image)
+        session._kind.value = "photograph"
+        session._loop.change()
+        assert _settled(session)
+        entry = viewer.entries[0]
+        _, position = stage_pose(image.camera, entry.frame)
+        np.testing.assert_allclose(session._client.camera.position, position, atol=1e-4)
+        assert session._note.content == ""
+        # A drag leaves the camera's place, and with it the photograph.
+        for kind, x in (("mousePressed", 100), ("mouseMoved", 200), ("mouseReleased", 200)):
+            page.call("Input.dispatchMouseEvent", type=kind, x=x, y=400, button="left",
+                      buttons=1, clickCount=1)  # fmt: skip
+        assert waits_for(lambda: session.at is None)
+        assert waits_for(lambda: "Click a camera" in session._note.content)
+
+
+@needs_browser
+def test_switches_of_the_page_act(viewer, tmp_path):
+    with served_page(tmp_path, viewer.url) as page:
+        session = _session(viewer)
+        assert waits_for(lambda: "Show cameras" in text(page))
+        before = session._cameras_on.value
+        toggle(page, "Show cameras")
+        assert waits_for(lambda: session._cameras_on.value != before)
+        shots = []
+        session._client.send_file_download = lambda name, data, **_: shots.append((name, data))
+        click_text(page, "Screenshot", "button")
+        assert waits_for(lambda: shots)
+        assert shots[0][1].startswith(b"\x89PNG")
+
+
+@needs_browser
+def test_two_browsers_have_switches_of_their_own_and_may_go(viewer, tmp_path):
+    with served_page(tmp_path / "a", viewer.url) as first:
+        one = _session(viewer)
+        with served_page(tmp_path / "b", viewer.url):
+            assert waits_for(lambda: len(viewer._sessions) == 2)
+            two = list(viewer._sessions.values())[-1]
+            assert waits_for(lambda: two._nodes)
+            two._kind.value = "depth"
+            two._points_on.value = True
+            two._restyle()
+            assert one._kind.value == "Gaussians"
+            assert not next(iter(one._nodes.values())).visible
+        # The second was cut off; the first goes on.
+        assert waits_for(lambda: len(viewer._sessions) == 1)
+        assert waits_for(lambda: not two._loop._thread.is_alive())
+        frames = one._loop.frames
+        one.refresh()
+        assert waits_for(lambda: one._loop.frames > frames)
+        go(first, viewer.url)
+        assert waits_for(lambda: list(viewer._sessions.values()) not in ([], [one]))
+
+
+# What is drawn -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def entry(run_folder):
+    shown = open_shown(run_folder)
+    return Entry(shown, stage_frame(shown))
+
+
+def _canvas_at(entry, image, size):
+    wxyz, position = stage_pose(image.camera, entry.frame)
+    fov = fitted_fov(image.camera, size[0] / size[1])
+    return canvas_view(wxyz, position, fov, size, entry.frame)
+
+
+def test_a_canvas_at_a_camera_is_that_camera(entry):
+    image = entry.shown.scene.images[3]
+    canvas = _canvas_at(entry, image, (image.camera.width, image.camera.height))
+    np.testing.assert_allclose(canvas.cam_from_world, image.camera.cam_from_world, atol=1e-9)
+    np.testing.assert_allclose(canvas.K[1, 1], image.camera.K[1, 1])
+
+
+def test_a_wide_canvas_shows_the_photograph_in_its_middle(entry):
+    image = entry.shown.scene.images[0]
+    canvas = _canvas_at(entry, image, (400, 90))
+    white = np.full((90, 120, 3), 255, np.uint8)
+    laid = laid_onto(canvas, white, image.camera, smooth=False)
+    columns = np.flatnonzero(laid[45, :, 0])
+    assert abs(len(columns) - 120) <= 2
+    assert abs(columns.mean() - 199.5) <= 1
+
+
+def test_every_picture_is_drawn_and_differs(entry):
+    image = entry.shown.scene.images[0]
+    canvas = _canvas_at(entry, image, (160, 120))
+    kinds = ("Gaussians", "depth", "photograph", "error", "points", "origins", "uncovered cells")
+    assert entry.kinds == kinds
+    drawn = {}
+    for kind in kinds:
+        picture, why = entry.draw(kind, canvas, image)
+        assert why == ""
+        assert picture.shape == (120, 160, 3)
+        assert picture.std() > 3
+        drawn[kind] = picture
+    # What is drawn is what was photographed, as far as Gaussians nobody trained can be.
+    close = np.abs(drawn["photograph"].astype(int) - drawn["Gaussians"]).mean()
+    mirrored = np.abs(drawn["photograph"][:, ::-1].astype(int) - drawn["Gaussians"]).mean()
+    assert close < mirrored
+
+
+def test_a_moving_picture_keeps_what_shows_most(entry, monkeypatch):
+    image = entry.shown.scene.images[0]
+    canvas = _canvas_at(entry, image, (160, 120))
+    count = len(entry.shown.gaussians)
+    monkeypatch.setattr(pictures, "MOST_MOVING", count // 2)
+    full, _ = entry.draw("Gaussians", canvas, image)
+    quick, _ = entry.draw("Gaussians", canvas, image, quick=True)
+    assert entry.quick_renderer.count == count // 2
+    assert np.abs(full.astype(int) - quick).mean() < 0.6 * full.std()
+
+
+def test_what_needs_a_camera_says_so(entry):
+    canvas = _canvas_at(entry, entry.shown.scene.images[0], (64, 48))
+    for kind in ("photograph", "error", "uncovered cells"):
+        picture, why = entry.draw(kind, canvas, None)
+        assert picture is None
+        assert "Click a camera" in why
+
+
+def test_a_folder_that_vanishes_is_told_not_fatal(room, run_folder, tmp_path):
+    own = shutil.copytree(room, tmp_path / "own")
+    shown = open_shown(run_folder, own)
+    entry = Entry(shown, stage_frame(shown))
+    shutil.rmtree(own)
+    image = shown.scene.images[0]
+    picture, why = entry.draw("photograph", _canvas_at(entry, image, (64, 48)), image)
+    assert picture is None
+    assert "cannot be read" in why
+    assert entry.draw("uncovered cells", _canvas_at(entry, image, (64, 48)), image)[0] is not None
+
+
+def test_points_of_several_origins_are_switched_apart(rng):
+    source = np.repeat(np.array([0, 2, 9], np.uint8), 50)
+    rgb = rng.integers(0, 255, (150, 3), dtype=np.uint8)
+    cloud = PointCloud(rng.random((150, 3)), rgb, source)
+    clouds = clouds_of(cloud, TrainingFrame(np.zeros(3), 2.0), 1000)
+    assert [each.count for each in clouds] == [50, 50, 50]
+    assert len({each.color for each in clouds}) == 3
+    np.testing.assert_allclose(clouds[0].xyz, 2 * cloud.xyz[:50], rtol=1e-6)
+    thinned = clouds_of(cloud, TrainingFrame(np.zeros(3), 2.0), 75)
+    assert [(each.count, len(each.xyz)) for each in thinned] == [(50, 25)] * 3
+
+
+# The command -------------------------------------------------------------------------------------
+
+
+def test_a_taken_port_is_told(capsys, room):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ParameterError, match="--port"):
+            free_port("127.0.0.1", port)
+        with pytest.raises(SystemExit) as stop:
+            main(["view", str(room), "--port", str(port)])
+    said = capsys.readouterr()
+    assert stop.value.code == 2
+    assert re.fullmatch(r"error: expected to listen at .*in use.*\n", said.err)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("nowhere",), "nowhere"),
+        (("ROOM", "--host", "256.0.0.1"), "--host"),
+        (("ROOM", "--port", "99999"), "--port"),
+        (("ROOM", "--compare", "nowhere", "--port", "0"), "nowhere"),
+    ],
+)
+def test_bad_input_is_one_line(words, said, room, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        main(["view", *(str(room) if word == "ROOM" else word for word in words)])
+    heard = capsys.readouterr()
+    assert stop.value.code == 2
+    assert said in heard.err
+    assert heard.err.count("\n") == 1
