@@ -9,7 +9,7 @@ BASE := $(VENV)/.base
 TRAIN := $(VENV)/.train
 READY := $(VENV)/.ready
 
-.PHONY: demo demo-points test coverage lint format bench clean
+.PHONY: demo demo-points test quick coverage lint format bench clean
 .DEFAULT_GOAL := test
 
 $(BASE): pyproject.toml constraints.txt
@@ -40,6 +40,12 @@ demo-points: $(BASE)
 # A file's tests share what they make, so a file goes to one process.
 test: $(READY)
 	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+
+# The tests of the rooms that differ from BASE, without the slow ones: under 90 seconds.
+BASE ?= HEAD
+quick: $(READY)
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile -m 'not slow' \
+	  $$($(BIN)/python tests/changed.py $(BASE))
 
 coverage: $(READY)
 	$(BIN)/python -m pytest --cov --cov-report=term

@@ -18,6 +18,11 @@ def _untold_compilation(monkeypatch):
     monkeypatch.setattr("splatseed.console.TOLD_AFTER", math.inf)
 
 
+def pytest_collection_modifyitems(items) -> None:
+    """Slow tests last: what fails is known before they begin."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)

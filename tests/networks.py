@@ -128,8 +128,8 @@ SAVED = {
 
 def save_network(name: str, folder: Path) -> Path:
     """Save a network with random weights, large enough to make a map that is not flat."""
-    import torch  # noqa: PLC0415
-    import transformers  # noqa: PLC0415
+    import torch
+    import transformers
 
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -151,7 +151,7 @@ def onnx_sum(
     factor: int = 1,
 ) -> Path:
     """Write a network whose map is red + 2 green + 4 blue of its input, ``factor`` times smaller."""
-    from onnx import TensorProto, checker, helper, numpy_helper, save  # noqa: PLC0415
+    from onnx import TensorProto, checker, helper, numpy_helper, save
 
     dtype, kind = (np.float16, TensorProto.FLOAT16) if half else (np.float32, TensorProto.FLOAT)
     weights = np.zeros((1, 3, factor, factor), dtype)

@@ -171,6 +171,7 @@ def test_help_does_not_wait_for_what_computes():
     assert run.returncode == 0, run.stderr
 
 
+@pytest.mark.slow
 def test_every_module_can_be_imported_first():
     """Each in a process of its own, forked from one that has loaded what is not ours, and the front
     door, which Python loads before any module behind it."""
@@ -249,7 +250,7 @@ def test_the_front_door_lists_what_the_packages_promise():
 
 
 def test_every_error_is_ours_and_says_three_things():
-    from splatseed import errors  # noqa: PLC0415  (so that the front door is tested without it)
+    from splatseed import errors
 
     for name in errors.__all__:
         error = getattr(errors, name)("a cat", found="a dog", fix="Look again.")

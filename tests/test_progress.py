@@ -29,7 +29,7 @@ def test_threads_do_every_piece_once():
 def test_an_interrupt_waits_for_the_pieces_in_hand_and_drops_the_rest():
     running, started, lock = set(), [], threading.Lock()
 
-    def work(start, stop):  # noqa: ARG001
+    def work(start, stop):
         with lock:
             running.add(start)
             started.append(start)
@@ -37,7 +37,7 @@ def test_an_interrupt_waits_for_the_pieces_in_hand_and_drops_the_rest():
         with lock:
             running.discard(start)
 
-    def interrupt(stage, done):  # noqa: ARG001
+    def interrupt(stage, done):
         if done > 0:
             raise KeyboardInterrupt
 
@@ -48,7 +48,7 @@ def test_an_interrupt_waits_for_the_pieces_in_hand_and_drops_the_rest():
 
 
 def test_an_error_in_a_thread_comes_out():
-    def work(start, stop):  # noqa: ARG001
+    def work(start, stop):
         if start == 50:
             message = "at 50"
             raise ValueError(message)

@@ -1,8 +1,8 @@
 """A measurement in a process of its own.
 
-Promise: the child has the number of threads asked for from its first import on, in Numba, PyTorch and
-BLAS alike; idle threads sleep, as they do under the command line; nothing of the parent's caches,
-memory or settings is in what it measures.
+Promise: the child has the number of threads asked for from its first import on, in Numba, PyTorch
+and BLAS alike; idle threads sleep, as they do under the command line; nothing of the parent's
+caches, memory or settings is in what it measures.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Two clocks: the wall's, and one for a machine that others use too.
 
 Notation: ``wall`` is seconds on the wall. ``cpu`` (Linux) is, of everything that is timed, the time
-that the busiest thread was on a core: what the wall's would be were nothing else running, as long as
-what is timed runs either on one thread or on all of them at once. Promise: a reading is an array, so
-that differences can be taken thread by thread; its greatest entry is the time.
+that the busiest thread was on a core: what the wall's would be were nothing else running, as long
+as what is timed runs either on one thread or on all of them at once. Promise: a reading is an
+array, so that differences can be taken thread by thread; its greatest entry is the time.
 """
 
 from __future__ import annotations

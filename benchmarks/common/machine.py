@@ -35,5 +35,6 @@ def warn_if_busy() -> None:
     load = os.getloadavg()[0]
     if load > IDLE_LOAD:
         print(
-            f"WARNING: the load average is {load:.1f}; times below are not those of an idle machine.\n"
+            f"WARNING: the load average is {load:.1f}; times below are not those of an idle "
+            "machine.\n"
         )

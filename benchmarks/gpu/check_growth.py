@@ -2,9 +2,9 @@
 
     python benchmarks/gpu/check_growth.py
 
-The room of the demo, as many Gaussians as it has points. Prints the largest difference of pixels and errors between
-the two rasterisers, as a part of the largest value, and the test PSNR of a run of each strategy on each backend at
-one number of Gaussians.
+The room of the demo, as many Gaussians as it has points. Prints the largest difference of pixels
+and errors between the two rasterisers, as a part of the largest value, and the test PSNR of a run
+of each strategy on each backend at one number of Gaussians.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ def main() -> None:
                 run.train()
                 count, seconds = len(run.state.params["means"]), run.state.watch.seconds
                 print(
-                    f"{strategy}, {backend}: {run.trainer.test_psnr():.2f} dB, {count:,}, {seconds:.1f} s"
+                    f"{strategy}, {backend}: {run.trainer.test_psnr():.2f} dB, {count:,}, "
+                    f"{seconds:.1f} s"
                 )
 
 

@@ -4,15 +4,16 @@ Run on a machine with CUDA and gsplat 1.5.3::
 
     python benchmarks/gpu/compare_gsplat.py --golden tests/render/golden_gsplat.npz
 
-Prints, by case and array, the largest difference over the largest entry, and exits with 1 where more
-than ``ODD_ONES`` of the entries differ by more than ``TOLERANCE``. gsplat works in float32 with a fast
-exponential and adds gradients in any order; now and then a pixel falls on the other side of the
-cut-off at 1/255, hence the allowance. ``--golden`` keeps the small cases, inputs and gsplat's results,
-for the tests of machines without a GPU.
+Prints, by case and array, the largest difference over the largest entry, and exits with 1 where
+more than ``ODD_ONES`` of the entries differ by more than ``TOLERANCE``. gsplat works in float32
+with a fast exponential and adds gradients in any order; now and then a pixel falls on the other
+side of the cut-off at 1/255, hence the allowance. ``--golden`` keeps the small cases, inputs and
+gsplat's results, for the tests of machines without a GPU.
 
 The golden file (.npz) holds float32 arrays ``case/inputs/NAME`` and ``case/outputs/NAME`` and, as
 ``case/options``, the other arguments in JSON. Outputs are ``image``, ``alpha`` and ``d_NAME``, the
-gradient of sum (image - 0.3)^2 + sum (alpha - 0.5)^2; ``d_means2d`` and ``absgrad`` where not packed.
+gradient of sum (image - 0.3)^2 + sum (alpha - 0.5)^2; ``d_means2d`` and ``absgrad`` where not
+packed.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """OpenSplat's program on the same Gaussians and photographs, where the user has it.
 
-Promise: nothing of OpenSplat is imported or linked; it is run as a user runs it, on a COLMAP scene in
-a temporary folder. It goes on from a .ply with our Gaussians, at a step where it uses harmonics of
-degree 3 and does not densify. What it takes to start is left out: the time is the difference of a
-short and a longer run over the difference of their steps. Options are those of its version 1.1.5.
+Promise: nothing of OpenSplat is imported or linked; it is run as a user runs it, on a COLMAP scene
+in a temporary folder. It goes on from a .ply with our Gaussians, at a step where it uses harmonics
+of degree 3 and does not densify. What it takes to start is left out: the time is the difference of
+a short and a longer run over the difference of their steps. Options are those of its version 1.1.5.
 
 Compare speed, not quality: the CPU build of that version sorts by a depth that it reads wrongly.
 """

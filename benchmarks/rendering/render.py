@@ -2,8 +2,8 @@
 
 Notation: a *useful pair* is a pixel with a Gaussian that adds to its colour (``splats.py``); G is
 10^9. Promise: every measurement has a process of its own; times are the best of several passes over
-one view, stage by stage; ratios are of one run on one machine. Each table is Markdown. See README.md
-for what is and is not measured.
+one view, stage by stage; ratios are of one run on one machine. Each table is Markdown. See
+README.md for what is and is not measured.
 """
 
 from __future__ import annotations

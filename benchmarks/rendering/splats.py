@@ -1,10 +1,11 @@
 """A room of Gaussians as training leaves them, its photographs, and how much there is to blend in it.
 
-Notation: N Gaussians in the made room's metres (``splatseed.synthetic``), V cameras of W x H pixels.
-A *useful pair* is a pixel with a Gaussian that adds to its colour: alpha is at least 1/255, and the
-pixel's transmittance has not ended before. Promise: the same scene for the same numbers and seed.
-``SIZE`` was chosen once, so that a pixel has about 50 useful pairs at 400 x 300 with 50,000 Gaussians
-and at 800 x 600 with 200,000 (both are 2.4 pixels a Gaussian); how many there are is always counted.
+Notation: N Gaussians in the made room's metres (``splatseed.synthetic``), V cameras of W x H
+pixels. A *useful pair* is a pixel with a Gaussian that adds to its colour: alpha is at least 1/255,
+and the pixel's transmittance has not ended before. Promise: the same scene for the same numbers and
+seed. ``SIZE`` was chosen once, so that a pixel has about 50 useful pairs at 400 x 300 with 50,000
+Gaussians and at 800 x 600 with 200,000 (both are 2.4 pixels a Gaussian); how many there are is
+always counted.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ SIZE_SPREAD = 0.5
 THICKNESS = 0.1
 """Size across the surface, of the size along it."""
 OPACITY_SPREAD = 2.0
-"""Standard deviation of the opacities' logits: trained scenes have many faint and many solid ones."""
+"""Standard deviation of the opacities' logits: trained scenes have many faint and many solid
+ones."""
 FAINTEST = 0.005
 """Densification prunes what is fainter."""
 HARMONICS = 0.03

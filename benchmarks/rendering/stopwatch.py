@@ -1,9 +1,9 @@
 """Where the time of a render or a training step goes, without a change to what is timed.
 
-Notation: a *stage* is some of the package's functions; its time is its own, less that of stages that
-it calls, by one of ``clocks``. Promise: functions are replaced by ones that call them and look at the
-clock, and put back afterwards; a stage that never ran is an error, so that a renamed function cannot
-read as no time.
+Notation: a *stage* is some of the package's functions; its time is its own, less that of stages
+that it calls, by one of ``clocks``. Promise: functions are replaced by ones that call them and look
+at the clock, and put back afterwards; a stage that never ran is an error, so that a renamed
+function cannot read as no time.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 from benchmarks.common.clocks import Clock, start_clock
 
 from splatseed.render import blending, blending_vjp, functions
-from splatseed.render.functions import Blend, Harmonics, Project
+from splatseed.render.autograd import Blend, Harmonics, Project
 
 __all__ = ["RENDER_STAGES", "Stopwatch", "timed"]
 

@@ -1,10 +1,10 @@
 """A peer: 3D Gaussian splatting as one would write it in plain PyTorch, with autograd's gradients.
 
 Notation: N Gaussians, one camera, D = 3 channels; tiles are 16 x 16 px. Promise: it is given what
-costs nothing to give: projection, culling and spherical harmonics are gsplat's own PyTorch versions,
-for all Gaussians at once; lists are sorted once; within a tile everything is computed for all pixels
-and all listed Gaussians at once. The specification is ``splatseed.render.reference``'s, cut-offs
-included, and the tests hold the two rasterisers to each other.
+costs nothing to give: projection, culling and spherical harmonics are gsplat's own PyTorch
+versions, for all Gaussians at once; lists are sorted once; within a tile everything is computed for
+all pixels and all listed Gaussians at once. The specification is ``splatseed.render.reference``'s,
+cut-offs included, and the tests hold the two rasterisers to each other.
 """
 
 from __future__ import annotations

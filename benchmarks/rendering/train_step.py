@@ -1,9 +1,9 @@
 """Time and memory of one training step on the CPU, where they go, and what starting up costs.
 
 Notation: a step shows one photograph: render, loss, backward, Adam and the bookkeeping of strategy
-``default``, with spherical harmonics of degree 3. Promise: it is the trainer's own step that is timed;
-the Gaussians are put back before each, so that all have the same work; every measurement has a process
-of its own. Each table is Markdown. See README.md for what is and is not measured.
+``default``, with spherical harmonics of degree 3. Promise: it is the trainer's own step that is
+timed; the Gaussians are put back before each, so that all have the same work; every measurement has
+a process of its own. Each table is Markdown. See README.md for what is and is not measured.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def _step(
     """Take a step from where all steps begin; its seconds by stage, the rest and the whole."""
     _put_back(trainer.state.params, before)
     watch.lap()
-    watch.wrap("rest", trainer._advance)(FIRST_STEP + i % (LAST_STEP - FIRST_STEP))  # noqa: SLF001
+    watch.wrap("rest", trainer._advance)(FIRST_STEP + i % (LAST_STEP - FIRST_STEP))  # noqa: SLF001  (there is no public way)
     lap = watch.lap()
     return {**lap, "whole": sum(lap.values())}
 
@@ -142,8 +142,8 @@ def _stages(trainer: Trainer) -> dict[str, Sequence[Place]]:
     optimizers, strategy = trainer.state.optimizers.values(), trainer.state.strategy
     return {
         **RENDER_STAGES,
-        "loss": [(losses._CpuLoss, "forward")],  # noqa: SLF001
-        "loss backward": [(losses._CpuLoss, "backward")],  # noqa: SLF001
+        "loss": [(losses._CpuLoss, "forward")],  # noqa: SLF001  (there is no public way)
+        "loss backward": [(losses._CpuLoss, "backward")],  # noqa: SLF001  (there is no public way)
         "photograph": [(loop, "photograph")],
         "Adam": [(each, name) for each in optimizers for name in ("step", "zero_grad")],
         "strategy": [(strategy, "before"), (strategy, "after")],
@@ -303,7 +303,7 @@ def print_opensplat(
     header = [
         "view, Gaussians",
         "threads",
-        "OpenSplat, ms a step",
+        "OpenSplat, ms per step",
         "ours, median ms",
         "OpenSplat/ours",
     ]

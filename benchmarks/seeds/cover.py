@@ -1,6 +1,7 @@
 """Cover: how fast it is, and how near the guessed depths come to points that were taken away.
 
-Speed: 100 views of 800 x 600 in a made room, beside the same coverage in plain NumPy in the same run.
+Speed: 100 views of 800 x 600 in a made room, beside the same coverage in plain NumPy in the same
+run.
 Depths: real captures, test and validation views left out; see ``cover_rules.py`` and README.md.
 """
 

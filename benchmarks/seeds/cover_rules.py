@@ -1,9 +1,9 @@
 """Rules for the depth of an empty cell, held against points that were taken away.
 
-Notation: a *hole* is a view's own pattern of empty cells, moved so that an empty cell of it falls on a point
-that the view's track proves to be visible; what the hole hides is hidden from all views. The error
-is |log(guess / depth)| of that point. Promise: test views and validation views are not read; a rule sees
-what ``cover`` would see.
+Notation: a *hole* is a view's own pattern of empty cells, moved so that an empty cell of it falls
+on a point that the view's track proves to be visible; what the hole hides is hidden from all views.
+The error is |log(guess / depth)| of that point. Promise: test views and validation views are not
+read; a rule sees what ``cover`` would see.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
 """Depth-guided lifting on two real captures: how far from the surfaces it puts points, and how long it takes.
 
-Notation: *held out* is every eighth frame by name: its photograph and depth are never lifted from, and
-its depth is the surface that new points are held against. A point is *judged* if in some held-out frame
-it falls on a pixel with depth and not more than 5 cm behind it (behind, it is hidden, and nothing is
-known). *error* is the distance of judged points to the nearest place of the held-out surfaces, *off* the
-share of them over 5 cm away; *gap* is the distance from these surfaces to the nearest point of the cloud,
-*bare* their share with no point within 5 cm. Promise: the captures are only read; without them the
-script says so and ends.
+Notation: *held out* is every eighth frame by name: its photograph and depth are never lifted from,
+and its depth is the surface that new points are held against. A point is *judged* if in some
+held-out frame it falls on a pixel with depth and not more than 5 cm behind it (behind, it is
+hidden, and nothing is known). *error* is the distance of judged points to the nearest place of the
+held-out surfaces, *off* the share of them over 5 cm away; *gap* is the distance from these surfaces
+to the nearest point of the cloud, *bare* their share with no point within 5 cm. Promise: the
+captures are only read; without them the script says so and ends.
 
-Run it as ``python -m benchmarks.seeds.depth`` (some minutes, and one more for each capture the first time:
-SfM points are triangulated and kept under ``--cache``); ``--speed`` measures time alone.
+Run it as ``python -m benchmarks.seeds.depth`` (some minutes, and one more for each capture the
+first time: SfM points are triangulated and kept under ``--cache``); ``--speed`` measures time
+alone.
 """
 
 from __future__ import annotations

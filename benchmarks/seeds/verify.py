@@ -1,10 +1,11 @@
 """Verify: what it makes of interpolated points where the surfaces are known, and how long it takes.
 
-Notation: points of ``mls`` at 16x are held against the training photographs of a capture; *judged*, *error* and *off*
-are those of ``depth.py``, by the depth of the held-out frames; of the made room the surfaces themselves are known. A
-*fate* is what verify made of a point: it agrees, lies
-on a flat place without texture (bare), is seen by too few photographs (unchecked), or was dropped. Promise: the
-captures are only read; speed is measured in a process of its own, on the made room that ``stereo.py`` keeps.
+Notation: points of ``mls`` at 16x are held against the training photographs of a capture; *judged*,
+*error* and *off* are those of ``depth.py``, by the depth of the held-out frames; of the made room
+the surfaces themselves are known. A *fate* is what verify made of a point: it agrees, lies on a
+flat place without texture (bare), is seen by too few photographs (unchecked), or was dropped.
+Promise: the captures are only read; speed is measured in a process of its own, on the made room
+that ``stereo.py`` keeps.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from splatseed.seeding.photographs import MAX_SIZE, read_views
 from splatseed.synthetic.room import build_room
 from splatseed.upsample.method import NewPoints
 from splatseed.views.photographs import user_cache_dir
-from splatseed.views.sightings import find_sightings
+from splatseed.views.visibility import find_visibility
 
 __all__ = ["whole_run"]
 
@@ -91,7 +92,7 @@ def hold(scene: Scene, new: NewPoints) -> Held:
     images = scene.split(HELD_OUT)[0]
     views = read_views(scene, images, MAX_SIZE, ss.progress.silent)
     with patch.object(module, "MAX_COST", max(THRESHOLDS)):
-        left = module.verify(views, images, find_sightings(scene), given)
+        left = module.verify(views, images, find_visibility(scene), given)
     return Held(new.xyz, left.xyz, left.sizes.astype(int), left.confidence)
 
 
@@ -205,11 +206,11 @@ def whole_run(folder: str, points: int, repeats: int) -> dict[str, Any]:
     new = cloud.select(cloud.source != 0)
     given, images = NewPoints(new.xyz, new.rgb), scene.images
     views = read_views(scene, images, MAX_SIZE, ss.progress.silent)
-    sightings = find_sightings(scene)
-    module.verify(views, images, sightings, NewPoints(new.xyz[:WARM], new.rgb[:WARM]))  # compiles
+    visibility = find_visibility(scene)
+    module.verify(views, images, visibility, NewPoints(new.xyz[:WARM], new.rgb[:WARM]))  # compiles
     before, best = status_bytes("VmRSS"), None
     for _ in range(repeats):
-        stages, left = staged(lambda note: module.verify(views, images, sightings, given, note))
+        stages, left = staged(lambda note: module.verify(views, images, visibility, given, note))
         if best is None or stages["all"] < best["all"]:
             best = stages
     return {

@@ -1,8 +1,9 @@
 """Stereo with one choice undone: settings, or a copy of the package with some lines replaced.
 
-Notation: an *edit* is a file of the package, a text in it and what takes its place. Promise: an edit whose text does not
-stand exactly once in its file is an error, so that a renamed constant cannot read as a choice that does not matter;
-the package itself is never written to, and compiled code of a copy goes away with it.
+Notation: an *edit* is a file of the package, a text in it and what takes its place. Promise: an
+edit whose text does not stand exactly once in its file is an error, so that a renamed constant
+cannot read as a choice that does not matter; the package itself is never written to, and compiled
+code of a copy goes away with it.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Depth from photographs alone: how fast, how near the truth, and what each choice gives.
 
-Notation: see ``stereo_speed``, ``stereo_truth`` and ``stereo_points``, where the measuring is done. Promise: every
-measurement has a process of its own; each table is Markdown. What needs captures is left out, with the reason, where
-there are none. See README.md for what is and is not measured.
+Notation: see ``stereo_speed``, ``stereo_truth`` and ``stereo_points``, where the measuring is done.
+Promise: every measurement has a process of its own; each table is Markdown. What needs captures is
+left out, with the reason, where there are none. See README.md for what is and is not measured.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class Settings:
     """What to measure."""
 
     parts: tuple[str, ...] = PARTS
-    """speed: a hypothesis; whole: 100 views; truth: against true depth; points: against SfM's points;
-    bare: without any points; foliage: treehill."""
+    """speed: a hypothesis; whole: 100 views; truth: against true depth; points: against SfM's
+    points; bare: without any points; foliage: treehill."""
     scenes: tuple[str, ...] = TRUE_SCENES
     """Where depth is known."""
     arms: tuple[str, ...] = tuple(ARMS)

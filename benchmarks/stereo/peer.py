@@ -1,7 +1,7 @@
 """The photometric cost of planes as one writes it: a scalar Numba loop over pixels, planes, views and samples.
 
-Notation: as in ``splatseed.stereo.cost``. Promise: the same cost up to rounding. It is given what costs nothing to
-give: weights and likeness of a window are computed once a pixel, not once a plane.
+Notation: as in ``splatseed.stereo.cost``. Promise: the same cost up to rounding. It is given what
+costs nothing to give: weights and likeness of a window are computed once a pixel, not once a plane.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Stereo on captures without true depth, against SfM's points of which it was not told.
 
-Notation: of a capture's training photographs (the test views are taken out) some neighbours by name; of its points every
-second is *held out*. A held-out point that an image sees is *known* if its pixel has a depth; its error is that of
-the plane there, relative. Promise: captures are only read. Points are no truth: they lie on texture, and are
-themselves off by a part of a percent.
+Notation: of a capture's training photographs (the test views are taken out) some neighbours by
+name; of its points every second is *held out*. A held-out point that an image sees is *known* if
+its pixel has a depth; its error is that of the plane there, relative. Promise: captures are only
+read. Points are no truth: they lie on texture, and are themselves off by a part of a percent.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from splatseed.camera import Camera
 from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.result import Stereo
 from splatseed.stereo.settings import StereoSettings
-from splatseed.views.sightings import Sightings, find_sightings
 from splatseed.views.view import data_factor, load_views
+from splatseed.views.visibility import Visibility, find_visibility
 
 __all__ = ["PointScore", "score_points"]
 
@@ -32,7 +32,8 @@ class PointScore:
 
     Args:
         kept: Share of the maps' pixels that have a depth.
-        known: Share of the held-out points, once for each image that sees them, whose pixel has one.
+        known: Share of the held-out points, once for each image that sees them, whose pixel has
+            one.
         within_1: Share of these that are within 1% of it.
         within_5: Likewise 5%.
         seconds: Processor time.
@@ -67,13 +68,13 @@ def _score(name: str, settings: StereoSettings, limit: int) -> PointScore:
     scene = ss.load_scene(find_scenes() / name)
     images = scene.split()[0][:limit]
     views = load_views(scene, images, data_factor=data_factor(images, settings.max_size))
-    sightings = find_sightings(scene)
-    told = _every_second(sightings, 0)
+    visibility = find_visibility(scene)
+    told = _every_second(visibility, 0)
     find_stereo(views[:2], images[:2], told, settings)  # compiled
     started = time.process_time()
     stereo = find_stereo(views, images, told, settings)
     seconds = time.process_time() - started
-    held_out = _every_second(sightings, 1)
+    held_out = _every_second(visibility, 1)
     errors = [_errors(stereo, i, held_out.of(image)) for i, image in enumerate(images)]
     error = np.concatenate(errors)
     known = np.isfinite(error)
@@ -87,16 +88,16 @@ def _score(name: str, settings: StereoSettings, limit: int) -> PointScore:
     )
 
 
-def _every_second(sightings: Sightings, first: int) -> Sightings:
+def _every_second(visibility: Visibility, first: int) -> Visibility:
     """Half of the points; who sees them stays known."""
-    mine = sightings.point_idx % 2 == first
+    mine = visibility.point_idx % 2 == first
     before = np.concatenate([[0], np.cumsum(mine)])
-    start = {key: int(before[at]) for key, at in sightings.start.items()}
+    start = {key: int(before[at]) for key, at in visibility.start.items()}
     count = {
-        key: int(before[at + sightings.count[key]] - before[at])
-        for key, at in sightings.start.items()
+        key: int(before[at + visibility.count[key]] - before[at])
+        for key, at in visibility.start.items()
     }
-    return Sightings(sightings.xyz, sightings.point_idx[mine], start, count)
+    return Visibility(visibility.xyz, visibility.point_idx[mine], start, count)
 
 
 def _errors(stereo: Stereo, i: int, xyz: np.ndarray) -> np.ndarray:

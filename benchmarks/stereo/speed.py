@@ -1,8 +1,8 @@
 """How fast stereo is: a hypothesis beside a scalar loop, and a hundred views from photographs to seeds.
 
-Notation: a *hypothesis* is one plane at one pixel, tried in five sources of 25 samples; seconds are one thread's on
-a core. Promise: every measurement has a process of its own, which has compiled before the clock starts; both
-cost functions are seen to give the same costs.
+Notation: a *hypothesis* is one plane at one pixel, tried in five sources of 25 samples; seconds are
+one thread's on a core. Promise: every measurement has a process of its own, which has compiled
+before the clock starts; both cost functions are seen to give the same costs.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from splatseed.stereo.quads import make_quads
 from splatseed.stereo.settings import StereoSettings
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.texture import value_noise
-from splatseed.views.sightings import find_sightings
 from splatseed.views.view import load_views
+from splatseed.views.visibility import find_visibility
 
 __all__ = ["hypothesis_seconds", "prepare_views", "whole_run"]
 
@@ -121,7 +121,7 @@ def whole_run(folder: str, clock: Clock, threads_used: int) -> dict[str, Any]:
     settings = StereoSettings(grid=GRID)
     fuse(
         find_stereo(
-            load_views(scene, scene.images[:2]), scene.images[:2], find_sightings(scene), settings
+            load_views(scene, scene.images[:2]), scene.images[:2], find_visibility(scene), settings
         ),
         CELL,
     )  # compiles
@@ -136,6 +136,6 @@ def whole_run(folder: str, clock: Clock, threads_used: int) -> dict[str, Any]:
         last = now
 
     views = load_views(scene, scene.images, progress=note)
-    stereo = find_stereo(views, scene.images, find_sightings(scene), settings, 0, note)
+    stereo = find_stereo(views, scene.images, find_visibility(scene), settings, 0, note)
     seeds = fuse(stereo, CELL, note)
     return {"stages": stages, "seeds": len(seeds), "peak": status_bytes("VmHWM")}

@@ -1,9 +1,9 @@
 """Stereo against true depth: two real captures with a depth camera, a made room, and the room without texture.
 
-Notation: every eighth photograph by name is *held out*: stereo does not see it, and its depth is the surface that
-seeds are held against. A *pixel* is one of a stereo map; its true depth is that of the four depth pixels around its
-centre: their mean where they lie on one surface, any of them where they do not. Promise: captures are only
-read; what is made goes into a cache.
+Notation: every eighth photograph by name is *held out*: stereo does not see it, and its depth is
+the surface that seeds are held against. A *pixel* is one of a stereo map; its true depth is that of
+the four depth pixels around its centre: their mean where they lie on one surface, any of them where
+they do not. Promise: captures are only read; what is made goes into a cache.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.fusion import fuse
 from splatseed.stereo.result import Stereo
 from splatseed.stereo.settings import StereoSettings
-from splatseed.stereo.without_points import known_sightings
+from splatseed.stereo.without_points import known_visibility
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.raycast import render_views
 from splatseed.synthetic.room import Room
@@ -92,7 +92,8 @@ def score_all(
         cache: Where.
         settings: Fields of ``StereoSettings``.
         limit: Photographs of a capture at most, the first by name.
-        without: "points": forget what Structure-from-Motion found; "depths": the depth maps as well.
+        without: "points": forget what Structure-from-Motion found; "depths": the depth maps as
+            well.
     """
     chosen = StereoSettings(**settings)
     return {name: asdict(_score(name, Path(cache), chosen, limit, without)) for name in names}
@@ -111,9 +112,9 @@ def _score(name: str, cache: Path, settings: StereoSettings, limit: int, without
         seen = seen.replace(depths=None)
     factor = data_factor(images, settings.max_size)
     views = load_views(scene, images, data_factor=factor)
-    find_stereo(views[:2], images[:2], known_sightings(scene), settings)  # compiled
+    find_stereo(views[:2], images[:2], known_visibility(scene), settings)  # compiled
     started = time.process_time()
-    stereo = find_stereo(views, images, known_sightings(seen), settings)
+    stereo = find_stereo(views, images, known_visibility(seen), settings)
     seeds = fuse(stereo, CELL)
     seconds = time.process_time() - started
     kept, one, five = _map_shares(stereo, scene)

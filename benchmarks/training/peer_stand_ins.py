@@ -1,9 +1,10 @@
 """gsplat's own trainer on a machine without CUDA: what its file asks for, and what it gets instead.
 
-Promise: nothing of gsplat's examples is kept here. The file is the user's, and it is run as its users
-run it: with its own command line, presets, schedules and losses. What it gets from here are the views
-and points of a capture in memory, our rasteriser, our SSIM (both compute what gsplat's CUDA code
-does), and things that do nothing in place of a viewer, logs and files that are never asked for.
+Promise: nothing of gsplat's examples is kept here. The file is the user's, and it is run as its
+users run it: with its own command line, presets, schedules and losses. What it gets from here are
+the views and points of a capture in memory, our rasteriser, our SSIM (both compute what gsplat's
+CUDA code does), and things that do nothing in place of a viewer, logs and files that are never
+asked for.
 
 For a process of its own: modules stand in only while the file is imported, but functions that are
 replaced stay so.
@@ -55,8 +56,8 @@ UNUSED = (
     "cv2", "nerfview", "sklearn", "torch.utils.tensorboard", "torchmetrics", "torchmetrics.image",
     "torchmetrics.image.lpip", "viser", "yaml",
 )  # fmt: skip
-"""Imported by its files and without work to do here: lenses without distortion, no files, no scores of
-its own (one scorer serves both trainers)."""
+"""Imported by its files and without work to do here: lenses without distortion, no files, no scores
+of its own (one scorer serves both trainers)."""
 PINHOLE = 1
 
 

@@ -1,9 +1,9 @@
 """Our trainer beside gsplat's own (examples/simple_trainer.py of version 1.5.3), on the CPU.
 
-Both train on the same photographs, cameras, points, steps and cap, through the same rasteriser, and are
-scored by the same function; what differs is the trainer: its loop, learning rates, schedules, losses,
-densification and normalisation of the world. Each run has a process of its own. Prints Markdown; says on
-stderr how far it is. See README.md.
+Both train on the same photographs, cameras, points, steps and cap, through the same rasteriser, and
+are scored by the same function; what differs is the trainer: its loop, learning rates, schedules,
+losses, densification and normalisation of the world. Each run has a process of its own. Prints
+Markdown; says on stderr how far it is. See README.md.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """What seeds are worth: trained from, on held-out training views, at equal numbers of Gaussians.
 
-The test views (names sorted, every 8th) are taken out of a capture first; of the rest every 8th is held out and
-scored. Runs have a process of their own each; those that are in the ledger are not run again. Prints Markdown; see
-README.md.
+The test views (names sorted, every 8th) are taken out of a capture first; of the rest every 8th is
+held out and scored. Runs have a process of their own each; those that are in the ledger are not run
+again. Prints Markdown; see README.md.
 """
 
 from __future__ import annotations

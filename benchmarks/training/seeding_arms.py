@@ -1,7 +1,8 @@
 """The arms of ``seeding.py``: seeds of one method, trained on held-out training views.
 
-Notation: rho is Gaussians per pixel of a photograph at the size that is trained. Promise: the views that a run is
-scored on are held out of the training views after the test views were taken out, and no method looks at them.
+Notation: rho is Gaussians per pixel of a photograph at the size that is trained. Promise: the views
+that a run is scored on are held out of the training views after the test views were taken out, and
+no method looks at them.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """How close new points come to known surfaces, and how well they fill them.
 
 Notation: h is the spacing of a case's originals (mean distance to the 6 nearest); error, p95 and
-coverage are in units of h and mean what ``splatseed.diagnostics.geometry`` says, sum = error + coverage. A *case*
-is a shape, a noise level and a seed; an *arm* is a method with its parameters. Promise: nothing here
-depends on the clock; the same code gives the same tables.
+coverage are in units of h and mean what ``splatseed.diagnostics.geometry`` says, sum = error +
+coverage. A *case* is a shape, a noise level and a seed; an *arm* is a method with its parameters.
+Promise: nothing here depends on the clock; the same code gives the same tables.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Every method as a Python loop over new points, straight from the paper's text: the slow baseline.
 
-Notation: eqs. are the paper's; a *base* is the original a new point starts from. Each function makes
-one new point and returns (xyz [3], rgb [3]). Promise: the loop is a fair one. The kd-tree, and for
-Voronoi the diagram, are built once; nothing is computed twice for one point; and the paper's own
-parameters are used, which are cheaper than this package's defaults (fewer neighbours, world axes, no
-outlier check). A ratio to these times is therefore a lower bound.
+Notation: eqs. are the paper's; a *base* is the original a new point starts from. Each function
+makes one new point and returns (xyz [3], rgb [3]). Promise: the loop is a fair one. The kd-tree,
+and for Voronoi the diagram, are built once; nothing is computed twice for one point; and the
+paper's own parameters are used, which are cheaper than this package's defaults (fewer neighbours,
+world axes, no outlier check). A ratio to these times is therefore a lower bound.
 """
 
 from __future__ import annotations

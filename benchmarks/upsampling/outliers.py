@@ -1,9 +1,10 @@
 """Planted outliers: how many the isolation rule of the default profile finds, and what it costs.
 
-Notation: the made room stands inside a background that thins out with distance; *planted* points are uniform in the
-room's bounding box. Shares are of planted points caught, and of the room's and the background's own
-points lost. Promise: the rule is the package's own (``sound_bases``), beside the usual global filter:
-drop points whose mean distance to 16 neighbours exceeds the cloud's mean by some standard deviations.
+Notation: the made room stands inside a background that thins out with distance; *planted* points
+are uniform in the room's bounding box. Shares are of planted points caught, and of the room's and
+the background's own points lost. Promise: the rule is the package's own (``sound_bases``), beside
+the usual global filter: drop points whose mean distance to 16 neighbours exceeds the cloud's mean
+by some standard deviations.
 """
 
 from __future__ import annotations

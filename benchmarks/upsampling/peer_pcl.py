@@ -1,9 +1,9 @@
 """The peer: upsampling by the Point Cloud Library's moving least squares, in C++ on OpenMP.
 
 Promise: the same originals, neighbourhoods of the same size (a ball whose radius is the median
-distance to the 16th neighbour), a quadratic fit, as many threads as cores and about as many points a
-base; only ``process()`` is timed, which builds its search tree as ``splatseed.upsample`` does. PCL's
-points carry no colours here, ours do.
+distance to the 16th neighbour), a quadratic fit, as many threads as cores and about as many points
+a base; only ``process()`` is timed, which builds its search tree as ``splatseed.upsample`` does.
+PCL's points carry no colours here, ours do.
 """
 
 from __future__ import annotations

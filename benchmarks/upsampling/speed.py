@@ -1,8 +1,8 @@
 """Speed and memory of every method, beside the targets, the naive loop and a peer.
 
-Notation: a run takes N originals to ratio * N points, arrays in memory to arrays in memory, after one
-run of the same kind on a small cloud has loaded the compiled code. Promise: every ratio is of two
-times taken in the same run on the same machine and cloud; what could not be measured says why.
+Notation: a run takes N originals to ratio * N points, arrays in memory to arrays in memory, after
+one run of the same kind on a small cloud has loaded the compiled code. Promise: every ratio is of
+two times taken in the same run on the same machine and cloud; what could not be measured says why.
 Each table is Markdown. See README.md for what is and is not measured.
 """
 

@@ -1,8 +1,8 @@
 """Why FITPACK's smoothing s does nothing at the paper's k = 25.
 
 Notation: s bounds a fit's squared residual; inner knots are those beyond the corners of a single
-bicubic polynomial. Promise: SciPy's own ``SmoothBivariateSpline`` on neighbourhoods of the made room
-in their principal axes, scaled to unit reach, where a height field fits them best.
+bicubic polynomial. Promise: SciPy's own ``SmoothBivariateSpline`` on neighbourhoods of the made
+room in their principal axes, scaled to unit reach, where a height field fits them best.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ from splatseed.preview import choose_camera, render_points
 from splatseed.scene import Image
 from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.upsample import methods_for
-from splatseed.views.sightings import find_sightings
 from splatseed.views.viewpoint import choose_image, look_at
+from splatseed.views.visibility import find_visibility
 
 HERE = Path(__file__).parent
 RATIO = 8
@@ -178,7 +178,7 @@ def lifted_from(scene: ss.Scene, image: Image, cloud: ss.PointCloud) -> Picture:
     column, row = np.floor(np.where(inside[:, None], uv, 0.0)).astype(int).T
     centred = np.abs(uv - np.floor(uv) - 0.5).max(axis=1) < 2e-3
     own = inside & centred & (np.abs(scene.depths.read(image.name).values[row, column] - z) < 1e-2)
-    sfm = find_sightings(scene).of(image).astype(np.float32)
+    sfm = find_visibility(scene).of(image).astype(np.float32)
     blue = new.select(own).replace(rgb=np.full((own.sum(), 3), (60, 130, 200), np.uint8))
     black = ss.PointCloud(sfm, np.zeros((len(sfm), 3), np.uint8))
     scale = width / camera.width

@@ -1,7 +1,7 @@
 """The terminal: progress bars on stderr, results on stdout.
 
-Promise: nothing is drawn when stderr is not a terminal; a stage's time runs until the next begins; what is
-printed is shown as it is, so that no file name can colour, move or rewrite anything.
+Promise: nothing is drawn when stderr is not a terminal; a stage's time runs until the next begins;
+what is printed is shown as it is, so that no file name can colour, move or rewrite anything.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
 
 
 def print_commands(title: str, commands: Sequence[tuple[str, str]]) -> None:
-    """Print commands one a line, unwrapped, so that they can be copied."""
+    """Print commands one per line, unwrapped, so that they can be copied."""
     _print_title(title)
     _print_columns(commands)
 

@@ -21,8 +21,8 @@ from splatseed.errors import SceneFormatError
 __all__ = ["ASPECT_SLACK", "DepthKind", "DepthMap", "DepthMaps"]
 
 DepthKind = Literal["z", "ray", "inverse"]
-"""What a value is: planar depth along the camera's axis, distance along the pixel's ray, or something
-that falls with z as a / z + b does (what most monocular networks predict)."""
+"""What a value is: planar depth along the camera's axis, distance along the pixel's ray, or
+something that falls with z as a / z + b does (what most monocular networks predict)."""
 
 ASPECT_SLACK = 0.02
 """By how much a map's shape may differ from its image's: the rounding of a resized copy."""

@@ -1,8 +1,9 @@
 """Lens distortion: where rays of the pinhole camera meet the image of a real lens.
 
-Notation: a ray (x, y, 1) in camera axes is named by its place (x, y) on the plane at depth 1; the lens
-moves it to another place (u, v) there, and pixels are (fx u + cx, fy v + cy). Parameters are those of
-COLMAP's camera models, by its definitions (src/colmap/sensor/models.h), the first of which are OpenCV's.
+Notation: a ray (x, y, 1) in camera axes is named by its place (x, y) on the plane at depth 1; the
+lens moves it to another place (u, v) there, and pixels are (fx u + cx, fy v + cy). Parameters are
+those of COLMAP's camera models, by its definitions (src/colmap/sensor/models.h), the first of which
+are OpenCV's.
 Promise: float64; pure functions of arrays of any shape.
 """
 
@@ -57,7 +58,8 @@ def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.nda
 
     Args:
         lens: The camera, of which focal length and centre are left out.
-        xy: Places on the plane; far out, where a polynomial has lost its meaning, so has the result.
+        xy: Places on the plane; far out, where a polynomial has lost its meaning, so has the
+            result.
     """
     x, y = xy[..., 0], xy[..., 1]
     k = lens.params[CAMERA_MODELS[lens.model].num_focal + 2 :]
@@ -79,7 +81,8 @@ def rays_through(lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]) -> Float64[n
         uv: Pixel coordinates; the first pixel's centre is (0.5, 0.5).
 
     Returns:
-        Places on the plane at depth 1, float64 [*B, 2]; NaN where no ray within the lens's fold leads there.
+        Places on the plane at depth 1, float64 [*B, 2]; NaN where no ray within the lens's fold
+        leads there.
     """
     K = lens.K
     goal = (np.asarray(uv, np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]
@@ -100,12 +103,13 @@ def rays_through(lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]) -> Float64[n
 def fold_radius(lens: Intrinsics, most: float) -> float:
     """The distance from (0, 0) at which the lens folds: farther rays would come nearer to the centre.
 
-    Polynomials are fitted to the image; beyond it they turn back sooner or later, and would show the
-    image a second time.
+    Polynomials are fitted to the image; beyond it they turn back sooner or later, and would show
+    the image a second time.
 
     Args:
         lens: The camera.
-        most: How far to look, on the plane at depth 1; the result where there is no fold up to there.
+        most: How far to look, on the plane at depth 1; the result where there is no fold up to
+            there.
     """
     radius = np.linspace(0.0, most, STEPS + 1)
     angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)

@@ -1,7 +1,7 @@
 """Names of files as text that a terminal and a shell take literally.
 
-Promise: whatever characters a name has, it can neither move the cursor, colour the terminal, begin a new
-line nor change the command that it is printed in.
+Promise: whatever characters a name has, it can neither move the cursor, colour the terminal, begin
+a new line nor change the command that it is printed in.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Notation: N points; ``xyz`` in scene units and the scene's world frame; ``rgb`` 8-bit sRGB as stored
 by COLMAP; ``source`` 0 for an original point, otherwise the code of the method that made the point.
 The *attributes* normals, sizes and confidence are there or not, and NaN where they are not known of
-a point. Promise: arrays have the shapes and dtypes below and are read-only; methods return new clouds,
-in which every point keeps all that is known of it.
+a point. Promise: arrays have the shapes and dtypes below and are read-only; methods return new
+clouds, in which every point keeps all that is known of it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ ORIGINAL = 0
 """The ``source`` code of points that were in the input."""
 
 GENERATED = 255
-"""The ``source`` code of points made by a method that has no code of its own, or that is not known."""
+"""The ``source`` code of points made by a method that has no code of its own, or that is not
+known."""
 
 ATTRIBUTES: Mapping[str, tuple[int, ...]] = MappingProxyType(
     {"normals": (3,), "sizes": (), "confidence": ()}
@@ -184,7 +185,7 @@ def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:
         raise PointCloudError(
             "xyz as numbers of shape [N, 3]",
             found=f"{xyz.dtype} {list(xyz.shape)}",
-            fix="Pass one row x, y, z a point.",
+            fix="Pass one row x, y, z per point.",
         )
     if rgb.shape != xyz.shape or rgb.dtype != np.uint8:
         raise PointCloudError(
@@ -196,7 +197,7 @@ def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:
         raise PointCloudError(
             f"source of shape [{len(xyz)}]",
             found=f"{list(source.shape)}",
-            fix="Pass one code a point, or leave it out.",
+            fix="Pass one code per point, or leave it out.",
         )
 
 
@@ -207,7 +208,7 @@ def _check_attribute(name: str, values: np.ndarray, num_points: int) -> None:
         raise PointCloudError(
             f"{name} as numbers of shape {list(shape)}",
             found=f"{values.dtype} {list(values.shape)}",
-            fix="Pass one value a point, NaN where it is not known, or leave them out.",
+            fix="Pass one value per point, NaN where it is not known, or leave them out.",
         )
     fits = np.isnan(values) | _in_range(name, values)
     wrong = np.unique(np.nonzero(~fits)[0])

@@ -22,7 +22,8 @@ INSTALL = {
     "viser": "viser>=1.1",
     "zstandard": "zstandard>=0.22",
 }
-"""What to ask pip for, as in pyproject.toml: extras of splatseed itself can only be had from its folder."""
+"""What to ask pip for, as in pyproject.toml: extras of splatseed itself can only be had from its
+folder."""
 
 
 def require(*packages: str) -> None:

@@ -183,8 +183,8 @@ class Scene:
         tracks: Tracks of the first ``len(tracks)`` points, which are the originals.
         source: Where it was read from; None for a scene made in memory.
         warnings: What the reader repaired or found odd, one sentence each.
-        depths: Depth maps of some of the images; None where there are none. They are read when asked
-            for.
+        depths: Depth maps of some of the images; None where there are none. They are read when
+            asked for.
         listed: The split that lists beside the scene give; None where there are none.
         left_out: How many points of its files it does without.
     """

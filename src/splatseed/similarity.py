@@ -1,7 +1,7 @@
 """Similarities: rotation, one scale and translation, between two frames of one scene.
 
-Notation: ``target_from_source`` takes x to scale * rotation @ x + translation. Promise: double precision;
-a fit is the least-squares one (Umeyama 1991) without reflection.
+Notation: ``target_from_source`` takes x to scale * rotation @ x + translation. Promise: double
+precision; a fit is the least-squares one (Umeyama 1991) without reflection.
 """
 
 from __future__ import annotations

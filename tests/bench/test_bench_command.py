@@ -67,6 +67,7 @@ def _rows(folder):
     return Ledger.open(folder / "ledger.sqlite", read_only=True).rows()
 
 
+@pytest.mark.slow
 def test_runs_everything_once_and_a_failed_run_ends_nothing_else(bench, plan_path, tmp_path):
     folder = tmp_path / "B"
     plan = plan_path(
@@ -95,6 +96,7 @@ def test_runs_everything_once_and_a_failed_run_ends_nothing_else(bench, plan_pat
     assert {"cpu", "cores", "python", "versions"} <= sessions[0].keys()
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_it_goes_on(plan_path, tmp_path):
     """SIGKILL in the middle of the second run's training."""
     folder = tmp_path / "B"
@@ -133,6 +135,7 @@ def test_two_processes_share_the_runs_of_one_folder(plan_path, tmp_path):
     assert len({row.worker for row in rows}) == 2
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_says_how_to_go_on(plan_path, tmp_path):
     folder = tmp_path / "B"
     process = _begin("--plan", plan_path(repeats=1, methods=("sfm",), max_steps=5000), "-o", folder)
@@ -225,7 +228,8 @@ def test_the_quick_preset_makes_its_own_scene(bench, tmp_path, monkeypatch):
 def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
     """It takes a second; to make the room and to import PyTorch took over a minute."""
     code = (
-        "import sys; from splatseed.cli import main; main(['bench', '--preset', 'quick', '--dry-run']);"
+        "import sys; from splatseed.cli import main; main(['bench', '--preset', 'quick', "
+        "'--dry-run']);"
         "print(*sys.modules)"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -241,7 +241,7 @@ def test_an_interrupt_leaves_nothing(what, code, says, room, tmp_path, splatseed
 def _fail_halfway(monkeypatch, error):
     """Let the points' file fail after some of it is written."""
 
-    def write(path, points, tracks=None):  # noqa: ARG001  (the signature it stands in for)
+    def write(path, points, tracks=None):
         Path(path).write_bytes(b"half")
         raise error
 

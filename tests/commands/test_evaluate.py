@@ -10,13 +10,13 @@ import pytest
 torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
-from splatseed.evaluate import evaluate_views  # noqa: E402
-from splatseed.io import load_scene  # noqa: E402
-from splatseed.io.ply.points import write_ply  # noqa: E402
-from splatseed.splat.gaussians import initial_gaussians  # noqa: E402
-from splatseed.splat.ply import write_gaussians  # noqa: E402
-from splatseed.train.run import prepare_run  # noqa: E402
-from splatseed.train.settings import TrainSettings  # noqa: E402
+from splatseed.evaluate import evaluate_views
+from splatseed.io import load_scene
+from splatseed.io.ply.points import write_ply
+from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.ply import write_gaussians
+from splatseed.train.run import prepare_run
+from splatseed.train.settings import TrainSettings
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ from splatseed.depth.alignment import align_map
 from splatseed.depth.planar import ray_length
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.views.sightings import camera_points, find_sightings
+from splatseed.views.visibility import camera_points, find_visibility
 
 SCALES = 1.5 ** np.linspace(-3, 3, 12)
 
@@ -155,5 +155,5 @@ def test_of_points_that_hide_each_other_the_nearest_counts(exact):
     xyz = camera.unproject(uv, np.array([2.0, 5.0, 5.0])).astype(np.float32)
     behind = camera.unproject(uv[:1], np.array([-1.0])).astype(np.float32)
     points = type(exact.points)(np.concatenate([xyz, behind]), np.zeros((4, 3), np.uint8))
-    seen = find_sightings(exact.replace(points=points, tracks=None)).of(image)
+    seen = find_visibility(exact.replace(points=points, tracks=None)).of(image)
     np.testing.assert_allclose(seen, xyz[[0, 2]], rtol=1e-6)

@@ -49,7 +49,7 @@ def test_photographs_must_be_there(exact, tmp_path):
 
 
 def test_a_photograph_of_another_shape_is_refused(exact, tmp_path):
-    from PIL import Image as PilImage  # noqa: PLC0415
+    from PIL import Image as PilImage
 
     folder = tmp_path / "images"
     shutil.copytree(exact.source.image_dir, folder)

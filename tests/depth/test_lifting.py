@@ -127,7 +127,7 @@ def test_bytes_follow_from_the_seed_whatever_the_threads(profile, exact, monkeyp
 
 def test_new_points_turn_and_grow_with_the_scene(exact):
     """A rotation of the world, and 1000 times the unit, with depth in the old one."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415
+    from scipy.spatial.transform import Rotation
 
     turn, shift, factor = (
         Rotation.random(random_state=1).as_matrix(),

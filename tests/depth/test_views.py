@@ -8,9 +8,9 @@ import pytest
 from splatseed.camera import Camera
 from splatseed.depth.alignment import Alignment
 from splatseed.depth.consistency import find_support
-from splatseed.depth.harmony import harmonize
 from splatseed.depth.neighbors import choose_neighbors
 from splatseed.depth.planar import PlanarDepth
+from splatseed.depth.scale_synchronisation import harmonize
 from splatseed.depth.settings import Settings
 from splatseed.depth.views import Reduced, View
 from splatseed.depthmap import DepthMap

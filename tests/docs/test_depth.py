@@ -23,8 +23,8 @@ LINES = [
 @pytest.fixture(scope="module")
 def known():
     """The help of each verb, printed once."""
-    import contextlib  # noqa: PLC0415
-    import io  # noqa: PLC0415
+    import contextlib
+    import io
 
     def text(verb):
         said = io.StringIO()

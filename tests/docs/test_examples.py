@@ -83,6 +83,7 @@ def test_render_on_a_cpu(run, tmp_path):
         assert picture.size == (320, 120)
 
 
+@pytest.mark.slow
 def test_train_and_score(run, tmp_path):
     out = run("06_train_and_score.py", "example_room", 40)
     counts = [int(n.replace(",", "")) for n in re.findall(r"([\d,]+) Gaussians", out)]

@@ -23,7 +23,7 @@ def test_the_examples_run(tmp_path, monkeypatch, capsys):
     assert len(BLOCKS) == 3
     for block in BLOCKS:
         # Our own documentation; three steps show that it runs as well as three thousand.
-        exec(block.replace("max_steps=3000", "max_steps=3"), {})  # noqa: S102
+        exec(block.replace("max_steps=3000", "max_steps=3"), {})  # noqa: S102  (runs the documentation's code)
     said = capsys.readouterr().out
     assert str(len(capture.scene.points)) in said
     assert "torch.Size([1, 240, 320, 3]) torch.Size([200, 3]) torch.Size([1, 200, 2])" in said

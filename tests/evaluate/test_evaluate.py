@@ -13,8 +13,8 @@ from PIL import Image
 # An import below imports PyTorch, so that it has to come after the question whether it is there.
 torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
 
-from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError  # noqa: E402
-from splatseed.evaluate import (  # noqa: E402
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.evaluate import (
     EvalResult,
     ViewScore,
     evaluate_model,
@@ -23,13 +23,13 @@ from splatseed.evaluate import (  # noqa: E402
     load_model,
     write_renders,
 )
-from splatseed.evaluate.lpips import LPIPS_NETS  # noqa: E402
-from splatseed.evaluate.model import frame_of_scene, gaussian_renderer  # noqa: E402
-from splatseed.io import load_scene  # noqa: E402
-from splatseed.splat.gaussians import initial_gaussians  # noqa: E402
-from splatseed.splat.ply import write_gaussians  # noqa: E402
-from splatseed.synthetic import make_capture, write_capture  # noqa: E402
-from splatseed.views.view import View  # noqa: E402
+from splatseed.evaluate.lpips import LPIPS_NETS
+from splatseed.evaluate.model import frame_of_scene, gaussian_renderer
+from splatseed.io import load_scene
+from splatseed.splat.gaussians import initial_gaussians
+from splatseed.splat.ply import write_gaussians
+from splatseed.synthetic import make_capture, write_capture
+from splatseed.views.view import View
 
 
 @pytest.fixture

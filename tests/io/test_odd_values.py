@@ -17,7 +17,7 @@ from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.upsample import upsample
-from splatseed.views.sightings import camera_points
+from splatseed.views.visibility import camera_points
 
 from .colmap import text_form
 

@@ -39,7 +39,7 @@ def ramp():
 @pytest.fixture
 def offline(monkeypatch):
     """No connection may as much as be tried."""
-    import socket  # noqa: PLC0415
+    import socket
 
     def refuse(*_, **__):
         raise AssertionError("a connection was tried")

@@ -104,7 +104,7 @@ def test_subfolders_and_foreign_suffixes_keep_their_names(own_path, network, tmp
     for image, name in ((first, "left/a.png"), (second, "right/a.png")):
         (scene.source.image_dir / name).parent.mkdir()
         shutil.move(scene.source.image_dir / image.name, scene.source.image_dir / name)
-    from dataclasses import replace  # noqa: PLC0415
+    from dataclasses import replace
 
     renamed = (replace(first, name="left/a.png"), replace(second, name="right/a.png"))
     scene = scene.replace(images=renamed)

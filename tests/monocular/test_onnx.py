@@ -62,7 +62,8 @@ def test_a_map_lies_on_its_photograph(factor, sides, ramp, tmp_path):
     said = Preparation(56, 14, (0.0, 0.0, 0.0), (7 / 255, 7 / 255, 7 / 255))
     (depth,) = load_network(str(path), kind="z", device="cpu", preparation=said)([ramp])
     inner = (slice(8, -8), slice(8, -8))
-    # The toy network looks at one of each 2 x 2 pixels, half a pixel of 56 up and left of its centre.
+    # The toy network looks at one of each 2 x 2 pixels, half a pixel of 56 up and left of its
+    # centre.
     expected = ramp[..., 0] - (factor - 1) * 0.5 * (
         77 / 56 + 118 / (sides[1] if sides[1] == 98 else 84)
     )

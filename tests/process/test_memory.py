@@ -81,7 +81,7 @@ def test_the_runs_of_a_benchmark(free):
     machine = Machine("this machine", "cpu", 2, 1, lambda *_: True, is_local=True)
     check_machine(machine, 500)
     with pytest.raises(
-        ParameterError, match=r"at most 500 seeds a run with 2 at a time.*--cap-max 500"
+        ParameterError, match=r"at most 500 seeds per run with 2 at a time.*--cap-max 500"
     ):
         check_machine(machine, 501)
     check_machine(Machine("a cluster", "cpu", 2, 1, lambda *_: True), 501)

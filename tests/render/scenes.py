@@ -1,8 +1,8 @@
 """Small random scenes, and the slow reference called as ``rasterization`` is.
 
 Notation: N Gaussians, C cameras, D channels, K coefficients. A scene is a dictionary of
-``rasterization``'s arguments; ``losses`` weights every output with fixed random numbers, so that one
-backward pass asks for every gradient at once.
+``rasterization``'s arguments; ``losses`` weights every output with fixed random numbers, so that
+one backward pass asks for every gradient at once.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def slow_rasterization(
     sh_degree: int | None = None,
     render_mode: str = "RGB",
     rasterize_mode: str = "classic",
-    packed: bool = True,  # noqa: ARG001  (makes no difference to the picture)
+    packed: bool = True,
     **rest: Any,
 ) -> tuple[Tensor, Tensor]:
     """``rasterize_reference`` for C cameras, all colour models and modes: images and alphas."""

@@ -15,7 +15,7 @@ from gsplat.cuda._torch_impl import (
 from torch import Tensor
 
 from splatseed.render import rasterization
-from splatseed.render.functions import Harmonics
+from splatseed.render.autograd import Harmonics
 
 from .scenes import random_scene
 
@@ -51,7 +51,8 @@ def test_projection(rng, options: dict[str, float]) -> None:
     ours = (info["radii"] > 0).all(dim=-1)
     assert seen.sum() > 50
     assert (~seen).sum() > 50
-    # An opacity of 1 reaches 1/255 at 3.329 sigmas, their code's box ends at 3.33: a pixel more or less.
+    # An opacity of 1 reaches 1/255 at 3.329 sigmas, their code's box ends at 3.33: a pixel more or
+    # less.
     assert (info["radii"] - expected["radii"])[ours & seen].abs().max() <= 1
     assert (ours != seen).sum() <= 1
     for name, relative in (("means2d", 1e-6), ("depths", 1e-6), ("conics", 1e-5)):

@@ -37,7 +37,8 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 def assert_same(ours: Tensor, theirs: Tensor, what: str, tolerance: float = 1e-4) -> None:
     """Within ``tolerance`` of the largest entry.
 
-    Expected depth, which divides by alpha, comes nearest to it: up to 7e-5; the rest stays below a third of that.
+    Expected depth, which divides by alpha, comes nearest to it: up to 7e-5; the rest stays below a
+    third of that.
     """
     assert ours.shape == theirs.shape, what
     scale = max(float(theirs.abs().max()), 1e-3)

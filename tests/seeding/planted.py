@@ -1,7 +1,8 @@
 """A textured plane before a few cameras, and new points beside it: where each belongs is known.
 
-Notation: the plane goes through the world's origin, ``NORMAL`` towards the cameras; N originals lie on it in rows
-and columns, ``STEP`` metres apart. New points carry their numbers in their colours, so that what is left can be told.
+Notation: the plane goes through the world's origin, ``NORMAL`` towards the cameras; N originals lie
+on it in rows and columns, ``STEP`` metres apart. New points carry their numbers in their colours,
+so that what is left can be told.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from splatseed.seeding.verify import verify
 from splatseed.synthetic.raycast import render_view
 from splatseed.synthetic.room import Room
 from splatseed.upsample.method import NewPoints
-from splatseed.views.sightings import Sightings
 from splatseed.views.view import View
+from splatseed.views.visibility import Visibility
 
 from ..stereo.made import DOWN, STONE, arc, tilted_plane
 
@@ -69,14 +70,14 @@ def hold(
     """``verify`` of new points [M, 3]; ``seen``: the originals of each view, all when left out."""
     seen = [range(len(known))] * len(views) if seen is None else seen
     starts = np.cumsum([0, *map(len, seen)]).tolist()
-    sightings = Sightings(
+    visibility = Visibility(
         np.asarray(known, np.float64),
         np.array([row for each in seen for row in each], np.int64),
         dict(enumerate(starts)),
         {k: len(each) for k, each in enumerate(seen)},
     )
     images = [_image(k, view) for k, view in enumerate(views)]
-    return verify(views, images, sightings, numbered(new))
+    return verify(views, images, visibility, numbered(new))
 
 
 def numbered(xyz: np.ndarray) -> NewPoints:

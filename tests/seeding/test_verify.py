@@ -17,7 +17,7 @@ from splatseed.seeding.surroundings import Surroundings
 from splatseed.seeding.upsampling import add_verified
 from splatseed.seeding.verify import (
     BARE_CONFIDENCE,
-    FARTHEST,
+    LARGEST_MOVE,
     MAX_COST,
     STEEPEST,
     TEXTURE,
@@ -199,7 +199,7 @@ def test_planes_go_through_their_points_and_face_the_camera(views, rng):
         if abs(n @ ray) < STEEPEST * np.linalg.norm(ray):
             steep += 1
             continue
-        assert moved == pytest.approx(max(-0.05 / abs(n @ ray), -FARTHEST), rel=1e-5)
+        assert moved == pytest.approx(max(-0.05 / abs(n @ ray), -LARGEST_MOVE), rel=1e-5)
         for step in ([0, 0], [3, 0], [0, -4]):
             there = np.linalg.inv(view.K) @ [*(pixel + step), 1.0]  # depth 1 in the camera's axes
             w = (n @ view.cam_from_world[:3, :3].T @ there) / (n @ ray)

@@ -11,8 +11,8 @@ from splatseed.scene import Scene
 from splatseed.stereo.depths import Stereo, find_stereo
 from splatseed.stereo.settings import StereoSettings
 from splatseed.synthetic.surfaces import Union
-from splatseed.views.sightings import find_sightings
 from splatseed.views.view import load_views
+from splatseed.views.visibility import find_visibility
 
 from .made import arc, ball_before_wall, photograph, tilted_plane
 
@@ -31,7 +31,7 @@ class Planted:
 
 def find(scene: Scene) -> Stereo:
     views = load_views(scene, scene.images)
-    return find_stereo(views, scene.images, find_sightings(scene), SETTINGS)
+    return find_stereo(views, scene.images, find_visibility(scene), SETTINGS)
 
 
 def plant(folder, surfaces: Union, **options) -> Planted:

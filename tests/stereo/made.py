@@ -1,7 +1,8 @@
 """Made captures of single surfaces, a few small views each, and what is true of their maps.
 
-Notation: V views on an arc, W x H pixels; the surfaces stand about the world's origin, the cameras ``FAR`` before
-it on -z. Promise: photographs are ray cast, so that depth and normals at any place of any view are exact.
+Notation: V views on an arc, W x H pixels; the surfaces stand about the world's origin, the cameras
+``FAR`` before it on -z. Promise: photographs are ray cast, so that depth and normals at any place
+of any view are exact.
 """
 
 from __future__ import annotations

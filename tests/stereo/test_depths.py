@@ -14,8 +14,8 @@ from splatseed.pointcloud import PointCloud
 from splatseed.stereo import stereo_depths
 from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.settings import StereoSettings
-from splatseed.views.sightings import find_sightings
 from splatseed.views.view import load_views
+from splatseed.views.visibility import find_visibility
 
 from .conftest import SETTINGS
 from .made import (
@@ -188,8 +188,8 @@ def test_the_maps_of_some_views_are_those_of_all(ball):
     scene, only = ball.scene, [3, 0]
     views = load_views(scene, scene.images)
     settings = dataclasses.replace(SETTINGS, num_witnesses=2)
-    every = find_stereo(views, scene.images, find_sightings(scene), settings)
-    some = find_stereo(views, scene.images, find_sightings(scene), settings, only=only)
+    every = find_stereo(views, scene.images, find_visibility(scene), settings)
+    some = find_stereo(views, scene.images, find_visibility(scene), settings, only=only)
     for i in only:
         assert some.map(i).depth.tobytes() == every.map(i).depth.tobytes()
         assert some.map(i).normal.tobytes() == every.map(i).normal.tobytes()

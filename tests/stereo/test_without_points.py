@@ -12,10 +12,10 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Scene
 from splatseed.stereo import stereo_depths
-from splatseed.stereo.without_points import SAMPLES, glimpse, known_sightings
+from splatseed.stereo.without_points import SAMPLES, glimpse, known_visibility
 from splatseed.views.pairs import choose_by_pose
-from splatseed.views.sightings import find_sightings
 from splatseed.views.view import load_views
+from splatseed.views.visibility import find_visibility
 
 from .conftest import SETTINGS
 from .made import GREY, arc, photograph, relative_error, tilted_plane, true_depth
@@ -95,7 +95,7 @@ def test_depth_maps_stand_in_for_points(kind, plane):
             )
         maps[image.name] = DepthMap(depth.astype(np.float32), kind)
     del maps[plane.scene.images[1].name]
-    found = known_sightings(bare(plane.scene).replace(depths=maps))
+    found = known_visibility(bare(plane.scene).replace(depths=maps))
     if kind == "inverse":
         assert not len(found.xyz)  # its unit is nobody's
     else:
@@ -105,8 +105,8 @@ def test_depth_maps_stand_in_for_points(kind, plane):
 
 def test_points_are_taken_where_there_are_some(plane):
     maps = Maps({plane.scene.images[0].name: DepthMap(np.ones((80, 96), np.float32))})
-    found = known_sightings(plane.scene.replace(depths=maps))
-    np.testing.assert_array_equal(found.xyz, find_sightings(plane.scene).xyz)
+    found = known_visibility(plane.scene.replace(depths=maps))
+    np.testing.assert_array_equal(found.xyz, find_visibility(plane.scene).xyz)
 
 
 def test_pairs_by_pose_look_the_same_way_from_another_place():

@@ -25,6 +25,7 @@ def _run(*words):
     return 0
 
 
+@pytest.mark.slow
 def test_trains_and_says_what_and_where(room_path, tmp_path, capsys):
     run = tmp_path / "run"
     words = (room_path, "--max-steps", "10", "--data-factor", "2", "-o", run)

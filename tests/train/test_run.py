@@ -49,6 +49,7 @@ def _stop_after(step):
 SMALL = {"default": {}, "grow": {"cap_max": 4000}, "mcmc": {"cap_max": 4000}, "none": {}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("strategy", "gain"), [("default", 2.0), ("grow", 2.0), ("mcmc", 2.5), ("none", 4.0)]
 )
@@ -338,6 +339,7 @@ def test_what_does_not_fit_the_memory_is_refused_with_what_would(begin, monkeypa
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["default", "grow", "mcmc"])
 def test_memory_holds_growth_and_the_run_says_so(begin, monkeypatch, strategy):
     settings = {"strategy": strategy, "max_steps": 100, **SMALL[strategy]}

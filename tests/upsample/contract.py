@@ -72,7 +72,8 @@ class Kind:
 
 METHOD_NAMES = ("linear", "triangle", "spline", "mls", "voronoi", "depth", "random", "copies")
 PHOTOGRAPH_METHODS = ("stereo", "cover", "auto")
-"""Those that make as many points as the photographs need: tests/seeding holds them to the contract."""
+"""Those that make as many points as the photographs need: tests/seeding holds them to the
+contract."""
 KINDS = [Kind(method, profile) for method in METHOD_NAMES for profile in ("default", "paper")]
 
 

@@ -1,8 +1,8 @@
 """Slow, literal versions of every method: Python loops straight from the equations.
 
 Notation: ``xyz`` float64 [n, 3] are distinct finite originals in file order, ``i`` a base point,
-``rows`` its neighbours, nearest first. A *surface* is a function S(u, v) fitted to the neighbours in
-the base's frame, ``local`` [k + 1, 3] being their coordinates u, v, z with the base last, at 0.
+``rows`` its neighbours, nearest first. A *surface* is a function S(u, v) fitted to the neighbours
+in the base's frame, ``local`` [k + 1, 3] being their coordinates u, v, z with the base last, at 0.
 Promise: a reference asks ``rng`` for the same numbers in the same order as the fast version (how
 many points each base makes, then the uniform draws), so that the two agree point by point.
 """

@@ -1,8 +1,8 @@
 """A made scene around any cloud: cameras, photographs and depth maps, for methods that need them.
 
-Notation: e is the longest edge of the cloud's bounding box. Cameras stand 8 e above the middle of the
-box and look down on a plane through it, in the world's axes. Whatever moves or scales the cloud moves or
-scales all of it.
+Notation: e is the longest edge of the cloud's bounding box. Cameras stand 8 e above the middle of
+the box and look down on a plane through it, in the world's axes. Whatever moves or scales the cloud
+moves or scales all of it.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
 
-from splatseed.cli import main  # noqa: E402
+from splatseed.cli import main
 
 
 def _run(capsys, *words):

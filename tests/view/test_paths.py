@@ -9,17 +9,17 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 
-from splatseed.errors import ParameterError, SceneFormatError  # noqa: E402
-from splatseed.io import load_scene  # noqa: E402
-from splatseed.splat.gaussians import Gaussians  # noqa: E402
-from splatseed.splat.ply import read_gaussians  # noqa: E402
-from splatseed.view.frames import depth_colors, split_picture  # noqa: E402
-from splatseed.view.paths import focus_of, orbit, path_of_file, smooth_path  # noqa: E402
-from splatseed.view.renderer import ModelRenderer, model_frame  # noqa: E402
-from splatseed.view.shown import open_shown  # noqa: E402
-from splatseed.view.video import even_size  # noqa: E402
-from splatseed.views.view import View, poses_of  # noqa: E402
-from splatseed.views.viewpoint import look_at  # noqa: E402
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io import load_scene
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.ply import read_gaussians
+from splatseed.view.frames import depth_colors, split_picture
+from splatseed.view.paths import focus_of, orbit, path_of_file, smooth_path
+from splatseed.view.renderer import ModelRenderer, model_frame
+from splatseed.view.shown import open_shown
+from splatseed.view.video import even_size
+from splatseed.views.view import View, poses_of
+from splatseed.views.viewpoint import look_at
 
 UP = np.array([0.0, 0.0, 1.0])
 

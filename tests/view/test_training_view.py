@@ -12,12 +12,12 @@ torch = pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
-from splatseed.io import load_scene  # noqa: E402
-from splatseed.train.run import prepare_run  # noqa: E402
-from splatseed.train.settings import TrainSettings  # noqa: E402
-from splatseed.view.canvas import canvas_view, fitted_fov, stage_pose  # noqa: E402
-from splatseed.view.training import TrainingViewer  # noqa: E402
-from splatseed.view.viewer import free_port  # noqa: E402
+from splatseed.io import load_scene
+from splatseed.train.run import prepare_run
+from splatseed.train.settings import TrainSettings
+from splatseed.view.canvas import canvas_view, fitted_fov, stage_pose
+from splatseed.view.training import TrainingViewer
+from splatseed.view.viewer import free_port
 
 STEPS = 40
 

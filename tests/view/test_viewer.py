@@ -12,18 +12,18 @@ import pytest
 torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
-from splatseed.cli import main  # noqa: E402
-from splatseed.errors import ParameterError  # noqa: E402
-from splatseed.pointcloud import PointCloud  # noqa: E402
-from splatseed.splat.frame import TrainingFrame  # noqa: E402
-from splatseed.view import pictures  # noqa: E402
-from splatseed.view.canvas import canvas_view, fitted_fov, laid_onto, stage_pose  # noqa: E402
-from splatseed.view.pictures import Entry  # noqa: E402
-from splatseed.view.shown import open_shown  # noqa: E402
-from splatseed.view.stage import clouds_of  # noqa: E402
-from splatseed.view.viewer import Viewer, free_port, stage_frame  # noqa: E402
+from splatseed.cli import main
+from splatseed.errors import ParameterError
+from splatseed.pointcloud import PointCloud
+from splatseed.splat.frame import TrainingFrame
+from splatseed.view import pictures
+from splatseed.view.canvas import canvas_view, fitted_fov, laid_onto, stage_pose
+from splatseed.view.pictures import Entry
+from splatseed.view.shown import open_shown
+from splatseed.view.stage import clouds_of
+from splatseed.view.viewer import Viewer, free_port, stage_frame
 
-from .page import (  # noqa: E402
+from .page import (
     CHROMIUM,
     click_text,
     go,

@@ -101,7 +101,7 @@ def test_what_a_fold_would_show_again_is_unknown():
 @pytest.fixture
 def distorted(room_path, tmp_path):
     """The room with one photograph of a lens, of which a copy of half the size is on disk."""
-    import shutil  # noqa: PLC0415
+    import shutil
 
     shutil.copytree(room_path, tmp_path / "copy")
     scene = load_scene(tmp_path / "copy")

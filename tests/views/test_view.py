@@ -73,7 +73,7 @@ def test_split_takes_every_eighth_by_name(room):
 
 
 def test_files_resized_beforehand_scale_the_intrinsics(room_path, tmp_path):
-    import shutil  # noqa: PLC0415
+    import shutil
 
     copy = tmp_path / "copy"
     shutil.copytree(room_path, copy)

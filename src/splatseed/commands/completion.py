@@ -1,6 +1,7 @@
 """``splatseed --completion``: a script by which a shell completes verbs and options.
 
-Promise: the options are those that the verbs have; where none begins as what was typed, files are offered.
+Promise: the options are those that the verbs have; where none begins as what was typed, files are
+offered.
 """
 
 from __future__ import annotations

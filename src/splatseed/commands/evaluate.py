@@ -47,7 +47,7 @@ class Options:
     data_factor: CountOrNone = None
     """By how much photographs are made smaller; a run's own, else 1."""
     test_every: CountOrNone = None
-    """Of the images sorted by name, every so many-th is scored; a run's own, else 8."""
+    """Score every n-th image, sorted by name; by default as the run was trained, else 8."""
     transform: Annotated[
         str | None,
         tyro.conf.arg(
@@ -57,8 +57,8 @@ class Options:
         ),
     ] = None
     """From the scene's world to the model's, where its trainer normalised that: a JSON file with a
-    matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for what its
-    examples do; none: score the model where it is, whatever it looks like."""
+    matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for what
+    its examples do; none: score the model where it is, whatever it looks like."""
     lpips_net: Literal["vgg", "alex"] = "vgg"
     """The network that LPIPS compares features of."""
     lpips_weights: PathOrNone = None

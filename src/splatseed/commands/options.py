@@ -55,7 +55,8 @@ def parse_options(
         raise ParameterError(
             f"the options of splatseed {verb}",
             found=_sentence(said.getvalue()),
-            fix=f"{_suggestion(kind, said.getvalue(), arguments)}Run splatseed {verb} --help to see them.",
+            fix=f"{_suggestion(kind, said.getvalue(), arguments)}Run splatseed {verb} --help to "
+            "see them.",
         ) from None
     return options
 

@@ -1,10 +1,10 @@
 """The scale (and shift) that takes an image's depth map to the scene's units, by its SfM points.
 
-Notation: at an SfM point that falls into a pixel, ``value`` is the map's and ``z`` the point's planar
-depth. For maps of the kinds "z" and "ray" z = scale value (value divided by the length of the pixel's
-ray for "ray"; the shift is 0), for "inverse" 1 / z = scale value + shift. Promise: an image is left out
-rather than believed when too few points see depth, or when it fits much worse than the others; each
-such image is reported with the reason.
+Notation: at an SfM point that falls into a pixel, ``value`` is the map's and ``z`` the point's
+planar depth. For maps of the kinds "z" and "ray" z = scale value (value divided by the length of
+the pixel's ray for "ray"; the shift is 0), for "inverse" 1 / z = scale value + shift. Promise: an
+image is left out rather than believed when too few points see depth, or when it fits much worse
+than the others; each such image is reported with the reason.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
-from splatseed.views.sightings import SeenPoints, camera_points, find_sightings
+from splatseed.views.visibility import SeenPoints, camera_points, find_visibility
 
 __all__ = ["Alignment", "Fit", "align", "align_map", "reject_outliers", "trust_units", "values_at"]
 
@@ -44,7 +44,8 @@ MAX_RESIDUAL = 0.25
 
 UNIT_POINTS = 20
 UNIT_SLACK = 1.25
-"""A map that is not aligned is refused where this many SfM points say that it is off by this factor."""
+"""A map that is not aligned is refused where this many SfM points say that it is off by this
+factor."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,8 @@ class Alignment:
         scale: Scene units per unit of the map; for inverse depth, its inverse units likewise.
         shift: Added after scaling; 0 but for inverse depth.
         num_points: SfM points that see depth.
-        residual: Median of the points' |aligned depth / depth of the point - 1|; NaN without points.
+        residual: Median of the points' |aligned depth / depth of the point - 1|; NaN without
+            points.
         rejected: Why the image is left out, in one sentence; None = it is used.
     """
 
@@ -81,8 +83,8 @@ def align(
         fit: "robust": the median of z / value, or a line by reweighted least squares for inverse
             depth. "least-squares": the paper's equation 7.
         min_points: Images with fewer points that see depth are rejected.
-        max_residual_ratio: Images whose residual exceeds this many times the median image's, and 1%,
-            are rejected; None keeps all.
+        max_residual_ratio: Images whose residual exceeds this many times the median image's, and
+            1%, are rejected; None keeps all.
         progress: Told how many maps are read.
 
     Returns:
@@ -96,7 +98,7 @@ def align(
         raise SceneNotFoundError(
             "a scene with depth maps", found="none", fix="Name their folder with --depth."
         )
-    depths, sightings = scene.depths, find_sightings(scene)
+    depths, visibility = scene.depths, find_visibility(scene)
     images = [image for image in scene.images if image.name in depths]
     found: list[Alignment | None] = [None] * len(images)
 
@@ -104,7 +106,7 @@ def align(
         for i in range(start, stop):
             depth = depths.read(images[i].name)
             camera = map_camera(depth, images[i])
-            points = camera_points(camera, sightings.of(images[i]))
+            points = camera_points(camera, visibility.of(images[i]))
             found[i] = align_map(depth, camera, points, fit, min_points)
 
     in_threads(work, len(images), 1, "align depth", progress)
@@ -166,8 +168,8 @@ def values_at(
 ) -> tuple[Float64[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
     """What the map holds where points fall, and their planar depth: [K] each, K <= M see depth.
 
-    A point takes the value of the pixel it falls into. Distances along the ray are turned into planar
-    depth by the ray through that pixel's centre.
+    A point takes the value of the pixel it falls into. Distances along the ray are turned into
+    planar depth by the ray through that pixel's centre.
     """
     column, row = points.uv.astype(np.int64).T
     value = depth.values[row, column].astype(np.float64)

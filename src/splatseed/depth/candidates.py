@@ -1,8 +1,9 @@
 """The candidates of all images in one list, how far each can be trusted, and the choice among them.
 
-Notation: C candidates; ``tier`` 0 is sound, then come ``UNCONFIRMED``, ``NEAR_EDGE`` and ``DISTRUSTED``.
-Promise: a candidate of a higher tier is taken only if all of the lower tiers are; among those of one
-tier, points are spread evenly in space, or every image gives the same number as far as it can.
+Notation: C candidates; ``tier`` 0 is sound, then come ``UNCONFIRMED``, ``NEAR_EDGE`` and
+``DISTRUSTED``.
+Promise: a candidate of a higher tier is taken only if all of the lower tiers are; among those of
+one tier, points are spread evenly in space, or every image gives the same number as far as it can.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.depth.consistency import Support, find_support
-from splatseed.depth.harmony import harmonize
 from splatseed.depth.neighbors import choose_neighbors
 from splatseed.depth.planar import lift_pixels
+from splatseed.depth.scale_synchronisation import harmonize
 from splatseed.depth.settings import Settings
-from splatseed.depth.spreading import spread_points
 from splatseed.depth.views import Reduced, View
+from splatseed.depth.voxel_thinning import thin_by_voxels
 from splatseed.errors import PointCloudError
 from splatseed.progress import Progress, in_threads
 
@@ -164,7 +165,7 @@ def _pick(
     """Which ``num`` of the members of a tier to take, beside the points that are there."""
     if settings.spread:
         xyz, footprint = candidates.xyz, candidates.footprint
-        return spread_points(xyz, footprint, members, there, num, rng)
+        return thin_by_voxels(xyz, footprint, members, there, num, rng)
     which = np.flatnonzero(members)
     view_idx = np.repeat(np.arange(len(candidates.counts)), candidates.counts)
     picked = np.zeros(len(members), bool)

@@ -1,9 +1,10 @@
 """Whether other views confirm a point, or look through it.
 
-Notation: at a point that falls into another view's frame at planar depth z, that view has its own depth d
-at the four grid points around it. The view *confirms* the point if |d - z| <= tolerance z for one of them
-and the colours of both views there are close; it *looks through* the point if all four d are clearly
-farther. A point that lies behind what the view sees is hidden from it, and nothing follows.
+Notation: at a point that falls into another view's frame at planar depth z, that view has its own
+depth d at the four grid points around it. The view *confirms* the point if |d - z| <= tolerance z
+for one of them and the colours of both views there are close; it *looks through* the point if all
+four d are clearly farther. A point that lies behind what the view sees is hidden from it, and
+nothing follows.
 Promise: only reduced copies are read, so no file is opened again.
 """
 

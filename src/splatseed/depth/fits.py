@@ -1,9 +1,9 @@
 """Fits that take depth values to the scene's units, with and without regard to outliers.
 
 Notation: at M SfM points, ``value`` is what the map holds and ``z`` the planar depth of the point,
-both positive, float64 [M]. A scale s means z = s value. A line (a, b) means 1 / z = a value + b: networks
-of the MiDaS kind predict depth's inverse up to scale and shift. Promise: nothing is random; multiplying
-``z`` by a power of two divides or multiplies the result by it exactly.
+both positive, float64 [M]. A scale s means z = s value. A line (a, b) means 1 / z = a value + b:
+networks of the MiDaS kind predict depth's inverse up to scale and shift. Promise: nothing is
+random; multiplying ``z`` by a power of two divides or multiplies the result by it exactly.
 """
 
 from __future__ import annotations
@@ -57,8 +57,9 @@ def least_squares_line(value: Values, z: Values) -> tuple[float, float]:
 def robust_line(value: Values, z: Values) -> tuple[float, float]:
     """(a, b) that most points agree with, by relative error r = z (a value + b) - 1.
 
-    Of the lines through 256 pairs of points, the one whose errors have the least median is refined by
-    iteratively reweighted least squares with Tukey's biweight, as LO-RANSAC refines its best sample.
+    Of the lines through 256 pairs of points, the one whose errors have the least median is refined
+    by iteratively reweighted least squares with Tukey's biweight, as LO-RANSAC refines its best
+    sample.
     """
     line = _best_of_pairs(value, 1.0 / z)
     floor = 1e-6  # an exact fit must not divide by zero

@@ -1,9 +1,10 @@
 """Depth-guided lifting, from the images of a scene to new points.
 
-Notation: every image gives *candidates*; a candidate is *sound* if enough views confirm it, none looks
-through it, and no jump of depth is near. Promise: exactly the number asked for, or one error that says
-how many there can be; sound candidates first, then those that too few views confirm, then those near
-jumps, and none that a view looks through (unless that is allowed). A note says when it came to that.
+Notation: every image gives *candidates*; a candidate is *sound* if enough views confirm it, none
+looks through it, and no jump of depth is near. Promise: exactly the number asked for, or one error
+that says how many there can be; sound candidates first, then those that too few views confirm, then
+those near jumps, and none that a view looks through (unless that is allowed). A note says when it
+came to that.
 """
 
 from __future__ import annotations
@@ -24,17 +25,17 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.pointcloud import ORIGINAL
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
-from splatseed.views.sightings import find_sightings
+from splatseed.views.visibility import find_visibility
 
 __all__ = ["Lifted", "lift"]
 
 OVERSAMPLING = 1.4
-"""Candidates a new point, where views are compared or points spread."""
+"""Candidates per new point, where views are compared or points spread."""
 MAX_OVERSAMPLING = 16.0
-"""Candidates a new point, at most; a round of reading multiplies them by up to ``MAX_GROWTH``."""
+"""Candidates per new point, at most; a round of reading multiplies them by up to ``MAX_GROWTH``."""
 MAX_GROWTH = 8.0
 SURPLUS = 1.25
-"""More candidates than seem to be needed, lest another round be."""
+"""How many times as many candidates are drawn as seem to be needed, to save another round."""
 NAMED = 3
 """Images that a note names."""
 
@@ -47,7 +48,7 @@ class Lifted(NamedTuple):
     rgb: UInt8[np.ndarray, "M 3"]
     """Colours, uint8 [M, 3]."""
     notes: tuple[str, ...]
-    """What was left out or made do with, one sentence each."""
+    """What was left out or replaced, one sentence each."""
 
 
 def lift(
@@ -96,7 +97,8 @@ def lift(
 def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
     """The scene with the mean of its cameras at the origin, and where that was.
 
-    Candidates are float32, which far from the origin (UTM coordinates) would be too coarse to compare.
+    Candidates are float32, which far from the origin (UTM coordinates) would be too coarse to
+    compare.
     """
     if not scene.images:
         return scene, np.zeros(3)
@@ -139,7 +141,7 @@ def _reader(scene: Scene, settings: Settings) -> Reader:
             found="none",
             fix="Put them beside the model in a folder named images.",
         )
-    return Reader(folder, scene.depths, find_sightings(scene), settings)
+    return Reader(folder, scene.depths, find_visibility(scene), settings)
 
 
 def _read_all(
@@ -219,7 +221,7 @@ def _originals(scene: Scene) -> Float32[np.ndarray, "N 3"]:
 
 
 def _relaxed_notes(tier: UInt8[np.ndarray, " M"], settings: Settings) -> tuple[str, ...]:
-    """What had to be made do with."""
+    """One sentence on each shortage that was worked around."""
     unconfirmed, edge = (int(np.count_nonzero(tier == t)) for t in (UNCONFIRMED, NEAR_EDGE))
     notes = []
     if unconfirmed:

@@ -1,10 +1,11 @@
 """Which other views to ask about a view's points.
 
-Notation: V views, S sample points of each. A view *covers* a sample of another, with a weight by the angle
-that the two cameras' rays to it enclose: little where the rays nearly coincide, since a sensor errs alike
-from one place, and none from 90 degrees on, where the other side of a surface is seen. Promise: neighbours
-are chosen one after another, each for the samples that those before it cover least, first by frames alone
-(few of all views), then by what each sees there according to its map (``num`` of these few).
+Notation: V views, S sample points of each. A view *covers* a sample of another, with a weight by
+the angle that the two cameras' rays to it enclose: little where the rays nearly coincide, since a
+sensor errs alike from one place, and none from 90 degrees on, where the other side of a surface is
+seen. Promise: neighbours are chosen one after another, each for the samples that those before it
+cover least, first by frames alone (few of all views), then by what each sees there according to its
+map (``num`` of these few).
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ LEAST = 0.05
 """How much rays that coincide cover."""
 SEEN = 0.25
 """A view sees a sample if its own depth there differs by less than this share."""
-FAR = 1e6
+MOST_COLUMNS = 1e6
 """No grid has so many columns."""
 PIECE = 8
 """Views that a thread takes at a time."""
@@ -145,7 +146,7 @@ def _nearest(point, m):  # type: ignore[no-untyped-def]
     """Depth of a point in a view, and the nearest point of its grid; column -1 where there is none."""
     column, row, depth = place(point, m)
     column, row = column + 0.5, row + 0.5
-    if not (0.0 <= column < FAR and 0.0 <= row < FAR):
+    if not (0.0 <= column < MOST_COLUMNS and 0.0 <= row < MOST_COLUMNS):
         return depth, -1, -1
     return depth, int(column), int(row)
 

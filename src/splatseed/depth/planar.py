@@ -1,7 +1,7 @@
 """Depth maps in the pixels and the measure of a camera.
 
-Notation: a ray has unit z in camera axes, so that its length is distance over planar depth. Promise:
-a pixel's ray passes through its centre, at +0.5.
+Notation: a ray has unit z in camera axes, so that its length is distance over planar depth.
+Promise: a pixel's ray passes through its centre, at +0.5.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def ray_length(
 class PlanarDepth:
     """A map whose depth is worked out only where it is asked for.
 
-    Most maps need no more than one factor, and multiplying a whole map takes longer than all that is
-    done with the few pixels that are lifted.
+    Most maps need no more than one factor, and multiplying a whole map takes longer than all that
+    is done with the few pixels that are lifted.
 
     Args:
         values: float32 [H, W]; NaN, or not above 0, where depth is unknown.
@@ -113,8 +113,8 @@ def lift_pixels(
 ) -> Float32[np.ndarray, "C 3"]:
     """Write the world positions of pixels into ``out`` [C, 3], and return it.
 
-    Equation 9: P = c + z v, where v is the ray through the pixel's centre, with unit z in camera axes;
-    the text's P = c + s d v / |v| is the same with z = s d / |v|.
+    Equation 9: P = c + z v, where v is the ray through the pixel's centre, with unit z in camera
+    axes; the text's P = c + s d v / |v| is the same with z = s d / |v|.
 
     Args:
         pixel: Numbers row * W + column, [C].

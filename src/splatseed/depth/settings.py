@@ -20,7 +20,7 @@ class Settings:
     fit: Literal["robust", "least-squares"] = "robust"
     """How: medians and reweighting, or the paper's equation 7 (paper: least-squares)."""
     min_points: int = 20
-    """SfM points an image must see, or it is left out (paper: 1)."""
+    """Fewest SfM points that an image must see, else it is left out (paper: 1)."""
     max_residual_ratio: float | None = 3.0
     """Leave out images that fit this many times worse than the median one (paper: none)."""
     harmonize: bool = True
@@ -46,9 +46,10 @@ class Settings:
     color_tolerance: float | None = 0.15
     """Mean difference of a colour, 0 to 1, at which two views agree; none = not compared."""
     spread: bool = True
-    """Take points as evenly apart as their number allows, whatever image they are from (paper: no)."""
+    """Take points as evenly apart as their number allows, whatever image they are from (paper:
+    no)."""
     hold_out: int = 0
-    """Leave out every so many-th image by name, as trainers do for the test (8); 0 = use all."""
+    """Leave out every n-th image by name, as trainers do for the test (8); 0 = use all."""
 
     @property
     def harmonizes(self) -> bool:

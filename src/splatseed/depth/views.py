@@ -1,9 +1,9 @@
 """One image at a time: align its map, draw pixels, lift them, colour them; keep a reduced copy.
 
-Notation: a *view* is what stays of an image once its files are closed: C candidates, and the map and
-the photograph reduced to ``GRID`` pixels at most along the longer side, with which other images'
-candidates are compared. Promise: each file is read once; the candidates depend on the image, the seed
-and the settings alone, not on threads or other images.
+Notation: a *view* is what stays of an image once its files are closed: C candidates, and the map
+and the photograph reduced to ``GRID`` pixels at most along the longer side, with which other
+images' candidates are compared. Promise: each file is read once; the candidates depend on the
+image, the seed and the settings alone, not on threads or other images.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.camera import Camera
 from splatseed.depth.alignment import Alignment, align_map, trust_units
-from splatseed.depth.drawing import Drawn, draw_pixels
+from splatseed.depth.pixel_sampling import Drawn, sample_pixels
 from splatseed.depth.planar import PlanarDepth, lift_pixels, map_camera
 from splatseed.depth.settings import Settings
 from splatseed.depthmap import ASPECT_SLACK, DepthMap, DepthMaps
@@ -25,7 +25,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.kernels.jit import inline
 from splatseed.scene import Image
-from splatseed.views.sightings import SeenPoints, Sightings, camera_points
+from splatseed.views.visibility import SeenPoints, Visibility, camera_points
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage
@@ -105,13 +105,13 @@ class Reader:
     Args:
         folder: Where the photographs are.
         depths: Their maps.
-        sightings: The SfM points that each image sees.
+        visibility: The SfM points that each image sees.
         settings: The method's choices.
     """
 
     folder: Path
     depths: DepthMaps
-    sightings: Sightings
+    visibility: Visibility
     settings: Settings
 
     def read(self, image: Image, num: int, rng: np.random.Generator) -> View:
@@ -144,7 +144,7 @@ class Reader:
         """Everything that is asked of a map."""
         depth = self.depths.read(image.name)
         camera = map_camera(depth, image)
-        points = camera_points(camera, self.sightings.of(image))
+        points = camera_points(camera, self.visibility.of(image))
         alignment = self._align(depth, camera, points)
         if alignment.rejected is not None:
             nothing = np.empty(0, np.int64)
@@ -152,7 +152,7 @@ class Reader:
         planar = PlanarDepth.of(
             depth, camera, alignment.scale, alignment.shift, unit_ray=self.settings.unit_ray
         )
-        drawn = draw_pixels(planar.values, num, points.uv, self.settings, rng)
+        drawn = sample_pixels(planar.values, num, points.uv, self.settings, rng)
         seen = _Seen(alignment, camera, drawn, planar.at(drawn.pixel))
         if not (self.settings.compares_views or self.settings.harmonizes):
             return seen
@@ -181,7 +181,7 @@ def check_lens(image: Image) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What is taken from a map: the fields of ``View``, and every so many-th pixel in some unit."""
+    """What is taken from a map: the fields of ``View`` before scales are synchronised."""
 
     alignment: Alignment
     camera: Camera
@@ -228,7 +228,8 @@ def _reduce(seen: _Seen, coarse: Float32[np.ndarray, "h w"], photograph: PilImag
     first = factor // 2 + 0.5
     grid_from_map = np.array([[1, 0, -first], [0, 1, -first], [0, 0, factor]]) / factor
     size = [-(-side // -(-max(photograph.size) // GRID)) for side in photograph.size]
-    # The mean of 2 x 2 samples of each block is smooth enough, and several times as fast as the block's.
+    # The mean of 2 x 2 samples of each block is smooth enough, and several times as fast as the
+    # block's.
     samples = photograph.resize((2 * size[0], 2 * size[1]), resample=0)
     block_from_map = np.array(size) / [camera.width, camera.height]
     return Reduced(

@@ -1,9 +1,9 @@
 """How good a cloud is where the surfaces are known, and how far new points stray where not.
 
 Notation: h is a cloud's spacing: the mean over its points of the mean distance to the 6 nearest
-others. All scores are in units of h of the *originals*, so that scenes of any size compare. Promise:
-exact duplicates and non-finite points do not count as neighbours; nothing is random unless a ``rng``
-is passed.
+others. All scores are in units of h of the *originals*, so that scenes of any size compare.
+Promise: exact duplicates and non-finite points do not count as neighbours; nothing is random unless
+a ``rng`` is passed.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
 
-__all__ = ["FAR", "GeometryScore", "far_share", "local_spacing", "measure", "spacing"]
+__all__ = ["FAR_SPACINGS", "GeometryScore", "far_share", "local_spacing", "measure", "spacing"]
 
 NEIGHBORS = 6
 """Neighbours whose mean distance is the spacing: those of a point in a hexagonal pattern."""
 
-FAR = 3.0
+FAR_SPACINGS = 3.0
 """A new point is far when no original lies within this many of the nearest original's spacings."""
 
 Distance = Callable[[np.ndarray], np.ndarray]
@@ -158,7 +158,7 @@ def far_share(
     tree = cKDTree(originals, balanced_tree=False, compact_nodes=False)
     to_original, nearest = tree.query(finite)
     h = local_spacing(originals, originals[nearest], tree)
-    near = np.count_nonzero(to_original <= FAR * h)
+    near = np.count_nonzero(to_original <= FAR_SPACINGS * h)
     return float(1.0 - near / len(sample))
 
 

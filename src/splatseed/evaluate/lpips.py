@@ -6,8 +6,8 @@ channels; w_l >= 0 are weights of the channels learnt from human judgements. The
     d(x, y) = sum_l mean_places sum_c w_lc (f_lc(x) - f_lc(y))^2     (Zhang et al. 2018, eq. 1)
 
 Promise: version 0.1 of the metric, with the weights that torchvision publishes and the w_l that
-torchmetrics ships; torchvision itself is not needed; nothing is downloaded. Where weights are absent
-the error says what to fetch and where to put it.
+torchmetrics ships; torchvision itself is not needed; nothing is downloaded. Where weights are
+absent the error says what to fetch and where to put it.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ def load_model(
         path: A file of Gaussians in any format that ``export.read_model`` reads.
         scene_path: The scene.
         data_factor: By how much photographs are made smaller.
-        test_every: Of the images sorted by name, every so many-th is a test view.
+        test_every: Every n-th image, sorted by name, is a test view.
         transform: From the scene's world to the model's, if they differ: a file, or a word, as for
             ``find_transform``. When left out, the model must be in the scene's own world.
         device: Where to render; the CPU when left out.
@@ -90,8 +90,8 @@ def load_model(
 
     Raises:
         SceneNotFoundError: The model, the scene or its images are missing.
-        SceneFormatError: One of them is not what its format promises, or the model's Gaussians are not
-            where the scene's points are.
+        SceneFormatError: One of them is not what its format promises, or the model's Gaussians are
+            not where the scene's points are.
         ParameterError: The transform cannot be computed.
     """
     gaussians = read_model(path)

@@ -41,7 +41,7 @@ class EvalResult:
     """Scores over test views.
 
     Args:
-        per_image: One score a view, in the views' order; at least one.
+        per_image: One score per view, in the views' order; at least one.
         lpips_net: The network that LPIPS was measured with; None where it was not measured.
         lpips_reason: Why LPIPS was not measured; empty where it was.
         num_gaussians: How many Gaussians were rendered; None where the renderer is a black box.

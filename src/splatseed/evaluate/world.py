@@ -1,11 +1,12 @@
 """The world that a trained model lies in, which need not be its scene's.
 
-Notation: ``model_from_scene`` takes the scene's world to that of the Gaussians. Some trainers normalise the
-world before they train, and write Gaussians of that world; rendered from the scene's cameras these give a
-wrong picture, and a wrong score without a warning. *Apart* is the median distance from the scene's points to
-the nearest Gaussian, in units of the median distance between neighbouring Gaussians: in the right world about
-1 (0.1 to 1.3 for seeds and trained models of five scenes), in a wrong one 4 to 700. Promise: Gaussians that lie
-apart from the scene's points are refused, with a transform that mends it if one is found.
+Notation: ``model_from_scene`` takes the scene's world to that of the Gaussians. Some trainers
+normalise the world before they train, and write Gaussians of that world; rendered from the scene's
+cameras these give a wrong picture, and a wrong score without a warning. *Apart* is the median
+distance from the scene's points to the nearest Gaussian, in units of the median distance between
+neighbouring Gaussians: in the right world about 1 (0.1 to 1.3 for seeds and trained models of five
+scenes), in a wrong one 4 to 700. Promise: Gaussians that lie apart from the scene's points are
+refused, with a transform that mends it if one is found.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ LEAST = 20
 VISIBLE = -2.2
 """Logit of the least opacity that counts, a tenth."""
 FILES = ("dataparser_transforms.json", "cameras.json")
-"""Files of nerfstudio and graphdeco, in the model's folder or up to three above, that tell a transform."""
+"""Files of nerfstudio and graphdeco, in the model's folder or up to three above, that tell a
+transform."""
 _FIX = "Name another file, or a word: gsplat, none."
 
 
@@ -102,7 +104,8 @@ def check_world(
     )
     raise SceneFormatError(
         f"the Gaussians of {path} in the world of the scene, where its points are",
-        found=f"points {found:.0f} times as far from the nearest Gaussian as Gaussians from each other:"
+        found=f"points {found:.0f} times as far from the nearest Gaussian as Gaussians from each "
+        "other:"
         " another frame, or another scene",
         fix=fix,
     )
@@ -156,7 +159,8 @@ def _of_file(path: Path, scene: Scene) -> Similarity:
         world = None
     if world is None:
         raise SceneFormatError(
-            f"{path} to hold a similarity: a matrix of 3 or 4 rows of 4, by itself or as transform, with "
+            f"{path} to hold a similarity: a matrix of 3 or 4 rows of 4, by itself or as "
+            "transform, with "
             "a scale beside it",
             found=repr(rows)[:80],
             fix=_FIX,

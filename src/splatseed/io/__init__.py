@@ -1,8 +1,9 @@
-"""Reading scenes and writing them, one file a format.
+"""Reading scenes and writing them, one file per format.
 
 ``load_scene`` finds out what a path holds; ``write_scene`` makes a folder that every 3D Gaussian
 Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a scene's images.
-Promise: malformed input and failing output raise one error from ``splatseed.errors``; importing this package loads neither Numba nor SciPy.
+Promise: malformed input and failing output raise one error from ``splatseed.errors``; importing
+this package loads neither Numba nor SciPy.
 """
 
 from splatseed.io.cloud import clean_scene

@@ -1,8 +1,9 @@
 """Opening files that a scene names, which may be anything.
 
 Promise: only regular files are opened, so that nothing is waited for or read without end (a pipe,
-``/dev/zero``), and none that is larger than the free memory. What is refused raises an ``OSError`` whose
-``strerror`` says why, as what the system refuses does; ``read_bytes`` makes one of our errors of it.
+``/dev/zero``), and none that is larger than the free memory. What is refused raises an ``OSError``
+whose ``strerror`` says why, as what the system refuses does; ``read_bytes`` makes one of our errors
+of it.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ def read_file(path: Path) -> bytes:
     """The whole content of a regular file.
 
     Raises:
-        OSError: There is none, it cannot be read, is of another kind, or larger than the free memory.
+        OSError: There is none, it cannot be read, is of another kind, or larger than the free
+            memory.
     """
     with open_file(path) as file:
         size, free = os.fstat(file.fileno()).st_size, free_memory()

@@ -46,7 +46,7 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
 
 def _leads_out(name: str, image_dir: Path, root: Path) -> bool:
     """Whether an image's name leads out of its scene; links, which somebody made, may lead anywhere."""
-    path, around = (os.path.abspath(each) for each in (image_dir / name, root))  # noqa: PTH100
+    path, around = (os.path.abspath(each) for each in (image_dir / name, root))  # noqa: PTH100  (without following links)
     return os.path.commonpath([path, around]) != around
 
 

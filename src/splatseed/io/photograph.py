@@ -1,8 +1,9 @@
 """A photograph's file: its bytes, its size, its pixels.
 
-Promise: pixels are as stored, before any EXIF rotation, which is how COLMAP counts them; transparent
-ones are laid over black, which Gaussians are drawn on; grey of 16 bits, and floats of 0 to 1, become the
-nearest of 8 bits, colours of 16 bits their upper 8 (Pillow's way); every failure names the file.
+Promise: pixels are as stored, before any EXIF rotation, which is how COLMAP counts them;
+transparent ones are laid over black, which Gaussians are drawn on; grey of 16 bits, and floats of 0
+to 1, become the nearest of 8 bits, colours of 16 bits their upper 8 (Pillow's way); every failure
+names the file.
 """
 
 from __future__ import annotations
@@ -24,9 +25,11 @@ __all__ = ["check_photograph", "decode_photograph", "open_photograph", "photogra
 _CHECK_SCALE = 8
 """JPEG is checked at an eighth of its size: all of it is read, a fraction of it is computed."""
 _WIDE_GREY = ("I", "F")
-"""Pillow's modes for one channel of more than 8 bits, which it cuts off at 255 when it converts them."""
+"""Pillow's modes for one channel of more than 8 bits, which it cuts off at 255 when it converts
+them."""
 _INKS = ("CMYK", "LAB")
-"""Pillow's modes whose colours are not light of a screen; it would convert inks by a rule of thumb."""
+"""Pillow's modes whose colours are not light of a screen; it would convert inks by a rule of
+thumb."""
 _DECODER_FAILURES = (OSError, ValueError, SyntaxError)
 
 
@@ -67,8 +70,8 @@ def decode_photograph(path: Path, raw: bytes) -> PilImage.Image:
     """The pixels in a file's bytes, as RGB.
 
     Raises:
-        SceneFormatError: It is no image, is cut short or damaged, is in inks (CMYK), or has numbers of
-            unknown range.
+        SceneFormatError: It is no image, is cut short or damaged, is in inks (CMYK), or has numbers
+            of unknown range.
     """
     picture = open_photograph(path, raw)
     if picture.mode in _INKS:
@@ -106,14 +109,15 @@ def check_photograph(path: Path) -> tuple[int, int]:
 
 def _eight_bits(path: Path, picture: PilImage.Image) -> PilImage.Image:
     """Grey of 16 bits or of floats, as 8 bits."""
-    from PIL import Image  # noqa: PLC0415
+    from PIL import Image  # noqa: PLC0415  (loads with its use)
 
     try:
         values = np.asarray(picture)
     except _DECODER_FAILURES as error:
         raise _damaged(path, error) from None
     most = 1.0 if picture.mode == "F" else 65535.0
-    # Integers of 32 bits can have any range; in a PNG they are how some versions of Pillow open 16 bits.
+    # Integers of 32 bits can have any range; in a PNG they are how some versions of Pillow open 16
+    # bits.
     known = picture.mode != "I" or picture.format == "PNG"
     if not (known and values.min() >= 0 and values.max() <= most):  # nor is NaN
         raise SceneFormatError(
@@ -129,7 +133,7 @@ def _eight_bits(path: Path, picture: PilImage.Image) -> PilImage.Image:
 
 
 def _over_black(picture: PilImage.Image) -> PilImage.Image:
-    from PIL import Image  # noqa: PLC0415
+    from PIL import Image  # noqa: PLC0415  (loads with its use)
 
     black = Image.new("RGBA", picture.size, (0, 0, 0, 255))
     return Image.alpha_composite(black, picture).convert("RGB")

@@ -1,10 +1,11 @@
 """Which images are for training and which for the test, where a scene has files that say so.
 
-Notation: a *list* is a text file with one image name a line. Promise: the first of these is followed,
-and told of: ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) of a transforms.json, as
-nerfstudio writes them; ``train_list.txt``, ``test_list.txt`` (else ``validation_list.txt``) in the scene's folder, as its
-COLMAP reader has them; ``test.txt`` in the model's folder (graphdeco); ``train.txt`` and ``test.txt`` in the
-scene's. A list whose names fit no image is left aside, and told of too.
+Notation: a *list* is a text file with one image name a line. Promise: the first of these is
+followed, and told of: ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) of a
+transforms.json, as nerfstudio writes them; ``train_list.txt``, ``test_list.txt`` (else
+``validation_list.txt``) in the scene's folder, as its COLMAP reader has them; ``test.txt`` in the
+model's folder (graphdeco); ``train.txt`` and ``test.txt`` in the scene's. A list whose names fit no
+image is left aside, and told of too.
 """
 
 from __future__ import annotations

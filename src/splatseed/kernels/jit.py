@@ -4,8 +4,8 @@ Promise: a kernel compiled here divides by zero as NumPy does (Numba's Python se
 a SystemError inside ``prange``), releases the GIL, is cached on disk, and never reorders
 floating-point sums, so its bytes do not depend on the number of threads or on the cache.
 
-A cached kernel is keyed on what its own file says and on every file that this one reaches by its imports
-(``splatseed.kernels.sources``): kernels call functions and use constants of any file.
+A cached kernel is keyed on what its own file says and on every file that this one reaches by its
+imports (``splatseed.kernels.sources``): kernels call functions and use constants of any file.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["always_inline", "inline", "kernel", "parallel_range"]
 
 # TBB, where a distribution ships it, can hang at interpreter exit; a user's own choice stands.
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-    config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]
+    config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]  # absent from Numba's stubs
 
 
 class _Teller(event.Listener):
@@ -59,9 +59,9 @@ def inline(function: F) -> F:
 def always_inline(function: F) -> F:
     """Compile a helper into every kernel that calls it, for calls that are too many to be calls.
 
-    A call passes every array as seven numbers and counts references with locked additions; where the
-    compiler has its way (``inline``), it declines for large helpers, and kernels of many helpers
-    compile in half of the time.
+    A call passes every array as seven numbers and counts references with locked additions; where
+    the compiler has its way (``inline``), it declines for large helpers, and kernels of many
+    helpers compile in half of the time.
     """
     return _compile(function, forceinline=True)
 
@@ -76,15 +76,15 @@ def _compile(function: F, **options: bool) -> F:
 def _key_on_sources(compiled: Any, function: Callable[..., Any]) -> None:
     """Make machine code in the cache stale when any file changes that the function may be made of.
 
-    Numba asks for the function's own file only, and has no setting for more, so its stamp of the source
-    is replaced. Where there is no such stamp, as without a compiler (``NUMBA_DISABLE_JIT``), or no source
-    to be read, as in an archive, Numba's own way stays.
+    Numba asks for the function's own file only, and has no setting for more, so its stamp of the
+    source is replaced. Where there is no such stamp, as without a compiler (``NUMBA_DISABLE_JIT``),
+    or no source to be read, as in an archive, Numba's own way stays.
     """
     file: Any = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     if hasattr(file, "_source_stamp"):
         with suppress(OSError):
             path = Path(function.__code__.co_filename)
             digest = source_digest(path, function.__module__)
-            file._source_stamp = digest  # noqa: SLF001
+            file._source_stamp = digest  # noqa: SLF001  (there is no public way)
             # Looked at before the rest is unpickled, which may name modules that are gone.
-            file._version = f"{numba.__version__} {digest}"  # noqa: SLF001
+            file._version = f"{numba.__version__} {digest}"  # noqa: SLF001  (there is no public way)

@@ -30,8 +30,8 @@ def permutation(pattern: Sequence[int]):
     lanes = [int(each) for each in pattern]
 
     @intrinsic
-    def permute(typing_context, v):  # noqa: ARG001  (Numba's signature)
-        def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def permute(typing_context, v):
+        def generate(context, builder, signature, arguments):
             return _shuffle(builder, arguments[0], arguments[0], lanes)
 
         return f32x16(f32x16), generate
@@ -44,8 +44,8 @@ def lane(number: int):
     index = ir.Constant(I32, number)
 
     @intrinsic
-    def take(typing_context, v):  # noqa: ARG001
-        def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def take(typing_context, v):
+        def generate(context, builder, signature, arguments):
             return builder.extract_element(arguments[0], index)
 
         return types.float32(f32x16), generate
@@ -59,10 +59,10 @@ def _shuffle(builder, a, b, lanes):
 
 
 @intrinsic
-def three_sums(typing_context, a, b, c):  # noqa: ARG001
+def three_sums(typing_context, a, b, c):
     """The sums of the lanes of a, b and c, in lanes 0, 4 and 8 of the result."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         a, b, c = arguments
         # Halves of a and c, then quarters of those and of b, side by side.
         low, high = [*range(8), *range(16, 24)], [*range(8, 16), *range(24, 32)]
@@ -82,10 +82,10 @@ def three_sums(typing_context, a, b, c):  # noqa: ARG001
 
 
 @intrinsic
-def triple(typing_context, a, b, c):  # noqa: ARG001
+def triple(typing_context, a, b, c):
     """a, b and c in lanes 0, 1 and 2; the others hold anything."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         vector = UNDEFINED
         for number, each in enumerate(arguments):
             vector = builder.insert_element(vector, each, ir.Constant(I32, number))

@@ -1,8 +1,8 @@
 """Sixteen float32 lanes: a Numba type whose values live in vector registers.
 
 Auto-vectorisation fails on the rasteriser's loops (they branch, carry state over Gaussians and end
-early), and costs a factor of five to eight. This file gives kernels LLVM's ``<16 x float>`` instead:
-one AVX-512 register, which LLVM splits in two on AVX2 and in four on NEON.
+early), and costs a factor of five to eight. This file gives kernels LLVM's ``<16 x float>``
+instead: one AVX-512 register, which LLVM splits in two on AVX2 and in four on NEON.
 Promise: every operation is exactly the float32 one in each lane, in the order written; sums over
 lanes run in one fixed tree. Nothing here is ``fastmath``, so results do not depend on how a kernel
 was compiled or cached.
@@ -77,8 +77,8 @@ def _binary(instruction):
     """An intrinsic of two vectors that is one LLVM instruction."""
 
     @intrinsic
-    def operation(typing_context, a, b):  # noqa: ARG001  (Numba's signature)
-        def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def operation(typing_context, a, b):
+        def generate(context, builder, signature, arguments):
             return getattr(builder, instruction)(*arguments)
 
         return f32x16(f32x16, f32x16), generate
@@ -98,20 +98,20 @@ def _call(builder, name, arguments):
 
 
 @intrinsic
-def fma(typing_context, a, b, c):  # noqa: ARG001
+def fma(typing_context, a, b, c):
     """The product a b plus c, rounded once."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         return _call(builder, "fma", arguments)
 
     return f32x16(f32x16, f32x16, f32x16), generate
 
 
 @intrinsic
-def fnma(typing_context, a, b, c):  # noqa: ARG001
+def fnma(typing_context, a, b, c):
     """Minus a b plus c, rounded once."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         a, b, c = arguments
         return _call(builder, "fma", [builder.fneg(a), b, c])
 
@@ -119,20 +119,20 @@ def fnma(typing_context, a, b, c):  # noqa: ARG001
 
 
 @intrinsic
-def minimum(typing_context, a, b):  # noqa: ARG001
+def minimum(typing_context, a, b):
     """The lesser in each lane; of a NaN and a number, the number."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         return _call(builder, "minnum", arguments)
 
     return f32x16(f32x16, f32x16), generate
 
 
 @intrinsic
-def select_greater(typing_context, a, b, yes, no):  # noqa: ARG001
+def select_greater(typing_context, a, b, yes, no):
     """``yes`` where a > b, else ``no`` (also where either is NaN)."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         left, right, if_true, if_false = arguments
         return builder.select(builder.fcmp_ordered(">", left, right), if_true, if_false)
 
@@ -140,10 +140,10 @@ def select_greater(typing_context, a, b, yes, no):  # noqa: ARG001
 
 
 @intrinsic
-def splat(typing_context, x):  # noqa: ARG001
+def splat(typing_context, x):
     """The same float32 in every lane."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         return _splat(builder, arguments[0])
 
     return f32x16(types.float32), generate
@@ -156,7 +156,7 @@ def _splat(builder, x):
 
 
 @intrinsic
-def broadcast(typing_context, array, index):  # noqa: ARG001
+def broadcast(typing_context, array, index):
     """Element ``index`` of a contiguous float32 array in every lane; like ``element``'s, not below 0."""
 
     def generate(context, builder, signature, arguments):
@@ -166,7 +166,7 @@ def broadcast(typing_context, array, index):  # noqa: ARG001
 
 
 @intrinsic
-def element(typing_context, array, index):  # noqa: ARG001
+def element(typing_context, array, index):
     """Element ``index`` of a contiguous array.
 
     It must not be below 0: counting from the end, as NumPy does there, takes several instructions
@@ -191,7 +191,7 @@ def _address(context, builder, array_type, array, index):
 
 
 @intrinsic
-def load(typing_context, array, index):  # noqa: ARG001
+def load(typing_context, array, index):
     """Elements ``index`` to ``index + 15`` of a contiguous float32 array."""
 
     def generate(context, builder, signature, arguments):
@@ -202,7 +202,7 @@ def load(typing_context, array, index):  # noqa: ARG001
 
 
 @intrinsic
-def store(typing_context, array, index, v):  # noqa: ARG001
+def store(typing_context, array, index, v):
     """Write ``v`` to elements ``index`` to ``index + 15`` of a contiguous float32 array."""
 
     def generate(context, builder, signature, arguments):
@@ -222,7 +222,7 @@ def aligned(size):
 
 
 @intrinsic
-def load_columns(typing_context, array, index):  # noqa: ARG001
+def load_columns(typing_context, array, index):
     """Four vectors of sixteen rows of sixteen: lane i of vector j is element ``index + 16 i + j``.
 
     Four at a time fit the registers of AVX2, where all sixteen would go back to memory.
@@ -252,7 +252,7 @@ def _joined(builder, pieces):
 
 
 @intrinsic
-def store_transposed(typing_context, array, index, vectors):  # noqa: ARG001
+def store_transposed(typing_context, array, index, vectors):
     """Write lane i of vector j, of a tuple of sixteen, to element ``index + 16 i + j``."""
 
     def generate(context, builder, signature, arguments):
@@ -290,7 +290,7 @@ def _exchange(builder, rows, width):
 
 
 @intrinsic
-def prefetch(typing_context, array, index):  # noqa: ARG001
+def prefetch(typing_context, array, index):
     """Ask for the cache line of element ``index`` of a contiguous array, without waiting for it."""
 
     def generate(context, builder, signature, arguments):
@@ -318,20 +318,20 @@ def _fold(builder, vector, combine):
 
 
 @intrinsic
-def lane_sum(typing_context, v):  # noqa: ARG001
+def lane_sum(typing_context, v):
     """The sum of the lanes, float32, in a fixed tree."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         return _fold(builder, arguments[0], builder.fadd)
 
     return types.float32(f32x16), generate
 
 
 @intrinsic
-def any_greater(typing_context, a, b):  # noqa: ARG001
+def any_greater(typing_context, a, b):
     """Whether a > b in at least one lane."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         mask = builder.bitcast(builder.fcmp_ordered(">", *arguments), ir.IntType(LANES))
         return builder.icmp_unsigned("!=", mask, ir.Constant(mask.type, 0))
 
@@ -345,13 +345,13 @@ _EXP = [
 
 
 @intrinsic
-def exp_of_eighth(typing_context, x):  # noqa: ARG001
+def exp_of_eighth(typing_context, x):
     """exp(8 x) for x in [-0.7, 0], to 3e-6 relative; meaningless elsewhere.
 
     -5.6 is low enough: an alpha below 1/255 = exp(-5.54) is under the cut-off.
     """
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         value = ir.Constant(VECTOR, [float(_EXP[-1])] * LANES)
         for coefficient in reversed(_EXP[:-1]):
             constant = ir.Constant(VECTOR, [float(coefficient)] * LANES)
@@ -364,10 +364,10 @@ def exp_of_eighth(typing_context, x):  # noqa: ARG001
 
 
 @intrinsic
-def negative_magnitude(typing_context, v):  # noqa: ARG001
+def negative_magnitude(typing_context, v):
     """-|v|: the sign bit set."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         bits = builder.bitcast(arguments[0], INDEX)
         signs = ir.Constant(INDEX, [1 << 31] * LANES)
         return builder.bitcast(builder.or_(bits, signs), VECTOR)

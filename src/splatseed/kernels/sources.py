@@ -1,9 +1,10 @@
 """Which source files a compiled function may be made of, and a digest of what they say.
 
-Notation: a file *reaches* another file of its own package, or of splatseed, through the imports at its
-top, directly or by way of others. Imports that are indented, as those for annotations are, do not count.
-Promise: the digest depends on the contents of these files and on nothing else, neither on their dates
-nor on their place: two checkouts of one commit have the same.
+Notation: a file *reaches* another file of its own package, or of splatseed, through the imports at
+its top, directly or by way of others. Imports that are indented, as those for annotations are, do
+not count.
+Promise: the digest depends on the contents of these files and on nothing else, neither on their
+dates nor on their place: two checkouts of one commit have the same.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def _own_package(path: Path, module: str) -> Packages:
 
 
 @cache
-def _read(path: Path, packages: Packages, mtime_ns: int, size: int) -> _Source:  # noqa: ARG001
+def _read(path: Path, packages: Packages, mtime_ns: int, size: int) -> _Source:  # noqa: ARG001  (part of the cache's key)
     """A file is read again if its date or its size says that it has changed."""
     text = path.read_bytes()
     return _Source(hashlib.sha256(text).digest(), tuple(_imports(path, text, packages)))

@@ -37,8 +37,8 @@ def load_network(
     """Load a depth network that is on this machine.
 
     Args:
-        model: An ``.onnx`` file; a folder in transformers' format; or the id of a model that Hugging
-            Face's cache holds.
+        model: An ``.onnx`` file; a folder in transformers' format; or the id of a model that
+            Hugging Face's cache holds.
         kind: What it predicts; None: what its configuration tells.
         device: Where to run it; auto takes a GPU if there is one that can be used.
         preparation: How the input of an ONNX network is made, where its file leaves that open.

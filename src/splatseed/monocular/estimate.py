@@ -1,7 +1,7 @@
 """Predicting a depth map for every photograph of a scene, and keeping them.
 
-Promise: every photograph is read to its last byte before the network runs on the first; one batch is in
-memory at a time; the folder of maps appears whole or not at all.
+Promise: every photograph is read to its last byte before the network runs on the first; one batch
+is in memory at a time; the folder of maps appears whole or not at all.
 """
 
 from __future__ import annotations

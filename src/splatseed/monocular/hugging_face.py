@@ -199,7 +199,7 @@ def _check_folder(model: str) -> None:
 
 def _read_config(model: str) -> Any:
     """The configuration of a network for depth, from its folder or from Hugging Face's cache."""
-    from transformers import MODEL_FOR_DEPTH_ESTIMATION_MAPPING, AutoConfig  # noqa: PLC0415
+    from transformers import MODEL_FOR_DEPTH_ESTIMATION_MAPPING, AutoConfig  # noqa: PLC0415  (loads with its use)
 
     try:
         config = AutoConfig.from_pretrained(model, **_LOCAL)
@@ -278,7 +278,7 @@ def _misfit(model: str, found: str) -> SceneFormatError:
 @contextmanager
 def _silent() -> Iterator[None]:
     """Keep transformers' warnings and progress bars from the terminal."""
-    from transformers.utils import logging  # noqa: PLC0415
+    from transformers.utils import logging  # noqa: PLC0415  (loads with its use)
 
     level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity(logging.CRITICAL)

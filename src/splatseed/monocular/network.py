@@ -1,7 +1,8 @@
 """What a depth network is to the rest of splatseed, whoever made it and whatever runs it.
 
-Notation: a *prediction* is float32 [H, W], one value for each pixel of a photograph. Promise: what its
-values mean is stated with the reason for believing so, and where nothing says it the user is asked.
+Notation: a *prediction* is float32 [H, W], one value for each pixel of a photograph. Promise: what
+its values mean is stated with the reason for believing so, and where nothing says it the user is
+asked.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Depth networks in ``.onnx`` files, run by onnxruntime.
 
-Notation: a network takes [B, 3, h, w] and returns [B, h', w'] or [B, 1, h', w']; B, h and w are fixed
-by the file or left open. A photograph becomes (pixel / 255 - mean) / std for each channel. Promise:
-PyTorch is not needed; the input's name, type and size are the file's; a file that is of another form
-is refused before it is run.
+Notation: a network takes [B, 3, h, w] and returns [B, h', w'] or [B, 1, h', w']; B, h and w are
+fixed by the file or left open. A photograph becomes (pixel / 255 - mean) / std for each channel.
+Promise: PyTorch is not needed; the input's name, type and size are the file's; a file that is of
+another form is refused before it is run.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """How photographs become the input of a network whose file does not say: its ONNX form.
 
-Notation: a photograph of H x W pixels becomes (pixel / 255 - mean) / std for each channel, at h x w.
-Promise: what the user says goes before what lies beside the network's file, and that before what most
-depth networks use: 518 pixels in multiples of 14, and the colours of ImageNet.
+Notation: a photograph of H x W pixels becomes (pixel / 255 - mean) / std for each channel, at h x
+w.
+Promise: what the user says goes before what lies beside the network's file, and that before what
+most depth networks use: 518 pixels in multiples of 14, and the colours of ImageNet.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ class Preparation:
             )
         if self.std is not None and min(self.std) <= 0:
             raise ParameterError(
-                "--std above 0", found=f"{self.std}", fix="Give one number a channel."
+                "--std above 0", found=f"{self.std}", fix="Give one number per channel."
             )
 
 

@@ -1,8 +1,8 @@
 """Pictures of point clouds, maps and cells, as seen by the scene's own cameras.
 
 Notation: a picture is uint8 [H, W, 3]; a tile is a picture with its label; a page is tiles in rows.
-Promise: the functions that make pictures and tiles touch no files; the same input gives the same bytes;
-files appear whole or not at all.
+Promise: the functions that make pictures and tiles touch no files; the same input gives the same
+bytes; files appear whole or not at all.
 """
 
 from splatseed.preview.cells import CoveredView, cell_picture, preview_cells

@@ -1,8 +1,8 @@
 """Which cells of a photograph hold a seed, and which hold none.
 
-Notation: cell (i, j) of a ``covered`` grid [rows, columns] has the pixels from ``cell i`` and ``cell j`` on,
-``cell`` px a side; the last row and column may reach beyond the picture. Promise: no pixel of another
-cell takes a cell's colour.
+Notation: cell (i, j) of a ``covered`` grid [rows, columns] has the pixels from ``cell i`` and
+``cell j`` on, ``cell`` px a side; the last row and column may reach beyond the picture. Promise: no
+pixel of another cell takes a cell's colour.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Pages of clouds: before and after, every method, distances from the true surface.
 
-Notation: a picture is uint8 [H, W, 3]. Promise: the clouds of a page are seen by one of the scene's own
-cameras, where it has any; files appear whole or not at all.
+Notation: a picture is uint8 [H, W, 3]. Promise: the clouds of a page are seen by one of the scene's
+own cameras, where it has any; files appear whole or not at all.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ def plain(text: str) -> str:
 @lru_cache(maxsize=1)
 def _known_characters() -> frozenset[int]:
     """The characters that a figure can show."""
-    from matplotlib.font_manager import FontProperties, findfont, get_font  # noqa: PLC0415
+    from matplotlib.font_manager import FontProperties, findfont, get_font  # noqa: PLC0415  (loads with its use)
 
     paths = {findfont(FontProperties(family=[name])) for name in font_families()}
     return frozenset(code for path in paths for code in get_font(path).get_charmap())
@@ -62,7 +62,7 @@ def _known_characters() -> frozenset[int]:
 
 def font_file(text: str) -> str | None:
     """A font file that has all of a text's characters; None where no family has."""
-    from matplotlib.font_manager import FontProperties, findfont, get_font  # noqa: PLC0415
+    from matplotlib.font_manager import FontProperties, findfont, get_font  # noqa: PLC0415  (loads with its use)
 
     for name in font_families():
         path = findfont(FontProperties(family=[name]))

@@ -1,8 +1,8 @@
 """Depth, normals and confidence beside the photograph that they belong to.
 
-Notation: a map is H x W values in the pixels of its own camera; depth is planar z in scene units, normals
-are unit vectors in the camera's axes (x right, y down, z forward). Promise: what a map does not know is
-grey; every picture of a row is of one size, and shows the map's pixels as they are.
+Notation: a map is H x W values in the pixels of its own camera; depth is planar z in scene units,
+normals are unit vectors in the camera's axes (x right, y down, z forward). Promise: what a map does
+not know is grey; every picture of a row is of one size, and shows the map's pixels as they are.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Seeds by origin: each point in the colour of the method that made it.
 
-Notation: an origin is a ``PointCloud.source`` code. Promise: the same code has the same colour in every
-picture, told apart by the colour-blind for the methods that are mixed in one cloud (Okabe and Ito).
+Notation: an origin is a ``PointCloud.source`` code. Promise: the same code has the same colour in
+every picture, told apart by the colour-blind for the methods that are mixed in one cloud (Okabe and
+Ito).
 """
 
 from __future__ import annotations

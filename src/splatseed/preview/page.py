@@ -1,7 +1,7 @@
 """Pages: pictures of one size in rows, each with its label above.
 
-Notation: a picture is uint8 [H, W, 3]; a tile is a picture with its label. Promise: files appear whole
-or not at all.
+Notation: a picture is uint8 [H, W, 3]; a tile is a picture with its label. Promise: files appear
+whole or not at all.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Points drawn as seen by a camera.
 
-Notation: a picture is uint8 [H, W, 3], ``uv`` are pixels [N, 2]. Promise: points are drawn with a depth
-test, as small discs whose size belongs to the picture and not to the cloud, so that a denser cloud
-looks denser; the same input gives the same bytes.
+Notation: a picture is uint8 [H, W, 3], ``uv`` are pixels [N, 2]. Promise: points are drawn with a
+depth test, as small discs whose size belongs to the picture and not to the cloud, so that a denser
+cloud looks denser; the same input gives the same bytes.
 """
 
 from __future__ import annotations

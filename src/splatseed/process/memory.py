@@ -1,7 +1,8 @@
 """Memory that is free, and refusing what cannot fit it before any work is done.
 
-Promise: where the system does not tell how much is free, nothing is refused. An estimate counts what is
-sure to be held at once, so what is refused would not have ended well; what is let pass still may not.
+Promise: where the system does not tell how much is free, nothing is refused. An estimate counts
+what is sure to be held at once, so what is refused would not have ended well; what is let pass
+still may not.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Rasterisation of 3D Gaussians: gsplat's ``rasterization`` on any machine.
 
-``rasterization`` has the signature and the results of ``gsplat.rasterization`` (1.5.3). CUDA tensors
-go to gsplat itself; CPU tensors to this package's own rasteriser, so that code written for gsplat
-runs, trains and is tested without a GPU. ``MCMCStrategy`` is gsplat's on either device, and
-``mcmc_on_cpu`` a block within which gsplat's own runs on the CPU. It needs PyTorch; the strategy also
-needs gsplat (``pip install ".[train]"``).
+``rasterization`` has the signature and the results of ``gsplat.rasterization`` (1.5.3). CUDA
+tensors go to gsplat itself; CPU tensors to this package's own rasteriser, so that code written for
+gsplat runs, trains and is tested without a GPU. ``MCMCStrategy`` is gsplat's on either device, and
+``mcmc_on_cpu`` a block within which gsplat's own runs on the CPU. It needs PyTorch; the strategy
+also needs gsplat (``pip install ".[train]"``).
 """
 
 from __future__ import annotations

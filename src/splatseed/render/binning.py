@@ -1,17 +1,18 @@
 """Which Gaussians touch which tile, in depth order.
 
-Notation: tiles are 8 x 8 px, numbered row by row; a *pair* is a Gaussian with a tile that its ellipse
-touches, a *span* a Gaussian with the tiles of one row of tiles that it touches. Spans are numbered
-Gaussian by Gaussian in depth order, and each Gaussian's by row; pairs are listed tile by tile in depth
-order; ``listed_span`` and ``listed_rank`` lead from the list back to span and Gaussian. A Gaussian
-counts as touching a tile if within the rectangle of the tile's pixel centres its alpha reaches 1/255:
-exact, and opacity-aware, where a square of three sigmas would be far larger and still cut some off.
+Notation: tiles are 8 x 8 px, numbered row by row; a *pair* is a Gaussian with a tile that its
+ellipse touches, a *span* a Gaussian with the tiles of one row of tiles that it touches. Spans are
+numbered Gaussian by Gaussian in depth order, and each Gaussian's by row; pairs are listed tile by
+tile in depth order; ``listed_span`` and ``listed_rank`` lead from the list back to span and
+Gaussian. A Gaussian counts as touching a tile if within the rectangle of the tile's pixel centres
+its alpha reaches 1/255: exact, and opacity-aware, where a square of three sigmas would be far
+larger and still cut some off.
 Promise: ties in depth go by index; nothing depends on the number of threads.
 
-Stages: spans are sorted by row while they are found, then each row sorts its own by column. Both are
-counting sorts, which keep the depth order; a row's tiles stay in the first cache, where those of the
-whole image would not. Indices are unsigned where it counts: Numba asks of every other one whether it is
-negative, which took a third of the time.
+Stages: spans are sorted by row while they are found, then each row sorts its own by column. Both
+are counting sorts, which keep the depth order; a row's tiles stay in the first cache, where those
+of the whole image would not. Indices are unsigned where it counts: Numba asks of every other one
+whether it is negative, which took a third of the time.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -163,8 +164,8 @@ def _tiles(low, high, tiles):  # type: ignore[no-untyped-def]
 def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-def]
     """First and one-past-last row of tiles that each ellipse touches.
 
-    All of them where float32 has rounded the conic to one that is no ellipse (a needle or a sheet of
-    thousands of pixels).
+    All of them where float32 has rounded the conic to one that is no ellipse (a needle or a sheet
+    of thousands of pixels).
 
     Args:
         records: As in ``list_tiles``.
@@ -190,8 +191,8 @@ def _find_columns(  # type: ignore[no-untyped-def]
 ):
     """Write the span of every Gaussian in each of its rows to the row's part of ``spans``.
 
-    Within the strip of a row's pixel centres an ellipse extends furthest at its own extreme point if
-    that lies in the strip, else at the strip's edge.
+    Within the strip of a row's pixel centres an ellipse extends furthest at its own extreme point
+    if that lies in the strip, else at the strip's edge.
 
     Args:
         records: As in ``list_tiles``.

@@ -1,24 +1,24 @@
 """Front-to-back blending of Gaussians into pixels; ``blending_vjp`` is its gradient.
 
 Specification (``reference.py`` is its readable form): over the Gaussians of a pixel, nearest first,
-sigma = (a dx^2 + c dy^2) / 2 + b dx dy, alpha = min(0.999, opacity exp(-sigma)); those with
-alpha < 1/255 are skipped; blending ends before the Gaussian that would bring the transmittance T
-to 1e-4 or less; colour += alpha T c, T <- T (1 - alpha). (The reference skips sigma < 0 too; records
-hold ellipses, whose sigma is negative by rounding at most.)
+sigma = (a dx^2 + c dy^2) / 2 + b dx dy, alpha = min(0.999, opacity exp(-sigma)); those with alpha <
+1/255 are skipped; blending ends before the Gaussian that would bring the transmittance T to 1e-4 or
+less; colour += alpha T c, T <- T (1 - alpha). (The reference skips sigma < 0 too; records hold
+ellipses, whose sigma is negative by rounding at most.)
 
-Notation: h = (log opacity - sigma) / 8, so that alpha = exp(8 h); ``top`` = log(opacity) / 8 is where
-sigma is 0; LOWEST is where alpha is 1/255. A pixel that is done keeps its transmittance with a minus
-sign. A tile's 64 pixels are four blocks of 4 x 4, one vector each; the *hits* of a Gaussian in a tile
-are the blocks that it adds to, as bits.
+Notation: h = (log opacity - sigma) / 8, so that alpha = exp(8 h); ``top`` = log(opacity) / 8 is
+where sigma is 0; LOWEST is where alpha is 1/255. A pixel that is done keeps its transmittance with
+a minus sign. A tile's 64 pixels are four blocks of 4 x 4, one vector each; the *hits* of a Gaussian
+in a tile are the blocks that it adds to, as bits.
 
 Stages: a tile's list is taken in chunks. First h is formed for all four blocks and a whole chunk,
-without a branch, and which blocks are hit is noted down; then each block's hits are blended, with all
-state in registers. Deciding block by block instead costs half of the time: the processor guesses such
-branches wrong, and finds out late.
+without a branch, and which blocks are hit is noted down; then each block's hits are blended, with
+all state in registers. Deciding block by block instead costs half of the time: the processor
+guesses such branches wrong, and finds out late.
 
 Arrays: a *record* of a Gaussian is 16 float32: mean x, y; -a/16, -b/8, -c/16; top; 0; the channels;
-rest 0. A block image is [tiles, 4 blocks, channels, 16 lanes]. Arrays that begin at a multiple of 64
-bytes are read and written fastest.
+rest 0. A block image is [tiles, 4 blocks, channels, 16 lanes]. Arrays that begin at a multiple of
+64 bytes are read and written fastest.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -57,6 +57,11 @@ CHANNELS = 4
 BLOCKS = 4
 STOP = np.float32(1e-4)
 MAX_ALPHA = np.float32(0.999)
+# Lane l of a block is its pixel in column l % 4 and row l // 4:
+#    0  1  2  3      Blocks of a tile: 0 1
+#    4  5  6  7                        2 3
+#    8  9 10 11
+#   12 13 14 15
 COLUMN = np.tile(np.arange(4, dtype=np.float32), 4)
 ROW = np.repeat(np.arange(4, dtype=np.float32), 4)
 ZERO, ONE, HALF, FOUR = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.float32(4.0)
@@ -84,8 +89,8 @@ def forward(
         lane_y: ``ROW``.
         fourth: Whether the last channel is used.
         image: Written: float32 [t * 4 * CHANNELS * 16].
-        transmittance: Written: what of the light behind passes, float32 [t * 4 * 16].
-        hits: Written, uint8 [P]; blocks that no light reached at the start of a chunk have none.
+        transmittance: Written: T in front of the background, float32 [t * 4 * 16].
+        hits: Written, uint8 [P]; blocks whose pixels were all done when a chunk began have none.
     """
     columns = (len(tile_start) - 1) // len(row_order)
     for place in parallel_range(len(tile_start) - 1):
@@ -107,9 +112,9 @@ def _forward_tile(
     right, below = add(px, splat(FOUR)), add(py, splat(FOUR))
     h, state = aligned(BLOCKS * chunk * LANES), aligned(BLOCKS * STATE)
     hit = np.empty(BLOCKS * chunk, np.int64)
-    lit, start = np.int64(ALL), first
+    open_blocks, start = np.int64(ALL), first
     _clear(state)
-    while start < last and lit:
+    while start < last and open_blocks:
         n0 = n1 = n2 = n3 = 0
         stop = min(start + chunk, last)
         for entry in range(start, stop):
@@ -126,8 +131,8 @@ def _forward_tile(
             hit0, hit1 = np.int64(any_greater(h0, lowest)), np.int64(any_greater(h1, lowest))
             hit2, hit3 = np.int64(any_greater(h2, lowest)), np.int64(any_greater(h3, lowest))
             n0, n1, n2, n3 = n0 + hit0, n1 + hit1, n2 + hit2, n3 + hit3
-            hits[entry] = lit & (hit0 | hit1 << 1 | hit2 << 2 | hit3 << 3)
-        lit = (
+            hits[entry] = open_blocks & (hit0 | hit1 << 1 | hit2 << 2 | hit3 << 3)
+        open_blocks = (
             _blend_block(records, hit, h, 0, n0, fourth, state)
             | _blend_block(records, hit, h, 1, n1, fourth, state) << 1
             | _blend_block(records, hit, h, 2, n2, fourth, state) << 2
@@ -140,7 +145,7 @@ def _forward_tile(
 
 @always_inline
 def _clear(state):
-    """All light passes, and nothing is seen yet."""
+    """T = 1 and colour 0 at every pixel."""
     for q in range(BLOCKS):
         store(state, STATE * q, splat(ONE))
         for channel in range(CHANNELS):
@@ -151,8 +156,8 @@ def _clear(state):
 def _write(state, tile, image, transmittance):
     for q in range(BLOCKS):
         block = BLOCKS * tile + q
-        passing = negative_magnitude(load(state, STATE * q))
-        store(transmittance, LANES * block, subtract(splat(ZERO), passing))
+        signed = negative_magnitude(load(state, STATE * q))  # -T, done or not
+        store(transmittance, LANES * block, subtract(splat(ZERO), signed))
         for channel in range(CHANNELS):
             color = load(state, STATE * q + LANES * (1 + channel))
             store(image, LANES * (CHANNELS * block + channel), color)
@@ -163,6 +168,7 @@ def _exponents(records, r, left, right, above, below):
     """The h of a Gaussian at the pixels of a tile's four blocks."""
     mean_x, mean_y = broadcast(records, r), broadcast(records, r + 1)
     a, b, c = broadcast(records, r + 2), broadcast(records, r + 3), broadcast(records, r + 4)
+    # h = top - (a dx^2 + c dy^2) / 16 - b dx dy / 8; records hold -a/16, -b/8 and -c/16
     dx0, dx1 = subtract(mean_x, left), subtract(mean_x, right)
     dy0, dy1 = subtract(mean_y, above), subtract(mean_y, below)
     top = broadcast(records, r + 5)
@@ -178,27 +184,31 @@ def _exponents(records, r, left, right, above, below):
 
 @always_inline
 def _blend_block(records, hit, h, q, count, fourth, state):
-    """Blend what hits block q; returns 1 if light still passes somewhere, else 0."""
+    """Blend what hits block q; returns 1 if some pixel is not done, else 0."""
     zero, stop = splat(ZERO), splat(STOP)
     base, first = STATE * q, CHUNK * q
-    passing = load(state, base)
+    transmittance = load(state, base)
     c0, c1 = load(state, base + LANES), load(state, base + 2 * LANES)
     c2, c3 = load(state, base + 3 * LANES), load(state, base + 4 * LANES)
     for entry in range(first, first + count):
         r, exponent = element(hit, entry), load(h, LANES * entry)
+        # alpha = min(0.999, exp(8 h)), and 0 below 1/255
         alpha = select_greater(exponent, splat(LOWEST), exp_of_eighth(exponent), zero)
         alpha = minimum(alpha, splat(MAX_ALPHA))
-        rest = fnma(passing, alpha, passing)
-        gained = select_greater(rest, stop, multiply(passing, alpha), zero)
-        passing = select_greater(rest, stop, rest, negative_magnitude(passing))
-        c0 = fma(gained, broadcast(records, r + 7), c0)
-        c1 = fma(gained, broadcast(records, r + 8), c1)
-        c2 = fma(gained, broadcast(records, r + 9), c2)
+        # T' = T (1 - alpha); where T' <= 1e-4 the pixel is done: no weight, and T keeps a minus
+        # sign
+        after = fnma(transmittance, alpha, transmittance)
+        weight = select_greater(after, stop, multiply(transmittance, alpha), zero)
+        transmittance = select_greater(after, stop, after, negative_magnitude(transmittance))
+        # colour += alpha T c
+        c0 = fma(weight, broadcast(records, r + 7), c0)
+        c1 = fma(weight, broadcast(records, r + 8), c1)
+        c2 = fma(weight, broadcast(records, r + 9), c2)
         if fourth:
-            c3 = fma(gained, broadcast(records, r + 10), c3)
-    store(state, base, passing)
+            c3 = fma(weight, broadcast(records, r + 10), c3)
+    store(state, base, transmittance)
     store(state, base + LANES, c0)
     store(state, base + 2 * LANES, c1)
     store(state, base + 3 * LANES, c2)
     store(state, base + 4 * LANES, c3)
-    return np.int64(any_greater(passing, zero))
+    return np.int64(any_greater(transmittance, zero))

@@ -1,18 +1,19 @@
 """Gradients of ``blending``, whose notation and arrays this file shares.
 
-It walks front to back again: with the image known, what lies behind a Gaussian is what the image has
-less what has been blended so far, so nothing need be stored but which blocks each Gaussian hits.
+It walks front to back again: with the image known, what lies behind a Gaussian is what the image
+has less what has been blended so far, so nothing need be stored but which blocks each Gaussian
+hits.
 
-Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums are kept by *span*, a Gaussian in a row
-of tiles: p; p dx, p dy; p dx^2, p dx dy, p dy^2; d channels; |d mean x|, |d mean y|; rest 0, each
-summed over the row's pixels. With pixels at (x, y) from a block's centre and the mean at (mx, my),
-dx = mx - x, so that all of them follow from the moments of p about the centre.
+Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums are kept by *span*, a Gaussian in
+a row of tiles: p; p dx, p dy; p dx^2, p dx dy, p dy^2; d channels; |d mean x|, |d mean y|; rest 0,
+each summed over the row's pixels. With pixels at (x, y) from a block's centre and the mean at (mx,
+my), dx = mx - x, so that all of them follow from the moments of p about the centre.
 
 Stages: per tile and block the hits are queued, then blended with all state in registers. p and the
-gained weight of sixteen hits at a time are turned, so that a vector holds one pixel of sixteen
-Gaussians: their sums over pixels are then plain additions, and pixels have the same few coordinates.
-One thread takes a row of tiles from left to right, so that a span's sums are added up in a fixed order
-without atomics, while they are still in the cache: the same bytes every time.
+weights alpha T of sixteen hits at a time are turned, so that a vector holds one pixel of sixteen
+Gaussians: their sums over pixels are then plain additions, and pixels have the same few
+coordinates. One thread takes a row of tiles from left to right, so that a span's sums are added up
+in a fixed order without atomics, while they are still in the cache: the same bytes every time.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -59,7 +60,7 @@ CHUNK = 512
 AHEAD = 128
 """How many list entries ahead records and sums are asked for."""
 WEIGHTS, MEANS = LANES * LANES, 2 * LANES * LANES
-"""Where in a batch of sixteen hits the gained weights and the means are; p is at 0."""
+"""Where in a batch of sixteen hits the weights alpha T and the means are; p is at 0."""
 BATCH = MEANS + 2 * LANES
 ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 OUTER = np.float32(1.5)
@@ -92,11 +93,11 @@ def backward(
     for place in parallel_range(len(row_order)):
         row = row_order[place]
         queue, batch = np.empty(BLOCKS * CHUNK, np.int32), aligned(BATCH)
-        passing = aligned(BLOCKS * LANES)
+        transmittance = aligned(BLOCKS * LANES)
         for column in range(columns):
             tile = row * columns + column
             for q in range(BLOCKS):
-                store(passing, LANES * q, splat(ONE))
+                store(transmittance, LANES * q, splat(ONE))
             for start in range(tile_start[tile], tile_start[tile + 1], CHUNK):
                 stop = min(start + CHUNK, tile_start[tile + 1])
                 counts = _queue_hits(
@@ -110,13 +111,13 @@ def backward(
                         _backward_block(
                             records, listed_rank, listed_span, queue, CHUNK * q, counts[q],
                             lane_x, lane_y, x, y, True, gradient, CHANNELS * block, behind, block,
-                            passing, LANES * q, absolute, batch, sums,
+                            transmittance, LANES * q, absolute, batch, sums,
                         )  # fmt: skip
                     else:
                         _backward_block(
                             records, listed_rank, listed_span, queue, CHUNK * q, counts[q],
                             lane_x, lane_y, x, y, False, gradient, CHANNELS * block, behind, block,
-                            passing, LANES * q, absolute, batch, sums,
+                            transmittance, LANES * q, absolute, batch, sums,
                         )  # fmt: skip
 
 
@@ -144,17 +145,17 @@ def _queue_hits(hits, start, stop, records, listed_rank, sums, listed_span, queu
 @always_inline
 def _backward_block(
     records, listed_rank, listed_span, queue, first, count, lane_x, lane_y, x, y, fourth, gradient,
-    slopes, behind, beyond, passing, light, absolute, batch, sums,
+    gradient_at, behind, behind_at, transmittance, at, absolute, batch, sums,
 ):  # fmt: skip
     """Blend the ``count`` hits from ``queue[first]`` of the block whose corner is (x, y).
 
-    ``slopes``, ``beyond`` and ``light`` are where the block begins in the arrays before them.
+    ``gradient_at``, ``behind_at`` and ``at`` are where the block begins in the arrays before them.
     """
     zero, stop = splat(ZERO), splat(STOP)
     px, py = add(load(lane_x, 0), splat(x + HALF)), add(load(lane_y, 0), splat(y + HALF))
-    t, far = load(passing, light), load(behind, beyond)
-    v0, v1 = load(gradient, slopes), load(gradient, slopes + LANES)
-    v2, v3 = load(gradient, slopes + 2 * LANES), load(gradient, slopes + 3 * LANES)
+    t, far = load(transmittance, at), load(behind, behind_at)
+    v0, v1 = load(gradient, gradient_at), load(gradient, gradient_at + LANES)
+    v2, v3 = load(gradient, gradient_at + 2 * LANES), load(gradient, gradient_at + 3 * LANES)
     for begin in range(first, first + count, LANES):
         end = min(begin + LANES, first + count)
         # Alphas first: they wait for nothing, and so run ahead of what does.
@@ -166,29 +167,32 @@ def _backward_block(
         for k in range(end - begin):
             r = RECORD * _looked_up(listed_rank, queue, begin + k)
             alpha = load(batch, LANES * k)
-            rest = fnma(t, alpha, t)
-            alpha = select_greater(rest, stop, alpha, zero)
-            gained = multiply(t, alpha)
+            after = fnma(t, alpha, t)  # T' = T (1 - alpha)
+            alpha = select_greater(after, stop, alpha, zero)
+            weight = multiply(t, alpha)
+            # shade = gradient . c, and far = gradient . (colour of all that lies behind)
             shade = multiply(v0, broadcast(records, r + 7))
             shade = fma(v1, broadcast(records, r + 8), shade)
             shade = fma(v2, broadcast(records, r + 9), shade)
             if fourth:
                 shade = fma(v3, broadcast(records, r + 10), shade)
-            far = fnma(gained, shade, far)
+            far = fnma(weight, shade, far)
+            # d loss / d alpha = T shade - far / (1 - alpha); with d alpha / d sigma = -alpha,
+            # p = d loss / d sigma = (far / (1 - alpha) - T shade) alpha
             slope = fnma(t, shade, divide(far, subtract(splat(ONE), alpha)))
             # A clamped alpha is constant.
             p = select_greater(splat(MAX_ALPHA), alpha, multiply(slope, alpha), zero)
-            t = select_greater(rest, stop, rest, zero)
+            t = select_greater(after, stop, after, zero)
             store(batch, LANES * k, p)
-            store(batch, WEIGHTS + LANES * k, gained)
+            store(batch, WEIGHTS + LANES * k, weight)
         if absolute:
             _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, batch, sums)
-        _reduce(batch, x + np.float32(2.0), y + np.float32(2.0), gradient, slopes, fourth)
+        _reduce(batch, x + np.float32(2.0), y + np.float32(2.0), gradient, gradient_at, fourth)
         for k in range(end - begin):
             s = SUMS * _looked_up(listed_span, queue, begin + k)
             store(sums, s, add(load(sums, s), load(batch, LANES * k)))
-    store(passing, light, t)
-    store(behind, beyond, far)
+    store(transmittance, at, t)
+    store(behind, behind_at, far)
 
 
 @always_inline
@@ -209,7 +213,7 @@ def _alpha(records, r, px, py):
 
 
 @always_inline
-def _reduce(batch, center_x, center_y, gradient, slopes, fourth):
+def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
     """From p, weights and means of sixteen hits to their sums over the block, one row each."""
     zero = splat(ZERO)
     s0, x0, xx0 = _moments(load_columns(batch, 0))
@@ -226,7 +230,7 @@ def _reduce(batch, center_x, center_y, gradient, slopes, fourth):
     pxy = fma(mx, py, fnma(my, x, xy))
     c0 = c1 = c2 = c3 = zero
     for pixel in range(0, LANES, 4):
-        weights, first = load_columns(batch, WEIGHTS + pixel), slopes + pixel
+        weights, first = load_columns(batch, WEIGHTS + pixel), gradient_at + pixel
         c0 = _add_products(c0, weights, gradient, first)
         c1 = _add_products(c1, weights, gradient, first + LANES)
         c2 = _add_products(c2, weights, gradient, first + 2 * LANES)

@@ -1,13 +1,14 @@
 """Colour by direction: real spherical harmonics up to degree 3, and their gradient.
 
-Basis, order and signs are those of 3D Gaussian Splatting and gsplat (P.-P. Sloan, Efficient Spherical
-Harmonic Evaluation, 2013). The direction runs from the camera to the Gaussian and is normalised here.
+Basis, order and signs are those of 3D Gaussian Splatting and gsplat (P.-P. Sloan, Efficient
+Spherical Harmonic Evaluation, 2013). The direction runs from the camera to the Gaussian and is
+normalised here.
 
-Notation: x, y, z is the unit direction. Every basis function is a *factor* (1, x, y or z) times a *form*,
-c0 + c1 xx + c2 yy + c3 zz + c4 xy + c5 yz + c6 xz: lane k of a vector holds function k. A *row* is the
-45 numbers of a Gaussian beyond its first coefficients, three channels of 15; it is read as three
-vectors from ``FIRST`` on, which overlap.
-Directions are normalised in float64, the rest is float32.
+Notation: x, y, z is the unit direction. Every basis function is a *factor* (1, x, y or z) times a
+*form*, c0 + c1 xx + c2 yy + c3 zz + c4 xy + c5 yz + c6 xz: lane k of a vector holds function k. A
+*row* is the 45 numbers of a Gaussian beyond its first coefficients, three channels of 15; it is
+read as three vectors from ``FIRST`` on, which overlap. Directions are normalised in float64, the
+rest is float32.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -41,8 +42,8 @@ ROW = 45
 CHUNKS = 64
 """Pieces that threads take."""
 AHEAD = 10
-"""How many rows ahead memory is asked for: those of Gaussians out of sight are not read, and what is
-read in leaps does not come by itself."""
+"""How many rows ahead memory is asked for: those of Gaussians out of sight are not read, and what
+is read in leaps does not come by itself."""
 FIRST = (0, 15, 29)
 """Where in a row its three vectors begin: the last of them ends with it."""
 PART = 15
@@ -180,8 +181,8 @@ def harmonics_vjp(
                 _prefetch(rest, row + AHEAD * (skipped + ROW))
                 _prefetch(d_rest, row + AHEAD * (skipped + ROW))
                 d_color = triple(red, green, blue)
-                slopes = _row_vjp(*_vectors(x, y, z), d_color, rest, row, table, d_rest)
-                dx, dy, dz = lane_0(slopes), lane_4(slopes), lane_8(slopes)
+                gradients = _row_vjp(*_vectors(x, y, z), d_color, rest, row, table, d_rest)
+                dx, dy, dz = lane_0(gradients), lane_4(gradients), lane_8(gradients)
                 along = dx * x + dy * y + dz * z
                 dx, dy = (dx - along * x) * inverse, (dy - along * y) * inverse
                 dz = (dz - along * z) * inverse
@@ -298,7 +299,7 @@ def _slope(twice, one, other, square, with_one, with_other, table):
 
 
 @always_inline
-def _weighted(slopes, a, b, c):
+def _weighted(gradients, a, b, c):
     """Slopes times the numbers of a row, to be summed over lanes."""
-    total = fma(spread_1(slopes), b, multiply(spread_0(slopes), a))
-    return fma(spread_2(slopes), c, total)
+    total = fma(spread_1(gradients), b, multiply(spread_0(gradients), a))
+    return fma(spread_2(gradients), c, total)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from splatseed.render.functions import is_seen
+from splatseed.render.autograd import is_seen
 from splatseed.render.intersections import Grid, Intersections, intersect
 
 __all__ = ["Info", "View", "make_info"]
@@ -44,8 +44,8 @@ class _Wait(Enum):
 class Info(dict[str, Any]):
     """A dictionary whose lists of intersections are made when one of them is read.
 
-    ``in``, ``len``, ``keys()`` and printing know all names and make nothing; whatever hands out an entry,
-    a copy of the dictionary too, makes it.
+    ``in``, ``len``, ``keys()`` and printing know all names and make nothing; whatever hands out an
+    entry, a copy of the dictionary too, makes it.
     """
 
     def __getitem__(self, name: str) -> Any:

@@ -1,10 +1,10 @@
 """Which Gaussians touch which tiles, in gsplat's layout; for whoever asks: the CPU rasteriser has its own.
 
-Notation: G projected Gaussians, C cameras one after the other, I pairs of a Gaussian and a tile, and
-ceil(height / size) x ceil(width / size) tiles a camera. A pair's id is, from the highest bit down, its
-camera, its tile (row by row, in as many bits as write down the number of tiles) and the 32 bits of its
-depth, so that sorted ids are camera by camera, tile by tile, front to back. Promise: the numbers of
-gsplat 1.5.3's ``isect_tiles`` and ``isect_offset_encode``.
+Notation: G projected Gaussians, C cameras one after the other, I pairs of a Gaussian and a tile,
+and ceil(height / size) x ceil(width / size) tiles a camera. A pair's id is, from the highest bit
+down, its camera, its tile (row by row, in as many bits as write down the number of tiles) and the
+32 bits of its depth, so that sorted ids are camera by camera, tile by tile, front to back. Promise:
+the numbers of gsplat 1.5.3's ``isect_tiles`` and ``isect_offset_encode``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseed.render.functions import is_seen
+from splatseed.render.autograd import is_seen
 
 __all__ = ["Grid", "Intersections", "intersect"]
 

@@ -1,10 +1,10 @@
 """Between PyTorch's arrays and those of the blending kernels.
 
-Notation: N Gaussians of which G are visible; ``order`` [G] leads from depth rank to index; an image is
-[H, W, D]; records and block images are ``blending``'s. ``first`` is the first of the up to
-four channels that one pass of blending takes.
-Promise: every array is read and written once, in a fixed order; NumPy's gathers and transpositions of
-the same took a tenth of a training step.
+Notation: N Gaussians of which G are visible; ``order`` [G] leads from depth rank to index; an image
+is [H, W, D]; records and block images are ``blending``'s. ``first`` is the first of the up to four
+channels that one pass of blending takes.
+Promise: every array is read and written once, in a fixed order; NumPy's gathers and transpositions
+of the same took a tenth of a training step.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -131,30 +131,30 @@ def _first_lane(x, y, columns):
 
 
 @kernel
-def from_blocks(blocks, transmittance, columns, background, first, image, passing):
+def from_blocks(blocks, block_T, columns, background, first, image, transmittance):
     """A block image to this pass's channels of an image, on its background.
 
     Args:
         blocks: float32 [t * 4 * CHANNELS * 16].
-        transmittance: float32 [t * 4 * 16].
+        block_T: The transmittance T of the block image, float32 [t * 4 * 16].
         columns: Tiles in a row.
         background: float32 [D].
         first: First channel.
         image: Written, float32 [H, W, D].
-        passing: Written, the transmittance, float32 [H, W].
+        transmittance: Written: T, float32 [H, W].
     """
     height, width, depth = image.shape
-    pixels, passes = image.reshape(-1), passing.reshape(-1)
+    pixels, out_T = image.reshape(-1), transmittance.reshape(-1)
     for y in parallel_range(height):
         for x in range(0, width, 4):
             lane, at = _first_lane(x, y, columns), y * width + x
-            lights, rest = blocks[_color(lane) :], transmittance[lane : lane + 4]
-            row, passes_row = pixels[depth * at :], passes[at:]
+            colors, T = blocks[_color(lane) :], block_T[lane : lane + 4]
+            row, row_T = pixels[depth * at :], out_T[at:]
             if depth == RGB and x + 4 <= width:  # compiled for its own constants
-                _from_lanes(lights, rest, background, 0, 4, RGB, row, passes_row)
+                _from_lanes(colors, T, background, 0, 4, RGB, row, row_T)
             else:
                 count = min(4, width - x)
-                _from_lanes(lights, rest, background, first, count, depth, row, passes_row)
+                _from_lanes(colors, T, background, first, count, depth, row, row_T)
 
 
 @always_inline
@@ -164,17 +164,18 @@ def _color(lane):
 
 
 @always_inline
-def _from_lanes(lights, rest, background, first, count, depth, pixels, passes):
+def _from_lanes(colors, T, background, first, count, depth, pixels, out_T):
     """Up to four neighbours in a row."""
     for k in range(count):
-        passes[k] = rest[k]
+        out_T[k] = T[k]
         for channel in range(min(CHANNELS, depth - first)):
-            light = lights[LANES * channel + k] + rest[k] * background[first + channel]
-            pixels[depth * k + first + channel] = light
+            # colour + T background
+            color = colors[LANES * channel + k] + T[k] * background[first + channel]
+            pixels[depth * k + first + channel] = color
 
 
 @kernel
-def to_blocks(d_image, image, d_alphas, passing, columns, first, gradient, behind):
+def to_blocks(d_image, image, d_alphas, transmittance, columns, first, gradient, behind):
     """This pass's channels of the gradient to a block image, and what lies behind the first Gaussian.
 
     Every pass takes its own channels' part of what lies behind; the first takes that of alpha too.
@@ -183,7 +184,7 @@ def to_blocks(d_image, image, d_alphas, passing, columns, first, gradient, behin
         d_image: d loss / d image, float32 [H, W, D].
         image: float32 [H, W, D].
         d_alphas: d loss / d alpha, float32 [H, W].
-        passing: The transmittance, float32 [H, W].
+        transmittance: T, float32 [H, W].
         columns: Tiles in a row.
         first: First channel.
         gradient: Written, block image, float32 [t * 4 * CHANNELS * 16]; 0 outside of the image.
@@ -191,37 +192,37 @@ def to_blocks(d_image, image, d_alphas, passing, columns, first, gradient, behin
     """
     height, width, depth = image.shape
     d_pixels, pixels = d_image.reshape(-1), image.reshape(-1)
-    d_solid, passes = d_alphas.reshape(-1), passing.reshape(-1)
+    d_alpha, T = d_alphas.reshape(-1), transmittance.reshape(-1)
     for y in parallel_range(len(behind) // (TILE * columns)):
         for x in range(0, TILE * columns, 4):
             lane, at = _first_lane(x, y, columns), y * width + x
-            slopes, after = gradient[_color(lane) :], behind[lane : lane + 4]
+            gradients, after = gradient[_color(lane) :], behind[lane : lane + 4]
             if depth == RGB and x + 4 <= width and y < height:
                 _to_lanes(
-                    d_pixels[depth * at :], pixels[depth * at :], d_solid[at:], passes[at:],
-                    0, 4, RGB, slopes, after,
+                    d_pixels[depth * at :], pixels[depth * at :], d_alpha[at:], T[at:],
+                    0, 4, RGB, gradients, after,
                 )  # fmt: skip
             else:
                 count = min(4, max(width - x, 0)) if y < height else 0
                 _to_lanes(
-                    d_pixels[depth * at :], pixels[depth * at :], d_solid[at:], passes[at:],
-                    first, count, depth, slopes, after,
+                    d_pixels[depth * at :], pixels[depth * at :], d_alpha[at:], T[at:],
+                    first, count, depth, gradients, after,
                 )  # fmt: skip
 
 
 @always_inline
-def _to_lanes(d_pixels, pixels, d_solid, passes, first, count, depth, slopes, after):
+def _to_lanes(d_pixels, pixels, d_alpha, T, first, count, depth, gradients, after):
     """Up to four neighbours in a row, and 0 in what is left of four and of the channels."""
     wide = min(CHANNELS, depth - first)
     for k in range(count):
-        total = -d_solid[k] * passes[k] if first == 0 else np.float32(0.0)
+        total = -d_alpha[k] * T[k] if first == 0 else np.float32(0.0)
         for channel in range(wide):
-            slope = d_pixels[depth * k + first + channel]
-            slopes[LANES * channel + k] = slope
-            total += slope * pixels[depth * k + first + channel]
+            d_pixel = d_pixels[depth * k + first + channel]
+            gradients[LANES * channel + k] = d_pixel
+            total += d_pixel * pixels[depth * k + first + channel]
         after[k] = total
     for k in range(count, 4):
         after[k] = np.float32(0.0)
     for channel in range(CHANNELS):
         for k in range(count if channel < wide else 0, 4):
-            slopes[LANES * channel + k] = np.float32(0.0)
+            gradients[LANES * channel + k] = np.float32(0.0)

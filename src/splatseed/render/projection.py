@@ -1,15 +1,16 @@
 """Projection of 3D Gaussians to the image plane (EWA splatting), and its gradient.
 
-Specification (``reference.py`` is its readable form). With W, t the camera's rotation and translation,
-m_c = W m + t = (x, y, z), R = R(q / |q|), s the scales and J the Jacobian of the pinhole projection at
-m_c (its x / z and y / z held within 15% of the image's size beyond its edges), the 2D covariance is
-P P' + eps2d I with P = U diag(s), U = T R and T = J W; its inverse is the conic (a, b, c).
-(M. Zwicker et al., EWA Splatting, 2002; conventions and cut-offs as gsplat 1.5.3 publishes them.)
+Specification (``reference.py`` is its readable form). With W, t the camera's rotation and
+translation, m_c = W m + t = (x, y, z), R = R(q / |q|), s the scales and J the Jacobian of the
+pinhole projection at m_c (its x / z and y / z held within 15% of the image's size beyond its
+edges), the 2D covariance is P P' + eps2d I with P = U diag(s), U = T R and T = J W; its inverse is
+the conic (a, b, c). (M. Zwicker et al., EWA Splatting, 2002; conventions and cut-offs as gsplat
+1.5.3 publishes them.)
 
-Culled, with a radius of 0: z outside of the near and far planes, opacity under 1/255, nothing of the
-bounding box in the image, and whatever is not finite.
-Arithmetic is float64 inside, float32 in and out. Gaussians are worked on in blocks, a quantity a row, so
-that the compiler takes several at once; every one's numbers are as if it stood alone.
+Culled, with a radius of 0: z outside of the near and far planes, opacity under 1/255, nothing of
+the bounding box in the image, and whatever is not finite. Arithmetic is float64 inside, float32 in
+and out. Gaussians are worked on in blocks, a quantity per row, so that the compiler takes several
+at once; every one's numbers are as if it stood alone.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -22,11 +23,14 @@ import numpy as np
 
 from splatseed.kernels.jit import always_inline, kernel, parallel_range
 
-__all__ = ["CHUNKS", "MIN_ALPHA", "project", "project_vjp"]
+__all__ = ["CHUNKS", "EDGE", "MAX_SIGMAS", "MIN_ALPHA", "project", "project_vjp"]
 
 MIN_ALPHA = 1.0 / 255.0
+"""Least opacity that counts."""
 MAX_SIGMAS = 3.33
-EDGE = 0.3
+"""Half of the bounding box at the most: exp(-3.33^2 / 2) is 1/255."""
+EDGE = 0.15
+"""How far beyond the image's edges J is taken as it is, as a share of the image's size."""
 CHUNKS = 16
 """Pieces whose camera gradients are summed apart, whatever the number of threads."""
 BLOCK = 32
@@ -67,7 +71,7 @@ def project(
         compensations: Written, float32 [N].
     """
     for chunk in parallel_range(CHUNKS):
-        # One allocation a chunk: one a Gaussian takes as long as all of the arithmetic.
+        # One allocation per chunk: one per Gaussian takes as long as all of the arithmetic.
         block, projected = np.ones((GIVEN + 1, BLOCK), np.float32), np.empty((10, BLOCK))
         lanes = np.empty(BLOCK, np.intp)
         pose, lens = _pose(view), _lens(K, width, height)
@@ -110,7 +114,7 @@ def _lens(K, width, height):
     """fx, fy, cx, cy, and between what x / z and y / z are held."""
     fx, fy = np.float64(K[0, 0]), np.float64(K[1, 1])
     cx, cy = np.float64(K[0, 2]), np.float64(K[1, 2])
-    beyond_x, beyond_y = EDGE * 0.5 * width / fx, EDGE * 0.5 * height / fy
+    beyond_x, beyond_y = EDGE * width / fx, EDGE * height / fy
     return (
         fx, fy, cx, cy, -(cx / fx + beyond_x), (width - cx) / fx + beyond_x,
         -(cy / fy + beyond_y), (height - cy) / fy + beyond_y,
@@ -154,20 +158,24 @@ def _of_rows(weights, rows):
 def _project_block(block, pose, lens, eps2d, projected):
     """Project all of a block, and whatever its lanes hold."""
     for lane in range(BLOCK):
-        x, y, z = _in_camera(block, lane, pose)
+        x, y, z = _in_camera(block, lane, pose)  # m_c = W m + t
         J = _jacobian(x, y, z, lens)
+        # T = J W
         T0, T1 = _mix(J[0], pose[0], J[1], pose[2]), _mix(J[2], pose[1], J[3], pose[2])
         quat, _ = _quaternion(block, lane)
         R, s = _rotation(quat), _column(block, S, lane)
+        # P = T R diag(s); covariance P P' + eps2d I, its inverse the conic (a, b, c)
         P0, P1 = _times(_of_rows(T0, R), s), _times(_of_rows(T1, R), s)
         xx, xy, yy = _dot(P0, P0), _dot(P0, P1), _dot(P1, P1)
         raw = xx * yy - xy * xy
         xx, yy = xx + eps2d, yy + eps2d
         over = 1.0 / (xx * yy - xy * xy)
+        # u = fx x / z + cx, v = fy y / z + cy
         projected[U, lane] = lens[0] * (x * (1.0 / z)) + lens[2]
         projected[V, lane] = lens[1] * (y * (1.0 / z)) + lens[3]
         projected[DEPTH, lane], projected[A, lane] = z, yy * over
         projected[B, lane], projected[C, lane] = -xy * over, xx * over
+        # compensation = sqrt(det P P' / det(P P' + eps2d I))
         projected[COMPENSATION, lane] = math.sqrt(max(raw * over, 0.0))
         projected[SIGMA_X, lane], projected[SIGMA_Y, lane] = math.sqrt(xx), math.sqrt(yy)
         projected[OPACITY, lane] = over
@@ -188,7 +196,7 @@ def _in_camera(block, lane, pose):
 
 @always_inline
 def _jacobian(x, y, z, lens):
-    """J00, J02, J11 and J12."""
+    """J00, J02, J11 and J12 of J = [fx/z, 0, -fx x/z^2; 0, fy/z, -fy y/z^2], x/z and y/z held."""
     fx, fy, _, _, low_x, high_x, low_y, high_y = lens
     over = 1.0 / z
     x_z, y_z = min(max(x * over, low_x), high_x), min(max(y * over, low_y), high_y)
@@ -216,7 +224,7 @@ def _rotation(quat):
 
 @always_inline
 def _cull(block, near, far, width, height, antialiased, projected):
-    """Fill the row of opacities, which holds 1 / determinant so far, with 0 for what is culled."""
+    """Write each Gaussian's opacity, or 0 where it is culled, over 1 / determinant in that row."""
     for lane in range(BLOCK):
         u, v, z = projected[U, lane], projected[V, lane], projected[DEPTH, lane]
         over = projected[OPACITY, lane]
@@ -270,7 +278,7 @@ def project_vjp(
         d_view: Written, float64 [CHUNKS, 3, 4].
     """
     for chunk in parallel_range(CHUNKS):
-        block, slopes = np.ones((GIVEN + 7, BLOCK), np.float32), np.empty((10, BLOCK))
+        block, gradients = np.ones((GIVEN + 7, BLOCK), np.float32), np.empty((10, BLOCK))
         sums, indices = np.zeros((3, 4, BLOCK)), np.empty(BLOCK, np.intp)
         pose, lens = _pose(view), _lens(K, width, height)
         begin, end = chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS
@@ -291,21 +299,21 @@ def project_vjp(
                     block[DCOMPENSATION, lane] = weight * d_compensations[each]
                     for k in range(3):
                         block[DCONIC + k, lane] = weight * d_conics[each, k]
-                _block_vjp(block, pose, lens, eps2d, slopes, sums)
+                _block_vjp(block, pose, lens, eps2d, gradients, sums)
                 for lane in range(count):
                     each = indices[lane]
                     for k in range(3):
-                        d_means[each, k] = slopes[X + k, lane]
-                        d_scales[each, k] = slopes[S + k, lane]
+                        d_means[each, k] = gradients[X + k, lane]
+                        d_scales[each, k] = gradients[S + k, lane]
                     for k in range(4):
-                        d_quats[each, k] = slopes[Q + k, lane]
+                        d_quats[each, k] = gradients[Q + k, lane]
                 count = 0
         for k in range(12):
             d_view[chunk, k // 4, k % 4] = sums[k // 4, k % 4].sum()
 
 
 @always_inline
-def _block_vjp(block, pose, lens, eps2d, slopes, sums):
+def _block_vjp(block, pose, lens, eps2d, gradients, sums):
     """The gradients of a block's means, quaternions and scales; those of the pose are added up."""
     for lane in range(BLOCK):
         x, y, z = _in_camera(block, lane, pose)
@@ -316,9 +324,11 @@ def _block_vjp(block, pose, lens, eps2d, slopes, sums):
         U0, U1 = _of_rows(T0, R), _of_rows(T1, R)
         P0, P1 = _times(U0, s), _times(U1, s)
         d_xx, d_xy, d_yy = _covariance_vjp(block, lane, P0, P1, eps2d)
+        # dP = 2 dS P for the symmetric d covariance dS
         dP0, dP1 = _mix(2.0 * d_xx, P0, d_xy, P1), _mix(2.0 * d_yy, P1, d_xy, P0)
         for k in range(3):
-            slopes[S + k, lane] = dP0[k] * U0[k] + dP1[k] * U1[k]
+            gradients[S + k, lane] = dP0[k] * U0[k] + dP1[k] * U1[k]
+        # dU = dP diag(s), dR = T' dU, dT = dU R', dJ = dT W', dW = J' dT
         dU0, dU1 = _times(dP0, s), _times(dP1, s)
         dR = (
             _mix(T0[0], dU0, T1[0], dU1), _mix(T0[1], dU0, T1[1], dU1), _mix(T0[2], dU0, T1[2], dU1)
@@ -328,7 +338,7 @@ def _block_vjp(block, pose, lens, eps2d, slopes, sums):
             d_quat[0] * quat[0] + d_quat[1] * quat[1] + d_quat[2] * quat[2] + d_quat[3] * quat[3]
         )
         for k in range(4):  # the length of q changes nothing
-            slopes[Q + k, lane] = (d_quat[k] - along * quat[k]) * over
+            gradients[Q + k, lane] = (d_quat[k] - along * quat[k]) * over
         dT0 = _dot(R[0], dU0), _dot(R[1], dU0), _dot(R[2], dU0)
         dT1 = _dot(R[0], dU1), _dot(R[1], dU1), _dot(R[2], dU1)
         dJ = _dot(dT0, pose[0]), _dot(dT0, pose[2]), _dot(dT1, pose[1]), _dot(dT1, pose[2])
@@ -337,7 +347,7 @@ def _block_vjp(block, pose, lens, eps2d, slopes, sums):
         dW0, dW1 = _mix(J[0], dT0, dt[0], mean), _mix(J[2], dT1, dt[1], mean)
         dW2 = _mix(J[1], dT0, J[3], dT1)
         for k in range(3):
-            slopes[X + k, lane] = d_mean[k]
+            gradients[X + k, lane] = d_mean[k]
             sums[0, k, lane] += dW0[k]
             sums[1, k, lane] += dW1[k]
             sums[2, k, lane] += dW2[k] + dt[2] * mean[k]

@@ -1,9 +1,9 @@
 """``rasterization``: gsplat's signature, on the CPU.
 
-Meant for code written against gsplat 1.5.3: arguments, results and the ``info`` dict are gsplat's, so
-that its default densification runs unchanged, and MCMC by way of ``splatseed.render.MCMCStrategy``. What
-the CPU does not do (fisheye and orthographic cameras, distributed rendering, rolling shutter) is refused,
-never ignored.
+Meant for code written against gsplat 1.5.3: arguments, results and the ``info`` dict are gsplat's,
+so that its default densification runs unchanged, and MCMC by way of
+``splatseed.render.MCMCStrategy``. What the CPU does not do (fisheye and orthographic cameras,
+distributed rendering, rolling shutter) is refused, never ignored.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatseed.render.arguments import (
+from splatseed.render.autograd import Blend, Harmonics, Lens, Project
+from splatseed.render.info import Info, View, make_info
+from splatseed.render.validation import (
     check_absgrad,
     check_numbers,
     check_sparse,
     check_tensors,
     check_unsupported,
 )
-from splatseed.render.functions import Blend, Harmonics, Lens, Project
-from splatseed.render.info import Info, View, make_info
 from splatseed.requirements import require
 
 __all__ = ["rasterization"]
@@ -67,9 +67,9 @@ def rasterization(
         quats: wxyz rotations of any length but 0, [N, 4].
         scales: Standard deviations (not their logarithms), [N, 3].
         opacities: 0 to 1, [N].
-        colors: [N, D] or [C, N, D]; with ``sh_degree`` coefficients [N, K, 3] or [C, N, K, 3]. Beyond
-            gsplat, the first coefficient [N, 1, 3] and the rest [N, K - 1, 3] may come as a pair, as
-            trainers keep them: joining them would take a quarter of a training step.
+        colors: [N, D] or [C, N, D]; with ``sh_degree`` coefficients [N, K, 3] or [C, N, K, 3].
+            Beyond gsplat, the first coefficient [N, 1, 3] and the rest [N, K - 1, 3] may come as a
+            pair, as trainers keep them: joining them would take a quarter of a training step.
         viewmats: cam_from_world, OpenCV axes, [C, 4, 4].
         Ks: Pinhole matrices in px, [C, 3, 3].
         width: Pixels.
@@ -80,12 +80,14 @@ def rasterization(
         eps2d: Blur added to the 2D covariance, px^2.
         sh_degree: Degree of spherical harmonics, 0 to 3; None takes colours as they are.
         packed: Whether ``info`` lists visible Gaussians only; the image is the same.
-        tile_size: Pixels a tile of ``info``'s lists is wide and high; the image has tiles of its own.
+        tile_size: Pixels a tile of ``info``'s lists is wide and high; the image has tiles of its
+            own.
         backgrounds: Colours behind everything, [C, D].
         render_mode: Colour, depth accumulated (D) or expected (ED), or both.
-        sparse_grad: Whether what comes through projection to the gradients of means, quats and scales
-            is sparse (COO) and lists only the Gaussians that are seen; needs ``packed``. Means that
-            also get a gradient from harmonics' directions end with a dense one, as in gsplat.
+        sparse_grad: Whether what comes through projection to the gradients of means, quats and
+            scales is sparse (COO) and lists only the Gaussians that are seen; needs ``packed``.
+            Means that also get a gradient from harmonics' directions end with a dense one, as in
+            gsplat.
         absgrad: Whether ``info["means2d"].absgrad`` is set by backward.
         rasterize_mode: "antialiased" lowers opacities by what the blur adds.
         channel_chunk: Kept for gsplat's sake.
@@ -93,14 +95,14 @@ def rasterization(
 
     Returns:
         Colours [C, H, W, D] (with depth as last channel where asked for), alphas [C, H, W, 1], and
-        ``info``, gsplat's dictionary: means2d, radii, depths, conics, opacities ([C, N, ...], or for
-        ``packed`` [G, ...] with batch_ids, camera_ids and gaussian_ids, otherwise None); width, height,
-        tile_size, tile_width, tile_height (in tiles), n_batches, n_cameras; and, made when first read,
-        tiles_per_gauss, isect_ids, flatten_ids, isect_offsets.
+        ``info``, gsplat's dictionary: means2d, radii, depths, conics, opacities ([C, N, ...], or
+        for ``packed`` [G, ...] with batch_ids, camera_ids and gaussian_ids, otherwise None); width,
+        height, tile_size, tile_width, tile_height (in tiles), n_batches, n_cameras; and, made when
+        first read, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets.
 
     Raises:
-        ParameterError: An argument that the CPU rasteriser does not support, or tensors that are not
-            float32 or whose shapes do not go together.
+        ParameterError: An argument that the CPU rasteriser does not support, or tensors that are
+            not float32 or whose shapes do not go together.
         MissingDependencyError: CUDA tensors, and no gsplat.
 
     Example:
@@ -118,7 +120,7 @@ def rasterization(
         require("gsplat")
         from gsplat import rasterization as on_cuda  # noqa: PLC0415  (needs CUDA)
 
-        return on_cuda(  # type: ignore[no-any-return]
+        return on_cuda(  # type: ignore[no-any-return]  # gsplat is untyped
             means, quats, scales, opacities,
             torch.cat(colors, dim=1) if isinstance(colors, tuple) else colors,
             viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, tile_size, backgrounds, render_mode,
@@ -172,7 +174,7 @@ def _project(
     lens: Lens,
     sparse: bool,
 ) -> View:
-    radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]
+    radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
         means, quats, scales, opacities, viewmat, lens, sparse
     )
     if lens.antialiased:
@@ -196,7 +198,7 @@ def _colors(
         return base
     # The general inverse, as gsplat takes it: the rigid one has another gradient off the rotations.
     origin = torch.linalg.inv_ex(viewmats[camera]).inverse[:3, 3]
-    shades: Tensor = Harmonics.apply(means, origin, base, rest, view.radii, sh_degree)  # type: ignore[no-untyped-call]
+    shades: Tensor = Harmonics.apply(means, origin, base, rest, view.radii, sh_degree)  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
     return shades
 
 
@@ -235,7 +237,7 @@ def _blend(
         if ids is not None:  # a full slice would be copied by backward
             each = ids[rows]
             shapes, depths, radii = tuple(t[each] for t in shapes), depths[each], radii[each]
-        image, alpha = Blend.apply(  # type: ignore[no-untyped-call]
+        image, alpha = Blend.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
             means2d[rows], *shapes,
             None if backgrounds is None else backgrounds[camera],
             depths, radii, info["width"], info["height"],
@@ -243,7 +245,8 @@ def _blend(
         )  # fmt: skip
         images.append(image)
         alphas.append(alpha[..., None])
-    # Copies also of one: backward reads the image, and who changes it in place must not disturb that.
+    # Copies also of one: backward reads the image, and who changes it in place must not disturb
+    # that.
     return torch.stack(images), torch.stack(alphas)
 
 

@@ -1,8 +1,8 @@
 """The specification of the rasteriser: slow, dense, readable, float64 if its inputs are.
 
-Every Gaussian meets every pixel; PyTorch's autograd gives all gradients. The fast stages are held to
-this file by tests; where they disagree, this file is right. Conventions: OpenCV camera axes, pixel
-centres at +0.5, quaternions wxyz. Cut-offs are those that gsplat 1.5.3 publishes.
+Every Gaussian meets every pixel; PyTorch's autograd gives all gradients. The fast stages are held
+to this file by tests; where they disagree, this file is right. Conventions: OpenCV camera axes,
+pixel centres at +0.5, quaternions wxyz. Cut-offs are those that gsplat 1.5.3 publishes.
 """
 
 from __future__ import annotations
@@ -10,13 +10,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from splatseed.render.projection import EDGE, MAX_SIGMAS, MIN_ALPHA
+
 __all__ = ["rasterize_reference"]
 
-MIN_ALPHA = 1.0 / 255.0
 MAX_ALPHA = 0.999
 STOP = 1e-4
-EDGE = 0.15
-MAX_SIGMAS = 3.33
 
 
 def rasterize_reference(
@@ -70,13 +69,13 @@ def rasterize_reference(
     order = torch.argsort(torch.where(seen, points[:, 2], torch.inf), stable=True)[
         : int(seen.sum())
     ]
-    image, passing = _blend(
+    image, transmittance = _blend(
         means2d[order], torch.linalg.inv(covariance[order]), opacities[order], colors[order],
         width, height,
     )  # fmt: skip
     if background is not None:
-        image = image + passing[..., None] * background
-    return image, 1.0 - passing, means2d
+        image = image + transmittance[..., None] * background
+    return image, 1.0 - transmittance, means2d
 
 
 def _focal(K: Tensor) -> Tensor:
@@ -140,7 +139,7 @@ def _blend(
     """Gaussians in depth order into pixels: image [H, W, D] and what passes, [H, W]."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([x, y], dim=-1).to(means2d) + 0.5
-    passing = torch.ones(height, width).to(means2d)
+    transmittance = torch.ones(height, width).to(means2d)
     going_on = torch.ones(height, width, dtype=torch.bool)
     image = torch.zeros(height, width, colors.shape[1]).to(means2d)
     for mean, conic, opacity, color in zip(means2d, conics, opacities, colors, strict=True):
@@ -148,9 +147,9 @@ def _blend(
         sigma = 0.5 * (d[..., None, :] @ conic @ d[..., :, None])[..., 0, 0]
         alpha = (opacity * torch.exp(-sigma)).clamp(max=MAX_ALPHA)
         counts = going_on & (sigma >= 0) & (alpha >= MIN_ALPHA)
-        rest = torch.where(counts, passing * (1 - alpha), passing)
-        going_on = going_on & ~(counts & (rest <= STOP))
-        gained = torch.where(counts & going_on, alpha * passing, torch.zeros_like(alpha))
-        image = image + gained[..., None] * color
-        passing = torch.where(going_on, rest, passing)
-    return image, passing
+        after = torch.where(counts, transmittance * (1 - alpha), transmittance)
+        going_on = going_on & ~(counts & (after <= STOP))
+        weight = torch.where(counts & going_on, alpha * transmittance, torch.zeros_like(alpha))
+        image = image + weight[..., None] * color
+        transmittance = torch.where(going_on, after, transmittance)
+    return image, transmittance

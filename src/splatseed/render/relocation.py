@@ -5,8 +5,8 @@ Notation: o opacity, s scales, n how many Gaussians share the place. With o' = 1
 
     s' = s o / sum_{k=0}^{n-1} (-1)^k C(n, k+1) o'^(k+1) / sqrt(k+1)
 
-Promise: float64 inside, as the sum alternates; gsplat's files are not touched, and CUDA tensors go to
-gsplat's own functions.
+Promise: float64 inside, as the sum alternates; gsplat's files are not touched, and CUDA tensors go
+to gsplat's own functions.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def compute_relocation(
     if opacities.is_cuda:
         from gsplat.relocation import compute_relocation as on_cuda  # noqa: PLC0415  (needs CUDA)
 
-        return on_cuda(opacities, scales, ratios, binoms)  # type: ignore[no-any-return]
+        return on_cuda(opacities, scales, ratios, binoms)  # type: ignore[no-any-return]  # gsplat is untyped
     largest = len(binoms)
     shares = ratios.clamp(1, largest).view_as(opacities)
     old = opacities.to(torch.float64)
@@ -76,7 +76,7 @@ def covariances(
     if quats.is_cuda:
         from gsplat import quat_scale_to_covar_preci as on_cuda  # noqa: PLC0415  (needs CUDA)
 
-        return on_cuda(quats, scales, compute_covar, compute_preci, triu)  # type: ignore[no-any-return]
+        return on_cuda(quats, scales, compute_covar, compute_preci, triu)  # type: ignore[no-any-return]  # gsplat is untyped
     from gsplat.utils import normalized_quat_to_rotmat  # noqa: PLC0415  (as above)
 
     half = normalized_quat_to_rotmat(normalize(quats, dim=-1)) * scales[:, None, :]

@@ -1,13 +1,14 @@
 """A budget: how many seeds, and which are kept of too many.
 
-Notation: N points, of which ``num`` are kept. The views that see a point most closely are those in whose
-frame it falls at the smallest depth / focal length: ``CLOSEST`` of them. With a *spacing* of s pixels, a
-view's frame is cut into cells of s x s pixels, and its depth into slices of ``DEEP`` times that.
-A point is *needed* at a spacing if, in the view that sees it most closely, no kept point lies in its cell.
+Notation: N points, of which ``num`` are kept. The views that see a point most closely are those in
+whose frame it falls at the smallest depth / focal length: ``CLOSEST`` of them. With a *spacing* of
+s pixels, a view's frame is cut into cells of s x s pixels, and its depth into slices of ``DEEP``
+times that. A point is *needed* at a spacing if, in the view that sees it most closely, no kept
+point lies in its cell.
 Promise: points are asked in order, the originals first and then by priority; each is kept if it is
-needed, at the smallest spacing that keeps no more than ``num``; what is left of the number is filled
-up at smaller spacings. So the only point of a cell is kept before the second of any, nothing is drawn
-at random, and the bytes do not depend on the threads.
+needed, at the smallest spacing that keeps no more than ``num``; what is left of the number is
+filled up at smaller spacings. So the only point of a cell is kept before the second of any, nothing
+is drawn at random, and the bytes do not depend on the threads.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from splatseed.views.view import View
 __all__ = ["median_pixels", "parse_budget", "thin"]
 
 CLOSEST = 4
-"""Views in which a kept point is marked: enough that neighbours share one, few enough to be quick."""
+"""Views in which a kept point is marked: enough that neighbours share one, few enough to be
+quick."""
 DEEP = 4.0
 """Slices of depth, in cells: deep enough that noise along the ray makes no new cell."""
 CHUNKS = 64
@@ -39,7 +41,7 @@ CLOSE_ENOUGH = 0.02
 """How many fewer than the number a spacing may keep."""
 STEPS = 24
 LEAST_POWER = 0.2
-"""Of the number kept as a power of 1 / spacing, lest a step be too long; on surfaces it is 2."""
+"""Least exponent e assumed in: number kept ~ (1 / spacing)^e; bounds a step. On surfaces e is 2."""
 ACROSS = 4096.0
 """Pixels that a cloud without views is taken to measure."""
 FREE = np.uint64(0)
@@ -97,9 +99,10 @@ def thin(
         xyz: The points, in the world.
         views: Of which only cameras and sizes are looked at. Without any, cells are cubes in space.
         num: How many to keep, at least 1.
-        first: How many of the points, from the first on, are asked before the others: the originals.
-        priority: The higher is asked earlier, among originals and among the others; all equal when left
-            out. Points of equal priority are asked in their order.
+        first: How many of the points, from the first on, are asked before the others: the
+            originals.
+        priority: The higher is asked earlier, among originals and among the others; all equal when
+            left out. Points of equal priority are asked in their order.
 
     Returns:
         Indices, rising, int64 [min(num, N)].
@@ -140,7 +143,7 @@ def _order(
         raise PointCloudError(
             f"priority of shape [{num}]",
             found=f"{list(priority.shape)}",
-            fix="Pass one number a point, or leave it out.",
+            fix="Pass one number per point, or leave it out.",
         )
     return np.lexsort((-priority, np.arange(num) >= first))  # stable
 

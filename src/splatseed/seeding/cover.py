@@ -1,11 +1,12 @@
 """Cover: a seed in every part of every photograph that no point covers.
 
-Notation: cells, their depths and *covered* are those of ``coverage``. Views are taken in random order,
-each seeing the seeds of those before. An empty cell gets one seed on the ray through its centre, at the
-depth that ``guess`` finds: a median over the covered cells around it, in which depths count less that
-other views look through. Where a view has no covered cell, the median depth of all views must do.
-Promise: a cover seed is a guess and says so by its confidence; the same seed gives the same bytes on any
-number of cores: the views follow each other, on one.
+Notation: cells, their depths and *covered* are those of ``coverage``. Views are taken in random
+order, each seeing the seeds of those before. An empty cell gets one seed on the ray through its
+centre, at the depth that ``guess`` finds: a median over the covered cells around it, in which
+depths count less that other views look through. Where a view has no covered cell, the median depth
+of all views must do.
+Promise: a cover seed is a guess and says so by its confidence; the same seed gives the same bytes
+on any number of cores: the views follow each other, on one.
 
 How the rule was chosen is in ``benchmarks/README.md``.
 """
@@ -87,12 +88,13 @@ def cover(
         xyz: The points there are, in the world; those that are not finite are in no cell.
         cell: Side of a cell in pixels of the views, at least 1.
         rng: Draws the order of the views.
-        masks: For each view which pixels count, or None for all. A cell gets no seed unless half of its
-            pixels count.
+        masks: For each view which pixels count, or None for all. A cell gets no seed unless half of
+            its pixels count.
         progress: Told how far it is.
 
     Raises:
-        ParameterError: There is no view, a view has no pixels, ``cell`` is below 1, or masks do not fit.
+        ParameterError: There is no view, a view has no pixels, ``cell`` is below 1, or masks do not
+            fit.
         PointCloudError: ``xyz`` is not of shape [N, 3], or no point lies in any view.
     """
     xyz = check_points(views, xyz, cell)

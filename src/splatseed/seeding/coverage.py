@@ -1,15 +1,16 @@
 """Which parts of the pictures hold a point: the depths of a cloud on coarse cells.
 
-Notation: a view of W x H pixels is cut into ``ceil(H / c) x ceil(W / c)`` equal cells, of c x c pixels
-or a little less. The depth (planar z) of a cell is the lower quartile of the depths of the points that
-fall into it, infinite where none does. A cell is *hidden* if at least ``HIDING`` of its eight neighbours
-are nearer by more than ``NEARER``: a surface hides what shows between its points. It is *covered* if
-it holds a point and is not hidden.
+Notation: a view of W x H pixels is cut into ``ceil(H / c) x ceil(W / c)`` equal cells, of c x c
+pixels or a little less. The depth (planar z) of a cell is the lower quartile of the depths of the
+points that fall into it, infinite where none does. A cell is *hidden* if at least ``HIDING`` of its
+eight neighbours are nearer by more than ``NEARER``: a surface hides what shows between its points.
+It is *covered* if it holds a point and is not hidden.
 Promise: the bytes depend neither on the order of the points nor on the threads.
 
 The nearest depth, as a z-buffer keeps, will not do: of the points that their own tracks prove to be
 visible, a z-buffer that looks at neighbouring cells hides 7% (fox) to 97% (treehill), since
-Structure-from-Motion leaves a few points hanging in front of the cameras. This rule hides 0.3% to 16%.
+Structure-from-Motion leaves a few points hanging in front of the cameras. This rule hides 0.3% to
+16%.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ HIDING = 5
 """How many of the eight must be."""
 BLOCK = 512
 """Points that are projected before any is put into its cell, so that the former is vectorised."""
-FARTHEST = 3e38
+GREATEST_DEPTH = 3e38
 """Depths that float32 holds."""
 NONE = np.float32(np.inf)
 
@@ -103,7 +104,7 @@ def check_points(
     xyz = np.asarray(xyz)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise PointCloudError(
-            "xyz of shape [N, 3]", found=f"{list(xyz.shape)}", fix="Pass one row x, y, z a point."
+            "xyz of shape [N, 3]", found=f"{list(xyz.shape)}", fix="Pass one row x, y, z per point."
         )
     return np.ascontiguousarray(xyz, np.float32)
 
@@ -147,7 +148,7 @@ def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-unty
         project_block(xyz[start : start + num], matrix, at)
         for k in range(num):
             column, row, depth = at[0, k], at[1, k], at[2, k]
-            inside = 0.0 <= column < cols and 0.0 <= row < rows and 0.0 < depth < FARTHEST
+            inside = 0.0 <= column < cols and 0.0 <= row < rows and 0.0 < depth < GREATEST_DEPTH
             cells[start + k] = int(row) * cols + int(column) if inside else -1
             depths[start + k] = depth
 

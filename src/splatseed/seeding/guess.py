@@ -1,10 +1,10 @@
 """Guesses of the depth of a view's empty cells, from the covered cells around and from other views.
 
-Notation: of each of eight sectors of 45 degrees around an empty cell the nearest covered cell is asked, no
-farther than ``2 r + 1`` cells where r is how far the first is. A seed at its depth, on the ray through
-the empty cell's centre, is *contradicted* by another view if it stands there in front of a covered cell,
-nearer by more than ``NEARER``: that view looks through it. The guess is the median of the sectors' depths,
-weighted by ``1 / ((1 + contradictions) distance^2)``.
+Notation: of each of eight sectors of 45 degrees around an empty cell the nearest covered cell is
+asked, no farther than ``2 r + 1`` cells where r is how far the first is. A seed at its depth, on
+the ray through the empty cell's centre, is *contradicted* by another view if it stands there in
+front of a covered cell, nearer by more than ``NEARER``: that view looks through it. The guess is
+the median of the sectors' depths, weighted by ``1 / ((1 + contradictions) distance^2)``.
 Promise: a guess is a depth of the view; the bytes do not depend on the threads.
 """
 

@@ -1,9 +1,10 @@
 """Which views judge a new point: of those that see its base, the ones that see the point best.
 
-Notation: M new points, V views; the *base* of a point is the original it is nearest to. A view may judge a point if it
-sees its base, and the point lies well within its frame and within those of two of its sources (of its only one, if it
-has no more). It sees a point the better, the closer and the more frontal it is. Promise: who judges a point depends on
-that point, the poses and who sees what, not on the other points or on threads.
+Notation: M new points, V views; the *base* of a point is the original it is nearest to. A view may
+judge a point if it sees its base, and the point lies well within its frame and within those of two
+of its sources (of its only one, if it has no more). It sees a point the better, the closer and the
+more frontal it is. Promise: who judges a point depends on that point, the poses and who sees what,
+not on the other points or on threads.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Methods that look at the photographs: ``auto``, ``stereo`` and ``cover``.
 
-``stereo`` puts seeds on surfaces, found by comparing photographs; ``cover`` gives every part of every photograph that
-no point falls in one seed to look at; ``auto`` does both, in this order. Promise: how many seeds there are follows from
-the photographs, not from a ratio; held-out views are never looked at.
+``stereo`` puts seeds on surfaces, found by comparing photographs; ``cover`` gives every part of
+every photograph that no point falls in one seed to look at; ``auto`` does both, in this order.
+Promise: how many seeds there are follows from the photographs, not from a ratio; held-out views are
+never looked at.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class PhotographMethod:
     max_size: int = MAX_SIZE
     """Photographs are made smaller by a whole factor until their longer side has so many pixels."""
     hold_out: int = 0
-    """Leave out every so many-th image by name, as trainers do for the test (8); 0 = use all."""
+    """Leave out every n-th image by name, as trainers do for the test (8); 0 = use all."""
 
     name: ClassVar[str]
     traits: ClassVar[Traits] = Traits(frozenset({"photographs"}), chooses_number=True)
@@ -114,7 +115,7 @@ class Stereo(PhotographMethod):
     spacing: float = 8.0
     """Pixels between stereo's seeds in the photographs; not below the grid."""
     grid: int = 4
-    """Every so many-th pixel along a row and a column gets a depth."""
+    """Pixels between depths, along a row and a column."""
 
     name: ClassVar[str] = "stereo"
 
@@ -144,13 +145,13 @@ class Stereo(PhotographMethod):
 
     def _find(self, given: _Given, only: Sequence[int] | None = None) -> FoundStereo:
         from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
-        from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415
-        from splatseed.stereo.without_points import known_sightings  # noqa: PLC0415
+        from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
+        from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415  (loads with its use)
 
         settings, seed = StereoSettings(grid=self.grid), int(given.rng.integers(1 << 32))
-        sightings = known_sightings(given.scene)
+        visibility = known_visibility(given.scene)
         return find_stereo(
-            given.views, given.images, sightings, settings, seed, given.progress, only
+            given.views, given.images, visibility, settings, seed, given.progress, only
         )
 
 

@@ -1,14 +1,16 @@
 """Sliding points along their normals to where photographs agree.
 
-Notation: a point of one view, seen at pixel (u, v), with the plane through it: inverse depth w and its slopes gx, gy a
-pixel (``stereo.cost``). Moving the plane by t spacings h along its normal n, where n X is its distance from the camera,
-makes all three 1 / (1 + t h / (n X)) times as large; the point then lies where the plane meets the ray of (u, v), so
-that its window in the view stays what it was. Among the t, the one with the least
+Notation: a point of one view, seen at pixel (u, v), with the plane through it: inverse depth w and
+its slopes gx, gy a pixel (``stereo.cost``). Moving the plane by t spacings h along its normal n,
+where n X is its distance from the camera, makes all three 1 / (1 + t h / (n X)) times as large; the
+point then lies where the plane meets the ray of (u, v), so that its window in the view stays what
+it was. Among the t, the one with the least
 
     (cost(t) + FLOOR) (1 + t^2)
 
-is taken: a cost that is low for certain may move a point, small differences between high ones may not. Promise: a
-point's result depends on itself and the pictures, not on its neighbours in the list.
+is taken: a cost that is low for certain may move a point, small differences between high ones may
+not. Promise: a point's result depends on itself and the pictures, not on its neighbours in the
+list.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"

@@ -1,8 +1,9 @@
 """What the originals around a new point say of the surface there: how far apart they are, which way it faces.
 
-Notation: n originals, M new points; the *base* of a new point is its nearest original, and h, the mean distance of the
-base to its 6 nearest, its spacing. The normal is the last principal axis of the base and its 16 nearest. Promise: each
-new point's surroundings depend on its own position and the originals alone.
+Notation: n originals, M new points; the *base* of a new point is its nearest original, and h, the
+mean distance of the base to its 6 nearest, its spacing. The normal is the last principal axis of
+the base and its 16 nearest. Promise: each new point's surroundings depend on its own position and
+the originals alone.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ __all__ = ["Surroundings", "survey"]
 
 NEIGHBORS = 16
 FLAT = 0.4
-"""A neighbourhood is flat if it is so much thinner than it is wide, at most; noise alone has about 0.7."""
+"""A neighbourhood is flat if it is so much thinner than it is wide, at most; noise alone has about
+0.7."""
 BLOCK = 1 << 13
 
 

@@ -1,7 +1,7 @@
 """A scene's points within a budget: those that are known by where they are seen, guesses for what they leave.
 
-Promise: no more points than the number, and all of it where there are as many; nothing is drawn at random but the
-order of the views in which ``cover`` fills gaps.
+Promise: no more points than the number, and all of it where there are as many; nothing is drawn at
+random but the order of the views in which ``cover`` fills gaps.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ def thin_to(
 ) -> PointCloud:
     """At most ``num`` of a cloud's points, originals before others where both would do.
 
-    Cover is made anew for what thinning leaves: a guess fills a gap, and must not take the place of a
-    point that is known. Where there are no fewer originals than may stay, only originals do: they are
-    dense where there is detail, which is where few Gaussians are needed most.
+    Cover is made anew for what thinning leaves: a guess fills a gap, and must not take the place of
+    a point that is known. Where there are no fewer originals than may stay, only originals do: they
+    are dense where there is detail, which is where few Gaussians are needed most.
 
     Args:
         scene: Where the points belong.

@@ -1,9 +1,10 @@
 """``upsample``: a scene's points and new ones, made, checked, completed and thinned.
 
-Four steps, of which all but the first are asked for: a method makes points; ``verify`` holds interpolated ones
-against the photographs; ``cover`` gives the parts of photographs that no point falls in a seed; a budget thins all.
-Promise: without a budget the originals come first and unchanged; the same seed gives the same bytes whatever the number
-of threads; every point is finite.
+Four steps, of which all but the first are asked for: a method makes points; ``verify`` holds
+interpolated ones against the photographs; ``cover`` gives the parts of photographs that no point
+falls in a seed; a budget thins all.
+Promise: without a budget the originals come first and unchanged; the same seed gives the same bytes
+whatever the number of threads; every point is finite.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ CELL = 8
 """Side in pixels of the cells by which coverage is measured."""
 
 INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
-"""Methods whose points are guesses between others, which ``verify`` holds against the photographs."""
+"""Methods whose points are guesses between others, which ``verify`` holds against the
+photographs."""
 
 Note = Callable[[str], None]
 
@@ -65,24 +67,27 @@ def upsample(
     Args:
         scene: A scene, or a bare cloud. Points with ``source`` other than 0 are put aside: new
             points are made from originals only, and replace earlier new ones.
-        method: A key of ``METHODS``, or a method with its parameters. ``auto``, the default, looks at the
-            photographs; where there are none, ``mls`` is taken, and ``note`` is told.
-        ratio: Points in all, as a multiple of the originals (r N), for methods that interpolate;
-            4 when neither is given. The photographs say how many ``auto``, ``stereo`` and ``cover`` make.
+        method: A key of ``METHODS``, or a method with its parameters. ``auto``, the default, looks
+            at the photographs; where there are none, ``mls`` is taken, and ``note`` is told.
+        ratio: Points in all, as a multiple of the originals (r N), for methods that interpolate; 4
+            when neither is given. The photographs say how many ``auto``, ``stereo`` and ``cover``
+            make.
         num_points: Points in all, instead of ``ratio``.
-        budget: Most points in all: a number, or a string such as "0.25rho", Gaussians per pixel of one
-            photograph. May be below the number of originals.
-        cover: Side in pixels of the parts of the photographs that get a seed where no point falls in.
-        verify: Hold interpolated points against the photographs: slide them onto the surface, drop what
-            does not fit.
+        budget: Most points in all: a number, or a string such as "0.25rho", Gaussians per pixel of
+            one photograph. May be below the number of originals.
+        cover: Side in pixels of the parts of the photographs that get a seed where no point falls
+            in.
+        verify: Hold interpolated points against the photographs: slide them onto the surface, drop
+            what does not fit.
         seed: The same seed gives the same bytes, whatever the number of threads.
         profile: "default", or "paper" for the paper's text to the letter.
         progress: Told each stage and the fraction done.
-        note: Told what was left out or made do with, one sentence each.
+        note: Told what was left out or replaced, one sentence each.
         parameters: Fields of the method, such as ``k=12``.
 
     Returns:
-        The N originals, then the new points; ``source`` tells them apart. A budget takes points of both.
+        The N originals, then the new points; ``source`` tells them apart. A budget takes points of
+        both.
 
     Raises:
         ParameterError: An unknown method, profile or parameter, or a value or size out of range.
@@ -167,7 +172,7 @@ def add_verified(
         SceneNotFoundError: There are no photographs.
     """
     from splatseed.seeding.verify import verify  # noqa: PLC0415  (kernels load with use)
-    from splatseed.views.sightings import find_sightings  # noqa: PLC0415
+    from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
     codes = [source_code(name) for name in INTERPOLATING]
     guessed = np.isin(cloud.source, codes)
@@ -178,7 +183,7 @@ def add_verified(
     views = read_views(scene, images, MAX_SIZE, progress)
     points = cloud.select(guessed)
     new = NewPoints(points.xyz, points.rgb, (), source=points.source)
-    checked = verify(views, images, find_sightings(scene), new, progress)
+    checked = verify(views, images, find_visibility(scene), new, progress)
     for sentence in checked.notes:
         note(sentence)
     known = {name: getattr(checked, name) for name in ATTRIBUTES}

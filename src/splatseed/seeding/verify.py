@@ -1,10 +1,11 @@
 """verify: interpolated points held against the photographs, moved onto the surface or dropped.
 
-Notation: M new points, each with a spacing h and a normal from the originals around it (``surroundings``), and up to
-two views that judge it (``judges``), each with its sources. In each, the point slides along its normal to where the
-photographs agree (``sliding``), at a cost of one minus correlation; the better judge counts. Promise: the order of
-points stays; the same input gives the same bytes, whatever the number of threads; what no photograph can judge is kept
-and said to be unknown.
+Notation: M new points, each with a spacing h and a normal from the originals around it
+(``surroundings``), and up to two views that judge it (``judges``), each with its sources. In each,
+the point slides along its normal to where the photographs agree (``sliding``), at a cost of one
+minus correlation; the better judge counts. Promise: the order of points stays; the same input gives
+the same bytes, whatever the number of threads; what no photograph can judge is kept and said to be
+unknown.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ from splatseed.stereo.matching import make_pictures
 from splatseed.stereo.quads import grey_image
 from splatseed.upsample.method import NewPoints
 from splatseed.views.pairs import choose_sources
-from splatseed.views.sightings import Sightings
 from splatseed.views.view import View
+from splatseed.views.visibility import Visibility
 
 __all__ = ["BARE_CONFIDENCE", "MAX_COST", "verify"]
 
@@ -38,9 +39,11 @@ TEXTURE = 4.0
 BARE_CONFIDENCE = 0.1
 """Of points on flat places without texture, which are kept where they are."""
 STEEPEST = 0.3
-"""Cosine between ray and normal: what is steeper is taken for so steep, as its normal cannot be right."""
-FARTHEST = 0.3
-"""Largest move of a plane along its normal, in spacings, as a share of its distance from the camera."""
+"""Cosine between ray and normal: what is steeper is taken for so steep, as its normal cannot be
+right."""
+LARGEST_MOVE = 0.3
+"""Largest move of a plane along its normal, in spacings, as a share of its distance from the
+camera."""
 MOVED = 0.25
 """Spacings from which on a point counts as moved, in what is told."""
 
@@ -65,35 +68,37 @@ class _Trials:
 def verify(
     views: Sequence[View],
     images: Sequence[Image],
-    sightings: Sightings,
+    visibility: Visibility,
     new: NewPoints,
     progress: Progress = silent,
 ) -> NewPoints:
     """Hold interpolated points against the photographs.
 
-    A point stays, moved by up to 1.5 spacings along its normal, if the photographs agree there; its confidence
-    is their correlation. It stays where it is, with ``BARE_CONFIDENCE``, on a flat place without texture, and
-    with unknown confidence (NaN) where fewer than two photographs see it. All others are dropped.
+    A point stays, moved by up to 1.5 spacings along its normal, if the photographs agree there; its
+    confidence is their correlation. It stays where it is, with ``BARE_CONFIDENCE``, on a flat place
+    without texture, and with unknown confidence (NaN) where fewer than two photographs see it. All
+    others are dropped.
 
     Args:
         views: The photographs, at the size to compare.
         images: The images they are of, in the same order.
-        sightings: The originals that the points were made from, and who sees them.
+        visibility: The originals that the points were made from, and who sees them.
         new: The points, finite.
         progress: Told how far it is.
 
     Returns:
-        Those that stay, in their order, with confidence and normals (towards the judge; NaN where the
-        originals lie on a line); what else was known of them, and notes on how many were dropped and why.
+        Those that stay, in their order, with confidence and normals (towards the judge; NaN where
+        the originals lie on a line); what else was known of them, and notes on how many were
+        dropped and why.
     """
-    if len(sightings.xyz) < 2 or not len(new.xyz) or not views:
+    if len(visibility.xyz) < 2 or not len(new.xyz) or not views:
         return _unchecked(new)
-    seen = [sightings.rows_of(image) for image in images]
+    seen = [visibility.rows_of(image) for image in images]
     poses = np.stack([view.cam_from_world for view in views])
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
-    sources = choose_sources(seen, sightings.xyz, centers, NUM_SOURCES)
-    around = survey(sightings.xyz, new.xyz, progress)
-    judges = choose_judges(new.xyz, around, views, seen, len(sightings.xyz), sources)
+    sources = choose_sources(seen, visibility.xyz, centers, NUM_SOURCES)
+    around = survey(visibility.xyz, new.xyz, progress)
+    judges = choose_judges(new.xyz, around, views, seen, len(visibility.xyz), sources)
     trials = _try_all(new.xyz, around, views, judges, sources, progress)
     return _decide(new, around, trials, centers[judges])
 
@@ -179,7 +184,7 @@ def _planes(
     # n K^-1 (u, v, 1) w^-1 = n X, so w is linear in u and v with the slopes of n K^-1 / (n X)
     slopes = (n @ np.linalg.inv(view.K))[:, :2] / distance[:, None]
     planes = np.column_stack([1.0 / cam[:, 2], slopes])
-    reach = np.maximum(spacing / distance, -FARTHEST)
+    reach = np.maximum(spacing / distance, -LARGEST_MOVE)
     return uv.astype(np.float32), planes.astype(np.float32), reach.astype(np.float32)
 
 
@@ -241,7 +246,7 @@ def _notes(
     bare: Bool[np.ndarray, " M"],
     unknown: Bool[np.ndarray, " M"],
 ) -> tuple[str, ...]:
-    """How many points had which fate, a sentence each."""
+    """How many points had which fate, one sentence each."""
     dropped = ~(agrees | bare | unknown)
     fates = (
         (moved, "were moved by more than a quarter of their spacing to where they do"),

@@ -29,7 +29,8 @@ def undistort(
 ) -> Found:
     """Write a scene with its photographs free of lens distortion, and its cameras PINHOLE.
 
-    Poses, points and tracks stay; features move with the pixels. Photographs change their size a little.
+    Poses, points and tracks stay; features move with the pixels. Photographs change their size a
+    little.
 
     Args:
         scene: With photographs, all of them there.

@@ -1,9 +1,9 @@
 """What colour the photographs show a seed in, and how it changes with the direction.
 
-Notation: a Gaussian looks, along the unit direction d from a camera to it, like
-c(d) = 1/2 + sum_k y_k(d) h_k with the real spherical harmonics y up to degree 1, in 3DGS's order and
-signs: y = (C0, -C1 d_y, C1 d_z, -C1 d_x). Promise: the same bytes whatever the number of threads;
-a seed that no view shows keeps its colour.
+Notation: a Gaussian looks, along the unit direction d from a camera to it, like c(d) = 1/2 + sum_k
+y_k(d) h_k with the real spherical harmonics y up to degree 1, in 3DGS's order and signs: y = (C0,
+-C1 d_y, C1 d_z, -C1 d_x). Promise: the same bytes whatever the number of threads; a seed that no
+view shows keeps its colour.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ class _Shown(NamedTuple):
 def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarray, "N 4 3"]:
     """Coefficients h of each seed: least squares over the views that show it, held to its own colour.
 
-    With the colours p_v that V views show from directions d_v, and the seed's own colour p, it solves
-    min over h of sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1 h_1..3|^2,
-    a ridge regression of four unknowns a colour channel.
+    With the colours p_v that V views show from directions d_v, and the seed's own colour p, it
+    solves min over h of sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1
+    h_1..3|^2, a ridge regression of four unknowns per colour channel.
 
     Args:
         seeds: N points and their colours.

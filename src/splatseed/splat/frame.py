@@ -1,8 +1,8 @@
 """The frame that training works in: the cameras' centroid at 0, the farthest camera at distance 1.
 
-Notation: ``x_train = scale (x_world - origin)``; a *stray* camera is one so far from all others that
-its pose must be wrong. Promise: the frame depends on the training cameras alone, so that runs from
-different seeds are compared in one frame; strays have no say in it; there is no rotation, so
+Notation: ``x_train = scale (x_world - origin)``; a *stray* camera is one so far from all others
+that its pose must be wrong. Promise: the frame depends on the training cameras alone, so that runs
+from different seeds are compared in one frame; strays have no say in it; there is no rotation, so
 quaternions and spherical harmonics stay as they are; single precision suffices for far-off origins.
 """
 
@@ -27,7 +27,8 @@ cameras' extent, and as in 3DGS a tenth more."""
 STRAY_SHARE = 0.1
 """At most this share of the cameras, but always one, may be taken for strays."""
 STRAY_DISTANCE = 10.0
-"""How many times farther from the cameras' median a stray is than the farthest that cannot be one."""
+"""How many times farther from the cameras' median a stray is than the farthest that cannot be
+one."""
 MIN_CAMERAS = 5
 """Among fewer, nobody can say which are the usual ones."""
 

@@ -1,7 +1,7 @@
 """Renders of views beside the truth, with an error map.
 
-Notation: the error of a pixel is the mean over the channels of |render - truth|, 0 to 1. Promise: one
-colour scale for all pictures, so that they can be compared with one another.
+Notation: the error of a pixel is the mean over the channels of |render - truth|, 0 to 1. Promise:
+one colour scale for all pictures, so that they can be compared with one another.
 """
 
 from __future__ import annotations

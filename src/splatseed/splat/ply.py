@@ -1,9 +1,9 @@
 """Gaussians in a .ply of the layout that 3DGS introduced and every viewer opens.
 
-Notation: one vertex a Gaussian, float32 x, y, z, nx, ny, nz (zero), f_dc_0..2, f_rest_* (all of red,
-then green, then blue), opacity (logit), scale_0..2 (logarithms), rot_0..3 (wxyz). Promise: what was
-written is read back bit for bit; properties are found by name, so their order and further ones do
-not matter; a file appears whole or not at all.
+Notation: one vertex per Gaussian, float32 x, y, z, nx, ny, nz (zero), f_dc_0..2, f_rest_* (all of
+red, then green, then blue), opacity (logit), scale_0..2 (logarithms), rot_0..3 (wxyz). Promise:
+what was written is read back bit for bit; properties are found by name, so their order and further
+ones do not matter; a file appears whole or not at all.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """What Gaussians look like from a view, and the photograph that they are held to.
 
-Notation: gsplat's parameter dict as tensors: ``means``, ``scales`` (logarithms), ``quats``, ``opacities``
-(logits), ``sh0``, ``shN``. Promise: one rasteriser call serves training and scoring on CPU and CUDA alike.
+Notation: gsplat's parameter dict as tensors: ``means``, ``scales`` (logarithms), ``quats``,
+``opacities`` (logits), ``sh0``, ``shN``. Promise: one rasteriser call serves training and scoring
+on CPU and CUDA alike.
 """
 
 from __future__ import annotations

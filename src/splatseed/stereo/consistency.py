@@ -1,7 +1,8 @@
 """Which depths other views confirm.
 
-Notation: view i has planes [3, h, w] on its grid; point X at one of its grid points falls on the grid of view j at
-(column, row), where j's own plane at the nearest grid point says inverse depth w_j. Both *agree* if
+Notation: view i has planes [3, h, w] on its grid; point X at one of its grid points falls on the
+grid of view j at (column, row), where j's own plane at the nearest grid point says inverse depth
+w_j. Both *agree* if
 |z_ij w_j - 1| <= tolerance, z_ij the depth of X in j. Promise: only maps and cameras are read; every pair is asked
 in one direction only, so the order of views does not show.
 """
@@ -26,7 +27,8 @@ def confirm(
         costs: float32 [h, w].
         max_cost: What costs more neither asks nor answers.
         grid: Pixels between grid points.
-        j_from_i: Pixels of the view times depth, and 1, to those of the other times its depth; [3, 4].
+        j_from_i: Pixels of the view times depth, and 1, to those of the other times its depth; [3,
+            4].
         other_planes: Of the other view, float32 [3, p, q].
         other_costs: float32 [p, q].
         tolerance: Relative difference of depth.

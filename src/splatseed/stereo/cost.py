@@ -1,18 +1,19 @@
 """Photometric cost of planes: how unlike two photographs are around a pixel, if it lies on a plane.
 
-Notation: sixteen pixels at a time, a lane each. A plane is its inverse depth in pixels of the reference view,
-w(u, v) = w0 + gx (u - u0) + gy (v - v0), which is exact for planes in space. The point at pixel (u, v) falls in
-a source view at P / P_z with
+Notation: sixteen pixels at a time, a lane each. A plane is its inverse depth in pixels of the
+reference view, w(u, v) = w0 + gx (u - u0) + gy (v - v0), which is exact for planes in space. The
+point at pixel (u, v) falls in a source view at P / P_z with
 
     P = A (u, v, 1) + b w(u, v),    A = K_s R K_r^-1,    b = K_s t,
 
-R, t from reference to source. A window is 5 x 5 samples, ``STRIDE`` pixels apart. With weights c_i (sum 1) by colour
-and distance to the window's centre, reference samples r_i and source samples s_i, the cost in one source is
+R, t from reference to source. A window is 5 x 5 samples, ``STRIDE`` pixels apart. With weights c_i
+(sum 1) by colour and distance to the window's centre, reference samples r_i and source samples s_i,
+the cost in one source is
 
     1 - sum a_i s_i / sqrt(var_s + NOISE),    a_i = c_i (r_i - mean_r) / sqrt(var_r + NOISE),
 
-one minus the weighted normalised cross-correlation, drawn to 1 where there is no texture (NOISE). Promise: literal
-float32 arithmetic in a fixed order, so that results do not depend on threads.
+one minus the weighted normalised cross-correlation, drawn to 1 where there is no texture (NOISE).
+Promise: literal float32 arithmetic in a fixed order, so that results do not depend on threads.
 Source: bilaterally weighted NCC as in Schoenberger et al., Pixelwise View Selection (2016).
 """
 

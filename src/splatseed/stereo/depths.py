@@ -1,7 +1,8 @@
 """Depth maps from photographs alone: every view compared with a few others, then with their maps.
 
-Notation: V views of a scene. Promise: the same scene, settings and seed give the same bytes, whatever the number of
-threads; a depth stands only where other views' maps, found without it, agree.
+Notation: V views of a scene. Promise: the same scene, settings and seed give the same bytes,
+whatever the number of threads; a depth stands only where other views' maps, found without it,
+agree.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import Hints, hints_from
 from splatseed.stereo.without_points import TOO_FEW, glimpse
 from splatseed.views.pairs import choose_sources
-from splatseed.views.sightings import Sightings
 from splatseed.views.view import View
+from splatseed.views.visibility import Visibility
 
 __all__ = ["find_stereo"]
 
@@ -29,7 +30,7 @@ __all__ = ["find_stereo"]
 def find_stereo(
     views: Sequence[View],
     images: Sequence[Image],
-    sightings: Sightings,
+    visibility: Visibility,
     settings: StereoSettings,
     seed: int = 0,
     progress: Progress = silent,
@@ -40,22 +41,22 @@ def find_stereo(
     Args:
         views: The photographs at the size to compare.
         images: The images they are of, in the same order.
-        sightings: The points that each image sees, which depth is looked for around. Where there are too few,
-            small copies of the photographs are compared first, to have some.
+        visibility: The points that each image sees, which depth is looked for around. Where there
+            are too few, small copies of the photographs are compared first, to have some.
         settings: How.
         seed: The same seed gives the same bytes.
         progress: Told how far it is.
-        only: The views whose maps are wanted: these have the same bytes as if all were, and of the others no more
-            is found than what confirms them. All when left out.
+        only: The views whose maps are wanted: these have the same bytes as if all were, and of the
+            others no more is found than what confirms them. All when left out.
     """
-    if len(sightings.xyz) < TOO_FEW:
-        sightings = glimpse(views, seed, progress)
-    seen = [sightings.rows_of(image) for image in images]
+    if len(visibility.xyz) < TOO_FEW:
+        visibility = glimpse(views, seed, progress)
+    seen = [visibility.rows_of(image) for image in images]
     centers = np.stack([image.camera.center for image in images])
-    sources = choose_sources(seen, sightings.xyz, centers, settings.num_witnesses)
+    sources = choose_sources(seen, visibility.xyz, centers, settings.num_witnesses)
     needed = range(len(views)) if only is None else {*only, *sources[list(only)].ravel().tolist()}
     hints = [
-        _hints(view, sightings.xyz[rows]) if i in needed else None
+        _hints(view, visibility.xyz[rows]) if i in needed else None
         for i, (view, rows) in enumerate(zip(views, seen, strict=True))
     ]
     return match_views(views, hints, sources, settings, seed, progress)

@@ -1,9 +1,10 @@
 """One seed for each piece of surface, from the depth maps of all views.
 
-Notation: every view's picture is divided into cells of c x c pixels. A kept pixel of view i becomes a seed unless,
-in i or in a view that confirms it, the cell that it falls in already has a seed at that depth. Promise: seeds come in
-the order of the views and, within one, of falling confidence, whatever the number of threads; no two of them share a
-cell, at one depth, in a view that confirms either.
+Notation: every view's picture is divided into cells of c x c pixels. A kept pixel of view i becomes
+a seed unless, in i or in a view that confirms it, the cell that it falls in already has a seed at
+that depth. Promise: seeds come in the order of the views and, within one, of falling confidence,
+whatever the number of threads; no two of them share a cell, at one depth, in a view that confirms
+either.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"

@@ -1,7 +1,8 @@
 """StereoMap: what photographs say of the depth and the normal at the pixels of one of them.
 
-Notation: a map is H x W pixels; ``camera`` is the photograph's with its pixels those of the map, the centre of
-the first at (0.5, 0.5). Promise: what is not confirmed by other views is NaN, and its confidence 0.
+Notation: a map is H x W pixels; ``camera`` is the photograph's with its pixels those of the map,
+the centre of the first at (0.5, 0.5). Promise: what is not confirmed by other views is NaN, and its
+confidence 0.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ class StereoMap:
         name: Of the image.
         camera: Pinhole, in pixels of the map.
         depth: Planar z, scene units, float32 [H, W]; NaN where unknown.
-        normal: Unit vectors in camera axes, towards the camera, float32 [H, W, 3]; NaN where unknown.
+        normal: Unit vectors in camera axes, towards the camera, float32 [H, W, 3]; NaN where
+            unknown.
         confidence: From 0, unknown, to 1, float32 [H, W].
         sources: The names of the views it was compared with, best first; 8 at most.
         agreeing: Bit k is set where source k confirms the depth, uint8 [H, W].

@@ -1,7 +1,7 @@
 """Planes of every view by comparing it with others, and which of these others' planes agree.
 
-Notation: as in ``result``. Promise: a view's planes depend on the photographs, what is known beforehand and the seed
-alone: threads take whole views.
+Notation: as in ``result``. Promise: a view's planes depend on the photographs, what is known
+beforehand and the seed alone: threads take whole views.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def match_views(
     """
     check_stereo_memory(views, settings)
     greys = [grey_image(view.image) for view in views]
-    found: list[Found] = [None] * len(views)  # type: ignore[list-item]
+    found: list[Found] = [None] * len(views)  # type: ignore[list-item]  # filled in below
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):

@@ -37,8 +37,8 @@ def stereo_depths(
         SceneFormatError: A photograph cannot be used.
     """
     from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
-    from splatseed.stereo.without_points import known_sightings  # noqa: PLC0415
-    from splatseed.views.view import data_factor, load_views  # noqa: PLC0415
+    from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415  (loads with its use)
+    from splatseed.views.view import data_factor, load_views  # noqa: PLC0415  (loads with its use)
 
     settings = replace(settings or StereoSettings(), **choices)
     if len(scene.images) < 2:
@@ -54,5 +54,5 @@ def stereo_depths(
         undistort=True,
         progress=progress,
     )
-    stereo = find_stereo(views, scene.images, known_sightings(scene), settings, seed, progress)
+    stereo = find_stereo(views, scene.images, known_visibility(scene), settings, seed, progress)
     return tuple(stereo.map(i) for i in range(len(stereo.views)))

@@ -1,12 +1,13 @@
 """PatchMatch: planes handed from pixel to pixel and changed at random, where that lowers their cost.
 
-Notation: planes (w, gx, gy) float32 [3, h, w], inverse depth at a grid point's place and its slopes a pixel; costs
-float32 [h, w]. Grid point (i, j) lies at pixel ((j + 0.5) g, (i + 0.5) g). Points are red and black as on a
-chequerboard; a half sweep visits those of one colour, sixteen of a row at a time, and reads only the other colour.
-Promise: the planes depend on the pictures, the start and ``key`` alone: random numbers are hashed from the key and
-the point, so no order of work shows.
-Source: PatchMatch stereo (Bleyer et al. 2011), in the chequerboard order of Gipuma (Galliani et al. 2015), with the
-best of each arm as in ACMH (Xu and Tao 2019).
+Notation: planes (w, gx, gy) float32 [3, h, w], inverse depth at a grid point's place and its slopes
+per pixel; costs float32 [h, w]. Grid point (i, j) lies at pixel ((j + 0.5) g, (i + 0.5) g). Points
+are red and black as on a chequerboard; a half sweep visits those of one colour, sixteen of a row at
+a time, and reads only the other colour.
+Promise: the planes depend on the pictures, the start and ``key`` alone: random numbers are hashed
+from the key and the point, so no order of work shows.
+Source: PatchMatch stereo (Bleyer et al. 2011), in the chequerboard order of Gipuma (Galliani et al.
+2015), with the best of each arm as in ACMH (Xu and Tao 2019).
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"

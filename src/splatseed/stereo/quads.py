@@ -1,9 +1,9 @@
 """A grey image as words of four pixels, read between pixels sixteen places at a time.
 
-Notation: word (y, x) of a *quad image* holds the 8-bit pixels (y, x), (y, x+1), (y+1, x), (y+1, x+1) from
-its lowest byte on, so that one load of a lane brings all that bilinear interpolation needs. Column and row
-count from the centre of the first pixel. Promise: the value is the bilinear one, exact to float32 rounding;
-places outside the image take its border.
+Notation: word (y, x) of a *quad image* holds the 8-bit pixels (y, x), (y, x+1), (y+1, x), (y+1,
+x+1) from its lowest byte on, so that one load of a lane brings all that bilinear interpolation
+needs. Column and row count from the centre of the first pixel. Promise: the value is the bilinear
+one, exact to float32 rounding; places outside the image take its border.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
@@ -63,10 +63,11 @@ def _pack(grey, out):
 
 
 @intrinsic
-def sample(typing_context, quads, width, height, column, row):  # noqa: ARG001  (Numba's signature)
+def sample(typing_context, quads, width, height, column, row):
     """The image between its pixels: lane i at (column i, row i); NaN reads the first pixel.
 
-    ``quads`` is the flattened quad image, int32 [height * width]; ``width`` and ``height`` are int64.
+    ``quads`` is the flattened quad image, int32 [height * width]; ``width`` and ``height`` are
+    int64.
     """
 
     def generate(context, builder, signature, arguments):
@@ -85,10 +86,10 @@ def sample(typing_context, quads, width, height, column, row):  # noqa: ARG001  
 
 
 @intrinsic
-def square_root(typing_context, v):  # noqa: ARG001
+def square_root(typing_context, v):
     """The square root in each lane."""
 
-    def generate(context, builder, signature, arguments):  # noqa: ARG001
+    def generate(context, builder, signature, arguments):
         kind = ir.FunctionType(VECTOR, [VECTOR])
         function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{LANES}f32")
         return builder.call(function, arguments)

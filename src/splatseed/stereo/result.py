@@ -1,7 +1,7 @@
 """Stereo: what was found of all views, from which maps and seeds are made.
 
-Notation: V views of W x H pixels; maps have a pixel for every block of g x g pixels. Promise: a depth stands only
-where other views' maps, found without it, agree.
+Notation: V views of W x H pixels; maps have a pixel for every block of g x g pixels. Promise: a
+depth stands only where other views' maps, found without it, agree.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ class Stereo:
 
     Args:
         views: The photographs at the size that was compared.
-        planes: Of each view, float32 [3, h, w]: inverse depth and its slopes a pixel of the view.
+        planes: Of each view, float32 [3, h, w]: inverse depth and its slopes per pixel of the view.
         costs: Of each view, float32 [h, w].
-        agreeing: Of each view, which of its witnesses confirm a pixel, a bit each, uint8 [h, w].
+        agreeing: Of each view, which of its witnesses confirm a pixel, one bit per witness, uint8
+            [h, w].
         sources: The views that each was compared with, best first, int64 [V, K]; -1 = none.
         settings: How.
     """
@@ -66,8 +67,8 @@ class Stereo:
     def normals(self, i: int) -> Float32[np.ndarray, "h w 3"]:
         """Unit normals towards the camera, in its axes.
 
-        1 / z = m (u, v, 1) = (K' m) ray for the plane's m = (gx, gy, w0 - gx u0 - gy v0); the normal is
-        along -K' m, as 1 / z > 0 along every ray.
+        1 / z = m (u, v, 1) = (K' m) ray for the plane's m = (gx, gy, w0 - gx u0 - gy v0); the
+        normal is along -K' m, as 1 / z > 0 along every ray.
         """
         w, gx, gy = self.planes[i].astype(np.float64)
         place = (np.indices(w.shape)[::-1] + 0.5) * self.settings.grid

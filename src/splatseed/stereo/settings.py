@@ -19,7 +19,7 @@ class StereoSettings:
     max_size: int = 800
     """Photographs are made smaller by a whole factor until their longer side has so many pixels."""
     grid: int = 4
-    """Every so many-th pixel along a row and a column gets a depth."""
+    """Pixels between depths, along a row and a column."""
     sweeps: int = 4
     """Times that planes are handed on and refined."""
     num_sources: int = 5

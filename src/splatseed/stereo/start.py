@@ -1,8 +1,8 @@
 """Planes to begin with: through the points that Structure-from-Motion has near a pixel.
 
-Notation: a view sees M points at pixels uv [M, 2] with inverse depth w [M]; the grid has h x w points. Promise: K
-guesses a grid point, finite and positive; where a view sees too few points, inverse depths drawn evenly between the
-bounds.
+Notation: a view sees M points at pixels uv [M, 2] with inverse depth w [M]; the grid has h x w
+points. Promise: K guesses a grid point, finite and positive; where a view sees too few points,
+inverse depths drawn evenly between the bounds.
 """
 
 from __future__ import annotations

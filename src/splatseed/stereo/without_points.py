@@ -1,10 +1,11 @@
 """Points for a scene that has none: from its depth maps, or from a glimpse at small photographs.
 
-Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, twice. First some views are compared with
-neighbours chosen by pose, and any depth is tried at which the picture moves by less than its width; half of the good
-pixels are nearer than the *middle* depth that this gives. Then all views are compared with those that see such depths
-from well beside, and what others confirm are points. Promise: as for all of stereo, the same bytes for a seed; points
-that no photographs confirm are not made up.
+Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, twice. First some views are
+compared with neighbours chosen by pose, and any depth is tried at which the picture moves by less
+than its width; half of the good pixels are nearer than the *middle* depth that this gives. Then all
+views are compared with those that see such depths from well beside, and what others confirm are
+points. Promise: as for all of stereo, the same bytes for a seed; points that no photographs confirm
+are not made up.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from splatseed.stereo.matching import match_views
 from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import Hints
 from splatseed.views.pairs import choose_by_pose, choose_sources
-from splatseed.views.sightings import Sightings, find_sightings
 from splatseed.views.view import View
+from splatseed.views.visibility import Visibility, find_visibility
 
-__all__ = ["TOO_FEW", "glimpse", "known_sightings"]
+__all__ = ["TOO_FEW", "glimpse", "known_visibility"]
 
 TOO_FEW = 30
 """With fewer points a scene counts as having none."""
@@ -48,17 +49,17 @@ SAMPLES = 18
 """Rows and columns at which a depth map is asked."""
 
 
-def known_sightings(scene: Scene) -> Sightings:
+def known_visibility(scene: Scene) -> Visibility:
     """The points that each image sees: SfM's; where there are none, places of the scene's depth maps."""
-    sightings, maps = find_sightings(scene), scene.depths
-    if len(sightings.xyz) >= TOO_FEW or maps is None:
-        return sightings
+    visibility, maps = find_visibility(scene), scene.depths
+    if len(visibility.xyz) >= TOO_FEW or maps is None:
+        return visibility
     known = [image for image in scene.images if image.name in maps]
     places = [_places(image, maps.read(image.name)) for image in known]
-    return _unseen(np.concatenate(places)) if places else sightings
+    return _unseen(np.concatenate(places)) if places else visibility
 
 
-def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Sightings:
+def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
     """Points that small copies of photographs confirm.
 
     Args:
@@ -94,10 +95,10 @@ def _places(image: Image, depth: DepthMap) -> Float64[np.ndarray, "N 3"]:
     return camera.unproject(uv, z)
 
 
-def _unseen(xyz: Float64[np.ndarray, "N 3"]) -> Sightings:
+def _unseen(xyz: Float64[np.ndarray, "N 3"]) -> Visibility:
     """Points of which it is not known who sees them, not too many."""
     every = max(1, -(-len(xyz) // MOST_POINTS))
-    return Sightings(xyz[::every], np.empty(0, np.int64), {}, {})
+    return Visibility(xyz[::every], np.empty(0, np.int64), {}, {})
 
 
 def _camera(view: View) -> Camera:

@@ -54,7 +54,7 @@ def render_views(
 def render_view(
     room: Room, camera: Camera, supersample: int = 2
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"]]:
-    """One photograph and its depth; ``supersample`` squared rays a pixel for the colour."""
+    """One photograph and its depth; ``supersample`` squared rays per pixel for the colour."""
     shape = (camera.height, camera.width)
     t = _in_bundles(lambda rays: room.surfaces.intersect(camera.center, rays), pixel_rays(camera))
     depth = np.where(np.isfinite(t), t, 0.0).astype(np.float32).reshape(shape)

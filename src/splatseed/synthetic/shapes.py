@@ -1,8 +1,8 @@
 """Simple known shapes, on which a method's errors have a name.
 
 Notation: each shape is a ``Surface`` of about unit size, centred near the origin and tilted off the
-world's axes where it is flat, since a method that works in world axes shows it there. Promise: fixed,
-nothing random.
+world's axes where it is flat, since a method that works in world axes shows it there. Promise:
+fixed, nothing random.
 """
 
 from __future__ import annotations

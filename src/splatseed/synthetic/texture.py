@@ -89,7 +89,8 @@ class Tiles:
     def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Colours in 0..1 of points, [N, 3]."""
         size = np.array(self.cell)
-        # Off the origin by a fraction of a cell, lest a wall at a round coordinate is a joint.
+        # Off the origin by a fraction of a cell, so that no wall at a round coordinate lies on a
+        # joint.
         position = xyz / size + 0.37
         colors = _read_palette(self.palette, _lattice_values(np.floor(position), self.seed))
         from_joint = np.abs(position - np.round(position)) * size

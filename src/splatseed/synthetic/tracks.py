@@ -24,7 +24,8 @@ from splatseed.synthetic.surfaces import Surface
 __all__ = ["TrackNoise", "TrackedPoints", "corner_strength", "find_corners", "track_points"]
 
 MIN_STRENGTH = 6e-5
-"""Least corner strength of a feature, for grey values 0..1: above a bare wall's, below texture's."""
+"""Least corner strength of a feature, for grey values 0..1: above a bare wall's, below
+texture's."""
 
 MERGE_PIXELS = 2.4
 """Corners of different views that unproject to within this many pixels are one point."""

@@ -1,7 +1,7 @@
 """SineSheet: a corrugated sheet, the smooth curved surface without a closed-form distance.
 
-Notation: in the sheet's frame (rows of ``frame``, origin at ``corner``) a point is (u, v, w) and the
-sheet is w = height(u) = A sin(2 pi u / wavelength) for 0 <= u <= size[0], 0 <= v <= size[1].
+Notation: in the sheet's frame (rows of ``frame``, origin at ``corner``) a point is (u, v, w) and
+the sheet is w = height(u) = A sin(2 pi u / wavelength) for 0 <= u <= size[0], 0 <= v <= size[1].
 Promise: distances and depths are refined by bisection to 1e-10 of the sheet's size.
 A ray that only grazes a crest, entering and leaving within a 48th of a wave, may be taken to miss
 it.

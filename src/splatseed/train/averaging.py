@@ -1,8 +1,8 @@
 """The mean of the Gaussians over the end of a run, which is what the run ends with.
 
-Steps on one photograph each leave the parameters shaking about their best values, since only the rate of positions
-falls; their mean does not shake (Polyak and Juditsky, 1992). Promise: the mean begins anew where the number of
-Gaussians changes, so that each value in it is of one Gaussian.
+Steps on one photograph each leave the parameters shaking about their best values, since only the
+rate of positions falls; their mean does not shake (Polyak and Juditsky, 1992). Promise: the mean
+begins anew where the number of Gaussians changes, so that each value in it is of one Gaussian.
 """
 
 from __future__ import annotations

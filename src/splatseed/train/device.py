@@ -1,8 +1,8 @@
 """Where to train, and how many Gaussians fit the memory there.
 
-Promise: a GPU that is asked for is used or an error, never replaced in silence; a cloud
-that cannot be trained is refused before the first step, with the number that can, and one that grows
-is held at what fits.
+Promise: a GPU that is asked for is used or an error, never replaced in silence; a cloud that cannot
+be trained is refused before the first step, with the number that can, and one that grows is held at
+what fits.
 """
 
 from __future__ import annotations

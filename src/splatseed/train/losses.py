@@ -1,8 +1,8 @@
 """The loss of 3DGS, (1 - s) L1 + s (1 - SSIM) with s = 0.2.
 
-Notation: images are [H, W, 3], values about 0..1. Promise: on the CPU the loss and its gradient come
-from one Numba pass and do not depend on the number of threads; on CUDA from PyTorch's convolutions,
-which compute the same (that code runs on the CPU too, and the tests compare them).
+Notation: images are [H, W, 3], values about 0..1. Promise: on the CPU the loss and its gradient
+come from one Numba pass and do not depend on the number of threads; on CUDA from PyTorch's
+convolutions, which compute the same (that code runs on the CPU too, and the tests compare them).
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """How near the photographs come to each point: the yardstick of its Gaussian's size and rate.
 
 Notation: N points and the training views, both in the training frame; a *near depth* is the least
-depth at which a view sees a point. A length divided by it is an angle, so a rate or a size stated in
-near depths is the same in the pictures wherever a Gaussian stands: in front of cameras that stand
-close together, on a table between them, or far behind both. 3DGS takes the cameras' extent for all.
+depth at which a view sees a point. A length divided by it is an angle, so a rate or a size stated
+in near depths is the same in the pictures wherever a Gaussian stands: in front of cameras that
+stand close together, on a table between them, or far behind both. 3DGS takes the cameras' extent
+for all.
 Promise: every near depth is positive and finite; the same bytes whatever the number of threads.
 """
 

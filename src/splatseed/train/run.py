@@ -84,7 +84,7 @@ def prepare_run(
         output: The folder of the run.
         settings: How to train.
         options: What else to do.
-        note: Told what the user should know, a sentence each.
+        note: Told what the user should know, one sentence each.
         progress: Told how far reading is.
 
     Raises:

@@ -1,10 +1,11 @@
 """The numbers that a run is made of and when things happen: splatseed's own, and 3DGS's.
 
-Notation: a *full* run has 30,000 steps, and all numbers of 3DGS are stated for it; T are the steps of
-the run at hand. Lengths, and so the rates of positions, are in *yardsticks*: a Gaussian's near depth
-(``near_depths``) in splatseed's conventions, the cameras' extent in 3DGS's. Promise: a full run of
-splatseed's differs from 3DGS's by the yardstick, the bound on first sizes and MCMC's start; these and
-each departure in short runs were chosen on held-out training views: see benchmarks/README.md.
+Notation: a *full* run has 30,000 steps, and all numbers of 3DGS are stated for it; T are the steps
+of the run at hand. Lengths, and so the rates of positions, are in *yardsticks*: a Gaussian's near
+depth (``near_depths``) in splatseed's conventions, the cameras' extent in 3DGS's. Promise: a full
+run of splatseed's differs from 3DGS's by the yardstick, the bound on first sizes and MCMC's start;
+these and each departure in short runs were chosen on held-out training views: see
+benchmarks/README.md.
 """
 
 from __future__ import annotations
@@ -38,19 +39,20 @@ GROWTH = 1.05
 LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType(
     {"default": 6, "grow": 1, "mcmc": 24, "none": 1}
 )
-"""A short run densifies so many times, if need be more often than every 100 steps: gradients averaged
-over few photographs are noise."""
+"""A short run densifies so many times, if need be more often than every 100 steps: gradients
+averaged over few photographs are noise."""
 MOST_SPEEDUP: Mapping[str, float] = MappingProxyType(
     {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 4.0}
 )
-"""Learning rates of a short run are multiplied by how many times shorter it is than a full one, but by
-no more than this. Positions have as far to go in a short run as in a long one; with a higher rate of
-opacities, Gaussians die that are needed later."""
+"""Learning rates of a short run are multiplied by how many times shorter it is than a full one, but
+by no more than this. Positions have as far to go in a short run as in a long one; with a higher
+rate of opacities, Gaussians die that are needed later."""
 FORGETTING = 1e-3
 """1 - beta2 of Adam, what it forgets of the squared gradients in a step, as in 3DGS."""
 MOST_FORGETTING = 1e-2
-"""A short run forgets so many times faster as it is shorter than a full one, but no faster than this:
-its gradients shrink within some hundred steps, and steps are divided by what is remembered."""
+"""A short run forgets so many times faster as it is shorter than a full one, but no faster than
+this: its gradients shrink within some hundred steps, and steps are divided by what is
+remembered."""
 GROW_EVERY = FULL_RUN // 15
 """Steps of a full run from one round of ``grow`` to the next, and to the first: each round looks at
 contributions for as many photographs as it can."""
@@ -60,8 +62,8 @@ found their places are noise."""
 MEAN_FROM = 0.8
 """Part of a run from which on the mean of the Gaussians is taken."""
 LARGEST = 0.05
-"""Largest size of a first Gaussian, in near depths. Where SfM has few points the gaps between them are
-wide, and what fills one hides all that lies behind it."""
+"""Largest size of a first Gaussian, in near depths. Where SfM has few points the gaps between them
+are wide, and what fills one hides all that lies behind it."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +90,8 @@ class Schedule:
         scale_factor: Size of the first Gaussians, as a multiple of the gaps between them.
         largest: And at most so many near depths.
         flatness: Thickness of the first Gaussians whose normals are used, as a part of their size.
-        mean_from: After so many steps the mean of the Gaussians is taken, with which the run ends; None
-            for the last step's.
+        mean_from: After so many steps the mean of the Gaussians is taken, with which the run ends;
+            None for the last step's.
     """
 
     max_steps: int

@@ -1,7 +1,7 @@
 """The points that a run starts from.
 
-Promise: points that are left out are reported; which ones are kept depends on points and cameras alone; of
-what is known of them they have what the run uses, and nothing else.
+Promise: points that are left out are reported; which ones are kept depends on points and cameras
+alone; of what is known of them they have what the run uses, and nothing else.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from splatseed.views.view import View
 __all__ = ["SEEDS_SHARE", "seeded", "seeds_digest", "usable_seeds"]
 
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
-"""Seeds at most, as a part of the cap, of strategies that add to what is there; of the others all of it."""
+"""Seeds at most, as a part of the cap, of strategies that add to what is there; of the others all
+of it."""
 
 
 def seeded(
@@ -45,7 +46,7 @@ def seeded(
     if as_it_is or _was_seeded(scene):
         return scene
     from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
-    from splatseed.upsample import configure  # noqa: PLC0415
+    from splatseed.upsample import configure  # noqa: PLC0415  (loads with its use)
 
     start = time.perf_counter()
     part = SEEDS_SHARE.get(settings.densification, 1.0)
@@ -58,8 +59,10 @@ def seeded(
     )
     new = len(cloud) - cloud.num_original
     note(
-        f"Seeds by method auto: {cloud.num_original:,} points of the scene and {new:,} new ones, in "
-        f"{time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as they are."
+        f"Seeds by method auto: {cloud.num_original:,} points of the scene and {new:,} new ones, "
+        "in "
+        f"{time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as "
+        "they are."
     )
     return scene.replace(points=cloud)
 
@@ -84,8 +87,8 @@ def usable_seeds(
         points: Those of the scene.
         settings: Whose cap counts, and which say if sizes and normals are used.
         note: Told what was left out, and what is asked for and not known.
-        views: The training views, of which only cameras and sizes are looked at; crowds are judged in space
-            when left out.
+        views: The training views, of which only cameras and sizes are looked at; crowds are judged
+            in space when left out.
     """
     finite = points.select(points.finite)
     if len(finite) < len(points):
@@ -108,7 +111,8 @@ def _within_cap(
     first = points.num_original
     seeds = points.select(thin(points.xyz, views, cap, first=first, priority=points.confidence))
     note(
-        f"{len(points):,} seeds were thinned to --cap-max {cap:,}, {seeds.num_original:,} of them originals."
+        f"{len(points):,} seeds were thinned to --cap-max {cap:,}, {seeds.num_original:,} of them "
+        "originals."
         + (" They leave densification no room." if settings.densification == "default" else "")
     )
     return seeds

@@ -30,16 +30,17 @@ LONG_RUN = 4000
 """Steps from which on strategy ``auto`` is ``mcmc``: its noise pays off late (see benchmarks)."""
 
 BYTES_EACH = 2000
-"""Memory of a Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes), and as
-much again for the rasteriser's lists and for copies while Gaussians are added."""
+"""Memory of a Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
+and as much again for the rasteriser's lists and for copies while Gaussians are added."""
 
 
 @dataclass(frozen=True)
 class TrainSettings:
     """How to train.
 
-    The one place of a setting beside the code that heeds it: the options of ``train`` and ``bench``,
-    plans, ledgers and ``config.json`` take these fields, their defaults and docstrings as they are.
+    The one place of a setting beside the code that heeds it: the options of ``train`` and
+    ``bench``, plans, ledgers and ``config.json`` take these fields, their defaults and docstrings
+    as they are.
 
     Raises:
         ParameterError: A value is out of its range.
@@ -70,7 +71,8 @@ class TrainSettings:
     test_every: int = 8
     """Keep every n-th image, sorted by name, for the test."""
     opacity_reset: bool = False
-    """Lower all opacities from time to time, as 3DGS does (strategy default; gsplat 1.5.3 does not)."""
+    """Lower all opacities from time to time, as 3DGS does (strategy default; gsplat 1.5.3 does
+    not)."""
     seed_sizes: bool = False
     """Begin with the sizes in the scene's seeds.npz, not those of the gaps between seeds."""
     seed_normals: bool = False
@@ -78,8 +80,9 @@ class TrainSettings:
     seed_colors: bool = False
     """Begin with the colours that the training photographs show each seed in, by direction."""
     seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds: its default is "auto"
-    """Begin with the scene's points as they are, or let method ``auto`` add to them what the training
-    photographs ask for. Points that splatseed has added already, and 3DGS's conventions, are left alone."""
+    """Begin with the scene's points as they are, or let method ``auto`` add to them what the
+    training photographs ask for. Points that splatseed has added already, and 3DGS's conventions,
+    are left alone."""
 
     def __post_init__(self) -> None:
         for name, kind in (("backend", Backend), ("seeding", Seeding)):

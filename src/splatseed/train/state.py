@@ -53,7 +53,7 @@ class TrainState:
 
     Args:
         params: The Gaussians.
-        optimizers: One a parameter.
+        optimizers: One per parameter.
         strategy: What changes their number.
         step: Steps done.
         records: The curve so far.

@@ -45,7 +45,8 @@ class NewPoints(NamedTuple):
     normals: Float32[np.ndarray, "M 3"] | None = None
     """Unit normals, world axes, float32 [M, 3]; NaN where unknown."""
     sizes: Float32[np.ndarray, " M"] | None = None
-    """Radius that a Gaussian there should begin with, float32 [M], scene units; NaN where unknown."""
+    """Radius that a Gaussian there should begin with, float32 [M], scene units; NaN where
+    unknown."""
     confidence: Float32[np.ndarray, " M"] | None = None
     """How sure it is that a surface is there, float32 [M], 0 to 1; NaN where unknown."""
     source: UInt8[np.ndarray, " M"] | None = None

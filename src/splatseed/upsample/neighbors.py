@@ -2,7 +2,7 @@
 
 Notation: n distinct finite originals in *rows* (kd-tree leaf order: neighbouring rows are
 neighbours in space, which keeps every later pass in cache); ``rank`` is a row's place among them
-in file order; k neighbours a row, nearest first, never the row itself; h = ``spacing`` = mean
+in file order; k neighbours per row, nearest first, never the row itself; h = ``spacing`` = mean
 distance to the 6 nearest.
 Promise: random draws are assigned by rank, not by row, so that results do not depend on how the
 kd-tree happened to cut space.

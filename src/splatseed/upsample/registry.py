@@ -1,8 +1,9 @@
 """METHODS: every upsampling method by name, imported when first looked up.
 
-Built-in methods come first: those of ``methods/``, and those that parts of the package above it add when they are imported,
-as all are with the package (``add_built_in``). Then come what installed packages register under the entry-point group
-``splatseed.methods`` (``name = "package.module:Class"``). A built-in name cannot be taken over.
+Built-in methods come first: those of ``methods/``, and those that parts of the package above it add
+when they are imported, as all are with the package (``add_built_in``). Then come what installed
+packages register under the entry-point group ``splatseed.methods`` (``name =
+"package.module:Class"``). A built-in name cannot be taken over.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Which views to compare each view with: those that see the same places from another side.
 
-Notation: V views, P points. The *worth* of a pair is the sum, over the points that both see, of a weight by the
-angle between their two rays: none where the rays nearly coincide, as depth then moves a point hardly at all in the
-pictures, full between ``FULL`` and ``WIDE`` degrees, and falling beyond, as a surface looks another then.
+Notation: V views, P points. The *worth* of a pair is the sum, over the points that both see, of a
+weight by the angle between their two rays: none where the rays nearly coincide, as depth then moves
+a point hardly at all in the pictures, full between ``FULL`` and ``WIDE`` degrees, and falling
+beyond, as a surface looks another then.
 Promise: the pairs depend on poses and on who sees what, not on threads or the order of points.
 """
 

@@ -1,9 +1,10 @@
 """From a point of the world to a place on a view's grid.
 
 Notation: ``matrix`` [3, 4] maps homogeneous world points to (column z, row z, z). With K @
-``cam_from_world[:3]`` columns and rows are pixel coordinates, the centre of the first at (0.5, 0.5); a
-coarser grid, or one whose points lie at whole numbers, has its own first matrix instead of K. Promise:
-computed in float64 with one division, in the order written, whatever the type of the point.
+``cam_from_world[:3]`` columns and rows are pixel coordinates, the centre of the first at (0.5,
+0.5); a coarser grid, or one whose points lie at whole numbers, has its own first matrix instead of
+K. Promise: computed in float64 with one division, in the order written, whatever the type of the
+point.
 """
 
 from __future__ import annotations

@@ -1,9 +1,11 @@
 """Photographs of a distorted lens as a pinhole camera would have taken them.
 
-Notation: the pinhole camera has the lens's own focal length, centre and size. The pixel (i, j) of its
-image looks along the ray K^-1 (j + 0.5, i + 0.5, 1), which the lens maps to a place in the photograph.
-Promise: colours are interpolated between the four pixels around that place and rounded; pixels that the
-photograph does not show, or shows a second time beyond a fold, are black and known to be unknown.
+Notation: the pinhole camera has the lens's own focal length, centre and size. The pixel (i, j) of
+its image looks along the ray K^-1 (j + 0.5, i + 0.5, 1), which the lens maps to a place in the
+photograph.
+Promise: colours are interpolated between the four pixels around that place and rounded; pixels that
+the photograph does not show, or shows a second time beyond a fold, are black and known to be
+unknown.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """From where to look at a scene.
 
-Notation: ``uv`` are pixels [M, 2]; an image's *fill* is how much of its frame has points. Promise: the
-choice is deterministic; it is one of the scene's own cameras where it has any, else one made up from
-the cloud alone.
+Notation: ``uv`` are pixels [M, 2]; an image's *fill* is how much of its frame has points. Promise:
+the choice is deterministic; it is one of the scene's own cameras where it has any, else one made up
+from the cloud alone.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ def test_uneven_spacing_shows(rng):
 
 
 def photograph(path, pixels):
-    from PIL import Image as PilImage  # noqa: PLC0415
+    from PIL import Image as PilImage
 
     PilImage.fromarray(pixels).save(path)
 

@@ -113,7 +113,7 @@ def test_seeds_are_those_that_the_command_writes(specs, own_room, tmp_path, meth
     xyz[3], xyz[5] = np.nan, xyz[6]
     spoilt = tmp_path / "spoilt"
     write_scene(scene, spoilt)
-    from splatseed.io.ply.points import write_ply  # noqa: PLC0415
+    from splatseed.io.ply.points import write_ply
 
     for path in (spoilt / "sparse" / "0").glob("points3D.*"):
         path.unlink()
@@ -147,7 +147,7 @@ def test_a_damaged_checkpoint_means_to_begin_anew(specs, do, tmp_path):
     assert do(specs["sfm"], progress=_stop_at(7)).status == "interrupted"
     (tmp_path / "work" / "a" / "checkpoint.pt").write_bytes(b"damaged")
     steps = []
-    progress = lambda stage, f: stage == "train" and steps.append(f * 20)  # noqa: E731
+    progress = lambda stage, f: stage == "train" and steps.append(f * 20)
     assert do(specs["sfm"], progress=progress).status == "done"
     assert min(steps) == pytest.approx(1)
 

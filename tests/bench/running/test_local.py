@@ -64,17 +64,17 @@ class Heard(Watcher):
     def begun(self, spec):
         self.said.append(("begun", spec.repeat))
 
-    def progress(self, spec, stage, fraction):  # noqa: ARG002
+    def progress(self, spec, stage, fraction):
         assert (stage, fraction) == ("train", 0.5)
         self._on_progress()
 
-    def done(self, spec, result):  # noqa: ARG002
+    def done(self, spec, result):
         self.said.append(("done", spec.repeat))
 
-    def failed(self, spec, error):  # noqa: ARG002
+    def failed(self, spec, error):
         self.said.append(("failed", spec.repeat))
 
-    def handed_back(self, spec, reason):  # noqa: ARG002
+    def handed_back(self, spec, reason):
         self.said.append(("back", spec.repeat))
 
 

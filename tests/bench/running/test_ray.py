@@ -54,6 +54,7 @@ def specs(small_plan, room_path):
     return plan_runs(small_plan, [survey(room_path, "room")], "cpu", package_version("splatseed"))
 
 
+@pytest.mark.slow
 def test_all_runs_end_up_done_once_although_a_node_is_lost(cluster, small_plan, tmp_path):
     training = dataclasses.replace(small_plan.training, max_steps=250)
     plan = dataclasses.replace(
@@ -124,7 +125,7 @@ def test_each_run_gets_a_share_that_any_node_has(monkeypatch):
 
 
 def test_no_cluster_and_no_ray_are_one_line(monkeypatch):
-    import ray  # noqa: PLC0415
+    import ray
 
     def none(**_):
         raise ConnectionError("nobody\nthere")

@@ -13,6 +13,7 @@ from splatseed.io import load_scene
 from splatseed.upsample import METHODS
 
 
+@pytest.mark.slow
 def test_demo_leaves_a_scene_scores_and_pictures(tmp_path, splatseed):
     out = tmp_path / "demo"
     run = splatseed("demo", "--views", 6, "--ratio", 4, "--train-steps", 0, "-o", out)

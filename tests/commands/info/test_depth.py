@@ -85,7 +85,7 @@ def test_the_worst_are_listed_first_and_the_rest_on_demand(tour, tmp_path, splat
 
 def test_why_an_image_is_left_out(tour, tmp_path, splatseed):
     names = sorted(image.name for image in load_scene(tour).images)[:8]
-    blind = lambda i, z: z * np.nan if i == 2 else z  # noqa: E731
+    blind = lambda i, z: z * np.nan if i == 2 else z
     maps = _rewrite(tour, tmp_path / "maps", blind, names=names)
     out = splatseed("info", tour, "--depth", maps).out
     pairs = _pairs(out)
@@ -142,7 +142,7 @@ def _as_rgbd(scene, depths, folder):
 
 
 def test_the_picture_shows_photographs_depth_and_points(tour, tmp_path, splatseed):
-    blind = lambda i, z: z * np.nan if i == 2 else z  # noqa: E731
+    blind = lambda i, z: z * np.nan if i == 2 else z
     maps = _rewrite(tour, tmp_path / "maps", blind)
     words = ("info", tour, "--depth", maps, "--picture")
     assert splatseed(*words, tmp_path / "a.png").code == 0

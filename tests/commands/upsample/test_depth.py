@@ -118,7 +118,7 @@ def test_flags_of_depth_do_nothing_for_other_methods(room, tmp_path, splatseed):
 
 
 def test_previews_show_depth_where_there_is_some(room, tmp_path, splatseed, monkeypatch):
-    import splatseed.preview as preview  # noqa: PLC0415, PLR0402  (its function is replaced)
+    import splatseed.preview as preview  # noqa: PLR0402  (its function is replaced)
 
     shown = []
     monkeypatch.setattr(

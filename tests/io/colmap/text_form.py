@@ -35,7 +35,8 @@ _POINT_HEADER = "# POINT3D_ID X Y Z R G B ERROR TRACK[] as IMAGE_ID POINT2D_IDX"
 
 def write_cameras(path: Path, intrinsics: Sequence[Intrinsics]) -> None:
     lines = (
-        f"{camera.camera_id} {camera.model} {camera.width} {camera.height} {_spaced(map(float, camera.params))}"
+        f"{camera.camera_id} {camera.model} {camera.width} {camera.height} "
+        f"{_spaced(map(float, camera.params))}"
         for camera in intrinsics
     )
     _write_lines(path, _CAMERA_HEADER, lines)

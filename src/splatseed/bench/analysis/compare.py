@@ -1,9 +1,9 @@
 """Two benchmarks: what they were run with, what changed, and whether that is more than noise.
 
-Notation: the change of an arm on a scene is its mean PSNR in B less that in A, dB. Promise: runs of two
-ledgers are not paired, as a seed need not mean the same in another version: the noise of each ledger is
-taken from what its own repeats do (of all arms of a scene together), and the test is Welch's, adjusted
-after Holm over all changes.
+Notation: the change of an arm on a scene is its mean PSNR in B less that in A, dB. Promise: runs of
+two ledgers are not paired, as a seed need not mean the same in another version: the noise of each
+ledger is taken from what its own repeats do (of all arms of a scene together), and the test is
+Welch's, adjusted after Holm over all changes.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ def settings_table(found: Comparison) -> Table:
 
 
 def change_table(found: Comparison) -> Table:
-    """All changes: a row an arm, a column a scene, the mean last.
+    """All changes: a row per arm, a column per scene, the mean last.
 
     Args:
         found: The comparison.
@@ -204,8 +204,10 @@ def change_table(found: Comparison) -> Table:
         for mean in found.means
     )
     note = (
-        "PSNR in B less that in A, dB ± standard error. *: more than noise (Welch's test, Holm-corrected"
-        " over all changes on scenes, and over all means); ~: within noise. (1 run): nothing is known of the"
+        "PSNR in B less that in A, dB ± standard error. *: more than noise (Welch's test, "
+        "Holm-corrected"
+        " over all changes on scenes, and over all means); ~: within noise. (1 run): nothing is "
+        "known of the"
         " noise."
     )
     return Table(

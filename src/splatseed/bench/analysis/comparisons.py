@@ -1,8 +1,8 @@
 """Gain against ratio, gain against strategy, and gain at equal numbers of Gaussians.
 
-Notation: gains are those of ``splatseed.bench.analysis.gains``: mean over scenes, for these scenes alone. Promise:
-counts are equal where the runs' last numbers of Gaussians differ by 1% at most, in every pair; whether
-they are is looked up, not assumed from the strategy.
+Notation: gains are those of ``splatseed.bench.analysis.gains``: mean over scenes, for these scenes
+alone. Promise: counts are equal where the runs' last numbers of Gaussians differ by 1% at most, in
+every pair; whether they are is looked up, not assumed from the strategy.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ def ratio_table(study: Study) -> Table:
 
 
 NOTE = (
-    "dB ± the standard error of training these scenes again. ~: within noise (Holm-corrected over the"
+    "dB ± the standard error of training these scenes again. ~: within noise (Holm-corrected over "
+    "the"
     " variants of a strategy). Means are over the scenes that a variant has."
 )
 
@@ -73,7 +74,8 @@ def strategy_table(study: Study) -> Table:
         tuple(rows),
         (
             NOTE
-            + " Strategy none adds no Gaussians, so that it shows what seeds alone are worth, but also"
+            + " Strategy none adds no Gaussians, so that it shows what seeds alone are worth, but "
+            "also"
             " gives upsampled runs more Gaussians than sfm.",
             f"{study.description}.",
         ),
@@ -116,8 +118,10 @@ def equal_count_table(study: Study) -> Table:
 
 def _equal_note(study: Study, any_rows: bool) -> str:
     rule = (
-        "Listed are the variants of which every run ends within 1% of the number of Gaussians of the sfm"
-        " run that it is paired with. That happens where a cap binds both: with strategy mcmc, or where"
+        "Listed are the variants of which every run ends within 1% of the number of Gaussians of "
+        "the sfm"
+        " run that it is paired with. That happens where a cap binds both: with strategy mcmc, or "
+        "where"
         " --cap-max thins out the seeds of strategy none. ~: within noise."
     )
     if any_rows:
@@ -126,6 +130,7 @@ def _equal_note(study: Study, any_rows: bool) -> str:
         "a cap of {:,}".format(study.settings["cap_max"]) if study.settings["cap_max"] else "no cap"
     )
     return (
-        f"None qualifies (strategies {', '.join(study.strategies)}, {capped}): gains may come from the mere"
+        f"None qualifies (strategies {', '.join(study.strategies)}, {capped}): gains may come from "
+        "the mere"
         f" number of Gaussians. {rule}"
     )

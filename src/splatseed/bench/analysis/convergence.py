@@ -1,9 +1,9 @@
 """How soon a run is as good as the baseline in the end.
 
-Notation: a run *reaches* the target where its test PSNR first is at least the last PSNR of the baseline's
-run on the same scene with the same repeat; between two tests of the curve the PSNR is taken as a straight
-line. Seconds are those of training, and of making the seeds. Promise: runs that never reach it are
-counted, not dropped silently: a mean over those that do would flatter.
+Notation: a run *reaches* the target where its test PSNR first is at least the last PSNR of the
+baseline's run on the same scene with the same repeat; between two tests of the curve the PSNR is
+taken as a straight line. Seconds are those of training, and of making the seeds. Promise: runs that
+never reach it are counted, not dropped silently: a mean over those that do would flatter.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ def reach(result: RunResult, target: float) -> Reached | None:
         target: PSNR in dB.
 
     Returns:
-        None where it never is. A run that is above at its first test has reached it there at the latest.
+        None where it never is. A run that is above at its first test has reached it there at the
+        latest.
     """
     before: CurvePoint | None = None
     for point in result.curve:
@@ -170,10 +171,14 @@ def convergence_table(study: Study, strategy: StrategyName) -> Table:
 
 
 NOTE = (
-    "Where a run's test PSNR first is at least the last one of the sfm run of the same scene and repeat;"
-    " seconds with upsampling. 'sfm' reaches its own last PSNR earlier where its curve is not rising at"
-    " the end. Means are over the runs that reach it, within scenes first; ratios are geometric means,"
-    " below 1 is sooner, given only where all runs reach it. ~: a ratio within noise (t-test over scenes,"
+    "Where a run's test PSNR first is at least the last one of the sfm run of the same scene and "
+    "repeat;"
+    " seconds with upsampling. 'sfm' reaches its own last PSNR earlier where its curve is not "
+    "rising at"
+    " the end. Means are over the runs that reach it, within scenes first; ratios are geometric "
+    "means,"
+    " below 1 is sooner, given only where all runs reach it. ~: a ratio within noise (t-test over "
+    "scenes,"
     " or over repeats where there is one scene; Holm-corrected over the column)."
 )
 

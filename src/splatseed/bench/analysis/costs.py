@@ -1,7 +1,7 @@
 """What every variant gives and costs on average: quality; and the paper's table 3 beside ours.
 
-Promise: means are over runs within a scene first, then over the scenes that the variant and the baseline
-both have, so that a method is not charged for scenes that another was spared.
+Promise: means are over runs within a scene first, then over the scenes that the variant and the
+baseline both have, so that a method is not charged for scenes that another was spared.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from splatseed.train.settings import StrategyName
 __all__ = ["cost_table", "mean_of", "quality_table"]
 
 QUALITY_NOTE = (
-    "Means over the scenes that a method and sfm both have: compare methods of equally many scenes. PSNR"
+    "Means over the scenes that a method and sfm both have: compare methods of equally many "
+    "scenes. PSNR"
     " and SSIM are better when higher, LPIPS when lower. What is noise, the tables of gains say."
 )
 
@@ -176,8 +177,10 @@ def _notes(study: Study, strategy: StrategyName) -> tuple[str, ...]:
         for result in cell.values()
     }
     ours = (
-        f"Means over {len(scenes)} scenes ({', '.join(scenes)}). MB are of a million bytes. Times are wall"
-        " clock as measured, so that runs side by side on one machine slow each other; upsampling is not"
+        f"Means over {len(scenes)} scenes ({', '.join(scenes)}). MB are of a million bytes. Times "
+        "are wall"
+        " clock as measured, so that runs side by side on one machine slow each other; upsampling "
+        "is not"
         f" part of training. Device: {', '.join(sorted(devices))}."
     )
     theirs = "The paper's are means over all scenes of its dataset, on its own machine."

@@ -1,8 +1,8 @@
 """What kind of scene it is, in a few numbers.
 
-Notation: l1 >= l2 >= l3 are the variances of a point and its 16 nearest along their principal axes; h is
-a point's mean distance to its 6 nearest. Promise: all numbers are free of units, so that scenes compare;
-originals alone are described, never points that splatseed added; nothing is random.
+Notation: l1 >= l2 >= l3 are the variances of a point and its 16 nearest along their principal axes;
+h is a point's mean distance to its 6 nearest. Promise: all numbers are free of units, so that
+scenes compare; originals alone are described, never points that splatseed added; nothing is random.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ class Descriptors:
         gap: Median of h as views see it, as a share of the image's longer side.
         unevenness: Standard deviation of the natural logarithm of h.
         empty: Mean share of the views' area that no point projects to; NaN without images.
-        texture: Mean length of the gradient of grey values 0 to 1, per pixel of photographs made 320
-            pixels large; NaN without photographs.
+        texture: Mean length of the gradient of grey values 0 to 1, per pixel of photographs made
+            320 pixels large; NaN without photographs.
     """
 
     planarity: float
@@ -157,7 +157,7 @@ def _texture(scene: Scene, progress: Progress) -> float:
     for image in _some(scene) if folder is not None else []:
         progress("describe photographs", len(energies) / VIEWS)
         with suppress(SplatseedError):  # a photograph that cannot be read is not part of the mean
-            energies.append(_energy(_grey(folder / image.name)))  # type: ignore[operator]
+            energies.append(_energy(_grey(folder / image.name)))  # type: ignore[operator]  # checked by the caller
     return float(np.mean(energies)) if energies else np.nan
 
 

@@ -1,8 +1,8 @@
 """What every variant gains over the cloud as it is, and how sure that is.
 
-Notation: a gain is PSNR of a variant less that of the baseline, dB, paired by scene and repeat. Promise:
-the p values of one strategy's gains are adjusted together: those on single scenes as one family, those
-over scenes as another; see ``splatseed.bench.analysis.statistics``.
+Notation: a gain is PSNR of a variant less that of the baseline, dB, paired by scene and repeat.
+Promise: the p values of one strategy's gains are adjusted together: those on single scenes as one
+family, those over scenes as another; see ``splatseed.bench.analysis.statistics``.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ class MeanGains:
         over_all: Of all variants together: what a variant picked blindly gives.
         best: The variant that gains most on average.
         over_best: Its mean gain; a little flattering, as it was chosen by the scores that it is of.
-        per_scene: The best variant of each scene, chosen by the test views that it is scored on: not a
-            gain that anybody can have.
+        per_scene: The best variant of each scene, chosen by the test views that it is scored on:
+            not a gain that anybody can have.
         num_scenes: Scenes in the means.
         num_variants: Variants in the means: those that every scene has.
     """

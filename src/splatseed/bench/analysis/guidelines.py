@@ -1,10 +1,10 @@
 """Guidelines derived from the data: which kind of scene gains from which method.
 
-Notation: a *guideline* is about a descriptor and a method: scenes with more of the one gain more (or
-less) from the other. Promise: every guideline comes with its rank correlation, its p value, exact where
-scenes are few, adjusted after Holm over all that were looked at, and with how many scenes agree; none is
-called supported unless its adjusted p is at most 5%, and what the number of scenes can support at all
-is said.
+Notation: a *guideline* is about a descriptor and a method: scenes with more of the one gain more
+(or less) from the other. Promise: every guideline comes with its rank correlation, its p value,
+exact where scenes are few, adjusted after Holm over all that were looked at, and with how many
+scenes agree; none is called supported unless its adjusted p is at most 5%, and what the number of
+scenes can support at all is said.
 """
 
 from __future__ import annotations
@@ -32,14 +32,18 @@ FEWEST = 3
 """With two scenes every correlation is perfect."""
 
 SCENE_NOTE = (
-    "Planarity, linearity and scattering of a point's 16 nearest (Weinmann et al. 2015) and their curvature"
-    " (surface variation, Pauly et al. 2002), means over the points; gap: the median spacing of points as"
-    " the views see it, as a share of the image's longer side; unevenness: the standard deviation of the"
+    "Planarity, linearity and scattering of a point's 16 nearest (Weinmann et al. 2015) and their "
+    "curvature"
+    " (surface variation, Pauly et al. 2002), means over the points; gap: the median spacing of "
+    "points as"
+    " the views see it, as a share of the image's longer side; unevenness: the standard deviation "
+    "of the"
     " logarithm of spacing; empty: the share of the images' area without points; texture: the mean"
     " gradient of grey values at 320 pixels."
 )
 WINNER_NOTE = (
-    "The best is chosen by the scores that it has, so that its gain flatters; within noise: it may as well"
+    "The best is chosen by the scores that it has, so that its gain flatters; within noise: it "
+    "may as well"
     " be any other."
 )
 
@@ -126,11 +130,12 @@ def rank_correlation(
     """Spearman's correlation and its two-sided p value.
 
     Args:
-        x: One value a scene, not all equal.
+        x: One value per scene, not all equal.
         y: Another, likewise.
 
     Returns:
-        The correlation, and how often chance gives one at least as strong: over all orders of up to 8
+        The correlation, and how often chance gives one at least as strong: over all orders of up to
+        8
         scenes, else by Student's t.
     """
     from scipy.stats import rankdata, spearmanr  # noqa: PLC0415  (slow to import)
@@ -168,7 +173,8 @@ def verdict(found: Sequence[Guideline]) -> str:
     """
     if not found:
         return (
-            f"No guideline can be looked for: that takes at least {FEWEST} scenes with gains and with"
+            f"No guideline can be looked for: that takes at least {FEWEST} scenes with gains and "
+            "with"
             " descriptors."
         )
     scenes = max(each.scenes for each in found)
@@ -178,7 +184,8 @@ def verdict(found: Sequence[Guideline]) -> str:
         return f"Supported by {scenes} scenes, after {len(found)} were looked at: {said}"
     fewest = fewest_scenes(len(found))
     why = (
-        f" It could hardly be otherwise: with {len(found)} of them looked at, even a perfect order of scenes"
+        f" It could hardly be otherwise: with {len(found)} of them looked at, even a perfect order "
+        "of scenes"
         f" is evidence only from {fewest} scenes on, and here there are {scenes}."
         if scenes < fewest
         else ""
@@ -206,8 +213,10 @@ def guideline_table(found: Sequence[Guideline], strategy: str, most: int = 10) -
         for each in found[:most]
     )
     note = (
-        f"The {len(rows)} likeliest of {len(found)} that were looked at (each descriptor with each method,"
-        " whose gain is the mean over its ratios). Scenes agree when they are on the same side of both"
+        f"The {len(rows)} likeliest of {len(found)} that were looked at (each descriptor with each "
+        "method,"
+        " whose gain is the mean over its ratios). Scenes agree when they are on the same side of "
+        "both"
         " medians as the correlation says. p is of Spearman's rank correlation, exact up to"
         f" {EXACT} scenes; supported is what is at most 5% after Holm."
     )

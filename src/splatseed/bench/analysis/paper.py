@@ -1,9 +1,9 @@
 """The paper's own numbers, for ours to stand beside.
 
-Notation: a *dataset* is Mip-NeRF360 or Replica; an *entry* is a method and its ratio, ``("sfm", 1.0)`` for
-the cloud as it is. Promise: the numbers are those of the paper's tables 1 to 3. They are of 30,000 steps and,
-for Mip-NeRF360, of photographs at a quarter (outdoors) or half (indoors) of their size; how far they
-would stray from one run to the next is not known.
+Notation: a *dataset* is Mip-NeRF360 or Replica; an *entry* is a method and its ratio, ``("sfm",
+1.0)`` for the cloud as it is. Promise: the numbers are those of the paper's tables 1 to 3. They are
+of 30,000 steps and, for Mip-NeRF360, of photographs at a quarter (outdoors) or half (indoors) of
+their size; how far they would stray from one run to the next is not known.
 """
 
 from __future__ import annotations

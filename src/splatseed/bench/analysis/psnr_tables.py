@@ -1,8 +1,8 @@
 """The paper's tables 1 and 2 beside ours: PSNR of every scene and variant, and what it gains.
 
-Notation: marks are as in ``MARKS``. Promise: our numbers carry their standard error over repeats, the
-paper's stand in a row of their own where the scene's name is one of its scenes; nothing is marked as
-best that could be noise.
+Notation: marks are as in ``MARKS``. Promise: our numbers carry their standard error over repeats,
+the paper's stand in a row of their own where the scene's name is one of its scenes; nothing is
+marked as best that could be noise.
 """
 
 from __future__ import annotations
@@ -31,25 +31,34 @@ __all__ = ["MARKS", "gain_cell", "gain_table", "mean_gain_table", "psnr_tables"]
 NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
 
 MARKS = (
-    "PSNR in dB, mean ± standard error over repeats. Bold: the best of its row, where its gain over sfm"
+    "PSNR in dB, mean ± standard error over repeats. Bold: the best of its row, where its gain "
+    "over sfm"
     " is significant (paired by scene and repeat, Holm-corrected over all gains on scenes in this"
-    " strategy, 5%), or sfm where all are significantly worse; † where it is also better than the second best. ~: within noise of sfm."
+    " strategy, 5%), or sfm where all are significantly worse; † where it is also better than the "
+    "second best. ~: within noise of sfm."
     " (1 run): a single repeat, which has no standard error of its own."
 )
 PAPER_NOTE = (
-    "Rows '(paper)' are the numbers printed there: 30,000 steps, a quarter (outdoors) or half (indoors) of"
+    "Rows '(paper)' are the numbers printed there: 30,000 steps, a quarter (outdoors) or half "
+    "(indoors) of"
     " the size of Mip-NeRF360's photographs."
 )
 GAIN_NOTE = (
-    "dB ± standard error. On a scene and on these scenes, the noise is that of training again; on scenes"
-    " like these, it is the spread of gains from scene to scene, repeats averaged first. Means are over"
-    " the scenes that a column has. ~: within noise (Holm-corrected over all cells of scenes, and over"
+    "dB ± standard error. On a scene and on these scenes, the noise is that of training again; on "
+    "scenes"
+    " like these, it is the spread of gains from scene to scene, repeats averaged first. Means "
+    "are over"
+    " the scenes that a column has. ~: within noise (Holm-corrected over all cells of scenes, and "
+    "over"
     " each row of means). (1 run): a single pair, of whose noise nothing is known."
 )
 MEAN_NOTE = (
-    "dB over sfm. All variants together: what a variant picked blindly gives. Best single variant: a"
-    " little flattering, as it is chosen by the scores that it is of. Best of each scene: chosen on the"
-    " very test views that it is scored on, so that noise counts as gain; not a gain that anybody can"
+    "dB over sfm. All variants together: what a variant picked blindly gives. Best single "
+    "variant: a"
+    " little flattering, as it is chosen by the scores that it is of. Best of each scene: chosen "
+    "on the"
+    " very test views that it is scored on, so that noise counts as gain; not a gain that anybody "
+    "can"
     " have. Variants that some scene lacks are left out."
 )
 TABLE_NAMES = {"mipnerf360": "table1", "replica": "table2", "": "table_scenes"}
@@ -163,7 +172,7 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
         return (words(name), *(gain(each) for each in found.variants))
 
     rows = [
-        row(scene, lambda v, scene=scene: gain_cell(found.on_scene.get((scene, v))))  # type: ignore[misc]
+        row(scene, lambda v, scene=scene: gain_cell(found.on_scene.get((scene, v))))  # type: ignore[misc]  # mypy cannot infer a lambda's default
         for scene in found.scenes
     ]
     rows.append(row("mean, these scenes", lambda v: gain_cell(found.on_these[v])))

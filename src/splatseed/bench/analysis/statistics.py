@@ -1,22 +1,28 @@
 """Whether a difference is more than noise.
 
-Notation: ``values`` [A, R] are one scene's scores, arm by repeat, NaN where there is no run; row 0 is
-the baseline. A *difference* is between two arms, paired by repeat. Three things are told apart:
+Notation: ``values`` [A, R] are one scene's scores, arm by repeat, NaN where there is no run; row 0
+is the baseline. A *difference* is between two arms, paired by repeat. Three things are told apart:
 
-* On **one scene**: the mean over repeats of paired differences. With two or three repeats each pair of
-  arms alone says little of the noise, so it is estimated from all arms of the scene together: what is
-  left when every arm and every repeat has its own mean (the analysis of variance of a randomised block
-  design; Montgomery, Design and Analysis of Experiments, ch. 4). For two arms this is the paired t-test.
-  It takes all arms to be equally noisy: one of six at twice the noise of the rest is claimed falsely in
-  12% of tests rather than 5, the others in 3%.
-* On **these scenes**: the mean over scenes of the former. Its noise is the scenes' own, added up, with
-  degrees of freedom after Welch and Satterthwaite. It says what training again on the same scenes gives.
-* On **scenes like these**: the same mean, but repeats are averaged within a scene first and the t-test is
-  over scenes. Repeats of one scene are not independent evidence about another, so counting every run as
-  a sample would find gains that are not there.
+* On **one scene**: the mean over repeats of paired differences. With two or three repeats each pair
+of
+  arms alone says little of the noise, so it is estimated from all arms of the scene together: what
+  is
+  left when every arm and every repeat has its own mean (the analysis of variance of a randomised
+  block design; Montgomery, Design and Analysis of Experiments, ch. 4). For two arms this is the
+  paired t-test. It takes all arms to be equally noisy: one of six at twice the noise of the rest is
+  claimed falsely in 12% of tests rather than 5, the others in 3%.
+* On **these scenes**: the mean over scenes of the former. Its noise is the scenes' own, added up,
+with
+  degrees of freedom after Welch and Satterthwaite. It says what training again on the same scenes
+  gives.
+* On **scenes like these**: the same mean, but repeats are averaged within a scene first and the
+t-test is
+  over scenes. Repeats of one scene are not independent evidence about another, so counting every
+  run as a sample would find gains that are not there.
 
-Promise: p values are two-sided; over a family of comparisons they are adjusted after Holm (1979), which
-bounds the chance of any false claim in it; where nothing can be said, p is NaN and no claim is made.
+Promise: p values are two-sided; over a family of comparisons they are adjusted after Holm (1979),
+which bounds the chance of any false claim in it; where nothing can be said, p is NaN and no claim
+is made.
 """
 
 from __future__ import annotations
@@ -108,8 +114,8 @@ def paired_differences(values: Float[np.ndarray, "A R"]) -> tuple[Difference | N
         values: Scores by arm and repeat, NaN where there is no run, [A, R].
 
     Returns:
-        One for each of rows 1 to A - 1; None where it and row 0 have no repeat in common. ``p`` is not
-        adjusted yet.
+        One for each of rows 1 to A - 1; None where it and row 0 have no repeat in common. ``p`` is
+        not adjusted yet.
     """
     noise, df = pooled_noise(values)
     return tuple(_paired(row - values[0], noise, df) for row in values[1:])
@@ -149,7 +155,7 @@ def these_scenes(scenes: Sequence[Difference]) -> Difference:
     """The mean of differences on several scenes, for these scenes alone.
 
     Args:
-        scenes: One a scene, at least one.
+        scenes: One per scene, at least one.
     """
     mean = float(np.mean([each.mean for each in scenes]))
     variance = np.array([each.se**2 for each in scenes])

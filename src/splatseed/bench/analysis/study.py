@@ -1,9 +1,10 @@
 """What a ledger's finished runs can be compared with: runs that differ in nothing but the seeds.
 
-Notation: a *variant* is what makes the seeds (method, profile, ratio, parameters); a *study* holds runs
-whose settings are equal in all but the variant, the strategy, the scene and the repeat; a *cell* is what
-one variant gave on one scene under one strategy, by repeat. Promise: runs of different settings or
-versions are never compared; a run whose PSNR is not finite is set aside and counted, not averaged.
+Notation: a *variant* is what makes the seeds (method, profile, ratio, parameters); a *study* holds
+runs whose settings are equal in all but the variant, the strategy, the scene and the repeat; a
+*cell* is what one variant gave on one scene under one strategy, by repeat. Promise: runs of
+different settings or versions are never compared; a run whose PSNR is not finite is set aside and
+counted, not averaged.
 """
 
 from __future__ import annotations
@@ -187,8 +188,8 @@ def _size(factor: object) -> str:
 def studies(rows: Iterable[RunRow]) -> tuple[Study, ...]:
     """The studies in a ledger's rows; the one with the most runs first.
 
-    Scenes may differ in size; only where one scene was run at several ``data_factor`` are these kept
-    apart. Where a scene's name stands for different content, its label says which.
+    Scenes may differ in size; only where one scene was run at several ``data_factor`` are these
+    kept apart. Where a scene's name stands for different content, its label says which.
 
     Args:
         rows: As the ledger has them; those not done are passed over.

@@ -1,7 +1,7 @@
 """The answer in a few sentences: does upsampling help on these scenes, by which method, at what cost?
 
-Promise: a gain is called one only where it is more than noise after adjusting for the number of variants;
-where a single run was made of each, the sentences say that nothing is known of the noise.
+Promise: a gain is called one only where it is more than noise after adjusting for the number of
+variants; where a single run was made of each, the sentences say that nothing is known of the noise.
 """
 
 from __future__ import annotations
@@ -57,7 +57,8 @@ def _answer(found: Gains, best: Variant) -> str:
         text = f"{lead} yes, {len(better)} {of} gain more than noise, {best.label} most ({decibels(top)})."
     else:
         text = (
-            f"{lead} no gain beyond noise was found among {_count(len(found.variants), 'variant')}; the"
+            f"{lead} no gain beyond noise was found among "
+            f"{_count(len(found.variants), 'variant')}; the"
             f" highest is that of {best.label}, {decibels(top)}."
         )
     loses = (
@@ -78,7 +79,8 @@ def _by_scene(found: Gains, best: Variant) -> str:
     kinds: tuple[Verdict, ...] = ("better", "worse", "within noise")
     counts = {kind: sum(each.verdict == kind for each in known) for kind in kinds}
     return (
-        f"On single scenes {best.label} is better on {counts['better']}, worse on {counts['worse']} and"
+        f"On single scenes {best.label} is better on {counts['better']}, worse on "
+        f"{counts['worse']} and"
         f" within noise on {counts['within noise']} of {len(known)}."
     )
 
@@ -102,7 +104,8 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
     longer = _times(study, strategy, best, lambda r: r.train_seconds)
     larger = _times(study, strategy, best, lambda r: float(r.num_gaussians))
     text = (
-        f"{best.label} costs {seconds:.1f} s of upsampling a scene, {longer:.2f} times {BASELINE.label}'s"
+        f"{best.label} costs {seconds:.1f} s of upsampling per scene, {longer:.2f} times "
+        f"{BASELINE.label}'s"
         f" training time and {larger:.2f} times its Gaussians."
     )
     sooner = speed(study, strategy, best)
@@ -113,7 +116,8 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
         return f"{text} {part} reach {BASELINE.label}'s last PSNR."
     steps, clock = (_ratio(each) for each in (sooner.log_steps, sooner.log_seconds))
     return (
-        f"{text} It is as good as {BASELINE.label} in the end after {steps} the steps and {clock} the"
+        f"{text} It is as good as {BASELINE.label} in the end after {steps} the steps and {clock} "
+        "the"
         f" seconds that {BASELINE.label} itself takes."
     )
 

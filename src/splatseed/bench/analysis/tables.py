@@ -1,8 +1,9 @@
 """Tables as CSV, Markdown and LaTeX.
 
 Notation: a *cell* is words, or a number with its standard error, a mark and whether it is set bold.
-Promise: CSV has numbers in full, with columns of their own for standard errors and marks; Markdown and
-LaTeX have them rounded and with what their marks mean below; whatever names are in them is escaped.
+Promise: CSV has numbers in full, with columns of their own for standard errors and marks; Markdown
+and LaTeX have them rounded and with what their marks mean below; whatever names are in them is
+escaped.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Fingerprints of what runs depend on: a scene's content, its photographs, its depth maps.
 
-Promise: a fingerprint depends on content alone, not on where files lie, when they were written, or the
-order in which a system lists them; photographs count byte for byte, depth maps as they are read.
+Promise: a fingerprint depends on content alone, not on where files lie, when they were written, or
+the order in which a system lists them; photographs count byte for byte, depth maps as they are
+read.
 """
 
 from __future__ import annotations

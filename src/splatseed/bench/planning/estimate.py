@@ -1,8 +1,8 @@
 """How long a benchmark will take, and how much disk: an estimate, which its own runs make better.
 
-Notation: a step of training takes about a + b G + c P seconds for G Gaussians and P pixels. Promise:
-before there are runs that tell, a, b and c are those of one machine, so that the estimate can be off by
-several times; with finished runs in the ledger their median takes the place of these.
+Notation: a step of training takes about a + b G + c P seconds for G Gaussians and P pixels.
+Promise: before there are runs that tell, a, b and c are those of one machine, so that the estimate
+can be off by several times; with finished runs in the ledger their median takes the place of these.
 """
 
 from __future__ import annotations
@@ -143,8 +143,8 @@ def _measured_growth(done: Sequence[RunRow]) -> dict[tuple[str, float | None], f
 def _seconds_around(row: RunRow) -> float:
     """What a run took beside its steps; little if it was begun before and went on."""
     assert row.result is not None  # noqa: S101  (only finished runs are asked about)
-    assert row.started is not None  # noqa: S101
-    assert row.finished is not None  # noqa: S101
+    assert row.started is not None  # noqa: S101  (for mypy: it is known here)
+    assert row.finished is not None  # noqa: S101  (for mypy: it is known here)
     return max(row.finished - row.started - row.result.train_seconds, 0.0)
 
 

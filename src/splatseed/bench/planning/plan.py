@@ -1,8 +1,8 @@
 """A plan: which scenes, which arms, how often, and how each run is trained.
 
-Notation: see ``records``. Promise: a plan that exists is valid; the runs of a plan come in an order in
-which all arms of all scenes have been run once before any is repeated, so that a benchmark which is
-stopped early still compares all of them.
+Notation: see ``records``. Promise: a plan that exists is valid; the runs of a plan come in an order
+in which all arms of all scenes have been run once before any is repeated, so that a benchmark which
+is stopped early still compares all of them.
 """
 
 from __future__ import annotations
@@ -110,8 +110,8 @@ class Plan:
     def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:
         """The arms of one strategy: the original cloud first.
 
-        A method whose profiles are one and the same has one arm, of the first of them; one that makes
-        as many seeds as the photographs need has no ratio.
+        A method whose profiles are one and the same has one arm, of the first of them; one that
+        makes as many seeds as the photographs need has no ratio.
         """
         arms = [Arm(SFM, "default", 1, strategy)] if SFM in self.methods else []
         for method in self.methods:

@@ -1,7 +1,8 @@
 """Plans as TOML files: reading one with errors that name the key, and writing one that can be read.
 
-Promise: what ``plan_text`` writes, ``read_plan`` reads back as the same plan; a key that is misspelt, or
-whose value is of another kind, is an error and never passed over. Paths in a file are relative to it.
+Promise: what ``plan_text`` writes, ``read_plan`` reads back as the same plan; a key that is
+misspelt, or whose value is of another kind, is an error and never passed over. Paths in a file are
+relative to it.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ KINDS: Mapping[str, _Kind] = {
     SCENES: TABLES,
     PARAMETERS: TABLE,
 }
-"""What each key of a plan takes: there is one for each field of ``Plan``, but ``training`` is flat."""
+"""What each key of a plan takes: there is one for each field of ``Plan``, but ``training`` is
+flat."""
 
 
 def read_plan(path: Path) -> Plan:

@@ -1,8 +1,9 @@
 """Plans made before: the paper's two data sets, and one that a laptop can run.
 
 Notation: a preset's scenes are folders of one folder, the data set. Promise: scenes, folders of
-photographs, ratios and steps are those of the paper's tables 1 and 2 (docs/paper.md), and every eighth
-image is kept for the test; photographs are taken as the data set gives them, not made smaller anew.
+photographs, ratios and steps are those of the paper's tables 1 and 2 (docs/paper.md), and every
+eighth image is kept for the test; photographs are taken as the data set gives them, not made
+smaller anew.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """What a run of the benchmark is asked for, and what came of it.
 
-Notation: an *arm* is everything about a run but its scene and its repeat: two runs are *paired* when
-those two are equal. Promise: ``RunSpec.key`` depends on all that determines the result and on nothing
-else (not on where the scene lies), so that a run that is in the ledger need never be repeated.
+Notation: an *arm* is everything about a run but its scene and its repeat: two runs are *paired*
+when those two are equal. Promise: ``RunSpec.key`` depends on all that determines the result and on
+nothing else (not on where the scene lies), so that a run that is in the ledger need never be
+repeated.
 """
 
 from __future__ import annotations
@@ -175,7 +176,7 @@ class RunResult:
         psnr: Mean over test images of each one's PSNR, dB.
         ssim: Mean SSIM.
         lpips: Mean LPIPS; None where it was not measured.
-        per_image: One score a test view.
+        per_image: One score per test view.
         curve: The test views on the way, in order of steps.
         num_seeds: Points that training began with.
         num_gaussians: Gaussians at the end.

@@ -1,7 +1,8 @@
 """Scenes of a benchmark: opening one, and what is to be known of it before it is run.
 
 Promise: a scene is opened in one way wherever a benchmark does it; what would make every run on a
-scene fail (no photographs, lenses with distortion, depth that cannot be read) is found here, before any.
+scene fail (no photographs, lenses with distortion, depth that cannot be read) is found here, before
+any.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Pictures of the seeds of each method, from one camera.
 
-Promise: seeds are made again exactly as the runs made them (the same scene, parameters and seed), and only
-while the scene's files are what they were; else a sentence says why there is no picture.
+Promise: seeds are made again exactly as the runs made them (the same scene, parameters and seed),
+and only while the scene's files are what they were; else a sentence says why there is no picture.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Figures: PSNR over steps and seconds, and gains by scene, ratio and strategy.
 
-Notation: a colour is a method and a mark's shape a ratio, in all figures the same; a dashed line or a
-hollow mark is the profile "paper". Promise: bars and bands say in the title what they are; nothing is drawn for a single run but
-the run itself.
+Notation: a colour is a method and a mark's shape a ratio, in all figures the same; a dashed line or
+a hollow mark is the profile "paper". Promise: bars and bands say in the title what they are;
+nothing is drawn for a single run but the run itself.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ MANY = 8
 """More curves than this in one picture cannot be told apart."""
 DPI = 120
 LATE = 0.15
-"""Curves are shown from this share of the steps on: what is before is the same steep rise for all."""
+"""Curves are shown from this share of the steps on: what is before is the same steep rise for
+all."""
 
 
 class Plot(NamedTuple):
@@ -71,7 +72,7 @@ def shown_variants(variants: Sequence[Variant]) -> tuple[Variant, ...]:
 
 
 def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
-    """Test PSNR over steps or over seconds, a panel a scene; None where there are no curves.
+    """Test PSNR over steps or over seconds, a panel per scene; None where there are no curves.
 
     Args:
         study: The study.
@@ -96,7 +97,8 @@ def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
     _legend(figure, arms, _marked)
     return Plot(
         f"psnr_{by}_{strategy}",
-        f"Test PSNR (dB) over {by}, strategy {strategy}: mean over repeats, and a band from the lowest"
+        f"Test PSNR (dB) over {by}, strategy {strategy}: mean over repeats, and a band from the "
+        "lowest"
         f" to the highest.{_left_out(arms[1:], variants)}",
         _png(figure),
     )
@@ -178,7 +180,8 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
     _legend(figure, variants, _mark_only)
     return Plot(
         f"gain_by_scene_{strategy}",
-        f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and 95% interval (of each"
+        f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and 95% interval (of "
+        "each"
         f" comparison alone, not adjusted for their number).{_left_out(variants, found.variants)}",
         _png(figure),
     )
@@ -301,7 +304,7 @@ def _marked(variant: Variant) -> dict[str, Any]:
 
 def _figure(width: float, height: float) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415  (loads with its use)
 
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)

@@ -1,7 +1,7 @@
 """The report's page: one file that needs no other, on a desk or on a phone, by day or by night.
 
-Promise: every text is escaped; the page may load nothing from anywhere (its own policy forbids it), runs
-one script of a few lines, and without it still shows everything.
+Promise: every text is escaped; the page may load nothing from anywhere (its own policy forbids it),
+runs one script of a few lines, and without it still shows everything.
 """
 
 from __future__ import annotations

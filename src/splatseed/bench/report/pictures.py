@@ -1,8 +1,8 @@
 """What a report needs of the scenes themselves: descriptors, and pictures of the seeds.
 
-Notation: what is kept lies in ``BENCH/descriptors.json`` and ``BENCH/figures``; ``clouds.json`` there says
-which picture is of which seeds. Promise: a scene is opened only for what is not kept yet; one that is gone
-or has changed costs its pictures and not the report.
+Notation: what is kept lies in ``BENCH/descriptors.json`` and ``BENCH/figures``; ``clouds.json``
+there says which picture is of which seeds. Promise: a scene is opened only for what is not kept
+yet; one that is gone or has changed costs its pictures and not the report.
 """
 
 from __future__ import annotations

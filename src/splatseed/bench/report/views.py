@@ -1,8 +1,8 @@
 """Test views: the photograph, what the baseline and the best variant make of it, and their errors.
 
-Notation: runs keep a few test views as pictures, with photograph, render and error map in a row (see
-``splatseed.splat.pictures``). Promise: both renders are of the same repeat; what is called best was chosen
-by mean gain on the scene, not by the view that is shown.
+Notation: runs keep a few test views as pictures, with photograph, render and error map in a row
+(see ``splatseed.splat.pictures``). Promise: both renders are of the same repeat; what is called
+best was chosen by mean gain on the scene, not by the view that is shown.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """The report of a benchmark: tables, figures, and a page that holds all of them.
 
-Notation: ``BENCH/report.html``, ``BENCH/tables/NAME.{csv,md,tex}``, ``BENCH/figures/NAME.png``. Promise: a
-report can be made at any time, of whatever is done by then, while runs go on; what is missing or has failed
-is listed; the page opens without a network; an earlier report is replaced as a whole.
+Notation: ``BENCH/report.html``, ``BENCH/tables/NAME.{csv,md,tex}``, ``BENCH/figures/NAME.png``.
+Promise: a report can be made at any time, of whatever is done by then, while runs go on; what is
+missing or has failed is listed; the page opens without a network; an earlier report is replaced as
+a whole.
 """
 
 from __future__ import annotations
@@ -87,8 +88,9 @@ def write_report(bench: Path, *, from_scenes: bool = True, progress: Progress = 
 
     Args:
         bench: The folder.
-        from_scenes: Whether scenes may be opened, to describe them and to draw the seeds of each method,
-            which are made again for it; what an earlier report kept of that is used either way.
+        from_scenes: Whether scenes may be opened, to describe them and to draw the seeds of each
+            method, which are made again for it; what an earlier report kept of that is used either
+            way.
         progress: Told the stages.
 
     Raises:
@@ -180,7 +182,8 @@ def _view_title(view: ComparedView) -> str:
     chosen = "the best" if view.gain > 0 else "the best, though it loses"
     return (
         f"{view.scene}, test view {view.name}: {view.best.label}, {chosen} on this"
-        f" scene ({view.gain:+.2f} dB over all its test views). Error maps: black is none, the brightest 0.25"
+        f" scene ({view.gain:+.2f} dB over all its test views). Error maps: black is none, the "
+        "brightest 0.25"
         " or more."
     )
 

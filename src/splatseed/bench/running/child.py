@@ -1,9 +1,10 @@
 """A run in a process of its own, for an honest peak of memory and so that nothing can end the rest.
 
 Notation: the process is started with the run as one line of JSON on its standard input, and answers
-with lines of JSON: ``{"stage": ..., "fraction": ...}`` on the way, ``{"status": ..., ...}`` at the end.
-Promise: it gets no Ctrl-C of the terminal's, but one SIGTERM from its parent when it shall stop; if its
-parent is gone, so is it.
+with lines of JSON: ``{"stage": ..., "fraction": ...}`` on the way, ``{"status": ..., ...}`` at the
+end.
+Promise: it gets no Ctrl-C of the terminal's, but one SIGTERM from its parent when it shall stop; if
+its parent is gone, so is it.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ class Child:
         """
         outcome = None
         assert self._process.stdin is not None  # noqa: S101  (asked for above)
-        assert self._process.stdout is not None  # noqa: S101
+        assert self._process.stdout is not None  # noqa: S101  (for mypy: it is known here)
         try:
             self._process.stdin.write(json.dumps(asdict(self._order)) + "\n")
             self._process.stdin.flush()

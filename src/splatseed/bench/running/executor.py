@@ -1,7 +1,7 @@
 """What executors have in common: claiming runs, signs of life, and what comes of an outcome.
 
-Promise: a run whose process is killed is tried once more, after all others, and then fails; an executor
-that stops hands every run back that is not done.
+Promise: a run whose process is killed is tried once more, after all others, and then fails; an
+executor that stops hands every run back that is not done.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """One run of the benchmark, from its specification to its result.
 
-Promise: a run that was interrupted goes on from its checkpoint, if there is one, and else begins anew;
-a run on files other than those that were planned is an error; whatever goes wrong comes back as an
-``Outcome`` and never as an exception, so that one bad run does not end the others.
+Promise: a run that was interrupted goes on from its checkpoint, if there is one, and else begins
+anew; a run on files other than those that were planned is an error; whatever goes wrong comes back
+as an ``Outcome`` and never as an exception, so that one bad run does not end the others.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """What is kept of a run: numbers, the curve, a few pictures; and of a failed one, why.
 
-Notation: ``BENCH/runs/KEY`` holds what is kept of the run KEY, ``BENCH/work/KEY`` what it works with
-while it goes on. Promise: the kept folder is there whole or not at all, and small: models are kept on
-request only.
+Notation: ``BENCH/runs/KEY`` holds what is kept of the run KEY, ``BENCH/work/KEY`` what it works
+with while it goes on. Promise: the kept folder is there whole or not at all, and small: models are
+kept on request only.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The ledger: which runs there are, who has them, and what came of them, in one SQLite file.
 
-Notation: a *worker* is a process that runs have been handed to; it gives a sign of life (*heartbeat*)
-every few seconds while it has any. Promise: a run is handed to one worker at a time, and is handed on
-only when its worker is gone; what is recorded as done stays so; whatever is killed at whatever moment,
-the file stays whole. SQLite's rollback journal is used, as its write-ahead log needs memory that the
-machines on a network file system do not share.
+Notation: a *worker* is a process that runs have been handed to; it gives a sign of life
+(*heartbeat*) every few seconds while it has any. Promise: a run is handed to one worker at a time,
+and is handed on only when its worker is gone; what is recorded as done stays so; whatever is killed
+at whatever moment, the file stays whole. SQLite's rollback journal is used, as its write-ahead log
+needs memory that the machines on a network file system do not share.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ TABLES = (
         heartbeat REAL,
         CHECK ((status = 'done') = (result IS NOT NULL))
     )""",
-    "CREATE TABLE IF NOT EXISTS sessions (id INTEGER PRIMARY KEY, started REAL, facts TEXT NOT NULL)",
+    """CREATE TABLE IF NOT EXISTS sessions (
+        id INTEGER PRIMARY KEY, started REAL, facts TEXT NOT NULL
+    )""",
 )
 
 

@@ -1,7 +1,8 @@
 """The local executor: processes on this machine, some at a time.
 
-Notation: a *slot* runs one process after the other; a machine's cores and GPUs are shared out among the
-slots. Promise: when the user stops, runs in training leave checkpoints; a second word stops at once.
+Notation: a *slot* runs one process after the other; a machine's cores and GPUs are shared out among
+the slots. Promise: when the user stops, runs in training leave checkpoints; a second word stops at
+once.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class LocalExecutor(Executor):
     Args:
         ledger: The ledger.
         bench: The benchmark's folder.
-        environments: The variables of each slot's processes; one slot an entry.
+        environments: The variables of each slot's processes; one entry per slot.
         options: What runs do beside.
         watcher: Told what happens.
     """

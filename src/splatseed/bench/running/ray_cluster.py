@@ -1,9 +1,10 @@
 """The Ray executor: runs as tasks on the nodes of a cluster.
 
-Notation: the *driver* is the process that the user started; it alone writes the ledger and the folder
-of the benchmark. Promise: a run works in a temporary folder of its node and comes back as bytes, so that
-nodes need not share a disk with the driver; its scene must be at the same path on every node, and with
-the same content, which is checked. A run whose node is lost is begun again on another.
+Notation: the *driver* is the process that the user started; it alone writes the ledger and the
+folder of the benchmark. Promise: a run works in a temporary folder of its node and comes back as
+bytes, so that nodes need not share a disk with the driver; its scene must be at the same path on
+every node, and with the same content, which is checked. A run whose node is lost is begun again on
+another.
 """
 
 from __future__ import annotations
@@ -107,8 +108,8 @@ def ray_cluster(address: str | None) -> Iterator[Cluster]:
     """Be connected to a cluster while the block runs.
 
     Args:
-        address: Its, or "auto" on one of its nodes; None for one of this machine alone, which is
-            started for the purpose.
+        address: Of the cluster, or "auto" on one of its nodes; None for one of this machine alone,
+            which is started for the purpose.
 
     Raises:
         MissingDependencyError: Ray is absent.

@@ -1,8 +1,8 @@
 """The seeds of a run: what its method makes of its scene, and how long that takes.
 
-Promise: seeds are the points that ``splatseed upsample`` would write for the same scene, method, ratio
-and seed: finite, and no two at one place. The time is that of upsampling alone, without the compilation
-of kernels, which happens once on a machine.
+Promise: seeds are the points that ``splatseed upsample`` would write for the same scene, method,
+ratio and seed: finite, and no two at one place. The time is that of upsampling alone, without the
+compilation of kernels, which happens once on a machine.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Workers: processes that have runs, and whether they are still there.
 
-Notation: a worker is named ``HOST:PID@SPACE``, where SPACE tells apart sets of process numbers: those
-of another boot, or of another container on the same host. Promise: a worker is held to be gone only if
-its process number is free where it ran, or if it gave no sign of life for ``STALE_SECONDS``.
+Notation: a worker is named ``HOST:PID@SPACE``, where SPACE tells apart sets of process numbers:
+those of another boot, or of another container on the same host. Promise: a worker is held to be
+gone only if its process number is free where it ran, or if it gave no sign of life for
+``STALE_SECONDS``.
 """
 
 from __future__ import annotations

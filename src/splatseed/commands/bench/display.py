@@ -1,4 +1,4 @@
-"""The display of a benchmark that runs: bars on stderr, one line a finished run on stdout."""
+"""The display of a benchmark that runs: bars on stderr, one line per finished run on stdout."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def check_machine(machine: Machine, seeds: int) -> None:
     check_memory(
         seeds,
         BYTES_EACH * machine.jobs,
-        f"seeds a run with {machine.jobs} at a time",
+        f"seeds per run with {machine.jobs} at a time",
         fix="Pass smaller --ratios, --cap-max {most}, or fewer --jobs.",
     )
 

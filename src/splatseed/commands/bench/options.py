@@ -70,8 +70,8 @@ class PlanTraining(TrainSettings):
 class Options:
     """Train from every method's seeds, several times each, on one machine or many, and compare.
 
-    Stop it when you like: the same command, or ``splatseed bench -o BENCH`` alone, goes on. Then see
-    ``splatseed bench report BENCH``, and ``splatseed bench compare A B`` for two benchmarks.
+    Stop it when you like: the same command, or ``splatseed bench -o BENCH`` alone, goes on. Then
+    see ``splatseed bench report BENCH``, and ``splatseed bench compare A B`` for two benchmarks.
     """
 
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], constructor=Path, metavar="DIR", help_behavior_hint="")] = None  # fmt: skip
@@ -91,7 +91,8 @@ class Options:
     training: Annotated[PlanTraining, tyro.conf.arg(name="")] = PlanTraining()
     """How each run is trained: its fields are options of their own."""
     depth: Annotated[tuple[Path, ...], _hint("the scene's")] = ()
-    """For method depth: a folder of maps a scene, or one folder with a subfolder of each one's name."""
+    """For method depth: a folder of maps per scene, or one folder with a subfolder of each one's
+    name."""
     preset: Annotated[PresetName | None, _hint("none")] = None
     """A plan made before: the paper's data sets (with --data), or quick, for a laptop."""
     data: Annotated[Path | None, _one(Path, "none")] = None
@@ -102,7 +103,7 @@ class Options:
     """Print the plan, how many runs it is, and an estimate of hours and disk; run nothing."""
     executor: Literal["local", "ray"] = "local"
     """Processes on this machine, or tasks on a Ray cluster (extra cluster)."""
-    jobs: Annotated[int | None, _one(int, "one a GPU, else 1; ray: what fits")] = None
+    jobs: Annotated[int | None, _one(int, "one per GPU, else 1; ray: what fits")] = None
     """Runs at a time."""
     threads: Annotated[int | None, _one(int, "the cores shared out")] = None
     """Threads of each run on the CPU."""
@@ -111,7 +112,7 @@ class Options:
     retry_failed: bool = False
     """Run again what has failed."""
     keep_models: bool = False
-    """Keep trained models: some 236 bytes a Gaussian."""
+    """Keep trained models: some 236 bytes per Gaussian."""
     lpips: bool = False
     """Measure LPIPS too; its weights must be there (see splatseed evaluate)."""
 
@@ -230,7 +231,8 @@ def _with_depth(
         found = [str(folder) for folder in folders]
     else:
         raise ParameterError(
-            f"--depth with a folder for each of {len(scenes)} scenes, or one with subfolders of their names",
+            f"--depth with a folder for each of {len(scenes)} scenes, or one with subfolders of "
+            "their names",
             found=f"{len(folders)} folders",
             fix="See --dry-run for the scenes and their order.",
         )

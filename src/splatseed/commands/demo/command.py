@@ -97,8 +97,8 @@ def _train(options: Options, ahead: KernelsAhead) -> bool:
         print_note(f"not trained: {error.found} installed. {error.fix}")
         return False
     # These import PyTorch.
-    from splatseed.commands.demo.training import Arm, train_arm, write_comparison  # noqa: PLC0415
-    from splatseed.train.settings import TrainSettings  # noqa: PLC0415
+    from splatseed.commands.demo.training import Arm, train_arm, write_comparison  # noqa: PLC0415  (loads with its use)
+    from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
 
     folder = options.output
     runs = [f"run_{name}" for name in ("sfm", SHOWN)]

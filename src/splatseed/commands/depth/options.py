@@ -42,9 +42,11 @@ class Options:
     model: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(or --stereo)")] = None
     """A folder in transformers' format, an id that Hugging Face's cache holds, or an .onnx file."""
     stereo: bool = False
-    """Match the photographs with each other instead: no network, on the CPU; normals and confidence too."""
+    """Match the photographs with each other instead: no network, on the CPU; normals and confidence
+    too."""
     colmap: bool = False
-    """With --stereo: write a COLMAP dense workspace, which colmap stereo_fusion makes a cloud of."""
+    """With --stereo: write a COLMAP dense workspace, which colmap stereo_fusion makes a cloud
+    of."""
     grid: Annotated[int | None, _number("4")] = None
     """With --stereo: a pixel of the map for every block of GRID x GRID of the photograph's."""
     seed: Annotated[int | None, _number("0")] = None

@@ -111,7 +111,8 @@ def _summarise(
     bent: bool,
 ) -> None:
     OUT.print(
-        f"{report.num_maps:,} depth maps of {_sizes(maps)}: {report.share_known:.0%} of their pixels"
+        f"{report.num_maps:,} depth maps of {_sizes(maps)}: {report.share_known:.0%} of their "
+        "pixels"
         f" confirmed by other views, in {seconds:.1f} s, written to {visible(report.path)}",
         soft_wrap=True,
     )
@@ -130,7 +131,7 @@ def _summarise(
 
 
 def _sizes(maps: Sequence[StereoMap]) -> str:
-    """Of the smallest and the largest map, if they differ."""
+    """Sizes of the smallest and the largest map, if they differ."""
     ordered = sorted((each.depth.shape for each in maps), key=math.prod)
     ends = dict.fromkeys((ordered[0], ordered[-1]))
     return " to ".join(f"{width} x {height}" for height, width in ends)

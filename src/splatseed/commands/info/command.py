@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
 __all__ = ["Options", "run"]
 
 KINDS_SHOWN = 3
-"""Kinds of cameras listed; collections of photographs from the web have one a photograph."""
+"""Kinds of cameras listed; collections of photographs from the web have one per photograph."""
 
 
 def _path(metavar: str) -> Any:
@@ -54,7 +54,8 @@ class Options:
     scene: Annotated[Path, tyro.conf.Positional]
     """A COLMAP scene folder, a folder with transforms.json, an RGB-D capture, or a .ply."""
     depth: Annotated[Path | None, _path("DIR")] = None
-    """Also hold a folder of depth maps, in any layout of docs/formats.md, against the SfM points."""
+    """Also hold a folder of depth maps, in any layout of docs/formats.md, against the SfM
+    points."""
     depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
     """What their values are: planar depth, distance along the ray, or inverse depth."""
     depth_scale: Annotated[float | None, _default("what the folder says")] = None
@@ -171,7 +172,7 @@ def _cloud_rows(cloud: CloudStatistics) -> list[tuple[str, str]]:
         ("isolated", f"{cloud.isolated:,}"),
         ("spacing 5/25/50/75/95%", spacing or "none"),
         ("bounding box", f"{low}  to  {high}"),
-        ("float32 step there", f"{cloud.resolution:.2g}"),
+        ("float32 resolution", f"{cloud.resolution:.2g}"),
     ]
 
 

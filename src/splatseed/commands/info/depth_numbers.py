@@ -1,6 +1,7 @@
 """What ``splatseed info --depth`` says of a scene's depth maps, in words and numbers.
 
-Promise: images are listed worst first: those left out, then by residual; all of them only if asked for.
+Promise: images are listed worst first: those left out, then by residual; all of them only if asked
+for.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def _summary(
     rows = [
         ("maps", maps),
         ("left out", f"{len(alignments) - len(used):,}"),
-        ("SfM points an image", _spread((a.num_points for a in alignments.values()), ".0f")),
+        ("SfM points per image", _spread((a.num_points for a in alignments.values()), ".0f")),
     ]
     if used:
         rows += [("scale", _spread((a.scale for a in used), ".4g"))]

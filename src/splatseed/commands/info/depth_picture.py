@@ -2,8 +2,8 @@
 
 Notation: a row is one image: its photograph, its depth (near is yellow, far is violet, unknown is
 grey; logarithmic, so that both near and far are told apart), and its SfM points on the photograph,
-coloured by |depth of the map / depth of the point - 1|. Promise: the images shown are a typical one,
-the best and the worst aligned ones, and one that was left out, where there are such.
+coloured by |depth of the map / depth of the point - 1|. Promise: the images shown are a typical
+one, the best and the worst aligned ones, and one that was left out, where there are such.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from splatseed.preview.colors import color_bar, heat, map_colors, usual_range
 from splatseed.preview.page import Tile, centered, fitted, write_grid
 from splatseed.preview.photographs import photograph_or_blank
 from splatseed.scene import Image, Scene
-from splatseed.views.sightings import find_sightings
+from splatseed.views.visibility import find_visibility
 
 __all__ = ["write_depth_picture"]
 
@@ -45,11 +45,11 @@ def write_depth_picture(scene: Scene, alignments: Mapping[str, Alignment], path:
     Raises:
         OutputError: The file cannot be written.
     """
-    by_name, sightings = {image.name: image for image in scene.images}, find_sightings(scene)
+    by_name, visibility = {image.name: image for image in scene.images}, find_visibility(scene)
     rows: list[Tile] = []
     for name, why in _chosen(alignments).items():
         image = by_name[name]
-        rows += _row(scene, image, alignments[name], sightings.of(image), why)
+        rows += _row(scene, image, alignments[name], visibility.of(image), why)
     bar = color_bar("0", f"off by {LIMIT:.0%} or more")
     return write_grid(centered(rows), path, columns=3, footer=bar)
 

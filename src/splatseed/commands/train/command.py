@@ -171,8 +171,9 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
         print_note(note)
     settings, views = training.settings, training.trainer.train_views
     OUT.print(
-        f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} test views"
-        f" of {views[0].width} x {views[0].height}, {len(training.state.params['means']):,} Gaussians)\n"
+        f"{visible(options.scene)} ({len(views)} training and"
+        f" {len(training.trainer.test_views)} test views of {views[0].width} x {views[0].height},"
+        f" {len(training.state.params['means']):,} Gaussians)\n"
         f"  -> {_strategy(settings)}, {settings.max_steps:,} steps, seed {settings.seed},"
         f" on {training.device}\n"
         f"  -> {visible(options.output)}",
@@ -259,7 +260,7 @@ def _summarise(options: Options, metrics: Mapping[str, Any]) -> None:
             ("test PSNR", psnr),
             ("test SSIM", f"{metrics['ssim']:.4f}"),
             ("Gaussians", f"{metrics['num_gaussians']:,} from {metrics['num_seeds']:,} seeds"),
-            ("training", f"{seconds:.1f} s, {1e3 * seconds / steps:.1f} ms a step"),
+            ("training", f"{seconds:.1f} s, {1e3 * seconds / steps:.1f} ms per step"),
             ("Gaussians in", str(options.output / "point_cloud.ply")),
             ("pictures", f"{options.output / 'renders'}, {options.output / 'curve.png'}"),
         ],

@@ -94,7 +94,8 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     method: str = DEFAULT_METHOD
-    """How new points are made; the flags of each method are below. auto looks at the photographs."""
+    """How new points are made; the flags of each method are below. auto looks at the
+    photographs."""
     ratio: Annotated[float | None, _number(float, "4, unless --num-points is given")] = None
     """Points in all, as a multiple of the originals, for methods that interpolate."""
     num_points: Annotated[int | None, _number(int, "by the ratio")] = None
@@ -102,9 +103,11 @@ class Options:
     budget: Annotated[str | None, _budget()] = None
     """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph."""
     cover_cell: Annotated[int | None, _cover()] = None
-    """Give each part of the photographs, of so many pixels a side, that no point falls in a seed."""
+    """Give each part of the photographs, of so many pixels a side, that no point falls in a
+    seed."""
     verify: bool = False
-    """Hold interpolated points against the photographs: slide them onto surfaces, drop what fits none."""
+    """Hold interpolated points against the photographs: slide them onto surfaces, drop what fits
+    none."""
     seed: int = 0
     """The same seed gives the same bytes."""
     profile: Profile = "default"
@@ -116,13 +119,16 @@ class Options:
     depth_scale: Annotated[float | None, _number(float, "what the folder says")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
     align: bool = True
-    """For --method depth: --no-align takes metric depth and poses as they are (--depth.no-align)."""
+    """For --method depth: --no-align takes metric depth and poses as they are
+    (--depth.no-align)."""
     preview: bool = False
-    """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's maps."""
+    """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's
+    maps."""
     gaussians: Annotated[
         Path | None, tyro.conf.arg(constructor=Path, help_behavior_hint="(default: none)")
     ] = None
-    """Also write the Gaussians to begin training with, a 3DGS .ply, for trainers that start from one."""
+    """Also write the Gaussians to begin training with, a 3DGS .ply, for trainers that start from
+    one."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write; auto keeps the input's."""
     copy_images: bool = False
@@ -159,7 +165,7 @@ def _help(arguments: list[str]) -> None:
 
 
 def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
-    """Options with one more field a method, whose default is the method given."""
+    """Options with one more field per method, whose default is the method given."""
     names = tuple(METHODS)
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
@@ -280,10 +286,11 @@ def _announce(
     for name in idle:
         print_note(f"The flags of {name} change nothing with --method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
-    parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]
+    parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]  # a method is a dataclass
     number = "as many as the photographs need" if total is None else f"{total:,} points"
     OUT.print(
-        f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} points)\n"
+        f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} "
+        "points)\n"
         f"  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n"
         f"  -> {visible(options.output)} ({number}, seed {options.seed})",
         soft_wrap=True,
@@ -318,7 +325,7 @@ def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
         "command": "upsample",
         "method": options.method,
         "profile": options.profile,
-        "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]
+        "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]  # a method is a dataclass
         "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
         "ratio": options.ratio,
         "num_points_asked": options.num_points,

@@ -116,7 +116,8 @@ def write_map_preview(
 
     if isinstance(method, Stereo):
         shown = _some_of(photographed(scene, method.hold_out))
-        # Found again, of the few that are shown: to keep the maps of all would take as much memory as the views.
+        # Found again, of the few that are shown: to keep the maps of all would take as much memory
+        # as the views.
         maps = method.maps(scene, shown, seed, clock)
         clock("preview", 0.9)
         preview_maps(scene, maps, folder / MAPS)

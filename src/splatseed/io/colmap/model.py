@@ -179,7 +179,7 @@ def point_columns(
     num_tracks = len(tracks) if tracks is not None else 0
     if num_tracks > len(points):
         raise PointCloudError(
-            "at most one track a point",
+            "at most one track per point",
             found=f"{num_tracks} tracks for {len(points)} points",
             fix="Drop the tracks of the points that were dropped.",
         )

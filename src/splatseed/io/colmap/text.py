@@ -3,8 +3,9 @@
 Notation: ``rows`` are the fields of the data lines, ``numbers`` their line numbers from 1. Lines
 that begin with ``#`` and blank ones are skipped, except that the line after an image's is always
 its features and may be blank. Promise: what one reads is what the binary form of the same model
-gives, to the last bit; a malformed file raises a single error that names the file and the line. Python loops
-over lines are the price of the format. The text form is read, never written: trainers load the binary one.
+gives, to the last bit; a malformed file raises a single error that names the file and the line.
+Python loops over lines are the price of the format. The text form is read, never written: trainers
+load the binary one.
 """
 
 from __future__ import annotations

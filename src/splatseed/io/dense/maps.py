@@ -86,7 +86,7 @@ def check_map(dense: DenseMap, images: Mapping[str, Image]) -> None:
         _refuse(dense, "the pose of its image", "another")
 
 
-def scaled_K(camera: Camera, width: int, height: int) -> Float64[np.ndarray, "3 3"]:  # noqa: N802
+def scaled_K(camera: Camera, width: int, height: int) -> Float64[np.ndarray, "3 3"]:  # noqa: N802  (K is the field's name)
     """The pinhole matrix of a camera whose image is resized to ``width`` x ``height``, [3, 3]."""
     scaled: np.ndarray = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     return scaled

@@ -1,7 +1,8 @@
 """OverlapPoints: points of the maps, with tracks, for a model that has none.
 
-Notation: a point's track names the image whose pixel it is and the sources that confirm it. Promise:
-at most ``PER_MAP`` points an image, evenly over its pixels; which ones depends on the map alone.
+Notation: a point's track names the image whose pixel it is and the sources that confirm it.
+Promise: at most ``PER_MAP`` points per image, evenly over its pixels; which ones depends on the map
+alone.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The photographs of a COLMAP dense workspace: as they are, or without the distortion of their lens.
 
-Notation: the pinhole camera of an undistorted photograph has the lens's own focal length, centre and size. Promise:
-photographs are linked, or copied, and never written to; undistorted ones keep their names and kinds of file.
+Notation: the pinhole camera of an undistorted photograph has the lens's own focal length, centre
+and size. Promise: photographs are linked, or copied, and never written to; undistorted ones keep
+their names and kinds of file.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ Undistort: TypeAlias = Callable[
     [UInt8[np.ndarray, "H W 3"], Intrinsics, Float64[np.ndarray, "3 3"]],
     tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]],
 ]
-"""``splatseed.views.undistortion.undistort``, or what does the same: pixels, lens and matrix to pixels and
-which of them are known."""
+"""``splatseed.views.undistortion.undistort``, or what does the same: pixels, lens and matrix to
+pixels and which of them are known."""
 
 _ASPECT_SLACK = 0.02
 _QUALITY: dict[str, Any] = {"quality": 95, "subsampling": 0}

@@ -1,7 +1,8 @@
 """A plain folder of stereo's maps, as ``--method depth`` reads them.
 
 Notation: for the image ``a/b.jpg`` there are ``a/b.jpg.npy``, its planar depth, and
-``a/b.jpg.stereo.npz`` with the rest: ``normal``, ``confidence``, ``agreeing``, ``sources`` and ``K``.
+``a/b.jpg.stereo.npz`` with the rest: ``normal``, ``confidence``, ``agreeing``, ``sources`` and
+``K``.
 Promise: readers of depth maps take the first and never see the second.
 """
 

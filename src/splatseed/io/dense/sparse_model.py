@@ -1,8 +1,8 @@
 """The sparse model of a COLMAP dense workspace: pinhole cameras in the photographs' own pixels.
 
-Notation: COLMAP numbers images by their place in the model, here ascending by image id. Promise: the
-points are the originals with their tracks; where there are no tracks, points of the maps stand in,
-because COLMAP learns from tracks alone which images overlap.
+Notation: COLMAP numbers images by their place in the model, here ascending by image id. Promise:
+the points are the originals with their tracks; where there are no tracks, points of the maps stand
+in, because COLMAP learns from tracks alone which images overlap.
 """
 
 from __future__ import annotations
@@ -88,7 +88,8 @@ def photograph_model(scene: Scene, sizes: Mapping[str, Size]) -> SparseModel:
     colours at the record's pixels, so that the two must agree.
 
     Args:
-        scene: Of a camera with distortion, the pinhole one is written that its undistorted photographs have.
+        scene: Of a camera with distortion, the pinhole one is written that its undistorted
+            photographs have.
         sizes: Of each photograph, by its name.
     """
     cameras: dict[tuple[int, Size], Intrinsics] = {}

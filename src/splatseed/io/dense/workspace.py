@@ -1,10 +1,10 @@
 """A COLMAP dense workspace, as its ``stereo_fusion`` takes it, from maps of our own.
 
-Notation: ``images/``, ``sparse/`` and ``stereo/`` as COLMAP's image_undistorter lays them out. COLMAP
-places pixel (column, row) of a map at (column, row) of its camera where everyone else, and its own
-sparse model, has (column + 0.5, row + 0.5). Promise: depths are those along COLMAP's rays, so that
-fused points lie where the scene has them, whatever the size of the maps; the folder appears whole or
-not at all.
+Notation: ``images/``, ``sparse/`` and ``stereo/`` as COLMAP's image_undistorter lays them out.
+COLMAP places pixel (column, row) of a map at (column, row) of its camera where everyone else, and
+its own sparse model, has (column + 0.5, row + 0.5). Promise: depths are those along COLMAP's rays,
+so that fused points lie where the scene has them, whatever the size of the maps; the folder appears
+whole or not at all.
 """
 
 from __future__ import annotations
@@ -58,8 +58,9 @@ def write_dense_workspace(
         overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the photographs instead of linking them.
         undistort: What takes the distortion of a lens out of a photograph, such as
-            ``splatseed.views.undistortion.undistort``. The workspace gets what it makes, and pinhole cameras of the
-            same matrix; maps are of these. Without it, distorted cameras are refused.
+            ``splatseed.views.undistortion.undistort``. The workspace gets what it makes, and
+            pinhole cameras of the same matrix; maps are of these. Without it, distorted cameras are
+            refused.
         provenance: How the maps came about, for ``splatseed.json``.
         progress: Told how many maps are written.
 
@@ -69,7 +70,8 @@ def write_dense_workspace(
     Raises:
         ParameterError: There is no map, or one does not belong to the scene.
         SceneNotFoundError: The scene has no photographs, or one is missing.
-        SceneFormatError: A camera has distortion that nothing takes out, or a photograph has not its shape.
+        SceneFormatError: A camera has distortion that nothing takes out, or a photograph has not
+            its shape.
         OutputError: The folder is taken or cannot be written, or an image's name leads out of it.
     """
     model = photograph_model(scene, check_dense_scene(scene, undistorts=undistort is not None))

@@ -1,4 +1,4 @@
-"""DepthFiles: the depth maps of a scene, one file an image, read when asked for.
+"""DepthFiles: the depth maps of a scene, one file per image, read when asked for.
 
 Notation: ``scale`` is stored units per unit of the scene, by which a file's numbers are divided.
 Promise: a map is float32 with NaN wherever nothing is known; reading keeps nothing in memory and is
@@ -26,11 +26,11 @@ from splatseed.io.depth.arrays import (
 from splatseed.io.depth.lens import Undistortion
 from splatseed.io.depth.pictures import read_exr, read_picture
 
-__all__ = ["FAR", "INTEGER_SCALE", "SUFFIXES", "DepthFiles"]
+__all__ = ["INTEGER_SCALE", "NOTHING_HIT", "SUFFIXES", "DepthFiles"]
 
 INTEGER_SCALE = 1000.0
 """Stored units per scene unit of integers whose scale nobody tells: millimetres in metres."""
-FAR = 1e9
+NOTHING_HIT = 1e9
 """From here on a distance is a renderer's word for "nothing hit"; Blender writes 1e10."""
 
 _SATURATED = 65535
@@ -45,7 +45,8 @@ _READERS: dict[str, Callable[[Path], StoredDepth]] = {
     ".png": read_picture,
 }
 SUFFIXES = tuple(_READERS)
-"""Suffixes of files that can be read. A PNG comes last: beside exact numbers it is their picture."""
+"""Suffixes of files that can be read. A PNG comes last: beside exact numbers it is their
+picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +108,11 @@ def _in_scene_units(
     divisor = scale or (INTEGER_SCALE if is_integer else 1.0)
     with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and so NaN
         values: np.ndarray = (stored / np.float64(divisor)).astype(np.float32)
-        unknown = ~(np.abs(values) < FAR) if kind == "inverse" else ~((values > 0) & (values < FAR))
+        unknown = (
+            ~(np.abs(values) < NOTHING_HIT)
+            if kind == "inverse"
+            else ~((values > 0) & (values < NOTHING_HIT))
+        )
     if is_integer and kind == "inverse":
         unknown |= stored == 0
     elif stored.dtype == np.uint16:

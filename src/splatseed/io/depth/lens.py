@@ -1,7 +1,7 @@
 """Depth maps of a distorted lens, brought to the pixels of undistorted photographs.
 
-Notation: ``lens`` is the camera that took the maps, in one of COLMAP's models; the photographs
-were undistorted to pinhole cameras at the same place. Promise: planar depth belongs to the ray and not
+Notation: ``lens`` is the camera that took the maps, in one of COLMAP's models; the photographs were
+undistorted to pinhole cameras at the same place. Promise: planar depth belongs to the ray and not
 to the pixel, so values are moved, never changed; a pixel takes the nearest value, so that no depth
 between two surfaces is made up, and NaN where the lens did not look.
 """

@@ -2,9 +2,10 @@
 
 Notation: a *stem* is a map's path without suffix, relative to the folder. For the image ``a/b.jpg``
 the stems are tried in this order: ``a/b.jpg``, ``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's
-dense stereo), ``a/b``, ``a/b_depth``, ``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM) and ``a/X.depth``
-for ``a/X.color.png`` (7-Scenes); for each, the suffixes in the order of ``SUFFIXES``. Promise: which
-file is taken depends on names alone, never on the order in which a system lists them.
+dense stereo), ``a/b``, ``a/b_depth``, ``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM) and
+``a/X.depth`` for ``a/X.color.png`` (7-Scenes); for each, the suffixes in the order of ``SUFFIXES``.
+Promise: which file is taken depends on names alone, never on the order in which a system lists
+them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A scene in two files: ``transforms_train.json`` and ``transforms_test.json``, as Blender's data sets have.
 
-Promise: both become one scene, whose images are named with their folders (``train/r_0.png``), and whose
-split is that of the files. Images that only ``transforms_val.json`` has are left out.
+Promise: both become one scene, whose images are named with their folders (``train/r_0.png``), and
+whose split is that of the files. Images that only ``transforms_val.json`` has are left out.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The content of a ``transforms.json`` to be written.
 
-Notation: as in ``splatseed.io.nerfstudio.transforms``. Promise: a file that was read keeps all its fields; a
-new one has those that nerfstudio's own conversion of a COLMAP model writes, which OpenSplat,
-Brush and LichtFeld Studio read too.
+Notation: as in ``splatseed.io.nerfstudio.transforms``. Promise: a file that was read keeps all its
+fields; a new one has those that nerfstudio's own conversion of a COLMAP model writes, which
+OpenSplat, Brush and LichtFeld Studio read too.
 """
 
 from __future__ import annotations

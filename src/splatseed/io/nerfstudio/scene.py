@@ -2,7 +2,8 @@
 
 Notation: the *transforms' space* is the world of the file's poses. Promise: points come from the
 file that the JSON names, else from a PLY known to lie in that space, else from a COLMAP model whose
-cameras prove how it is brought there: by a known turn of the axes, or by a similarity that fits them.
+cameras prove how it is brought there: by a known turn of the axes, or by a similarity that fits
+them.
 """
 
 from __future__ import annotations
@@ -113,8 +114,10 @@ def _transform_of_model(
         apart = np.abs(fitted.points(model_centers) - centers).max(axis=1)
         if len(centers) >= _FEWEST_FITTED and np.median(apart) <= _POSE_TOLERANCE * extent:
             note = (
-                f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and scaled"
-                f" by {fitted.scale:.3g}, as instant-ngp writes them; its points were brought there."
+                f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and "
+                "scaled"
+                f" by {fitted.scale:.3g}, as instant-ngp writes them; its points were brought "
+                "there."
             )
             return fitted.matrix, [note]
     raise SceneFormatError(

@@ -1,9 +1,9 @@
 """Scenes that splatseed wrote before: which of their points are originals, and what is known of them.
 
-Point files have no place for a point's origin, but ``splatseed.json`` beside them says how many of the
-points, the first ones, were in the input, and ``seeds.npz`` what made each of the others. New points
-must never be taken for originals: upsampling an output again starts from its originals and replaces
-what was made from them. Where no point at all is an original, all count as such.
+Point files have no place for a point's origin, but ``splatseed.json`` beside them says how many of
+the points, the first ones, were in the input, and ``seeds.npz`` what made each of the others. New
+points must never be taken for originals: upsampling an output again starts from its originals and
+replaces what was made from them. Where no point at all is an original, all count as such.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What killed processes leave behind: hidden partial outputs, found again and removed.
 
-Promise: what a process still writes to is never removed, as it holds a lock on it; where the system has no
-such locks nothing is.
+Promise: what a process still writes to is never removed, as it holds a lock on it; where the system
+has no such locks nothing is.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from pathlib import Path
 __all__ = ["held", "remove_leftovers", "remove_tree"]
 
 _SETTLED = 5.0
-"""Seconds after which a partial that nobody holds is a leftover: it is held right after it is made."""
+"""Seconds after which a partial that nobody holds is a leftover: it is held right after it is
+made."""
 _LOG = logging.getLogger(__name__)
 
 

@@ -1,9 +1,10 @@
 """``splatseed.json``: which folder may be replaced, and which of its files are ours.
 
 Notation: ``command`` says what wrote a folder, its *kind*; ``files`` lists the paths inside it with
-forward slashes. An entry may name a folder that is an output of its own: then that one's manifest says
-what is ours in there. Promise: a folder may be replaced only by its own kind, and only if nothing lies
-in it that is not listed; a manifest that is missing, damaged or has no list allows nothing.
+forward slashes. An entry may name a folder that is an output of its own: then that one's manifest
+says what is ours in there. Promise: a folder may be replaced only by its own kind, and only if
+nothing lies in it that is not listed; a manifest that is missing, damaged or has no list allows
+nothing.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """``seeds.npz``: what is known of an output's points that point files have no place for.
 
-Notation: N points, in the order of the point files; ``source`` uint8 [N], ``normals`` float16 [N, 3],
-``sizes`` float32 [N] and ``confidence`` float16 [N], in the scene's world, each there if it is known
-of any point; ``digest`` is the fingerprint of the positions that they belong to. Promise: the file
-has the same bytes for the same cloud; one of other points, or damaged, is told of and not used; no
-pickle is loaded, and nothing is allocated on the word of a header.
+Notation: N points, in the order of the point files; ``source`` uint8 [N], ``normals`` float16 [N,
+3], ``sizes`` float32 [N] and ``confidence`` float16 [N], in the scene's world, each there if it is
+known of any point; ``digest`` is the fingerprint of the positions that they belong to. Promise: the
+file has the same bytes for the same cloud; one of other points, or damaged, is told of and not
+used; no pickle is loaded, and nothing is allocated on the word of a header.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def write_seeds(folder: Path, points: PointCloud) -> None:
     if not arrays:
         return
     digest = np.frombuffer(_digest(points.xyz), np.uint8)
-    np.savez_compressed(folder / SEEDS, digest=digest, **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(folder / SEEDS, digest=digest, **arrays)  # type: ignore[arg-type]  # savez takes arrays by name
 
 
 def read_seeds(folder: Path, points: PointCloud) -> KnownOfSeeds:

@@ -1,10 +1,11 @@
 """Output that is there whole or not at all.
 
 Notation: the *target* is what the user named, the *partial* a hidden sibling ``.NAME.partial-XXXX``
-that is written first and renamed to the target at the end; a *leftover* is the partial of a process that
-was killed, which the next one for the same target removes. Promise: whatever interrupts the writing
-(an error, a full disk, Ctrl-C), the partial is removed and an older output is still there unharmed;
-an ``OSError`` becomes an ``OutputError`` that says what to do, and what cannot be removed is named.
+that is written first and renamed to the target at the end; a *leftover* is the partial of a process
+that was killed, which the next one for the same target removes. Promise: whatever interrupts the
+writing (an error, a full disk, Ctrl-C), the partial is removed and an older output is still there
+unharmed; an ``OSError`` becomes an ``OutputError`` that says what to do, and what cannot be removed
+is named.
 """
 
 from __future__ import annotations
@@ -40,8 +41,9 @@ def output_folder(
     """A folder to write into that appears at ``path`` when the block ends without an error.
 
     Missing parents are made. An empty folder at ``path`` is used up; a full one is replaced only
-    with ``overwrite``, and only if its ``splatseed.json`` says that the same kind wrote it and lists
-    all that is in it. That of the new one is written at the end, with what the block has put there.
+    with ``overwrite``, and only if its ``splatseed.json`` says that the same kind wrote it and
+    lists all that is in it. That of the new one is written at the end, with what the block has put
+    there.
 
     Args:
         path: Where the output is to be.

@@ -1,7 +1,7 @@
 """RGB-D captures in the layout of NICE-SLAM's Replica: colour images, poses and one camera.
 
-A folder holds ``results/frame*.jpg`` (or .png) and ``results/depth*.png``, ``traj.txt`` with
-one row-major 4x4 ``world_from_cam`` in OpenCV axes and metres a line, a line a frame in the order
+A folder holds ``results/frame*.jpg`` (or .png) and ``results/depth*.png``, ``traj.txt`` with one
+row-major 4x4 ``world_from_cam`` in OpenCV axes and metres per line, a line per frame in the order
 of the frames' numbers, and ``cam_params.json``, here or one folder up.
 
 The layout's principal point takes the centre of the top-left pixel as (0, 0): Replica's 1200 pixel
@@ -57,7 +57,7 @@ def load_rgbd(path: Path) -> Scene:
     trajectory = _read_trajectory(root / "traj.txt")
     if len(frames) != len(trajectory):
         raise SceneFormatError(
-            f"{root / 'traj.txt'} to have one line a frame, {len(frames)} for {root / 'results'}",
+            f"{root / 'traj.txt'} to have one line per frame, {len(frames)} for {root / 'results'}",
             found=f"{len(trajectory)} lines",
             fix="Put back the missing frames or lines.",
         )
@@ -139,7 +139,7 @@ def _bad_line(path: Path, number: int, found: str) -> SceneFormatError:
     return SceneFormatError(
         f"16 numbers, a row-major 4x4 world_from_cam, in {path} line {number}",
         found=found,
-        fix="Write one pose a line.",
+        fix="Write one pose per line.",
     )
 
 

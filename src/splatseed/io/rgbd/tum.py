@@ -1,8 +1,9 @@
 """RGB-D captures in the layout of TUM's RGB-D benchmark.
 
-A folder holds ``rgb.txt`` and ``depth.txt`` (``time path`` a line, times in seconds), ``groundtruth.txt``
-(``time tx ty tz qx qy qz qw`` a line, ``world_from_cam`` in OpenCV axes and metres) and the images, in
-``rgb/`` and ``depth/``; depth PNGs hold planar z times 5000. Lines that begin with # are comments.
+A folder holds ``rgb.txt`` and ``depth.txt`` (``time path`` a line, times in seconds),
+``groundtruth.txt`` (``time tx ty tz qx qy qz qw`` a line, ``world_from_cam`` in OpenCV axes and
+metres) and the images, in ``rgb/`` and ``depth/``; depth PNGs hold planar z times 5000. Lines that
+begin with # are comments.
 
 Notation: what is taken at different times belongs together if the times are within 0.02 s, the
 benchmark's own tolerance. Promise: every image returned exists, has its camera's size and a pose.
@@ -40,8 +41,8 @@ _COLOR_CAMERAS: dict[str, tuple[float, ...]] = {
     "2": (520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),
     "3": (535.4, 539.2, 320.1, 247.6),
 }
-"""fx fy cx cy k1 k2 p1 p2 k3 of the colour cameras, as the benchmark's page "File formats" gives them
-(the images of freiburg3 are undistorted already). The first pixel's centre is (0, 0) there."""
+"""fx fy cx cy k1 k2 p1 p2 k3 of the colour cameras, as the benchmark's page "File formats" gives
+them (the images of freiburg3 are undistorted already). The first pixel's centre is (0, 0) there."""
 _DEFAULT_CAMERA = (525.0, 525.0, 319.5, 239.5)  # ROS's, which that page gives too
 
 
@@ -53,17 +54,18 @@ def is_tum(root: Path) -> bool:
 def load_tum(path: Path) -> Scene:
     """Read the images, poses and depth maps of a TUM RGB-D capture; it has no points.
 
-    The camera is that of ``cam_params.json`` (here or one folder up, as in NICE-SLAM's layout), else
-    the published one of the series that the folder's name tells (freiburg1, 2 or 3), else ROS's default
-    with a warning. A pose is interpolated between the records before and after the image where both are
-    near, else it is the nearest record's. Images without a pose or a file are left out with a warning.
+    The camera is that of ``cam_params.json`` (here or one folder up, as in NICE-SLAM's layout),
+    else the published one of the series that the folder's name tells (freiburg1, 2 or 3), else
+    ROS's default with a warning. A pose is interpolated between the records before and after the
+    image where both are near, else it is the nearest record's. Images without a pose or a file are
+    left out with a warning.
 
     Args:
         path: The folder that holds ``rgb.txt`` and ``groundtruth.txt``.
 
     Returns:
-        A scene with posed images, one PINHOLE or FULL_OPENCV camera, an empty cloud, and in ``depths``
-        the maps nearest in time.
+        A scene with posed images, one PINHOLE or FULL_OPENCV camera, an empty cloud, and in
+        ``depths`` the maps nearest in time.
 
     Raises:
         SceneNotFoundError: A list is missing, or no image has a pose.

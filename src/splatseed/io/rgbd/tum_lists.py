@@ -1,8 +1,9 @@
 """The lists of a TUM RGB-D capture, and what belongs together by time.
 
-Notation: times are seconds, sorted; ``quats`` are unit wxyz of ``world_from_cam`` (the files have xyzw).
-Promise: a line that is neither a comment nor a record is a ``SceneFormatError`` that names it; records
-that are not finite (tracking was lost) are left out.
+Notation: times are seconds, sorted; ``quats`` are unit wxyz of ``world_from_cam`` (the files have
+xyzw).
+Promise: a line that is neither a comment nor a record is a ``SceneFormatError`` that names it;
+records that are not finite (tracking was lost) are left out.
 """
 
 from __future__ import annotations

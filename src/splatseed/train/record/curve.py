@@ -36,7 +36,7 @@ class Record(NamedTuple):
 
 
 def write_curve_csv(path: Path, records: Sequence[Record]) -> None:
-    """Write one row a record, with a header; a PSNR not taken is left blank.
+    """Write one row per record, with a header; a PSNR not taken is left blank.
 
     Raises:
         OutputError: The file cannot be written.
@@ -54,7 +54,7 @@ def write_curve_png(path: Path, records: Sequence[Record]) -> None:
         OutputError: The file cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
-    from matplotlib.figure import Figure  # noqa: PLC0415
+    from matplotlib.figure import Figure  # noqa: PLC0415  (loads with its use)
 
     figure = Figure(figsize=(7.0, 7.0), layout="constrained")
     FigureCanvasAgg(figure)

@@ -27,7 +27,7 @@ class Strategy(ABC):
         self.state: dict[str, Any] = {}
         self.capacity = capacity
 
-    def regularization(self, params: Parameters) -> Float[Tensor, ""] | None:  # noqa: ARG002
+    def regularization(self, params: Parameters) -> Float[Tensor, ""] | None:  # noqa: ARG002  (the interface's name)
         """What is added to the loss; nothing by default."""
         return None
 

@@ -1,8 +1,9 @@
 """How much of a photograph each Gaussian paints, and how wrong the pixels are that it paints.
 
-Notation: w_ip is the weight of Gaussian i in pixel p, its alpha times the transmittance in front of it, so that
-pixel p is sum_i w_ip c_i. Any rasteriser gives sums of weights as a gradient: of sum_p f_p sum_i w_ip c_i with
-respect to c_i. Promise: the Gaussians are left as they are, and so are their gradients.
+Notation: w_ip is the weight of Gaussian i in pixel p, its alpha times the transmittance in front of
+it, so that pixel p is sum_i w_ip c_i. Any rasteriser gives sums of weights as a gradient: of sum_p
+f_p sum_i w_ip c_i with respect to c_i. Promise: the Gaussians are left as they are, and so are
+their gradients.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 Notation: ``info`` is the rasteriser's; ``before`` runs ahead of the backward pass, ``after`` behind
 the optimisers. Promise: what runs are subclasses of gsplat's strategies, on both backends, which
-hold growth to a cap and to the memory, and MCMC's growth and noise to splatseed's conventions; ``state`` is all that
-a checkpoint must hold of them. gsplat 1.5.3 never resets opacities (it writes
+hold growth to a cap and to the memory, and MCMC's growth and noise to splatseed's conventions;
+``state`` is all that a checkpoint must hold of them. gsplat 1.5.3 never resets opacities (it writes
 ``step % reset_every == 0 & step > 0``, which is always false), so that is an option here.
 """
 
@@ -131,8 +131,8 @@ class _Bounded(MCMCStrategy):
     """gsplat's strategy, but that it may grow faster, and never beyond the memory.
 
     gsplat moves positions by a covariance times noise. A covariance is an area and a displacement a
-    length, so it is divided by the near depth: the noise of a Gaussian of given size in the pictures
-    is then the same in the pictures wherever it stands.
+    length, so it is divided by the near depth: the noise of a Gaussian of given size in the
+    pictures is then the same in the pictures wherever it stands.
     """
 
     capacity: Capacity | None = None

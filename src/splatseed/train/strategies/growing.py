@@ -1,11 +1,12 @@
 """Strategy ``grow``: a fixed budget, spent where the photographs are still wrong.
 
-Notation: of each Gaussian, over the views looked at since the last round: *pixels* c = sum w, *error* E = sum w e
-with e the absolute error of a pixel (see ``contributions``), and *most pixels*, c in the one view where it is
-largest. Promise: the number of Gaussians never exceeds the budget; which ones grow depends on the views and the
-seed alone. The idea of growing by the error that a Gaussian paints is that of S. Rota Bulo et al., "Revising
-Densification in Gaussian Splatting" (2024); what is taken away, when, and by what the error is divided were chosen
-on held-out training views: see benchmarks/README.md.
+Notation: of each Gaussian, over the views looked at since the last round: *pixels* c = sum w,
+*error* E = sum w e with e the absolute error of a pixel (see ``contributions``), and *most pixels*,
+c in the one view where it is largest. Promise: the number of Gaussians never exceeds the budget;
+which ones grow depends on the views and the seed alone. The idea of growing by the error that a
+Gaussian paints is that of S. Rota Bulo et al., "Revising Densification in Gaussian Splatting"
+(2024); what is taken away, when, and by what the error is divided were chosen on held-out training
+views: see benchmarks/README.md.
 """
 
 from __future__ import annotations
@@ -31,10 +32,12 @@ LOOK_EVERY = 2
 FAINT = 0.005
 """Opacity below which a Gaussian goes, as in 3DGS."""
 LEAST_PIXELS, LEAST_PART = 0.5, 0.1
-"""A Gaussian goes that paints less than this of a pixel, and less than this part of what Gaussians paint on
-average, in every view that shows it: where there are more Gaussians than pixels, all paint little."""
+"""A Gaussian goes that paints less than this of a pixel, and less than this part of what Gaussians
+paint on average, in every view that shows it: where there are more Gaussians than pixels, all paint
+little."""
 RECYCLED = 0.1
-"""Part of a full budget that is taken from those with the fewest pixels, and spent again, a round."""
+"""Part of a full budget that is taken from those with the fewest pixels, and spent again, a
+round."""
 FULL = 0.95
 """From this part of the budget on it counts as full."""
 FULL_AT = 0.35

@@ -1,8 +1,9 @@
 """Depth-guided lifting (paper, eqs. 7-9): pixels become points where a map says how far they are.
 
-P = c + z v, with c the camera's centre, v the ray through the pixel's centre and z its depth, scaled to the
-scene by the SfM points of the image. The work is done in ``splatseed.depth``; here are the method's
-parameters and their limits. Promise: every new point is the centre of a pixel of a map, at its depth.
+P = c + z v, with c the camera's centre, v the ray through the pixel's centre and z its depth,
+scaled to the scene by the SfM points of the image. The work is done in ``splatseed.depth``; here
+are the method's parameters and their limits. Promise: every new point is the centre of a pixel of a
+map, at its depth.
 """
 
 from __future__ import annotations

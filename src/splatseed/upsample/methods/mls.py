@@ -1,9 +1,10 @@
 """Moving least squares (paper, eqs. 4-5): a weighted quadratic height field at every base point.
 
-Minimise sum_j w_j (q(u_j, v_j) - z_j)^2 over q of degree 2, with w_j = 1 / max(d_j, d_1 / 2): inverse
-to the distance from the base point, held finite at the base itself. Coordinates are scaled by the
-distance of the k-th neighbour, and a ridge of 1e-6 times the mean diagonal settles what collinear or
-too few neighbours leave open. A position drawn on the patch is moved along the normal onto q.
+Minimise sum_j w_j (q(u_j, v_j) - z_j)^2 over q of degree 2, with w_j = 1 / max(d_j, d_1 / 2):
+inverse to the distance from the base point, held finite at the base itself. Coordinates are scaled
+by the distance of the k-th neighbour, and a ridge of 1e-6 times the mean diagonal settles what
+collinear or too few neighbours leave open. A position drawn on the patch is moved along the normal
+onto q.
 """
 
 from __future__ import annotations

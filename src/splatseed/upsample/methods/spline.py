@@ -4,8 +4,8 @@ Default: a P-spline. Over the 6 x 6 control values c of ``spline_basis``, minimi
 sum_j (S(u_j, v_j) - z_j)^2 + lambda c' P c; the penalty makes the problem well-posed for 26 points
 and 36 unknowns. lambda is fixed, or chosen for every patch by generalised cross-validation.
 
-Paper: FITPACK with smoothing s = 0.1 k at k = 25. Its smoothing is inert there: no fit gets an inner
-knot, so the result is the least-squares bicubic polynomial in world axes, which is what
+Paper: FITPACK with smoothing s = 0.1 k at k = 25. Its smoothing is inert there: no fit gets an
+inner knot, so the result is the least-squares bicubic polynomial in world axes, which is what
 ``basis="bicubic"`` computes.
 """
 

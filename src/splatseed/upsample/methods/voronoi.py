@@ -49,7 +49,8 @@ class Voronoi(NearestMethod):
     k: int = 25
     """Neighbours that shape a cell; half the distance of the last bounds it."""
     cells: Literal["clamped", "box"] = "clamped"
-    """Cells clamped to their neighbourhood, or Qhull's in the enlarged bounding box (paper: box)."""
+    """Cells clamped to their neighbourhood, or Qhull's in the enlarged bounding box (paper:
+    box)."""
     ball: float = 0.5
     """Radius of the ball that takes new points, as a share of the cell's radius (paper: 0.5)."""
     color_k: int = 5

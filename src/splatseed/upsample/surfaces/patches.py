@@ -21,7 +21,7 @@ __all__ = ["Patches", "lift"]
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """One patch a row, and the places on it where new points go.
+    """One patch per row, and the places on it where new points go.
 
     Args:
         cloud: The prepared originals, n rows.

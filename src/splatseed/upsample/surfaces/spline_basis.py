@@ -4,9 +4,9 @@ Notation: C = 6 control values a side on the domain [-1, 1] (3 uniform intervals
 c[a, b] lie flat as c[6 a + b]; S(u, v) = sum_ab B_a(u) B_b(v) c[a, b]. On a patch, u and v are
 scaled by the neighbours' largest |u| and |v|, and z by 1.5 times the k-th distance, so that every
 patch poses the same problem whatever the scene's units.
-Penalty: a discrete thin plate, D2'D2 x I + 2 D1'D1 x D1'D1 + I x D2'D2 (after P. Eilers and B. Marx,
-Flexible smoothing with B-splines and penalties, 1996, with the cross term of a thin plate). Its null
-space is the planes, so that strong smoothing tends to the least-squares plane.
+Penalty: a discrete thin plate, D2'D2 x I + 2 D1'D1 x D1'D1 + I x D2'D2 (after P. Eilers and B.
+Marx, Flexible smoothing with B-splines and penalties, 1996, with the cross term of a thin plate).
+Its null space is the planes, so that strong smoothing tends to the least-squares plane.
 """
 
 from __future__ import annotations

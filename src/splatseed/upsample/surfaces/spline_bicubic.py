@@ -2,7 +2,8 @@
 
 With k = 25 points and cubic degrees, ``SmoothBivariateSpline`` has room for no inner knot, so that
 its smoothing s never acts: the spline is the tensor-product cubic polynomial of 16 terms. It is
-fitted here by LAPACK's minimum-norm least squares, patch by patch, in coordinates scaled to [-1, 1].
+fitted here by LAPACK's minimum-norm least squares, patch by patch, in coordinates scaled to [-1,
+1].
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The CPU stages as PyTorch functions, one camera at a time.
+"""The CPU stages as PyTorch autograd functions, one camera at a time.
 
 ``Project``, ``Harmonics`` and ``Blend`` are separate so that the 2D means between the first and the
 last are an ordinary tensor: densification strategies watch its gradient. Tensors are float32 on the
@@ -28,7 +28,7 @@ ALIGNMENT = 64
 
 
 class Lens(NamedTuple):
-    """What of a camera is not differentiated."""
+    """The constants of a projection: no gradient flows to them."""
 
     K: np.ndarray
     """float32 [3, 3]."""
@@ -56,7 +56,7 @@ class Project(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(  # type: ignore[override]  # PyTorch's own takes anything
         ctx: Any,
         means: Tensor,
         quats: Tensor,
@@ -82,7 +82,7 @@ class Project(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]  # PyTorch's own takes anything
         """Gradients of the inputs."""
         means, quats, scales, viewmat = (_array(t) for t in ctx.saved_tensors)
         lens: Lens = ctx.lens
@@ -94,11 +94,11 @@ class Project(torch.autograd.Function):
         )  # fmt: skip
         d_view = torch.zeros(4, 4)
         d_view[:3] = torch.from_numpy(by_view.sum(axis=0))
-        slopes = [torch.from_numpy(each) for each in results]
+        d_inputs = [torch.from_numpy(each) for each in results]
         if ctx.sparse:
             rows = is_seen(torch.from_numpy(ctx.radii)).nonzero()[:, 0]
-            slopes = [_sparse(each, rows) for each in slopes]
-        return *slopes, None, d_view, None, None
+            d_inputs = [_sparse(each, rows) for each in d_inputs]
+        return *d_inputs, None, d_view, None, None
 
 
 def is_seen(radii: Tensor) -> Tensor:
@@ -116,12 +116,12 @@ def _sparse(dense: Tensor, rows: Tensor) -> Tensor:
 class Harmonics(torch.autograd.Function):
     """Harmonics to colours [N, 3]: 0.5 more, and at least 0.
 
-    Inputs: means [N, 3], the camera's place [3], coefficients, radii [N, 2], degree. Coefficients come
-    in one tensor [N, K, 3] and None, or in two, [N, 1, 3] and [N, K - 1, 3].
+    Inputs: means [N, 3], the camera's place [3], coefficients, radii [N, 2], degree. Coefficients
+    come in one tensor [N, K, 3] and None, or in two, [N, 1, 3] and [N, K - 1, 3].
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(  # type: ignore[override]  # PyTorch's own takes anything
         ctx: Any,
         means: Tensor,
         origin: Tensor,
@@ -142,7 +142,7 @@ class Harmonics(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, d_colors: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, d_colors: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]  # PyTorch's own takes anything
         """Gradients of the inputs."""
         means, origin, base, rest, radii = ctx.saved_tensors
         first, rows, skipped = _coefficients(base, rest)
@@ -216,7 +216,7 @@ class Blend(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(  # type: ignore[override]  # PyTorch's own takes anything
         ctx: Any,
         means2d: Tensor,
         conics: Tensor,
@@ -234,26 +234,31 @@ class Blend(torch.autograd.Function):
         channels = colors.shape[1]
         behind = np.zeros(channels, np.float32) if background is None else _array(background)
         image = np.empty((height, width, channels), np.float32)
-        passing = np.empty((height, width), np.float32)
+        transmittance = np.empty((height, width), np.float32)
         hits = np.empty(len(prepared.lists.listed_rank), np.uint8)
         for first in range(0, channels, blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
             blocks = _forward(prepared, records, channels - first, hits)
-            layout.from_blocks(*blocks, prepared.columns, behind, first, image, passing)  # type: ignore[call-arg]  # star arguments
-        ctx.prepared, ctx.on_absgrad, ctx.passing, ctx.image = prepared, on_absgrad, passing, image
+            layout.from_blocks(*blocks, prepared.columns, behind, first, image, transmittance)  # type: ignore[call-arg]  # star arguments
+        ctx.prepared, ctx.on_absgrad, ctx.transmittance, ctx.image = (
+            prepared,
+            on_absgrad,
+            transmittance,
+            image,
+        )
         ctx.hits = hits
         ctx.save_for_backward(means2d, conics, colors, opacities, background)
-        return torch.from_numpy(image), torch.from_numpy(1.0 - passing)
+        return torch.from_numpy(image), torch.from_numpy(1.0 - transmittance)
 
     @staticmethod
     @once_differentiable
-    def backward(  # type: ignore[override]
+    def backward(  # type: ignore[override]  # PyTorch's own takes anything
         ctx: Any, d_image: Tensor, d_alphas: Tensor
     ) -> tuple[Tensor | None, ...]:
         """Gradients of the inputs."""
         means2d, conics, colors, opacities, background = ctx.saved_tensors
         prepared: _Prepared = ctx.prepared
-        gradient, passing = _array(d_image), ctx.passing
+        gradient, transmittance = _array(d_image), ctx.transmittance
         absolute = ctx.on_absgrad is not None
         shapes = [tuple(each.shape) for each in (means2d, conics, opacities, colors)]
         shapes.append(shapes[0] if absolute else (0, 2))
@@ -261,7 +266,7 @@ class Blend(torch.autograd.Function):
         for first in range(0, colors.shape[1], blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
             totals = _backward(
-                prepared, records, ctx.hits, gradient, ctx.image, _array(d_alphas), passing, first,
+                prepared, records, ctx.hits, gradient, ctx.image, _array(d_alphas), transmittance, first,
                 absolute,
             )  # fmt: skip
             layout.scatter(  # type: ignore[call-arg]  # star arguments
@@ -271,7 +276,7 @@ class Blend(torch.autograd.Function):
             ctx.on_absgrad(torch.from_numpy(results[4]))
         d_background = None
         if background is not None and ctx.needs_input_grad[4]:
-            d_background = torch.from_numpy((gradient * passing[:, :, None]).sum(axis=(0, 1)))
+            d_background = torch.from_numpy((gradient * transmittance[:, :, None]).sum(axis=(0, 1)))
         d_means2d, d_conics, d_opacities, d_colors = map(torch.from_numpy, results[:4])
         return d_means2d, d_conics, d_colors, d_opacities, d_background, *(None,) * 5
 
@@ -348,14 +353,16 @@ def _backward(
     d_image: np.ndarray,
     image: np.ndarray,
     d_alphas: np.ndarray,
-    passing: np.ndarray,
+    transmittance: np.ndarray,
     first: int,
     absolute: bool,
 ) -> np.ndarray:
     """Gradient sums of every visible Gaussian, by depth rank, [G, 16]."""
     lists, lanes = prepared.lists, prepared.lanes
     gradient, behind = _aligned(lanes * blending.CHANNELS), _aligned(lanes)
-    layout.to_blocks(d_image, image, d_alphas, passing, prepared.columns, first, gradient, behind)
+    layout.to_blocks(
+        d_image, image, d_alphas, transmittance, prepared.columns, first, gradient, behind
+    )
     sums = _aligned(int(lists.span_start[-1]) * blending_vjp.SUMS, zero=True)
     blending_vjp.backward(
         records, lists.tile_start, lists.listed_rank, lists.listed_span, hits, prepared.row_order,

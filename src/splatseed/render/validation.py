@@ -134,7 +134,7 @@ def check_tensors(
 def _check_colors(
     colors: Any, n: tuple[int, ...], cameras: tuple[int, ...], sh_degree: int | None
 ) -> None:
-    """Shared by the cameras or one set a camera: only the number of axes tells them apart."""
+    """Shared by the cameras or one set per camera: only the number of axes tells them apart."""
     terms = 0 if sh_degree is None else (sh_degree + 1) ** 2
     one, axes = ("D", 2) if sh_degree is None else (f"K >= {terms}, 3", 3)
     shape = tuple(colors.shape)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial import cKDTree
 
-from splatseed.depth.spreading import _Cubes, spread_points
+from splatseed.depth.voxel_thinning import _Cubes, thin_by_voxels
 
 
 def sheet(rng, num):
@@ -22,7 +22,7 @@ def spread(xyz, num, rng, originals=None, footprint=None):
     every = np.ones(len(xyz), bool)
     footprint = every.astype(np.float32) if footprint is None else footprint
     originals = xyz[:0] if originals is None else originals
-    return np.flatnonzero(spread_points(xyz, footprint, every, originals, num, rng))
+    return np.flatnonzero(thin_by_voxels(xyz, footprint, every, originals, num, rng))
 
 
 def reference(xyz, footprint, originals, side):
@@ -59,7 +59,7 @@ def test_exactly_so_many_come_out(num, rng):
 
 def test_only_the_eligible_are_chosen(rng):
     xyz, eligible = sheet(rng, 3000), rng.random(3000) < 0.5
-    taken = spread_points(xyz, np.ones(3000, np.float32), eligible, xyz[:0], 800, rng)
+    taken = thin_by_voxels(xyz, np.ones(3000, np.float32), eligible, xyz[:0], 800, rng)
     assert np.count_nonzero(taken) == 800
     assert eligible[taken].all()
 

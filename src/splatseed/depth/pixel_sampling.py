@@ -1,9 +1,9 @@
 """Which pixels of a map to lift: known ones, away from jumps in depth, where SfM found little.
 
-Notation: a map is H x W; ``cells`` are squares of ``step`` pixels with a weight each; a pixel's number is
-row * W + column. w = 1 / depth, which is linear in the image on a plane at any slant, so that
-w(-k) + w(+k) = 2 w(0) there and a jump shows as what is left of it. Promise: no pixel is drawn twice;
-at least as many are drawn as are asked for, or all there are.
+Notation: a map is H x W; ``cells`` are squares of ``step`` pixels with a weight each; a pixel's
+number is row * W + column. w = 1 / depth, which is linear in the image on a plane at any slant, so
+that w(-k) + w(+k) = 2 w(0) there and a jump shows as what is left of it. Promise: no pixel is drawn
+twice; at least as many are drawn as are asked for, or all there are.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatseed.depth.settings import Settings
 from splatseed.kernels.jit import inline
 
-__all__ = ["Drawn", "draw_pixels"]
+__all__ = ["Drawn", "sample_pixels"]
 
 CELLS = 64
 """Cells along the longer side of a map, at most."""
@@ -45,7 +45,7 @@ class Drawn:
     edge: Bool[np.ndarray, " C"]
 
 
-def draw_pixels(
+def sample_pixels(
     values: Float32[np.ndarray, "H W"],
     num: int,
     points: Float64[np.ndarray, "M 2"],
@@ -211,8 +211,8 @@ def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyp
 def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyped-def]
     """Whether 1 / depth bends within ``radius``, across, down or diagonally, or is mostly unknown.
 
-    All distances are looked at along the row, where memory is near, and the largest alone elsewhere:
-    there, a jump that is passed twice can be missed.
+    All distances are looked at along the row, where memory is near, and the largest alone
+    elsewhere: there, a jump that is passed twice can be missed.
     """
     here = 2.0 / values[row, column]
     known, pairs = 0, 0

@@ -1,17 +1,18 @@
-"""One factor an image, so that maps agree with one another where they overlap.
+"""Scale synchronisation: one factor per image, so that maps agree with one another where they overlap.
 
-Notation: V views; depth of view i is multiplied by exp(g_i). A pair (i, j) that sees the same places has
-a = median log(d_j / z_ij), where z_ij is the depth in view j of candidates of view i, and d_j what view j
-knows there. Then to first order
+Notation: V views; depth of view i is multiplied by exp(g_i). A pair (i, j) that sees the same
+places has a = median log(d_j / z_ij), where z_ij is the depth in view j of candidates of view i,
+and d_j what view j knows there. Then to first order
 
     g_j - g_i = -a, to within the spread of the samples,    and    g_i = 0, to within the image's residual,
 
-the latter by its SfM points. Promise: the most probable g under these, with Huber's weights, found twice,
-the second time from where the first left the maps. Pairs move maps only against each other: the scale of
-all that overlap remains that of the SfM points. Nothing is random.
+the latter by its SfM points. Promise: the most probable g under these, with Huber's weights, found
+twice, the second time from where the first left the maps. Pairs move maps only against each other:
+the scale of all that overlap remains that of the SfM points. Nothing is random.
 
-SfM points of one image err together: on 7-Scenes red kitchen, where one sensor's scale is the same for all
-frames, scales fitted to one image at a time are off by 4% (standard deviation), and by up to 20%.
+SfM points of one image err together: on 7-Scenes red kitchen, where one sensor's scale is the same
+for all frames, scales fitted to one image at a time are off by 4% (standard deviation), and by up
+to 20%.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ SAMPLES = 96
 PAIRS = 6
 """Neighbours of a view that it is compared with: more do not change the result."""
 LEAST_SAMPLES = 12
-FAR = 0.25
+OTHER_SURFACE = 0.25
 """Logarithms of ratios beyond this are of other surfaces."""
 LEAST_SIGMA, LEAST_RESIDUAL = 0.005, 0.0005
 """No pair, and no SfM cloud, is believed to more than this."""
@@ -61,7 +62,7 @@ def harmonize(
         progress: Told how many are compared.
     """
     residuals = np.array([view.alignment.residual for view in views])
-    sigma = np.maximum(np.where(np.isfinite(residuals), residuals, FAR), LEAST_RESIDUAL)
+    sigma = np.maximum(np.where(np.isfinite(residuals), residuals, OTHER_SURFACE), LEAST_RESIDUAL)
     g = np.zeros(len(views))
     for _ in range(ROUNDS):
         g = _solve(_compare_all(views, neighbors, g, progress), g, sigma)
@@ -133,7 +134,7 @@ def _compare_pair(samples, z, factor, m, out):  # type: ignore[no-untyped-def]
         if not (0 <= column < z.shape[1] and 0 <= row < z.shape[0] and z[row, column] > 0):
             continue
         log = np.log(factor * z[row, column] / depth)
-        if abs(log) <= FAR:
+        if abs(log) <= OTHER_SURFACE:
             logs[count] = log
             count += 1
     if count >= LEAST_SAMPLES:

@@ -1,9 +1,9 @@
 """A given number of points out of many candidates, as far apart as that number allows.
 
-Notation: space is cut into cubes of one *side*; the key of a cube is its place, three numbers of 21 bits,
-scrambled so that any bits of it are as good as random ones. Promise: one candidate at most is taken of each cube, that of
-the finest footprint, and none where an original lies; the side is the largest that gives the number, to
-about a fiftieth; the result does not depend on threads.
+Notation: space is cut into cubes of one *side*; the key of a cube is its place, three numbers of 21
+bits, scrambled so that any bits of it are as good as random ones. Promise: one candidate at most is
+taken of each cube, that of the finest footprint, and none where an original lies; the side is the
+largest that gives the number, to about a fiftieth; the result does not depend on threads.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Float64
 from splatseed.kernels.hashing import scramble
 from splatseed.kernels.jit import inline, kernel, parallel_range
 
-__all__ = ["spread_points"]
+__all__ = ["thin_by_voxels"]
 
 BUCKETS = 32
 """Parts of the hash's range, worked on in parallel."""
@@ -27,7 +27,7 @@ SAMPLED = 2
 FEW = 1 << 16
 STEPS = 24
 LEAST_POWER = 0.2
-"""Of the number of cubes as a power of 1 / side, lest a step be too long."""
+"""Least exponent e that is assumed in: number of cubes ~ (1 / side)^e; bounds a step's length."""
 SLACK = 0.02
 EMPTY, BLOCKED = -1, -2
 """What a slot holds in place of a candidate."""
@@ -37,7 +37,7 @@ FINEST = 2.0**-20
 """The smallest side, as a share of the candidates' extent: places fit into the bits."""
 
 
-def spread_points(
+def thin_by_voxels(
     xyz: Float32[np.ndarray, "C 3"],
     footprint: Float32[np.ndarray, " C"],
     eligible: Bool[np.ndarray, " C"],

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.stats import chisquare
 
-from splatseed.depth.drawing import draw_pixels
+from splatseed.depth.pixel_sampling import sample_pixels
 from splatseed.depth.settings import Settings
 
 SHAPE = (60, 80)
@@ -29,7 +29,7 @@ def test_pixels_are_known_and_distinct(placement, num, rng):
     values = slanted(rng)
     points = rng.uniform(0, SHAPE[::-1], (40, 2))
     settings = Settings(placement=placement)
-    drawn = draw_pixels(values, num, points, settings, rng)
+    drawn = sample_pixels(values, num, points, settings, rng)
     known = int((values > 0).sum())
     assert min(num, known) <= len(drawn.pixel) <= max(1.2 * num + 2, known)
     assert len(np.unique(drawn.pixel)) == len(drawn.pixel) == len(drawn.edge)
@@ -40,7 +40,7 @@ def test_uniform_is_uniform(rng):
     values = slanted(rng, holes=0.0)
     counts = np.zeros(values.size)
     for _ in range(60):
-        np.add.at(counts, draw_pixels(values, 400, NOWHERE, PLAIN, rng).pixel, 1)
+        np.add.at(counts, sample_pixels(values, 400, NOWHERE, PLAIN, rng).pixel, 1)
     blocks = counts.reshape(6, 10, 8, 10).sum(axis=(1, 3)).ravel()
     assert chisquare(blocks).pvalue > 1e-4
     assert counts.max() < 25
@@ -50,7 +50,7 @@ def test_uniform_is_uniform(rng):
 def test_the_region_is_that_share_of_each_dimension(region, rng):
     values = slanted(rng, holes=0.0)
     settings = Settings(placement="uniform", edge_tolerance=None, region=region)
-    pixel = draw_pixels(values, 10_000, NOWHERE, settings, rng).pixel
+    pixel = sample_pixels(values, 10_000, NOWHERE, settings, rng).pixel
     row, column = np.divmod(pixel, SHAPE[1])
     assert len(pixel) == round(region * SHAPE[0]) * round(region * SHAPE[1])
     assert np.ptp(row) + 1 == round(region * SHAPE[0])
@@ -64,7 +64,7 @@ def test_pixels_go_where_points_are_far(rng):
     mean = {}
     for placement in ("uniform", "empty"):
         settings = Settings(placement=placement, edge_tolerance=None)
-        pixel = draw_pixels(values, 400, points, settings, rng).pixel
+        pixel = sample_pixels(values, 400, points, settings, rng).pixel
         row, column = np.divmod(pixel, SHAPE[1])
         mean[placement] = cKDTree(points).query(np.stack([column, row], axis=1))[0].mean()
         if placement == "empty":
@@ -78,13 +78,13 @@ def test_pixels_keep_off_the_jumps_of_depth(radius, rng):
     values[:, 40:] *= 1.1
     values[30:, :20] *= 0.9
     settings = Settings(placement="uniform", edge_radius=radius)
-    drawn = draw_pixels(values, 1500, NOWHERE, settings, rng)
+    drawn = sample_pixels(values, 1500, NOWHERE, settings, rng)
     row, column = np.divmod(drawn.pixel, SHAPE[1])
     assert not drawn.edge.any()
     assert not ((column >= 40 - radius) & (column < 40 + radius)).any()
     assert not ((row >= 30 + radius) & (column >= 20 - radius) & (column < 20 + radius)).any()
     assert not ((column < 20 - radius) & (row >= 30 - radius) & (row < 30 + radius)).any()
-    plain = np.divmod(draw_pixels(values, 1500, NOWHERE, PLAIN, rng).pixel, SHAPE[1])[1]
+    plain = np.divmod(sample_pixels(values, 1500, NOWHERE, PLAIN, rng).pixel, SHAPE[1])[1]
     assert ((plain >= 40 - radius) & (plain < 40 + radius)).any()
 
 
@@ -93,11 +93,11 @@ def test_a_slanted_plane_has_no_jumps_and_a_step_within_tolerance_is_none(rng):
     assert np.nanmax(np.abs(np.diff(values, axis=1) / values[:, 1:])) > 0.005
     settings = Settings(placement="uniform", edge_tolerance=0.001)
     num = values.size
-    assert not draw_pixels(values, num, NOWHERE, settings, rng).edge.any()
+    assert not sample_pixels(values, num, NOWHERE, settings, rng).edge.any()
     values[:, 40:] *= 1.02
     for tolerance, jumps in ((0.03, False), (0.01, True)):
         settings = Settings(placement="uniform", edge_tolerance=tolerance)
-        assert draw_pixels(values, num, NOWHERE, settings, rng).edge.any() == jumps
+        assert sample_pixels(values, num, NOWHERE, settings, rng).edge.any() == jumps
 
 
 def test_what_is_mostly_unknown_around_comes_last(rng):
@@ -106,13 +106,13 @@ def test_what_is_mostly_unknown_around_comes_last(rng):
     values[::6, 43:79:6] = 2.0  # sparse, as a lidar's
     settings = Settings(placement="uniform")
     known = int((values > 0).sum())
-    some = draw_pixels(values, known // 2, NOWHERE, settings, rng)
+    some = sample_pixels(values, known // 2, NOWHERE, settings, rng)
     assert (some.pixel % 80 < 40).all()
-    every = draw_pixels(values, known, NOWHERE, settings, rng)
+    every = sample_pixels(values, known, NOWHERE, settings, rng)
     assert len(every.pixel) == known
     assert every.edge[every.pixel % 80 > 40].all()
 
 
 def test_nothing_known_gives_nothing(rng):
     values = np.full(SHAPE, np.nan, np.float32)
-    assert len(draw_pixels(values, 10, NOWHERE, Settings(), rng).pixel) == 0
+    assert len(sample_pixels(values, 10, NOWHERE, Settings(), rng).pixel) == 0

@@ -1,9 +1,10 @@
 """Which SfM points each image sees: what depth maps are held against.
 
-Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the scene's world.
-Promise: only distinct finite originals take part. Where Structure-from-Motion says which features a point has
-(its track), that is taken; without tracks, points are projected, and of those that fall close together
-in the image only the nearest stay, as the others are probably hidden.
+Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the scene's
+world.
+Promise: only distinct finite originals take part. Where Structure-from-Motion says which features a
+point has (its track), that is taken; without tracks, points are projected, and of those that fall
+close together in the image only the nearest stay, as the others are probably hidden.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from splatseed.camera import Camera
 from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Image, Scene
 
-__all__ = ["SeenPoints", "Sightings", "camera_points", "find_sightings"]
+__all__ = ["SeenPoints", "Visibility", "camera_points", "find_visibility"]
 
 CELLS = 40
 """Columns and rows of an image within which points are taken to hide each other."""
@@ -44,7 +45,7 @@ def camera_points(camera: Camera, xyz: Float64[np.ndarray, "N 3"]) -> SeenPoints
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class Visibility:
     """The points of every image.
 
     Args:
@@ -72,13 +73,13 @@ class Sightings:
         return _in_front(self.xyz, image.camera)
 
 
-def find_sightings(scene: Scene) -> Sightings:
+def find_visibility(scene: Scene) -> Visibility:
     """Gather the points of every image once, to be asked for image by image."""
     usable = np.flatnonzero((scene.points.source == ORIGINAL) & scene.points.distinct)
     xyz = scene.points.xyz[usable].astype(np.float64)
     tracks = scene.tracks
     if tracks is None:
-        return Sightings(xyz, np.empty(0, np.int64), {}, {})
+        return Visibility(xyz, np.empty(0, np.int64), {}, {})
     row = np.full(len(scene.points), -1)
     row[usable] = np.arange(len(usable))
     point_idx = row[np.repeat(np.arange(len(tracks)), tracks.lengths)]
@@ -88,7 +89,7 @@ def find_sightings(scene: Scene) -> Sightings:
         image_ids = image_ids.astype(np.uint16)  # which is sorted by radix, ten times as fast
     order = np.argsort(image_ids, kind="stable")
     ids, start, count = np.unique(image_ids[order], return_index=True, return_counts=True)
-    return Sightings(
+    return Visibility(
         xyz,
         point_idx[good][order],
         dict(zip(ids.tolist(), start.tolist(), strict=True)),

@@ -106,11 +106,11 @@ def test_one_gaussian_one_camera_one_coefficient(count: int) -> None:
 
 
 def test_names_and_defaults_are_gsplats() -> None:
-    from inspect import signature  # noqa: PLC0415
+    from inspect import signature
 
-    from gsplat import rasterization as gsplats  # noqa: PLC0415
+    from gsplat import rasterization as gsplats
 
-    from splatseed.render.arguments import CUDA_ONLY  # noqa: PLC0415
+    from splatseed.render.validation import CUDA_ONLY
 
     ours, theirs = signature(rasterization).parameters, signature(gsplats).parameters
     named = [name for name in ours if name != "unsupported"]
