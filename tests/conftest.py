@@ -12,15 +12,15 @@ import pytest
 SCENES = Path(os.environ.get("SPLATSEED_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
 
 
-def pytest_collection_modifyitems(items) -> None:
-    """Slow tests last: what fails is known before they begin."""
-    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
-
-
 @pytest.fixture(autouse=True)
 def _untold_compilation(monkeypatch):
     """What commands say on stderr must not depend on what is compiled already."""
     monkeypatch.setattr("splatseed.console.TOLD_AFTER", math.inf)
+
+
+def pytest_collection_modifyitems(items) -> None:
+    """Slow tests last: what fails is known before they begin."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
 
 
 @pytest.fixture
