@@ -84,8 +84,7 @@ def _of_video(options: Options, clock: StageClock) -> SfmReport:
         report = _reconstruct(options, folder, clock)
     print_note(
         f"{len(picked.numbers)} of the video's {picked.total:,} frames were taken, in which the "
-        "picture moves"
-        f" by {picked.way:.1f} times its width."
+        f"picture moves by {picked.way:.1f} times its width."
     )
     return report
 

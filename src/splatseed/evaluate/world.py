@@ -100,14 +100,12 @@ def check_world(
         f"They fit with --transform {word}."
         if word
         else "Name the transform that its trainer applied with --transform FILE; "
-        "to score it as it is, "
-        f"pass --transform {NO_TRANSFORM}."
+        f"to score it as it is, pass --transform {NO_TRANSFORM}."
     )
     raise SceneFormatError(
         f"the Gaussians of {path} in the world of the scene, where its points are",
         found=f"points {found:.0f} times as far from the nearest Gaussian as Gaussians from each "
-        "other:"
-        " another frame, or another scene",
+        "other: another frame, or another scene",
         fix=fix,
     )
 
@@ -164,8 +162,7 @@ def _of_file(path: Path, scene: Scene) -> Similarity:
     if world is None:
         raise SceneFormatError(
             f"{path} to hold a similarity: a matrix of 3 or 4 rows of 4, by itself or as "
-            "transform, with "
-            "a scale beside it",
+            "transform, with a scale beside it",
             found=repr(rows)[:80],
             fix=_FIX,
         )

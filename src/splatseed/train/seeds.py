@@ -60,8 +60,7 @@ def seeded(
     new = len(cloud) - cloud.num_original
     note(
         f"Seeds by method auto: {cloud.num_original:,} points of the scene and {new:,} new ones, "
-        "in "
-        f"{time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as "
+        f"in {time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as "
         "they are."
     )
     return scene.replace(points=cloud)

@@ -208,10 +208,8 @@ def change_table(found: Comparison) -> Table:
     )
     note = (
         "PSNR in B less that in A, dB ± standard error. *: more than noise (Welch's test, "
-        "Holm-corrected"
-        " over all changes on scenes, and over all means); ~: within noise. (1 run): nothing is "
-        "known of the"
-        " noise."
+        "Holm-corrected over all changes on scenes, and over all means); ~: within noise. (1 "
+        "run): nothing is known of the noise."
     )
     return Table(
         "changes", "Changes from A to B", ("strategy", "method", *scenes, "mean"), rows, (note,)

@@ -48,8 +48,7 @@ def ratio_table(study: Study) -> Table:
 
 NOTE = (
     "dB ± the standard error of training these scenes again. ~: within noise (Holm-corrected over "
-    "the"
-    " variants of a strategy). Means are over the scenes that a variant has."
+    "the variants of a strategy). Means are over the scenes that a variant has."
 )
 
 
@@ -75,8 +74,7 @@ def strategy_table(study: Study) -> Table:
         (
             NOTE
             + " Strategy none adds no Gaussians, so that it shows what seeds alone are worth, but "
-            "also"
-            " gives upsampled runs more Gaussians than sfm.",
+            "also gives upsampled runs more Gaussians than sfm.",
             f"{study.description}.",
         ),
     )
@@ -119,10 +117,8 @@ def equal_count_table(study: Study) -> Table:
 def _equal_note(study: Study, any_rows: bool) -> str:
     rule = (
         "Listed are the variants of which every run ends within 1% of the number of Gaussians of "
-        "the sfm"
-        " run that it is paired with. That happens where a cap binds both: with strategy mcmc, or "
-        "where"
-        " --cap-max thins out the seeds of strategy none. ~: within noise."
+        "the sfm run that it is paired with. That happens where a cap binds both: with strategy "
+        "mcmc, or where --cap-max thins out the seeds of strategy none. ~: within noise."
     )
     if any_rows:
         return rule
@@ -131,6 +127,5 @@ def _equal_note(study: Study, any_rows: bool) -> str:
     )
     return (
         f"None qualifies (strategies {', '.join(study.strategies)}, {capped}): gains may come from "
-        "the mere"
-        f" number of Gaussians. {rule}"
+        f"the mere number of Gaussians. {rule}"
     )

@@ -172,14 +172,11 @@ def convergence_table(study: Study, strategy: StrategyName) -> Table:
 
 NOTE = (
     "Where a run's test PSNR first is at least the last one of the sfm run of the same scene and "
-    "repeat;"
-    " seconds with upsampling. 'sfm' reaches its own last PSNR earlier where its curve is not "
-    "rising at"
-    " the end. Means are over the runs that reach it, within scenes first; ratios are geometric "
-    "means,"
-    " below 1 is sooner, given only where all runs reach it. ~: a ratio within noise (t-test over "
-    "scenes,"
-    " or over repeats where there is one scene; Holm-corrected over the column)."
+    "repeat; seconds with upsampling. 'sfm' reaches its own last PSNR earlier where its curve is "
+    "not rising at the end. Means are over the runs that reach it, within scenes first; ratios "
+    "are geometric means, below 1 is sooner, given only where all runs reach it. ~: a ratio "
+    "within noise (t-test over scenes, or over repeats where there is one scene; Holm-corrected "
+    "over the column)."
 )
 
 

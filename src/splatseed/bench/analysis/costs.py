@@ -21,8 +21,8 @@ __all__ = ["cost_table", "mean_of", "quality_table"]
 
 QUALITY_NOTE = (
     "Means over the scenes that a method and sfm both have: compare methods of equally many "
-    "scenes. PSNR"
-    " and SSIM are better when higher, LPIPS when lower. What is noise, the tables of gains say."
+    "scenes. PSNR and SSIM are better when higher, LPIPS when lower. What is noise, the tables of "
+    "gains say."
 )
 
 Measure = Callable[[RunResult], float]
@@ -178,10 +178,8 @@ def _notes(study: Study, strategy: StrategyName) -> tuple[str, ...]:
     }
     ours = (
         f"Means over {len(scenes)} scenes ({', '.join(scenes)}). MB are of a million bytes. Times "
-        "are wall"
-        " clock as measured, so that runs side by side on one machine slow each other; upsampling "
-        "is not"
-        f" part of training. Device: {', '.join(sorted(devices))}."
+        "are wall clock as measured, so that runs side by side on one machine slow each other; "
+        f"upsampling is not part of training. Device: {', '.join(sorted(devices))}."
     )
     theirs = "The paper's are means over all scenes of its dataset, on its own machine."
     return ours, f"{study.description}. {theirs}"

@@ -33,18 +33,14 @@ FEWEST = 3
 
 SCENE_NOTE = (
     "Planarity, linearity and scattering of a point's 16 nearest (Weinmann et al. 2015) and their "
-    "curvature"
-    " (surface variation, Pauly et al. 2002), means over the points; gap: the median spacing of "
-    "points as"
-    " the views see it, as a share of the image's longer side; unevenness: the standard deviation "
-    "of the"
-    " logarithm of spacing; empty: the share of the images' area without points; texture: the mean"
-    " gradient of grey values at 320 pixels."
+    "curvature (surface variation, Pauly et al. 2002), means over the points; gap: the median "
+    "spacing of points as the views see it, as a share of the image's longer side; unevenness: "
+    "the standard deviation of the logarithm of spacing; empty: the share of the images' area "
+    "without points; texture: the mean gradient of grey values at 320 pixels."
 )
 WINNER_NOTE = (
     "The best is chosen by the scores that it has, so that its gain flatters; within noise: it "
-    "may as well"
-    " be any other."
+    "may as well be any other."
 )
 
 
@@ -174,8 +170,7 @@ def verdict(found: Sequence[Guideline]) -> str:
     if not found:
         return (
             f"No guideline can be looked for: that takes at least {FEWEST} scenes with gains and "
-            "with"
-            " descriptors."
+            "with descriptors."
         )
     scenes = max(each.scenes for each in found)
     supported = [each for each in found if each.supported]
@@ -185,8 +180,7 @@ def verdict(found: Sequence[Guideline]) -> str:
     fewest = fewest_scenes(len(found))
     why = (
         f" It could hardly be otherwise: with {len(found)} of them looked at, even a perfect order "
-        "of scenes"
-        f" is evidence only from {fewest} scenes on, and here there are {scenes}."
+        f"of scenes is evidence only from {fewest} scenes on, and here there are {scenes}."
         if scenes < fewest
         else ""
     )
@@ -214,11 +208,9 @@ def guideline_table(found: Sequence[Guideline], strategy: str, most: int = 10) -
     )
     note = (
         f"The {len(rows)} likeliest of {len(found)} that were looked at (each descriptor with each "
-        "method,"
-        " whose gain is the mean over its ratios). Scenes agree when they are on the same side of "
-        "both"
-        " medians as the correlation says. p is of Spearman's rank correlation, exact up to"
-        f" {EXACT} scenes; supported is what is at most 5% after Holm."
+        "method, whose gain is the mean over its ratios). Scenes agree when they are on the same "
+        "side of both medians as the correlation says. p is of Spearman's rank correlation, exact "
+        f"up to {EXACT} scenes; supported is what is at most 5% after Holm."
     )
     return Table(
         f"guidelines_{strategy}",

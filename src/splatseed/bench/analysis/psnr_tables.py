@@ -32,34 +32,27 @@ NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
 
 MARKS = (
     "PSNR in dB, mean ± standard error over repeats. Bold: the best of its row, where its gain "
-    "over sfm"
-    " is significant (paired by scene and repeat, Holm-corrected over all gains on scenes in this"
-    " strategy, 5%), or sfm where all are significantly worse; † where it is also better than the "
-    "second best. ~: within noise of sfm."
-    " (1 run): a single repeat, which has no standard error of its own."
+    "over sfm is significant (paired by scene and repeat, Holm-corrected over all gains on scenes "
+    "in this strategy, 5%), or sfm where all are significantly worse; † where it is also better "
+    "than the second best. ~: within noise of sfm. (1 run): a single repeat, which has no "
+    "standard error of its own."
 )
 PAPER_NOTE = (
     "Rows '(paper)' are the numbers printed there: 30,000 steps, a quarter (outdoors) or half "
-    "(indoors) of"
-    " the size of Mip-NeRF360's photographs."
+    "(indoors) of the size of Mip-NeRF360's photographs."
 )
 GAIN_NOTE = (
     "dB ± standard error. On a scene and on these scenes, the noise is that of training again; on "
-    "scenes"
-    " like these, it is the spread of gains from scene to scene, repeats averaged first. Means "
-    "are over"
-    " the scenes that a column has. ~: within noise (Holm-corrected over all cells of scenes, and "
-    "over"
-    " each row of means). (1 run): a single pair, of whose noise nothing is known."
+    "scenes like these, it is the spread of gains from scene to scene, repeats averaged first. "
+    "Means are over the scenes that a column has. ~: within noise (Holm-corrected over all cells "
+    "of scenes, and over each row of means). (1 run): a single pair, of whose noise nothing is "
+    "known."
 )
 MEAN_NOTE = (
     "dB over sfm. All variants together: what a variant picked blindly gives. Best single "
-    "variant: a"
-    " little flattering, as it is chosen by the scores that it is of. Best of each scene: chosen "
-    "on the"
-    " very test views that it is scored on, so that noise counts as gain; not a gain that anybody "
-    "can"
-    " have. Variants that some scene lacks are left out."
+    "variant: a little flattering, as it is chosen by the scores that it is of. Best of each "
+    "scene: chosen on the very test views that it is scored on, so that noise counts as gain; not "
+    "a gain that anybody can have. Variants that some scene lacks are left out."
 )
 TABLE_NAMES = {"mipnerf360": "table1", "replica": "table2", "": "table_scenes"}
 

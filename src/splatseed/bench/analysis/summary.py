@@ -81,8 +81,7 @@ def _by_scene(found: Gains, best: Variant) -> str:
     counts = {kind: sum(each.verdict == kind for each in known) for kind in kinds}
     return (
         f"On single scenes {best.label} is better on {counts['better']}, worse on "
-        f"{counts['worse']} and"
-        f" within noise on {counts['within noise']} of {len(known)}."
+        f"{counts['worse']} and within noise on {counts['within noise']} of {len(known)}."
     )
 
 
@@ -107,8 +106,7 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
     larger = _times(study, strategy, best, lambda r: float(r.num_gaussians))
     text = (
         f"{best.label} costs {seconds:.1f} s of upsampling per scene, {longer:.2f} times "
-        f"{BASELINE.label}'s"
-        f" training time and {larger:.2f} times its Gaussians."
+        f"{BASELINE.label}'s training time and {larger:.2f} times its Gaussians."
     )
     sooner = speed(study, strategy, best)
     if sooner is None:
@@ -119,8 +117,7 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
     steps, clock = (_ratio(each) for each in (sooner.log_steps, sooner.log_seconds))
     return (
         f"{text} It is as good as {BASELINE.label} in the end after {steps} the steps and {clock} "
-        "the"
-        f" seconds that {BASELINE.label} itself takes."
+        f"the seconds that {BASELINE.label} itself takes."
     )
 
 

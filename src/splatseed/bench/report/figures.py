@@ -98,8 +98,7 @@ def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
     return Plot(
         f"psnr_{by}_{strategy}",
         f"Test PSNR (dB) over {by}, strategy {strategy}: mean over repeats, and a band from the "
-        "lowest"
-        f" to the highest.{_left_out(arms[1:], variants)}",
+        f"lowest to the highest.{_left_out(arms[1:], variants)}",
         _png(figure),
     )
 
@@ -181,8 +180,8 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
     return Plot(
         f"gain_by_scene_{strategy}",
         f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and 95% interval (of "
-        "each"
-        f" comparison alone, not adjusted for their number).{_left_out(variants, found.variants)}",
+        "each comparison alone, not adjusted for their "
+        f"number).{_left_out(variants, found.variants)}",
         _png(figure),
     )
 

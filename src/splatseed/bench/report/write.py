@@ -181,10 +181,9 @@ def _views(part: _Part, bench: Path) -> Iterable[str]:
 def _view_title(view: ComparedView) -> str:
     chosen = "the best" if view.gain > 0 else "the best, though it loses"
     return (
-        f"{view.scene}, test view {view.name}: {view.best.label}, {chosen} on this"
-        f" scene ({view.gain:+.2f} dB over all its test views). Error maps: black is none, the "
-        "brightest 0.25"
-        " or more."
+        f"{view.scene}, test view {view.name}: {view.best.label}, {chosen} on this scene "
+        f"({view.gain:+.2f} dB over all its test views). Error maps: black is none, the brightest "
+        "0.25 or more."
     )
 
 

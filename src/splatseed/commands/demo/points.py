@@ -176,8 +176,7 @@ def _summarise(
 ) -> None:
     print_table(
         f"{len(scene.points):,} points, {options.ratio:g}x where the method has a ratio; distances "
-        "in "
-        "units of the originals' spacing, less is better",
+        "in units of the originals' spacing, less is better",
         ("method", "error", "median", "95%", "coverage", "far"),
         [
             (

@@ -112,8 +112,7 @@ def _summarise(
 ) -> None:
     OUT.print(
         f"{report.num_maps:,} depth maps of {_sizes(maps)}: {report.share_known:.0%} of their "
-        "pixels"
-        f" confirmed by other views, in {seconds:.1f} s, written to {visible(report.path)}",
+        f"pixels confirmed by other views, in {seconds:.1f} s, written to {visible(report.path)}",
         soft_wrap=True,
     )
     if options.preview:

@@ -171,12 +171,11 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
         print_note(note)
     settings, views = training.settings, training.trainer.train_views
     OUT.print(
-        f"{visible(options.scene)} ({len(views)} training and"
-        f" {len(training.trainer.test_views)} test views of {views[0].width} x {views[0].height},"
-        f" {len(training.state.params['means']):,} Gaussians)\n"
-        f"  -> {_strategy(settings)}, {settings.max_steps:,} steps, seed {settings.seed},"
-        f" on {training.device}\n"
-        f"  -> {visible(options.output)}",
+        f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} "
+        f"test views of {views[0].width} x {views[0].height}, "
+        f"{len(training.state.params['means']):,} Gaussians)\n  -> {_strategy(settings)}, "
+        f"{settings.max_steps:,} steps, seed {settings.seed}, on {training.device}\n  -> "
+        f"{visible(options.output)}",
         soft_wrap=True,
     )
 

@@ -290,9 +290,8 @@ def _announce(
     number = "as many as the photographs need" if total is None else f"{total:,} points"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} "
-        "points)\n"
-        f"  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n"
-        f"  -> {visible(options.output)} ({number}, seed {options.seed})",
+        f"points)\n  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n  "
+        f"-> {visible(options.output)} ({number}, seed {options.seed})",
         soft_wrap=True,
     )
 

@@ -115,9 +115,8 @@ def _transform_of_model(
         if len(centers) >= _FEWEST_FITTED and np.median(apart) <= _POSE_TOLERANCE * extent:
             note = (
                 f"The poses of {transforms.path.name} are those of {model_dir} turned, moved and "
-                "scaled"
-                f" by {fitted.scale:.3g}, as instant-ngp writes them; its points were brought "
-                "there."
+                f"scaled by {fitted.scale:.3g}, as instant-ngp writes them; its points were "
+                "brought there."
             )
             return fitted.matrix, [note]
     raise SceneFormatError(

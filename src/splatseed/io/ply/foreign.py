@@ -51,6 +51,5 @@ def _foreign(path: Path, found: str) -> SceneFormatError:
         f"{path} to be a scene, or a .ply of points",
         found=f"{found}: a trained model",
         fix="Score it with splatseed evaluate MODEL --scene SCENE, look at it with splatseed view "
-        "MODEL; a"
-        " .ply of it, by splatseed export MODEL -o OUT.ply, is read as points too.",
+        "MODEL; a .ply of it, by splatseed export MODEL -o OUT.ply, is read as points too.",
     )
