@@ -99,7 +99,7 @@ def test_finite_needs_all_three():
         (np.full((4, 3), "a"), np.zeros((4, 3), np.uint8), None, "xyz as numbers"),
         (np.zeros((4, 3)), np.zeros((4, 3)), None, "float64"),
         (np.zeros((4, 3)), np.zeros((3, 3), np.uint8), None, r"found uint8 \[3, 3\]"),
-        (np.zeros((4, 3)), np.zeros((4, 3), np.uint8), np.zeros(3, np.uint8), "one code a point"),
+        (np.zeros((4, 3)), np.zeros((4, 3), np.uint8), np.zeros(3, np.uint8), "one code per point"),
     ],
 )
 def test_arrays_that_do_not_fit(xyz, rgb, source, says):

@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.common.clocks import Clock, start_clock
 
-from splatseed.render import blending, blending_vjp, functions
+from splatseed.render import autograd, blending, blending_vjp
 from splatseed.render.autograd import Blend, Harmonics, Project
 
 __all__ = ["RENDER_STAGES", "Stopwatch", "timed"]
@@ -27,7 +27,7 @@ Place = tuple[Any, str]
 RENDER_STAGES: Mapping[str, Sequence[Place]] = {
     "project": ((Project, "forward"),),
     "harmonics": ((Harmonics, "forward"),),
-    "bin": ((functions, "_prepare"),),
+    "bin": ((autograd, "_prepare"),),
     "blend layout": ((Blend, "forward"),),
     "blend kernel": ((blending, "forward"),),
     "project backward": ((Project, "backward"),),

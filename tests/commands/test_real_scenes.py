@@ -55,7 +55,9 @@ def test_a_ply_of_fern(scenes, tmp_path, splatseed):
 def test_info_on_real_captures(name, scenes, splatseed):
     run = splatseed("info", scenes / name)
     assert (run.code, run.err) == (0, "")
-    assert f"{len(load_scene(scenes / name).points):,}" in run.out
+    scene = load_scene(scenes / name)
+    total = len(scene.points) + scene.left_out.duplicates + scene.left_out.non_finite
+    assert f"{total:,}" in run.out
     assert "nan" not in run.out
 
 

@@ -80,7 +80,7 @@ def test_one_point_far_out_is_not_the_coordinates_fault(rng):
 def test_a_point_beyond_all_distances_is_left_out(method, rng):
     cloud = _cloud(rng, 1e30)
     clean = clean_scene(Scene(cloud))
-    assert clean.warnings == ("1 point is beyond 1e15, and left out.",)
+    assert clean.warnings == ("1 point is beyond 1e15 and was left out.",)
     assert len(clean.points) == 499
     new = upsample(cloud, method, num_points=800).xyz[500:]
     assert np.abs(new).max() < 10

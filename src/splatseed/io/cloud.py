@@ -46,12 +46,12 @@ def clean_scene(scene: Scene) -> Scene:
 def _left_out_notes(points: PointCloud, left: LeftOut) -> list[str]:
     notes = []
     if left.non_finite:
-        what = "point is" if left.non_finite == 1 else "points are"
+        what, were = ("point is", "was") if left.non_finite == 1 else ("points are", "were")
         which = "beyond 1e15" if np.isfinite(points.xyz).all() else "not finite"
-        notes.append(f"{left.non_finite:,} {what} {which} and were left out.")
+        notes.append(f"{left.non_finite:,} {what} {which} and {were} left out.")
     if left.duplicates:
-        what = "point repeats" if left.duplicates == 1 else "points repeat"
-        notes.append(f"{left.duplicates:,} {what} the position of another and were left out.")
+        what, were = ("point repeats", "was") if left.duplicates == 1 else ("points repeat", "were")
+        notes.append(f"{left.duplicates:,} {what} the position of another and {were} left out.")
     return notes
 
 
