@@ -24,8 +24,8 @@ from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
 
-from machine import describe, warn_if_busy
-from markdown import table
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
 
 ROOT = Path(__file__).parents[1]
 MARKS = {

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from machine import describe, warn_if_busy
-from markdown import table
+from benchmarks.common.machine import describe, warn_if_busy
+from benchmarks.common.markdown import table
+from benchmarks.rendering.splats import make_workload
 from PIL import Image
-from splats import make_workload
 
 from splatseed.splat.frame import training_frame
 from splatseed.view.live import FrameLoop
