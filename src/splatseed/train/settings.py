@@ -27,7 +27,7 @@ BUDGET = 1_000_000
 AS_3DGS = "-3dgs"
 
 LONG_RUN = 4000
-"""Steps from which on strategy ``auto`` is ``mcmc``, which is ahead in long runs (see benchmarks)."""
+"""Steps from which on strategy ``auto`` is ``mcmc``, ahead in long runs (see benchmarks)."""
 
 BYTES_EACH = 2000
 """Memory of a Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
