@@ -1,9 +1,9 @@
 """A photograph's file: its bytes, its size, its pixels.
 
-Promise: pixels are as stored, before any EXIF rotation, which is how COLMAP counts them;
-transparent ones are laid over black, which Gaussians are drawn on; grey of 16 bits, and floats of 0
-to 1, become the nearest of 8 bits, colours of 16 bits their upper 8 (Pillow's way); every failure
-names the file.
+Promise: pixels are as stored, before any EXIF rotation, because COLMAP counts them so; transparent
+ones are composited over black, the background of renders; 16-bit grey, and floats in [0, 1], are
+rounded to 8 bits, and 16-bit colours keep their upper 8 (Pillow's way); every failure names the
+file.
 """
 
 from __future__ import annotations
@@ -23,18 +23,16 @@ if TYPE_CHECKING:
 __all__ = ["check_photograph", "decode_photograph", "open_photograph", "photograph_bytes"]
 
 _CHECK_SCALE = 8
-"""JPEG is checked at an eighth of its size: all of it is read, a fraction of it is computed."""
+"""JPEGs are checked at an eighth of their size: all bytes are read, few pixels are computed."""
 _WIDE_GREY = ("I", "F")
-"""Pillow's modes for one channel of more than 8 bits, which it cuts off at 255 when it converts
-them."""
+"""Pillow's modes for one channel of more than 8 bits, which its own conversion clips at 255."""
 _INKS = ("CMYK", "LAB")
-"""Pillow's modes whose colours are not light of a screen; it would convert inks by a rule of
-thumb."""
+"""Pillow's modes that are not RGB or grey; it would convert inks by a rule of thumb."""
 _DECODER_FAILURES = (OSError, ValueError, SyntaxError)
 
 
 def photograph_bytes(path: Path) -> bytes:
-    """The file as it is.
+    """The file's bytes.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -53,7 +51,7 @@ def photograph_bytes(path: Path) -> bytes:
 
 
 def open_photograph(path: Path, raw: bytes) -> PilImage.Image:
-    """The picture in a file's bytes, of which only the header is decoded yet.
+    """The picture in a file's bytes; only its header is decoded yet.
 
     Raises:
         SceneFormatError: It is no image.
@@ -78,7 +76,7 @@ def decode_photograph(path: Path, raw: bytes) -> PilImage.Image:
         raise SceneFormatError(
             f"{path} to be in RGB or grey",
             found=picture.mode,
-            fix="Export it as sRGB: what its colours look like depends on a printer's profile.",
+            fix="Export it as sRGB: the look of its colours depends on a printer's profile.",
         )
     if picture.mode.startswith(_WIDE_GREY):
         return _eight_bits(path, picture).convert("RGB")
@@ -116,10 +114,9 @@ def _eight_bits(path: Path, picture: PilImage.Image) -> PilImage.Image:
     except _DECODER_FAILURES as error:
         raise _damaged(path, error) from None
     most = 1.0 if picture.mode == "F" else 65535.0
-    # Integers of 32 bits can have any range; in a PNG they are how some versions of Pillow open 16
-    # bits.
+    # 32-bit integers can have any range; some versions of Pillow open 16-bit PNGs as such.
     known = picture.mode != "I" or picture.format == "PNG"
-    if not (known and values.min() >= 0 and values.max() <= most):  # nor is NaN
+    if not (known and values.min() >= 0 and values.max() <= most):  # NaN compares false
         raise SceneFormatError(
             f"{path} to have 8 or 16 bits a channel, or floats of 0 to 1",
             found=f"{values.dtype} from {values.min():g} to {values.max():g}",

@@ -27,7 +27,7 @@ def photometric_loss(
     """0.8 L1 + 0.2 (1 - SSIM), differentiable in ``render`` (Kerbl et al. 2023, eq. 7).
 
     Args:
-        render: What the Gaussians look like, float32; at least 11 pixels a side.
+        render: The rendered view, float32; at least 11 pixels a side.
         truth: The photograph.
     """
     if render.device.type == "cpu":
@@ -38,7 +38,7 @@ def photometric_loss(
 
 
 class _CpuLoss(torch.autograd.Function):
-    """The loss and, at once, its gradient: the loss is the end of the graph."""
+    """The loss together with its gradient: the loss is the end of the graph."""
 
     @staticmethod
     def forward(ctx: Any, render: Tensor, truth: Tensor) -> Tensor:
@@ -54,5 +54,5 @@ class _CpuLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
         (gradient,) = ctx.saved_tensors
-        # The loss is most often where backward begins, and multiplying by one takes a pass.
+        # backward mostly starts at the loss, and multiplying by one takes a whole pass.
         return gradient if float(upstream[0]) == 1.0 else gradient * upstream[0], None

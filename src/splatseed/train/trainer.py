@@ -1,4 +1,4 @@
-"""The training loop: show a photograph, compare, improve, change the number of Gaussians.
+"""The training loop: render a photograph's view, compare, optimise, densify.
 
 Notation: a step shows one training view; all cameras are in the training frame. Promise: on the CPU
 equal settings and seeds give equal bytes, whatever the number of threads and however often the run
@@ -31,7 +31,7 @@ from splatseed.views.view import View
 __all__ = ["Trainer"]
 
 RECORDS = 200
-"""Points of the curve of a run."""
+"""Number of records in the curve of a run."""
 TESTS = 20
 """How often the test views are rendered during a run."""
 
@@ -42,9 +42,9 @@ class Trainer:
     Args:
         state: The run, at any step; changed in place.
         settings: Its settings.
-        train_views: What is learnt from, in the training frame.
-        test_views: What is only looked at, likewise.
-        on_record: Told of each record, and whether the test views were rendered for it.
+        train_views: The views to learn from, in the training frame.
+        test_views: The views to evaluate on, likewise.
+        on_record: Told each record, and whether the test views were rendered for it.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Trainer:
 
     @torch.no_grad()
     def render(self, view: View) -> Float[Tensor, "H W 3"]:
-        """What a view looks like now."""
+        """The current render of a view."""
         degree = self.settings.schedule.sh_degree(self.state.step, self.settings.sh_degree)
         return render_view(self.state.params, view, degree)[0]
 

@@ -1,9 +1,9 @@
 """Photographs as pixels: decoded, made smaller by a whole factor, and kept for the next run.
 
-Promise: a smaller copy is the mean over f x f blocks, rounded (a few pixels at the right and lower
-edge that make no whole block are cut off), so intrinsics divide by f and nothing else; it is looked
-up by the content of the original, so a changed photograph is never mistaken for the old one. Only
-``cache_dir`` is written to, and what cannot be written there is not missed.
+Promise: a smaller copy is the mean over f x f blocks, rounded (pixels at the right and lower edge
+that do not fill a block are cut off), so intrinsics are divided by f and nothing else changes; it
+is looked up by the content of the original, so a changed photograph is never mistaken for the old
+one. Only ``cache_dir`` is written to, and a failure to write there is ignored.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["load_photograph", "user_cache_dir"]
 
 FILTER = "box-2"
-"""Goes into the key: change it with the way copies are made."""
+"""Part of the key: change it whenever the downsampling changes."""
 
 
 def load_photograph(
@@ -66,7 +66,7 @@ def load_photograph(
 
 
 def user_cache_dir() -> Path:
-    """Where this user's programs keep what they can make again (not created here)."""
+    """Where this user's programs cache files (not created here)."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
     elif sys.platform == "darwin":

@@ -1,10 +1,10 @@
 """Photographs of a distorted lens as a pinhole camera would have taken them.
 
 Notation: the pinhole camera has the lens's own focal length, centre and size. The pixel (i, j) of
-its image looks along the ray K^-1 (j + 0.5, i + 0.5, 1), which the lens maps to a place in the
+its image looks along the ray K^-1 (j + 0.5, i + 0.5, 1), which the lens maps to a position in the
 photograph.
-Promise: colours are interpolated between the four pixels around that place and rounded; pixels that
-the photograph does not show, or shows a second time beyond a fold, are black and known to be
+Promise: colours are interpolated between the four pixels around that position and rounded; pixels
+that the photograph does not show, or shows a second time beyond a fold, are black and marked as
 unknown.
 """
 
@@ -20,7 +20,7 @@ from splatseed.lens import distort, fold_radius
 __all__ = ["undistort"]
 
 ROWS = 64
-"""Rows that are computed at a time, which bounds the memory of their rays."""
+"""Rows computed at a time, which bounds the memory of their rays."""
 
 
 def undistort(
@@ -58,7 +58,7 @@ def _rays(
 
 @inline
 def _resample(pixels, uv, out, known):  # type: ignore[no-untyped-def]
-    """Colours at places in a photograph, NaN = nowhere; its edge pixels reach to its border."""
+    """Bilinear colours at positions, NaN = outside; edge pixels extend to the border."""
     height, width = pixels.shape[:2]
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -66,7 +66,7 @@ def _resample(pixels, uv, out, known):  # type: ignore[no-untyped-def]
             if not (0.0 <= u <= width and 0.0 <= v <= height):
                 continue
             known[i, j] = True
-            x = min(max(u - 0.5, 0.0), width - 1.0)  # in units where pixels' centres are whole
+            x = min(max(u - 0.5, 0.0), width - 1.0)  # pixel centres at whole numbers
             y = min(max(v - 0.5, 0.0), height - 1.0)
             left, top = int(x), int(y)
             right, below = min(left + 1, width - 1), min(top + 1, height - 1)

@@ -3,7 +3,7 @@
 Notation: ``_id`` comes from the file. Layouts as COLMAP's documentation of its output format gives
 them, little-endian. Promise: a file that was read is written back byte for byte; a malformed one
 raises a single error that names the file, the record and the byte; points are never looped over in
-Python. Writers write straight to ``path`` and let ``OSError`` pass: their caller stages the output.
+Python. Writers write straight to ``path`` and let ``OSError`` pass: their callers stage the output.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ def _split_points(
 
 
 def _track_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " N+1"]:
-    """Offsets into the track elements, from those of the records."""
+    """Offsets into the track elements, from the offsets of the records."""
     heads = np.arange(len(starts)) * _POINT.itemsize
     return np.asarray((starts - starts[0] - heads) // _OBSERVATION.itemsize)
 

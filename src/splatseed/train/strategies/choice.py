@@ -14,11 +14,11 @@ __all__ = ["make_strategy"]
 
 
 def make_strategy(settings: TrainSettings, device: torch.device | None = None) -> Strategy:
-    """The strategy that the settings name, on their schedule.
+    """The strategy named by the settings, on their schedule.
 
     Args:
         settings: How to train.
-        device: Whose memory bounds the number of Gaussians; the CPU's by default.
+        device: The device whose memory limits the number of Gaussians; the CPU by default.
     """
     capacity = Capacity(settings.cap, device or torch.device("cpu"))
     match settings.densification:

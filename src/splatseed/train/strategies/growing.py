@@ -1,12 +1,12 @@
-"""Strategy ``grow``: a fixed budget, spent where the photographs are still wrong.
+"""Strategy ``grow``: a fixed budget, spent where renders are still wrong.
 
-Notation: of each Gaussian, over the views looked at since the last round: *pixels* c = sum w,
+Notation: for each Gaussian, over the views looked at since the last round: *pixels* c = sum w,
 *error* E = sum w e with e the absolute error of a pixel (see ``contributions``), and *most pixels*,
 c in the one view where it is largest. Promise: the number of Gaussians never exceeds the budget;
-which ones grow depends on the views and the seed alone. The idea of growing by the error that a
-Gaussian paints is that of S. Rota Bulo et al., "Revising Densification in Gaussian Splatting"
-(2024); what is taken away, when, and by what the error is divided were chosen on held-out training
-views: see benchmarks/README.md.
+which ones grow depends only on the views and the seed. Growing by the error that a Gaussian
+contributes to follows S. Rota Bulo et al., "Revising Densification in Gaussian Splatting" (2024);
+what is removed, when, and the normalisation of the error were chosen on held-out training views:
+see benchmarks/README.md.
 """
 
 from __future__ import annotations
@@ -28,28 +28,28 @@ from splatseed.views.view import View
 __all__ = ["Growing"]
 
 LOOK_EVERY = 2
-"""Steps from one look at contributions to the next: a look costs half a step."""
+"""Steps between looks at contributions: a look costs half a step."""
 FAINT = 0.005
-"""Opacity below which a Gaussian goes, as in 3DGS."""
+"""Opacity below which a Gaussian is removed, as in 3DGS."""
 LEAST_PIXELS, LEAST_PART = 0.5, 0.1
-"""A Gaussian goes that paints less than this of a pixel, and less than this part of what Gaussians
-paint on average, in every view that shows it: where there are more Gaussians than pixels, all paint
-little."""
+"""A Gaussian is removed if, in every view that shows it, it contributes less than this much of a
+pixel, and less than this fraction of the average contribution: where there are more Gaussians than
+pixels, all contribute little."""
 RECYCLED = 0.1
-"""Part of a full budget that is taken from those with the fewest pixels, and spent again, a
-round."""
+"""Fraction of a full budget that each round takes from the Gaussians with the fewest pixels, and
+spends again."""
 FULL = 0.95
-"""From this part of the budget on it counts as full."""
+"""Fraction of the budget from which on it counts as full."""
 FULL_AT = 0.35
-"""Part of the run by which the budget is spent."""
+"""Fraction of the run by which the budget is spent."""
 FASTEST = 0.5
-"""Gaussians that are added in a round at most, as a part of those there are."""
+"""Most Gaussians added in a round, as a fraction of the existing ones."""
 LEAST_VIEWS = 2
-"""Looks that must have shown a Gaussian before it is taken away for what it paints."""
+"""Looks that must have shown a Gaussian before it is removed for its contribution."""
 
 
 class Growing(Strategy):
-    """Take away what paints little, split what paints wrong pixels, within a budget.
+    """Remove Gaussians that contribute little, split those with wrong pixels, within a budget.
 
     Args:
         settings: How to train.
@@ -70,7 +70,7 @@ class Growing(Strategy):
         truth: Float[Tensor, "H W 3"],
         step: int,
     ) -> None:
-        """Add what this view says of each Gaussian to the sums."""
+        """Add this view's measurements of each Gaussian to the sums."""
         if step % LOOK_EVERY or step > self.schedule.refine_stop:
             return
         pixels, errors = contributions(params, view, (render.detach() - truth).abs().mean(dim=-1))
@@ -85,9 +85,9 @@ class Growing(Strategy):
         params: Parameters,
         optimizers: Optimizers,
         step: int,
-        info: Any,  # noqa: ARG002  (gsplat's own need it)
+        info: Any,  # noqa: ARG002  (gsplat's own strategies need it)
     ) -> None:
-        """At the end of a round, change the Gaussians and begin the next."""
+        """At the end of a round, change the Gaussians and begin the next round."""
         schedule = self.schedule
         if (
             not schedule.refine_start <= step <= schedule.refine_stop
@@ -110,7 +110,7 @@ class Growing(Strategy):
         return self.state
 
     def _needless(self, params: Parameters) -> Bool[Tensor, " N"]:
-        """Which Gaussians go: the faint, the too large, and those that paint least."""
+        """Which Gaussians are removed: faint, too large, or with the least contribution."""
         sums, count = self._sums(params), len(params["means"])
         sizes = torch.exp(params["scales"].detach()).amax(dim=-1) / yardsticks(params)
         shown = sums["views"] >= LEAST_VIEWS
@@ -126,7 +126,7 @@ class Growing(Strategy):
         return needless
 
     def _grow(self, params: Parameters, optimizers: Optimizers, step: int) -> None:
-        """Split where E / sqrt(c) is largest: E alone favours the large, E / c the accidental."""
+        """Split where E / sqrt(c) is largest: E alone favours large ones, E / c chance."""
         sums = self._sums(params)
         scores = sums["errors"] / sums["pixels"].clamp_min(1e-6).sqrt()
         wanted = self._room(len(scores), step)
@@ -134,7 +134,7 @@ class Growing(Strategy):
         if number > 0:
             chosen = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
             chosen[torch.topk(scores, number).indices] = True
-            # The opacity of both halves together is that of the whole.
+            # Both halves together are as opaque as the whole.
             split(params, optimizers, {}, chosen, revised_opacity=True)
 
     def _room(self, count: int, step: int) -> int:
@@ -152,5 +152,5 @@ class Growing(Strategy):
 
 
 def _least(most_pixels: Float[Tensor, " M"]) -> float:
-    """The fewest pixels that are worth a Gaussian, where those that are shown paint so many."""
+    """The fewest pixels that are worth a Gaussian, given those of the Gaussians shown."""
     return min(LEAST_PIXELS, LEAST_PART * float(most_pixels.mean())) if len(most_pixels) else 0.0

@@ -1,8 +1,8 @@
-"""The paper's Voronoi cells: of the originals and the corners of an enlarged bounding box.
+"""The paper's Voronoi cells: those of the originals and the corners of an enlarged bounding box.
 
-The eight corners of the bounding box enlarged by 10% are added as sites so that the cells of the
+The eight corners of the bounding box, enlarged by 10%, are added as sites so that the cells of the
 originals are bounded. Most of the volume then lies in the cells of a few outer points and reaches
-far outside the scene; ``docs/paper.md`` measures it. Kept to reproduce the paper, not to be used.
+far outside the scene; ``docs/paper.md`` measures it. For reproducing the paper only.
 
 The cells come from Qhull's Delaunay tetrahedra, whose circumcentres are the Voronoi vertices. A
 cell's volume is the signed sum, over the tetrahedra at its site i and the ways to pick an edge ij
@@ -134,7 +134,7 @@ def _cross(a, b):  # type: ignore[no-untyped-def]
 
 @inline
 def _circumcenter(sites, corners, out):  # type: ignore[no-untyped-def]
-    """Write a tetrahedron's circumcentre; return whether it has one."""
+    """Write a tetrahedron's circumcentre; return whether it exists."""
     a = sites[corners[1]] - sites[corners[0]]
     b = sites[corners[2]] - sites[corners[0]]
     c = sites[corners[3]] - sites[corners[0]]
@@ -158,7 +158,7 @@ def _face_center(a, b):  # type: ignore[no-untyped-def]
 
 @inline
 def _add_volumes(sites, corners, vertex, volume):  # type: ignore[no-untyped-def]
-    """Add one tetrahedron's share to the cells of its four corners."""
+    """Add one tetrahedron's volume to the cells of its four corners."""
     for i in range(4):
         origin = sites[corners[i]]
         for j in range(4):

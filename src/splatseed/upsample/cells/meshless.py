@@ -27,13 +27,13 @@ MAX_NEIGHBORS = 58
 MAX_PLANES = 6 + MAX_NEIGHBORS
 MAX_VERTICES = 2 * MAX_PLANES  # 2 F - 4 on a simple polytope of F faces
 COINCIDENT = 1e-12
-"""Cuts shallower than this share of the cube are left out: they only make slivers."""
+"""Cuts shallower than this fraction of the cube are skipped: they only make slivers."""
 
 
 class Cells(NamedTuple):
     """Cells of n sites, all relative to the site.
 
-    ``center`` and ``radius`` describe the cell with its vertices drawn in to the clamping distance.
+    ``center`` and ``radius`` describe the cell with its vertices clamped to the clamping distance.
     """
 
     center: Float64[np.ndarray, "n 3"]
@@ -43,7 +43,7 @@ class Cells(NamedTuple):
     volume: Float64[np.ndarray, " n"]
     """Volume of the cell within its cube, [n]."""
     closed: Bool[np.ndarray, " n"]
-    """Whether the cell is the true Voronoi cell: no cube face is left and the security radius was
+    """Whether the cell is the true Voronoi cell: no cube face is left, and the security radius was
     passed, [n]."""
 
 
@@ -75,7 +75,7 @@ def _build(xyz, idx, distance, frames, first, last, center, radius, volume, clos
     for i in parallel_range(first, last):
         normal, offset = np.empty((MAX_PLANES, 3)), np.empty(MAX_PLANES)
         triple, vertex = np.empty((MAX_VERTICES, 3), np.int16), np.empty((MAX_VERTICES, 3))
-        twin = np.empty((MAX_PLANES, MAX_PLANES), np.int16)  # an edge is set before it is read
+        twin = np.empty((MAX_PLANES, MAX_PLANES), np.int16)  # entries are set before they are read
         reach = 0.5 * distance[i, -1]
         count = _cube(frames[i], reach, normal, offset, triple, vertex, twin)
         count, complete = _cut_all(
@@ -211,7 +211,7 @@ def _volume(normal, offset, triple, vertex, twin, count):  # type: ignore[no-unt
 
 @inline
 def _clamp(vertex, count, reach, center):  # type: ignore[no-untyped-def]
-    """Draw vertices in to ``reach``; fill their mean; return the largest distance from it."""
+    """Clamp vertices to ``reach``; fill their mean; return the largest distance from it."""
     center[:] = 0.0
     for v in range(count):
         length = math.sqrt(vertex[v, 0] ** 2 + vertex[v, 1] ** 2 + vertex[v, 2] ** 2)

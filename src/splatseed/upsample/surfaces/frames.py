@@ -2,7 +2,7 @@
 
 Notation: ``frames[i]`` [3, 3] has rows e_u, e_v (the tangent plane, widest axis first) and e_n (the
 normal), right-handed. Promise: axes and signs follow from the neighbourhood's shape alone, so they
-turn with the cloud; a neighbourhood on a line is reported, as its tangent plane is arbitrary.
+rotate with the cloud; a collinear neighbourhood is reported, as its tangent plane is arbitrary.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from splatseed.kernels.jit import inline, kernel, parallel_range
 __all__ = ["coordinate", "local_frames", "world_frames"]
 
 COLLINEAR = 1e-9
-"""Ratio of the two largest variances below which a neighbourhood counts as a line."""
+"""Ratio of the two largest variances below which a neighbourhood counts as collinear."""
 
 
 def world_frames(
     n: int,
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Bool[np.ndarray, " n"]]:
-    """The world's axes for each of ``n`` rows, [n, 3, 3], none of them on a line."""
+    """The world's axes for each of ``n`` rows, [n, 3, 3], none of them collinear."""
     return np.ascontiguousarray(np.broadcast_to(np.eye(3), (n, 3, 3))), np.zeros(n, bool)
 
 
@@ -37,7 +37,7 @@ def local_frames(
         idx: Neighbour rows, int32 [n, k].
 
     Returns:
-        Frames [n, 3, 3] with rows e_u, e_v, e_n, and which rows lie on a line, bool [n].
+        Frames [n, 3, 3] with rows e_u, e_v, e_n, and which rows are collinear, bool [n].
     """
     frames, collinear = np.empty((len(xyz), 3, 3)), np.empty(len(xyz), bool)
     _frames(xyz, idx, frames, collinear, COLLINEAR)
@@ -117,7 +117,7 @@ def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]
 
 @inline
 def _set_rows(frame, first, second, third):  # type: ignore[no-untyped-def]
-    # One by one: assigning a tuple to a row compiles 5 s of Numba's own checks and messages.
+    # One by one: assigning a tuple to a row makes Numba compile 5 s of its own checks and messages.
     for axis in range(3):
         frame[0, axis], frame[1, axis], frame[2, axis] = first[axis], second[axis], third[axis]
 

@@ -1,7 +1,7 @@
-"""Where on its patch a new point stands: the (u, v) that a height is then computed for.
+"""The position (u, v) of a new point on its patch, at which the height is then computed.
 
 Each function takes M uniform draws and returns uv, float32 [M, 2], in scene units relative to the
-base point. On a neighbourhood that is a line, v is 0: its tangent plane is arbitrary.
+base point. On a collinear neighbourhood v is 0, since its tangent plane is arbitrary.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def place_in_box(
 @kernel
 def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def]
     """Polar coordinates with a square-root radius, in place of the draws in ``uv``."""
-    turn = np.float32(2.0 * math.pi)  # float32 throughout: its sine and cosine are twice as fast
+    turn = np.float32(2.0 * math.pi)  # float32 sine and cosine are twice as fast
     for i in parallel_range(len(radius)):
         reach_u = np.float32(radius[i])
         reach_v = np.float32(0.0) if collinear[i] else reach_u

@@ -23,7 +23,7 @@ TERMS = (DEGREE + 1) * (DEGREE + 1)
 def bicubic_heights(
     patches: Patches, first: int, last: int, out: Float32[np.ndarray, " M"]
 ) -> None:
-    """Write the polynomial's height at all outputs of rows ``first:last`` into ``out`` [M]."""
+    """Write the polynomial's height at all new points of rows ``first:last`` into ``out`` [M]."""
     _heights(
         patches.cloud.xyz, patches.neighbors.idx, patches.neighbors.distance, patches.frames,
         patches.bases.start, patches.bases.count, patches.uv, first, last, out,

@@ -19,7 +19,7 @@ from splatseed.upsample.surfaces.spline_basis import CONTROL, PatchBasis, penalt
 __all__ = ["LAMBDAS", "cross_validate"]
 
 LAMBDAS = np.logspace(-3.0, 2.0, 11)
-"""The candidates: from nearly interpolating to nearly a plane."""
+"""The candidates: from near interpolation to near a plane."""
 COEFFICIENTS = CONTROL * CONTROL
 FREE = 3
 """Dimension of the planes."""
@@ -181,7 +181,7 @@ def _similar(matrix, v, p, first, squared):  # type: ignore[no-untyped-def]
 
 @inline
 def _score(diagonal, beside, y, smoothing):  # type: ignore[no-untyped-def]
-    """|lambda (T + lambda)^-1 y|^2 / (lambda tr (T + lambda)^-1)^2: GCV but for its constant m.
+    """|lambda (T + lambda)^-1 y|^2 / (lambda tr (T + lambda)^-1)^2: GCV without its constant m.
 
     The forward pivots f and backward pivots b of a tridiagonal matrix give both its solution and
     the diagonal of its inverse, 1 / (f_i + b_i - d_i).
