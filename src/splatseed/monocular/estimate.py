@@ -128,8 +128,8 @@ def _check_images(
     by_name = {image.name: image for image in images}
     sizes = {}
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
-        sizes = pool.map(lambda name: check_photograph(folder / name), sorted(by_name))
-        for name, size in zip(sorted(by_name), sizes, strict=True):
+        checked = pool.map(lambda name: check_photograph(folder / name), sorted(by_name))
+        for name, size in zip(sorted(by_name), checked, strict=True):
             _check_shape(folder / name, size, by_name[name])
             sizes[name] = _reduced(size, max_size)
             progress("check images", len(sizes) / len(by_name))

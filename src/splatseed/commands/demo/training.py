@@ -1,7 +1,7 @@
 """The demo's training: the same few steps from the SfM seeds and from the upsampled ones.
 
-Promise: the two runs differ in their seeds alone, and end with the same number of Gaussians; the
-seconds that seeds took are counted; the view that is shown is chosen before any is rendered.
+Promise: the two runs differ only in their seeds, and end with the same number of Gaussians; the
+time to make seeds is counted; the view that is shown is chosen before any is rendered.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ __all__ = ["Arm", "TrainedArm", "psnr_after", "total_seconds", "train_arm", "wri
 
 @dataclass(frozen=True)
 class Arm:
-    """One of the runs.
+    """One of the two runs.
 
     Args:
-        label: What its seeds are.
-        scene: The folder of the scene that holds them.
+        label: Names its seeds.
+        scene: The folder of the scene with the seeds.
         output: The folder of the run.
-        seconds: What making its seeds took.
+        seconds: Time it took to make the seeds.
     """
 
     label: str
@@ -44,13 +44,13 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class TrainedArm:
-    """A run that is done.
+    """A finished run.
 
     Args:
-        arm: Which.
-        metrics: What its metrics.json holds.
+        arm: The arm.
+        metrics: The content of its metrics.json.
         truth: The photograph of the view that is shown.
-        render: That view as rendered, 0 to 1.
+        render: The render of that view, 0 to 1.
     """
 
     arm: Arm
@@ -63,7 +63,7 @@ def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedAr
     """Train from an arm's seeds, and score.
 
     Raises:
-        KeyboardInterrupt: The user does not want to wait; a checkpoint is there to go on with.
+        KeyboardInterrupt: The user interrupted; a checkpoint was saved for resuming.
         SplatseedError: As ``prepare_run``.
     """
     stage = f"train {arm.label}"
@@ -80,12 +80,12 @@ def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedAr
 
 
 def total_seconds(each: TrainedArm) -> float:
-    """Of making the seeds and of training from them."""
+    """Seconds of making the seeds and training from them."""
     return each.arm.seconds + float(each.metrics["train_seconds"])
 
 
 def psnr_after(seconds: float, each: TrainedArm) -> float | None:
-    """The last test PSNR, in dB, of an arm within so many seconds in all; None before its first."""
+    """The last test PSNR, in dB, of an arm within ``seconds`` in all; None before its first."""
     tests = each.metrics["tests"]
     known = [test["psnr"] for test in tests if each.arm.seconds + test["seconds"] <= seconds]
     return known[-1] if known else None

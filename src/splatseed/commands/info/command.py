@@ -1,4 +1,4 @@
-"""``splatseed info``: what is in a scene, and what is wrong with it."""
+"""``splatseed info``: the contents of a scene, and its problems."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ KINDS_SHOWN = 3
 
 
 def _path(metavar: str) -> Any:
-    """How an optional path shows in the help."""
+    """How an optional path appears in the help."""
     return tyro.conf.arg(constructor=Path, metavar=metavar, help_behavior_hint="")
 
 
 def _default(stands_in: str) -> Any:
-    """How an option that may be left out shows in the help: with what stands in for it."""
+    """How an optional option appears in the help: with its default in words."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
 
 
@@ -54,7 +54,7 @@ class Options:
     scene: Annotated[Path, tyro.conf.Positional]
     """A COLMAP scene folder, a folder with transforms.json, an RGB-D capture, or a .ply."""
     depth: Annotated[Path | None, _path("DIR")] = None
-    """Also hold a folder of depth maps, in any layout of docs/formats.md, against the SfM
+    """Also compare a folder of depth maps, in any layout of docs/formats.md, with the SfM
     points."""
     depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
     """What their values are: planar depth, distance along the ray, or inverse depth."""
@@ -63,13 +63,13 @@ class Options:
     picture: Annotated[Path | None, _path("FILE")] = None
     """Write a PNG of depth beside photographs, and of where the two disagree."""
     list_all: Annotated[bool, tyro.conf.arg(name="all")] = False
-    """List the depth of all images, not of the worst alone."""
+    """List the depth of all images, not only of the worst."""
     json: bool = False
     """Print one JSON object instead, for scripts."""
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "info", arguments)
     with stage_display() as clock:
         clock("read", 0.0)
@@ -99,14 +99,14 @@ def run(arguments: list[str]) -> None:
 
 
 def _read(options: Options) -> Scene:
-    """The scene, with the depth maps that the user names, or else its own."""
+    """The scene, with the depth maps that the user names, else with its own."""
     scene = load_scene(options.scene, require_points=False)
     if options.depth is not None:
         maps = find_depths(scene, options.depth, kind=options.depth_kind, scale=options.depth_scale)
         return scene.replace(depths=maps)
     if options.depth_kind is not None or options.depth_scale is not None or options.picture:
         raise ParameterError(
-            "--depth DIR, whose maps --depth-kind, --depth-scale and --picture speak of",
+            "--depth DIR, which --depth-kind, --depth-scale and --picture refer to",
             found="none",
             fix="Name the folder.",
         )
@@ -114,7 +114,7 @@ def _read(options: Options) -> Scene:
 
 
 def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment] | None:
-    """How each map fits the SfM points, drawn if so asked; None where no maps were named."""
+    """How each map fits the SfM points, drawn if requested; None if no maps were named."""
     if options.depth is None:
         return None
     from splatseed.depth import align  # noqa: PLC0415  (loads Numba)
@@ -129,7 +129,7 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
 
 
 def _next_command(options: Options, scene: Scene) -> str:
-    """What to run on the scene: points can be upsampled once there are some."""
+    """The next command for the scene: points can be upsampled once there are some."""
     scene_dir = quoted(options.scene)
     if options.depth is not None and len(scene.points):
         maps = quoted(options.depth)
@@ -147,7 +147,7 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     sizes = Counter(f"{c.model} {c.width}x{c.height}" for c in scene.intrinsics)
     cameras = [f"{count:,} {kind}" for kind, count in sizes.most_common(KINDS_SHOWN)]
     if len(sizes) > KINDS_SHOWN:
-        cameras.append(f"{len(sizes) - KINDS_SHOWN:,} kinds more")
+        cameras.append(f"{len(sizes) - KINDS_SHOWN:,} more kinds")
     train, test = scene.split()
     by = f", by its {scene.listed.origin}" if scene.listed else ""
     images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"
@@ -191,13 +191,13 @@ def _spread(mean: float, percentiles: tuple[float, ...], style: str) -> str:
 
 
 def _method_rows(options: Options, scene: Scene) -> list[tuple[str, str]]:
-    """What would make the best points of this scene, and why."""
+    """The method that would make the best points for this scene, and why."""
     if not len(scene.points):
         return []
     if options.depth is not None:
         return [("method", "depth: there are depth maps")]
     if not scene.has_photographs:
-        return [("method", "mls: there are no photographs to look at")]
+        return [("method", "mls: the scene has no photographs")]
     return [("method", "auto: stereo between the photographs, and a seed where no point is seen")]
 
 
