@@ -271,7 +271,7 @@ class Photographs:
     """Reads the views' pixels by the paths that were laid out for them."""
 
     def __init__(self, capture: Capture, folder: Path) -> None:
-        self._pixels = {folder / "images" / view.name: view.image for view in capture.views}
+        self._pixels = {folder / "images" / view.name: view.photograph for view in capture.views}
 
     def __call__(self, path: str) -> np.ndarray:
         """The pixels, uint8 [H, W, 3]."""

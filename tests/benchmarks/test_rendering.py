@@ -59,7 +59,7 @@ def test_a_workload_is_the_same_each_time_and_survives_its_file(bench, workload,
             np.testing.assert_array_equal(array, other.gaussians.arrays()[name])
         for view, twin in zip(workload.views, other.views, strict=True):
             assert (view.name, view.width, view.height) == (twin.name, twin.width, twin.height)
-            np.testing.assert_array_equal(view.image, twin.image)
+            np.testing.assert_array_equal(view.photograph, twin.photograph)
             np.testing.assert_array_equal(view.cam_from_world, twin.cam_from_world)
 
 

@@ -23,7 +23,7 @@ from splatseed.evaluate.lpips import Lpips
 from splatseed.evaluate.result import NOT_ASKED, EvalResult, ViewScore
 from splatseed.evaluate.ssim import WINDOW
 from splatseed.progress import Progress, silent
-from splatseed.splat.rendering import photograph
+from splatseed.splat.rendering import photograph_of
 from splatseed.views.view import View
 
 __all__ = ["Render", "evaluate_views"]
@@ -84,7 +84,7 @@ def _score(render: Render, view: View, lpips: Lpips | None) -> ViewScore:
     image = render(view)
     seconds = _now() - start
     _check(image, view)
-    clamped, truth = image.clamp(0.0, 1.0), photograph(view, image.device)
+    clamped, truth = image.clamp(0.0, 1.0), photograph_of(view, image.device)
     return ViewScore(
         view.name,
         psnr=psnr(clamped, truth),

@@ -35,7 +35,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.splat.frame import TrainingFrame, training_frame
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.pictures import beside_truth, picture_name, write_picture
+from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
 from splatseed.splat.rendering import render_view
 from splatseed.views.view import View, load_views, poses_of
 
@@ -182,6 +182,6 @@ def write_renders(model: TrainedModel, folder: Path, progress: Progress = silent
         OutputError: A file cannot be written.
     """
     for done, view in enumerate(model.views):
-        picture = beside_truth(view.image, model.render(view).cpu().numpy())
+        picture = beside_photograph(view.photograph, model.render(view).cpu().numpy())
         write_picture(folder / picture_name(view.name), picture)
         progress("write", (done + 1) / len(model.views))

@@ -133,7 +133,7 @@ def _check_pixels(
             f"a mask or None for each of {len(views)} views", found=f"{len(masks)}", fix="Add None."
         )
     for view, mask in zip(views, masks, strict=True):
-        _check_size("pixels", view, view.image.shape[:2])
+        _check_size("pixels", view, view.photograph.shape[:2])
         if mask is not None:
             _check_size("a mask", view, np.shape(mask))
     return masks
@@ -198,7 +198,7 @@ def _make_seeds(
     shape = grid_of(view, cell)
     used = np.ones((1, 1), np.bool_) if mask is None else np.asarray(mask, np.bool_)
     rgb, usable = np.empty((len(empty), 3), np.uint8), np.empty(len(empty), np.bool_)
-    _mean_colors(view.image, used, shape, empty, rgb, usable)
+    _mean_colors(view.photograph, used, shape, empty, rgb, usable)
     xyz = np.empty((len(empty), 3), np.float32)
     _lift_all(world_from_grid(view, cell), shape[1], empty, depths, xyz)
     usable &= np.isfinite(xyz).all(axis=1)

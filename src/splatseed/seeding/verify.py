@@ -112,7 +112,7 @@ def _try_all(
     progress: Progress,
 ) -> _Trials:
     """Let every view judge its points."""
-    greys = [grey_image(view.image) for view in views]
+    greys = [grey_image(view.photograph) for view in views]
     trials = _no_trials(*judges.shape)
     order = np.argsort(judges, axis=None, kind="stable")
     starts = np.searchsorted(judges.ravel()[order], np.arange(len(views) + 1))

@@ -68,7 +68,7 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
         shown = _shown(xyz, view)
         basis = _harmonics(xyz[shown.seed_idx], view)
         normal[shown.seed_idx] += basis[:, :, None] * basis[:, None, :]
-        colors = _colors(view.image, shown) - 0.5
+        colors = _colors(view.photograph, shown) - 0.5
         right[shown.seed_idx] += basis[:, :, None] * colors[:, None, :]
     return np.linalg.solve(normal, right).astype(np.float32)
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from splatseed.render import rasterization
 from splatseed.views.view import View
 
-__all__ = ["photograph", "render_features", "render_view"]
+__all__ = ["photograph_of", "render_features", "render_view"]
 
 
 def render_view(
@@ -67,10 +67,10 @@ def _rasterize(
     return images.squeeze(0), info  # unlike indexing, its backward allocates no image of zeros
 
 
-def photograph(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
+def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
     """The view's photograph as float32 from 0 to 1."""
     # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be.
-    return torch.tensor(view.image, device=device).to(torch.float32).div_(255.0)
+    return torch.tensor(view.photograph, device=device).to(torch.float32).div_(255.0)
 
 
 def _harmonics(

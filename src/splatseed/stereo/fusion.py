@@ -143,7 +143,7 @@ def _seeds(stereo: Stereo, i: int, chosen: Int64[np.ndarray, " M"], cell: float)
     normals = stereo.normals(i)[row, column] @ view.cam_from_world[:3, :3]
     return StereoSeeds(
         camera.unproject(uv, z).astype(np.float32),
-        block_means(view.image, grid)[row, column],
+        block_means(view.photograph, grid)[row, column],
         normals.astype(np.float32),
         (cell * z / view.K[0, 0]).astype(np.float32),
         stereo.confidence(i)[row, column],

@@ -72,7 +72,7 @@ def match_views(
         progress: Told how far it is.
     """
     check_stereo_memory(views, settings)
-    greys = [grey_image(view.image) for view in views]
+    greys = [grey_image(view.photograph) for view in views]
     found: list[Found] = [None] * len(views)  # type: ignore[list-item]  # filled in below
 
     def work(start: int, stop: int) -> None:

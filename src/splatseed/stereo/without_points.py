@@ -108,7 +108,7 @@ def _camera(view: View) -> Camera:
 def _small(view: View) -> View:
     """A view downsampled by a whole factor."""
     factor = max(1, round(max(view.width, view.height) / SMALL))
-    image = block_means(view.image, factor)
+    image = block_means(view.photograph, factor)
     K = np.diag([1 / factor, 1 / factor, 1.0]) @ view.K
     mask = None
     if view.mask is not None:

@@ -25,7 +25,7 @@ from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, training_frame
-from splatseed.splat.pictures import beside_truth, picture_name, write_picture
+from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
@@ -280,7 +280,7 @@ class TrainingRun:
         names = [picture_name(view.name) for view in views]
         self.folder.claim([self.folder.renders / name for name in names])
         for i, (view, name) in enumerate(zip(views, names, strict=True)):
-            picture = beside_truth(view.image, self.trainer.render(view).cpu().numpy())
+            picture = beside_photograph(view.photograph, self.trainer.render(view).cpu().numpy())
             write_picture(staged.renders / name, picture)
             progress("write", (i + 1) / len(views))
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from splatseed.evaluate.images import psnr
 from splatseed.process.allocator import keep_freed_memory
 from splatseed.process.interruption import interruption
-from splatseed.splat.rendering import photograph, render_view
+from splatseed.splat.rendering import photograph_of, render_view
 from splatseed.train.averaging import add_to_mean, take_mean
 from splatseed.train.losses import photometric_loss
 from splatseed.train.parameters import optimize
@@ -75,11 +75,11 @@ class Trainer:
         with interruption() as stop, torch.random.fork_rng(self._cuda_devices()):
             state.watch.start()
             while state.step < self.settings.max_steps and not stop.requested:
-                render, truth = self._advance(state.step)
+                render, photograph = self._advance(state.step)
                 state.step += 1
                 on_step(state.step)
                 if self._is_due(RECORDS) or self._is_due(TESTS):
-                    self._record(render, truth)
+                    self._record(render, photograph)
             state.watch.stop()
         return state.step >= self.settings.max_steps
 
@@ -87,7 +87,7 @@ class Trainer:
         """Render and compare once, so that kernels are compiled before the clock runs."""
         view = self.train_views[0]
         render, _ = render_view(self.state.params, view, self.settings.sh_degree)
-        photometric_loss(render, photograph(view, self.device)).backward()
+        photometric_loss(render, photograph_of(view, self.device)).backward()
         for value in self.state.params.values():
             value.grad = None
 
@@ -103,18 +103,18 @@ class Trainer:
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
         torch.manual_seed(_step_seed(self.settings.seed, step))
         view = self.train_views[self._view_index(step)]
-        truth = photograph(view, self.device)
+        photograph = photograph_of(view, self.device)
         render, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
         strategy.before(params, optimizers, step, info)
-        loss = photometric_loss(render, truth)
+        loss = photometric_loss(render, photograph)
         state.losses.append(loss.detach())
         penalty = strategy.regularization(params)
         (loss if penalty is None else loss + penalty).backward()
         optimize(params, optimizers, schedule.rates(step))
-        strategy.observe(params, view, render, truth, step)
+        strategy.observe(params, view, render, photograph, step)
         strategy.after(params, optimizers, step, info)
         self._average(step + 1)
-        return render.detach(), truth
+        return render.detach(), photograph
 
     def _average(self, steps_done: int) -> None:
         """Take the Gaussians into their mean at the end of a run, and end with it."""
@@ -124,14 +124,14 @@ class Trainer:
             if steps_done == self.settings.max_steps:
                 take_mean(state.params, state.mean)
 
-    def _record(self, render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> None:
+    def _record(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> None:
         """Note how far the run is; the clock stands still meanwhile."""
         state = self.state
         loss = float(torch.stack(state.losses).mean(dtype=torch.float64))
         state.watch.stop()
         state.losses.clear()
         tested = round(self.test_psnr(), 4) if self._is_due(TESTS) else None
-        count, shown = len(state.params["means"]), round(psnr(render, truth), 4)
+        count, shown = len(state.params["means"]), round(psnr(render, photograph), 4)
         record = Record(state.step, round(state.watch.seconds, 3), loss, shown, tested, count)
         state.records.append(record)
         self.on_record(record)
@@ -139,7 +139,7 @@ class Trainer:
 
     def test_psnr(self) -> float:
         """Mean over the test views of each one's PSNR, dB."""
-        values = [psnr(self.render(v), photograph(v, self.device)) for v in self.test_views]
+        values = [psnr(self.render(v), photograph_of(v, self.device)) for v in self.test_views]
         return sum(values) / len(values)
 
     def _is_due(self, times: int) -> bool:

@@ -154,12 +154,12 @@ class Entry:
         return laid_onto(canvas, photograph, at.camera), ""
 
     def _error(self, canvas: View, at: Image | None) -> Drawn:
-        truth, why = self._photograph(canvas, at)
-        if truth is None or at is None:
+        photograph, why = self._photograph(canvas, at)
+        if photograph is None or at is None:
             return None, why
         white = np.full((2, 2, 3), 255, np.uint8)
         inside = laid_onto(canvas, white, at.camera, smooth=False) > 0
-        return np.where(inside, error_map(truth, self.renderer.color(canvas)), 0), ""
+        return np.where(inside, error_map(photograph, self.renderer.color(canvas)), 0), ""
 
     def _depth_map(self, canvas: View, at: Image | None) -> Drawn:
         maps = self._scene.depths

@@ -24,17 +24,17 @@ ROWS = 64
 
 
 def undistort(
-    pixels: UInt8[np.ndarray, "H W 3"], lens: Intrinsics, K: Float64[np.ndarray, "3 3"]
+    photograph: UInt8[np.ndarray, "H W 3"], lens: Intrinsics, K: Float64[np.ndarray, "3 3"]
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
     """The photograph without distortion, and which of its pixels are known.
 
     Args:
-        pixels: The photograph, of any size.
+        photograph: The photograph, of any size.
         lens: Its camera, of which the distortion counts.
-        K: The matrix of the camera in pixels of ``pixels``; that of the result as well.
+        K: The matrix of the camera in pixels of ``photograph``; that of the result as well.
     """
-    height, width = pixels.shape[:2]
-    out, known = np.zeros_like(pixels), np.zeros((height, width), np.bool_)
+    height, width = photograph.shape[:2]
+    out, known = np.zeros_like(photograph), np.zeros((height, width), np.bool_)
     corners = _rays(K, np.array([0.0, width]), np.array([0.0, height]))
     limit = fold_radius(lens, float(np.linalg.norm(corners, axis=-1).max()))
     column = np.arange(width) + 0.5
@@ -44,7 +44,7 @@ def undistort(
         with np.errstate(all="ignore"):  # beyond the fold nothing needs to be finite
             uv = distort(lens, rays) * K[[0, 1], [0, 1]] + K[:2, 2]
         uv[np.linalg.norm(rays, axis=-1) > limit] = np.nan
-        _resample(pixels, uv, out[rows], known[rows])
+        _resample(photograph, uv, out[rows], known[rows])
     return out, known
 
 
@@ -57,9 +57,9 @@ def _rays(
 
 
 @inline
-def _resample(pixels, uv, out, known):  # type: ignore[no-untyped-def]
+def _resample(photograph, uv, out, known):  # type: ignore[no-untyped-def]
     """Bilinear colours at positions, NaN = outside; edge pixels extend to the border."""
-    height, width = pixels.shape[:2]
+    height, width = photograph.shape[:2]
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             u, v = uv[i, j, 0], uv[i, j, 1]
@@ -72,6 +72,10 @@ def _resample(pixels, uv, out, known):  # type: ignore[no-untyped-def]
             right, below = min(left + 1, width - 1), min(top + 1, height - 1)
             a, b = x - left, y - top
             for channel in range(3):
-                upper = (1 - a) * pixels[top, left, channel] + a * pixels[top, right, channel]
-                lower = (1 - a) * pixels[below, left, channel] + a * pixels[below, right, channel]
+                upper = (1 - a) * photograph[top, left, channel] + a * photograph[
+                    top, right, channel
+                ]
+                lower = (1 - a) * photograph[below, left, channel] + a * photograph[
+                    below, right, channel
+                ]
                 out[i, j, channel] = int((1 - b) * upper + b * lower + 0.5)

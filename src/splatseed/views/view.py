@@ -39,8 +39,8 @@ class View:
 
     Args:
         name: The image's name in its scene.
-        image: Its pixels, sRGB, uint8 [H, W, 3].
-        K: Pinhole matrix in pixels of ``image``, float64 [3, 3].
+        photograph: Its pixels, sRGB, uint8 [H, W, 3].
+        K: Pinhole matrix in pixels of ``photograph``, float64 [3, 3].
         width: W.
         height: H.
         cam_from_world: World to OpenCV camera axes, float64 [4, 4].
@@ -48,7 +48,7 @@ class View:
     """
 
     name: str
-    image: UInt8[np.ndarray, "H W 3"]
+    photograph: UInt8[np.ndarray, "H W 3"]
     K: Float64[np.ndarray, "3 3"]
     width: int
     height: int
@@ -213,8 +213,8 @@ def _load_view(
     image: Image, folder: Path, data_factor: int, min_side: int, cache_dir: Path | None
 ) -> View:
     path = folder / image.name
-    pixels, file_size = load_photograph(path, data_factor, cache_dir)
-    height, width = pixels.shape[:2]
+    photograph, file_size = load_photograph(path, data_factor, cache_dir)
+    height, width = photograph.shape[:2]
     if min(width, height) < min_side:
         raise SceneFormatError(
             f"{path} to have at least {min_side} pixels a side at --data-factor {data_factor}",
@@ -225,11 +225,11 @@ def _load_view(
     scale = _file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor
     K = np.diag([*scale, 1.0]) @ camera.K
     if not image.intrinsics.has_distortion:
-        return View(image.name, pixels, K, width, height, camera.cam_from_world)
+        return View(image.name, photograph, K, width, height, camera.cam_from_world)
     from splatseed.views.undistortion import undistort  # noqa: PLC0415  (loads Numba)
 
-    pixels, known = undistort(pixels, image.intrinsics, K)
-    return View(image.name, pixels, K, width, height, camera.cam_from_world, known)
+    photograph, known = undistort(photograph, image.intrinsics, K)
+    return View(image.name, photograph, K, width, height, camera.cam_from_world, known)
 
 
 def _file_from_camera(

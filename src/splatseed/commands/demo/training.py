@@ -49,13 +49,13 @@ class TrainedArm:
     Args:
         arm: The arm.
         metrics: The content of its metrics.json.
-        truth: The photograph of the view that is shown.
+        photograph: The photograph of the view that is shown.
         render: The render of that view, 0 to 1.
     """
 
     arm: Arm
     metrics: Mapping[str, Any]
-    truth: UInt8[np.ndarray, "H W 3"]
+    photograph: UInt8[np.ndarray, "H W 3"]
     render: Float32[np.ndarray, "H W 3"]
 
 
@@ -76,7 +76,7 @@ def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedAr
     metrics = run.finish(lambda render, views: evaluate_views(render, views).to_dict(), clock)
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
     render = np.asarray(run.trainer.render(shown).cpu().numpy(), np.float32)
-    return TrainedArm(arm, metrics, shown.image, render)
+    return TrainedArm(arm, metrics, shown.photograph, render)
 
 
 def total_seconds(each: TrainedArm) -> float:
@@ -97,8 +97,8 @@ def write_comparison(arms: Sequence[TrainedArm], path: Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    truth = arms[0].truth
-    blank = np.full_like(truth, 255)
+    photograph = arms[0].photograph
+    blank = np.full_like(photograph, 255)
     renders = [
         Tile(
             f"{each.arm.label}: {each.metrics['psnr']:.2f} dB over all test views",
@@ -107,10 +107,10 @@ def write_comparison(arms: Sequence[TrainedArm], path: Path) -> None:
         for each in arms
     ]
     errors = [
-        Tile(f"error: black 0, bright {FULL_ERROR:g} or more", error_map(truth, each.render))
+        Tile(f"error: black 0, bright {FULL_ERROR:g} or more", error_map(photograph, each.render))
         for each in arms
     ]
-    tiles = [Tile("photograph, not trained on", truth), *renders, Tile("", blank), *errors]
+    tiles = [Tile("photograph, not trained on", photograph), *renders, Tile("", blank), *errors]
     write_grid(tiles, path, columns=1 + len(arms))
 
 

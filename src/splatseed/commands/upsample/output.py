@@ -94,7 +94,7 @@ def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
     clouds = [cloud.xyz[cloud.finite] for cloud in (scene.points, seeds)]
     before, after = (covered_cells(views, xyz, CELL) for xyz in clouds)
     shown = [
-        CoveredView(view.name, view.image, CELL, old, new)
+        CoveredView(view.name, view.photograph, CELL, old, new)
         for view, old, new in zip(views, before, after, strict=True)
     ]
     preview_cells(shown, path)

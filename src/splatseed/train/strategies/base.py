@@ -41,7 +41,7 @@ class Strategy(ABC):
         params: Parameters,
         view: View,
         render: Float[Tensor, "H W 3"],
-        truth: Float[Tensor, "H W 3"],
+        photograph: Float[Tensor, "H W 3"],
         step: int,
     ) -> None:
         """Called after the optimisers, with the result of the step; does nothing by default."""

@@ -67,13 +67,15 @@ class Growing(Strategy):
         params: Parameters,
         view: View,
         render: Float[Tensor, "H W 3"],
-        truth: Float[Tensor, "H W 3"],
+        photograph: Float[Tensor, "H W 3"],
         step: int,
     ) -> None:
         """Add this view's measurements of each Gaussian to the sums."""
         if step % LOOK_EVERY or step > self.schedule.refine_stop:
             return
-        pixels, errors = contributions(params, view, (render.detach() - truth).abs().mean(dim=-1))
+        pixels, errors = contributions(
+            params, view, (render.detach() - photograph).abs().mean(dim=-1)
+        )
         sums = self._sums(params)
         sums["errors"] += errors
         sums["pixels"] += pixels
