@@ -74,10 +74,21 @@ def resumed_settings(begun: Mapping[str, Any] | None, asked: TrainSettings) -> T
         then = begun.get(field.name, getattr(default, field.name))
         if field.name in WHERE or now == then:
             continue
+        _check_kind(field.name, then, getattr(default, field.name))
         if now != getattr(default, field.name):
             raise _differs(field.name, then, now)
         changes[field.name] = then
     return dataclasses.replace(asked, **changes)
+
+
+def _check_kind(name: str, then: object, default: object) -> None:
+    """Refuse a setting of another type, which comparisons would fail over."""
+    if isinstance(default, int) and not isinstance(then, int):
+        raise SceneFormatError(
+            f"{name} in the config.json of the run to be a number",
+            found=repr(then)[:80],
+            fix="Start again with --overwrite.",
+        )
 
 
 def check_same_seeds(path: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> None:
