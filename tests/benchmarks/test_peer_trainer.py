@@ -6,9 +6,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
-from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -186,16 +184,6 @@ from sklearn.neighbors import NearestNeighbors
 def distances(points):
     return NearestNeighbors(n_neighbors=4, metric="euclidean").fit(points).kneighbors(points)[0]
 """
-
-
-@pytest.fixture(scope="module")
-def bench():
-    """The modules by name; they import each other from the checkout."""
-    sys.path.insert(0, str(ROOT))
-    yield SimpleNamespace(
-        **{name.split(".")[1]: import_module(f"benchmarks.{name}") for name in MODULES}
-    )
-    sys.path.remove(str(ROOT))
 
 
 @pytest.fixture(scope="module")

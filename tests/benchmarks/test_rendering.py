@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import stat
 import sys
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -28,16 +27,6 @@ MODULES = (
     "rendering.render",
     "rendering.train_step",
 )
-
-
-@pytest.fixture(scope="module")
-def bench():
-    """The modules by name; they import each other from the checkout."""
-    sys.path.insert(0, str(ROOT))
-    yield SimpleNamespace(
-        **{name.split(".")[1]: import_module(f"benchmarks.{name}") for name in MODULES}
-    )
-    sys.path.remove(str(ROOT))
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.kernels.jit import inline
 from splatseed.scene import Image
+from splatseed.views.view import check_lens
 from splatseed.views.visibility import SeenPoints, Visibility, camera_points
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ class Reader:
             SceneNotFoundError: A file is gone.
             SceneFormatError: A file is damaged, has the wrong aspect ratio, or the lens distorts.
         """
-        check_lens(image)
+        check_lens(image, reason="along whose rays pixels are lifted")
         seen = self._read_map(image, num, rng)  # the map is let go before the photograph is read
         if seen.alignment.rejected is not None:
             return _nothing(seen.alignment, seen.camera)
@@ -163,20 +164,6 @@ class Reader:
         if not self.settings.align:
             return trust_units(depth, camera, points)
         return align_map(depth, camera, points, self.settings.fit, self.settings.min_points)
-
-
-def check_lens(image: Image) -> None:
-    """Refuse a lens with distortion: pixels would be lifted along wrong rays.
-
-    Raises:
-        SceneFormatError: It has distortion.
-    """
-    if image.intrinsics.has_distortion:
-        raise SceneFormatError(
-            "cameras without lens distortion (PINHOLE), along whose rays pixels are lifted",
-            found=f"{image.intrinsics.model} for {image.name}",
-            fix="Undistort the scene first: splatseed undistort SCENE -o OUT.",
-        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,11 +16,18 @@ import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_file
+from splatseed.scene import Scene
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage
 
-__all__ = ["check_photograph", "decode_photograph", "open_photograph", "photograph_bytes"]
+__all__ = [
+    "check_photograph",
+    "decode_photograph",
+    "open_photograph",
+    "photograph_bytes",
+    "photograph_folder",
+]
 
 _CHECK_SCALE = 8
 """JPEGs are checked at an eighth of their size: all bytes are read, few pixels are computed."""
@@ -29,6 +36,22 @@ _WIDE_GREY = ("I", "F")
 _INKS = ("CMYK", "LAB")
 """Pillow's modes that are not RGB or grey; it would convert inks by a rule of thumb."""
 _DECODER_FAILURES = (OSError, ValueError, SyntaxError)
+
+
+def photograph_folder(scene: Scene) -> Path:
+    """The folder that a scene's photographs are in.
+
+    Raises:
+        SceneNotFoundError: The scene has no images, or no folder of them.
+    """
+    folder = scene.source.image_dir if scene.source else None
+    if folder is None or not scene.images:
+        raise SceneNotFoundError(
+            "a scene with photographs",
+            found="no images" if folder else "no folder of images",
+            fix="Name a scene with cameras, and put its photographs into a folder named images.",
+        )
+    return folder
 
 
 def photograph_bytes(path: Path) -> bytes:

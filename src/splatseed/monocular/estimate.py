@@ -18,10 +18,15 @@ from jaxtyping import Float32, UInt8
 from PIL import Image as PilImage
 
 from splatseed.depthmap import ASPECT_SLACK
-from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.depth.folder import depth_folder
 from splatseed.io.output.staging import check_output
-from splatseed.io.photograph import check_photograph, decode_photograph, photograph_bytes
+from splatseed.io.photograph import (
+    check_photograph,
+    decode_photograph,
+    photograph_bytes,
+    photograph_folder,
+)
 from splatseed.monocular.network import DepthNetwork
 from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
@@ -88,7 +93,7 @@ def estimate_depths(
     for name, number in (("batch", batch), ("max-size", max_size)):
         if number < 1:
             raise ParameterError(f"--{name} of 1 or more", found=f"{number}", fix="Raise it.")
-    folder = _image_folder(scene)
+    folder = photograph_folder(scene)
     protect = (folder,) if scene.source is None else (folder, scene.source.root)
     check_output(output, kind="depth", overwrite=overwrite, protect=protect)
     sizes = _check_images(scene.images, folder, max_size, progress)
@@ -108,17 +113,6 @@ def estimate_depths(
     ordered = sorted(sizes.values(), key=lambda size: size[0] * size[1])
     seconds = time.perf_counter() - start
     return DepthReport(output, done, (ordered[0], ordered[-1]), tuple(sorted(flat)), seconds)
-
-
-def _image_folder(scene: Scene) -> Path:
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None or not scene.images:
-        raise SceneNotFoundError(
-            "a scene with photographs",
-            found="no images" if folder else "no folder of images",
-            fix="Name a scene with cameras, and put its photographs into a folder named images.",
-        )
-    return folder
 
 
 def _check_images(

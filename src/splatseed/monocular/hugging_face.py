@@ -31,6 +31,7 @@ from splatseed.errors import (
     SplatseedError,
 )
 from splatseed.monocular.network import DeviceName, Meaning, meaning_of, one_line
+from splatseed.process.torch_device import pick_torch_device
 
 __all__ = ["HuggingFaceNetwork", "load_hugging_face"]
 
@@ -153,7 +154,7 @@ def load_hugging_face(
         ParameterError: There is no such device, or nothing says what it predicts.
         MissingDependencyError: Its image processor needs torchvision, which is absent.
     """
-    where = _pick_device(device)
+    where = pick_torch_device(device, "--device")
     _check_folder(model)
     with _silent():
         meaning = meaning_of(_read_config(model).to_dict(), model, kind)
@@ -178,17 +179,6 @@ def _failed(error: Exception, values: Float[Tensor, "B 3 h w"]) -> SplatseedErro
         found=one_line(error),
         fix="Its preprocessor_config.json may belong to another network.",
     )
-
-
-def _pick_device(device: DeviceName) -> torch.device:
-    seen = torch.cuda.is_available()
-    if device == "cuda" and not seen:
-        raise ParameterError(
-            "a GPU for --device cuda",
-            found="none that PyTorch sees",
-            fix="Pass --device cpu, or install PyTorch's CUDA build.",
-        )
-    return torch.device("cuda" if seen and device != "cpu" else "cpu")
 
 
 def _check_folder(model: str) -> None:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import torch
 
-from splatseed.errors import ParameterError, PointCloudError
+from splatseed.errors import PointCloudError
 from splatseed.process.memory import free_memory
+from splatseed.process.torch_device import pick_torch_device
 from splatseed.train.settings import BYTES_EACH, Backend
 
 __all__ = [
@@ -24,14 +25,7 @@ def pick_device(backend: Backend) -> torch.device:
     Raises:
         ParameterError: CUDA is asked for and there is none.
     """
-    seen = torch.cuda.is_available()
-    if backend == "cuda" and not seen:
-        raise ParameterError(
-            "a GPU for --backend cuda",
-            found="none that PyTorch sees",
-            fix="Pass --backend cpu, or install PyTorch's CUDA build.",
-        )
-    return torch.device("cuda" if seen and backend != "cpu" else "cpu")
+    return pick_torch_device(backend, "--backend")
 
 
 def device_name(device: torch.device) -> str:

@@ -191,19 +191,22 @@ def _image_folder(scene: Scene) -> Path:
     return folder
 
 
-def check_lens(image: Image, scene: Path | None = None) -> None:
+def check_lens(
+    image: Image, scene: Path | None = None, reason: str = "which Gaussians are drawn with"
+) -> None:
     """Refuse an image whose camera has lens distortion.
 
     Args:
         image: The image.
         scene: The folder of its scene, for the command in the advice.
+        reason: Why the camera must be a pinhole.
 
     Raises:
         SceneFormatError: It has distortion.
     """
     if image.intrinsics.has_distortion:
         raise SceneFormatError(
-            "cameras without lens distortion (PINHOLE), which Gaussians are drawn with",
+            f"cameras without lens distortion (PINHOLE), {reason}",
             found=f"{image.intrinsics.model} for {image.name}",
             fix=undistort_first(scene),
         )

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.errors import ParameterError
 from splatseed.io.dense.colmap_files import write_consistency_graph, write_map
 from splatseed.io.dense.maps import DenseMap, check_map, depth_along, scaled_K
 from splatseed.io.dense.overlap import OverlapPoints
@@ -24,6 +24,7 @@ from splatseed.io.dense.report import DenseCount, DenseReport
 from splatseed.io.dense.sparse_model import Size, SparseModel, photograph_model
 from splatseed.io.output.layouts import write_json
 from splatseed.io.output.staging import MANIFEST, output_folder
+from splatseed.io.photograph import photograph_folder
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 
@@ -112,13 +113,7 @@ def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Si
             aspect ratio.
         OutputError: An image's name leads out of its folder.
     """
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None or not scene.images:
-        raise SceneNotFoundError(
-            "a scene with photographs",
-            found="no images" if folder else "no folder of images",
-            fix="Name a scene with cameras, and put its photographs into a folder named images.",
-        )
+    folder = photograph_folder(scene)
     return {image.name: check_image(image, folder, undistorts=undistorts) for image in scene.images}
 
 
