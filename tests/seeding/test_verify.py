@@ -113,7 +113,7 @@ def test_the_notes_count_every_point(views, places):
     kept = hold(views, KNOWN, new)
     dropped = len(new) - len(kept.xyz)
     assert f"of {len(new):,} new points agree" in kept.notes[0]
-    assert any(f"{dropped:,} do so nowhere and were dropped" in note for note in kept.notes)
+    assert any(f"{dropped:,} agree nowhere and were dropped" in note for note in kept.notes)
 
 
 def test_without_texture_flat_places_stay_and_others_go(views, places, rng):
