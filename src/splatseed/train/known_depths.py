@@ -19,6 +19,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.splat.frame import TrainingFrame
 from splatseed.stereo.of_scene import stereo_depths
+from splatseed.stereo.result import Stereo
 from splatseed.train.settings import TrainSettings
 
 __all__ = ["known_depths"]
@@ -30,6 +31,7 @@ def known_depths(
     settings: TrainSettings,
     device: torch.device,
     *,
+    stereo: Stereo | None = None,
     note: Callable[[str], None] = lambda _: None,
     progress: Progress = silent,
 ) -> Mapping[str, Float[Tensor, "h w"]]:
@@ -40,6 +42,7 @@ def known_depths(
         frame: The training frame.
         settings: Whose strategy, seed and test views count.
         device: Where the maps are wanted.
+        stereo: What seeding found already.
         note: Told what was found.
         progress: Told how far it is.
 
@@ -51,12 +54,15 @@ def known_depths(
     if not wanted or len(images) < 2:
         return {}
     start = time.perf_counter()
-    maps = stereo_depths(scene.replace(images=images), seed=settings.seed, progress=progress)
+    if stereo:
+        maps = tuple(stereo.map(i) for i in range(len(stereo.views)))
+    else:
+        maps = stereo_depths(scene.replace(images=images), seed=settings.seed, progress=progress)
     share = np.mean([each.known_share for each in maps])
-    seconds = time.perf_counter() - start
+    took = "" if stereo else f" ({time.perf_counter() - start:.0f} s)"
     note(
-        f"Stereo knows the depth of {share:.0%} of the pixels, where strategy grow places half of "
-        f"what it adds ({seconds:.0f} s). --placing none only splits."
+        f"Stereo knows the depth of {share:.0%} of the pixels{took}: strategy grow places half of "
+        "what it adds there. --placing none only splits."
     )
     return {
         each.name: torch.as_tensor(np.nan_to_num(each.depth * frame.scale)).to(device)

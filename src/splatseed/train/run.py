@@ -101,7 +101,7 @@ def prepare_run(
     begun = folder.read_config() if options.resume and folder.is_run else None
     settings = resumed_settings(begun, settings)
     device = pick_device(settings.backend)
-    scene = seeded(scene, settings, note, progress)
+    scene, stereo = seeded(scene, settings, note, progress)
     trained = scene.split(settings.test_every)[0]
     seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
     check_fits(len(seeds), device)
@@ -121,10 +121,15 @@ def prepare_run(
     for name in strays:
         note(stray_note(name))
     near = [frame.view(view) for view in views[0] if view.name not in strays]
-    depths = known_depths(scene, frame, settings, device, note=note, progress=progress)
+    start = time.perf_counter()
+    depths = known_depths(
+        scene, frame, settings, device, stereo=stereo, note=note, progress=progress
+    )
+    seconds = time.perf_counter() - start
     strategy = make_strategy(settings, device, depths)
     state = _state(folder if begun else None, seeds, frame, near, settings, strategy, device)
     if not begun:
+        state.watch.seconds += seconds  # what growth needs to know is part of what it costs
         folder.begin(config)
     if state.step:
         note(f"Going on after step {state.step:,} of {settings.max_steps:,}.")
