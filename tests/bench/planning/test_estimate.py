@@ -7,20 +7,21 @@ import dataclasses
 import pytest
 
 from splatseed.bench.planning.estimate import Estimator
-from splatseed.bench.planning.records import SFM, Arm, ImageScore, RunResult, RunRow, RunSpec
+from splatseed.bench.planning.records import SFM, Arm, RunResult, RunRow, RunSpec
 from splatseed.bench.planning.scenes import SceneFacts
+from splatseed.scores import EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
 FACTS = SceneFacts("room", "", "ab12", num_points=10_000, num_images=80, pixels=800 * 600)
 TRAINING = TrainSettings(max_steps=1000, backend="cpu")
 SPEC = RunSpec("room", "ab12", Arm("mls", "default", 8, "none"), repeat=0, training=TRAINING)
-SCORES = (ImageScore("a.png", 21.5, 0.8, None),)
-RESULT = RunResult(
-    21.5, 0.8, None, SCORES, (), 80_000, 80_000, 1888, 0.2, 500.0, 0.01, 10**9, "CPU"
-)
+SCORES = EvalResult((ViewScore("a.png", 21.5, 0.8, None, 0.01),), num_gaussians=80_000)
+RESULT = RunResult(SCORES, (), 80_000, 0.2, 500.0, 10**9, "CPU")
 
 
 def _row(spec=SPEC, seconds=530.0, **changes):
+    if "num_gaussians" in changes:
+        changes["scores"] = dataclasses.replace(SCORES, num_gaussians=changes.pop("num_gaussians"))
     result = dataclasses.replace(RESULT, **changes)
     return RunRow(spec, "done", result, started=1000.0, finished=1000.0 + seconds)
 

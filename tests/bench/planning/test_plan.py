@@ -75,7 +75,7 @@ def test_a_plan_survives_its_file(tmp_path_factory, plan):
 def test_a_file_has_a_key_for_each_field():
     own = {each.name for each in dataclasses.fields(Plan)} - {"training"}
     assert set(KINDS) == own | set(SHARED)
-    text = plan_text(Plan(training=TrainSettings(cap_max=5)))
+    text = plan_text(Plan(training=TrainSettings(cap_max=5), long_side=400))
     assert set(tomllib.loads(text)) == set(KINDS) - {"scenes", "parameters"}
 
 

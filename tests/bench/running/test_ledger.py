@@ -14,19 +14,20 @@ import time
 
 import pytest
 
-from splatseed.bench.planning.records import Arm, ImageScore, RunResult, RunSpec
+from splatseed.bench.planning.records import Arm, RunResult, RunSpec
 from splatseed.bench.running import ledger as ledger_module, worker as worker_module
 from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.worker import STALE_SECONDS, worker_name
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.scores import EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
 ARM = Arm("mls", "default", 8, "none")
 SPECS = [
     RunSpec("room", "ab12", ARM, repeat=r, training=TrainSettings(max_steps=100)) for r in range(5)
 ]
-SCORES = (ImageScore("a.png", 21.5, 0.8, None),)
-RESULT = RunResult(21.5, 0.8, None, SCORES, (), 7, 8, 1888, 0.2, 1.5, 0.01, 10**9, "CPU")
+SCORES = EvalResult((ViewScore("a.png", 21.5, 0.8, None, 0.01),), num_gaussians=8, model_bytes=1888)
+RESULT = RunResult(SCORES, (), 7, 0.2, 1.5, 10**9, "CPU")
 ME = worker_name()
 
 
@@ -55,7 +56,7 @@ def test_only_the_keys_that_are_asked_for_are_handed_out(ledger):
 def test_what_is_done_is_kept_and_never_handed_out_again(ledger):
     first = ledger.claim(ME)
     assert ledger.finish(first.key, RESULT)
-    other = dataclasses.replace(RESULT, psnr=0.0)
+    other = dataclasses.replace(RESULT, num_seeds=0)
     assert not ledger.finish(first.key, other)
     ledger.fail(first.key, ME, "too late")
     ledger.add(SPECS)

@@ -1,8 +1,8 @@
 """The seeds of a run: what its method makes of its scene, and how long that takes.
 
 Promise: seeds are the points that ``splatseed upsample`` would write for the same scene, method,
-ratio and seed: finite, and no two at one place. The time is that of upsampling alone, without the
-compilation of kernels, which happens once on a machine.
+ratio, budget and seed: finite, and no two at one place. The time is that of upsampling and thinning
+alone, without the compilation of kernels, which happens once on a machine.
 """
 
 from __future__ import annotations
@@ -12,15 +12,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
+
 from splatseed.bench.planning.records import SFM, RunSpec
 from splatseed.bench.planning.scenes import open_scene
 from splatseed.kernels.compilation import watched
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.upsample import chooses_number, configure, upsample
+from splatseed.seeding.upsampling import upsample
+from splatseed.upsample import Upsampler, chooses_number, configure
 
 __all__ = ["make_seeds", "scene_of"]
+
+PLAIN = "linear"
+"""Any method does where no point is to be made."""
 
 
 def scene_of(spec: RunSpec) -> Scene:
@@ -47,15 +53,33 @@ def make_seeds(
     Raises:
         SplatseedError: As ``splatseed.upsample``.
     """
-    if spec.arm.method == SFM:
+    if spec.arm.method == SFM and spec.most_seeds is None:
         return scene.points, 0.0
-    method = configure(spec.arm.method, spec.arm.profile, **spec.parameters)
-    ratio = None if chooses_number(spec.arm.method) else spec.arm.ratio
+    method, numbers = _asked(scene, spec)
     with _compilation() as compiling:
         start = time.perf_counter()
-        seeds = upsample(scene, method, ratio=ratio, seed=spec.repeat, progress=progress)
+        seeds = upsample(
+            scene, method, **numbers, budget=spec.most_seeds, seed=spec.repeat, progress=progress
+        )
         seconds = time.perf_counter() - start
-    return seeds.select(seeds.distinct), seconds - sum(compiling)
+    return seeds.select(seeds.distinct), max(seconds - sum(compiling), 0.0)
+
+
+def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, float]]:
+    """The method of a run, and how many points it is to make.
+
+    Under a budget, a method without a ratio fills what the originals leave of it.
+    """
+    arm, most = spec.arm, spec.most_seeds
+    if arm.method == SFM:
+        return configure(PLAIN), {"ratio": 1.0}
+    method = configure(arm.method, arm.profile, **spec.parameters)
+    if chooses_number(arm.method):
+        return method, {}
+    if arm.ratio or most is None:
+        return method, {"ratio": arm.ratio}
+    num_original = int(np.count_nonzero(scene.points.originals.distinct))
+    return (method, {"num_points": most}) if most > num_original else (method, {"ratio": 1.0})
 
 
 @contextmanager
