@@ -34,9 +34,7 @@ def result(psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, **chan
     )
     view = ViewScore("a.png", psnr, 0.8, changes.pop("lpips", None), 0.01, psnr + 0.5, 0.9)
     values = {
-        "scores": EvalResult(
-            (view,), num_gaussians=num_gaussians, model_bytes=num_gaussians * 236
-        ),
+        "scores": EvalResult((view,), num_gaussians=num_gaussians, model_bytes=num_gaussians * 236),
         "curve": curve,
         "num_seeds": num_gaussians,
         "upsample_seconds": 0.5,

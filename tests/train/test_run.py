@@ -16,8 +16,8 @@ import torch
 from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
-from splatseed.splat.ply import read_gaussians
 from splatseed.evaluate import evaluate_views
+from splatseed.splat.ply import read_gaussians
 from splatseed.train import device, run as run_module, trainer
 from splatseed.train.averaging import add_to_mean
 from splatseed.train.parameters import gaussians_of

@@ -15,6 +15,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
@@ -71,7 +72,7 @@ def find_covisible(
             depths.append(grid)
             progress(STAGE, 0.5 * len(depths) / len(views))
         seen = list(zip(train, map(_farthest, depths), strict=False))
-        grids = pool.map(lambda pair: _covisible(*pair, seen), zip(test, depths[len(train) :]))
+        grids = pool.map(lambda *pair: _covisible(*pair, seen), test, depths[len(train) :])
         for view, grid in zip(test, grids, strict=True):
             found[view.name] = grid
             progress(STAGE, 0.5 + 0.5 * len(found) / len(test))
@@ -128,7 +129,7 @@ def _planar(found: DepthMap, view: View) -> Float32[np.ndarray, "H W"]:
     K = np.diag([width / view.width, height / view.height, 1.0]) @ view.K
     v, u = np.indices((height, width)) + 0.5
     along = np.hypot(np.hypot((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]), 1.0)
-    return (found.values / along).astype(np.float32)
+    return np.asarray(found.values / along, np.float32)
 
 
 def _filled(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
@@ -154,18 +155,17 @@ def _farthest(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "
 
 
 def _covisible(
-    pair: tuple[View, Float32[np.ndarray, "rows cols"]],
+    view: View,
+    depths: Float32[np.ndarray, "rows cols"],
     seen: Sequence[tuple[View, Float32[np.ndarray, "rows cols"]]],
 ) -> Bool[np.ndarray, "rows cols"]:
-    view, depths = pair
     xyz1 = _in_world(view, np.where(np.isfinite(depths), depths, -1.0))
     count = sum((_sees(other, known, xyz1) for other, known in seen), np.zeros(len(xyz1), np.int32))
-    return (np.asarray(count) >= LEAST_VIEWS).reshape(depths.shape) & np.isfinite(depths)
+    enough = np.asarray(count).reshape(depths.shape) >= LEAST_VIEWS
+    return np.asarray(enough & np.isfinite(depths))
 
 
-def _in_world(
-    view: View, depths: Float64[np.ndarray, "rows cols"]
-) -> Float64[np.ndarray, "C 4"]:
+def _in_world(view: View, depths: Float64[np.ndarray, "rows cols"]) -> Float64[np.ndarray, "C 4"]:
     """The cells' centres at their depths, homogeneous."""
     rows, cols = depths.shape
     place = np.indices(depths.shape).reshape(2, -1)[::-1] + 0.5
@@ -196,7 +196,7 @@ def write_covisible(path: Path, grids: Grids) -> None:
         OutputError: The file cannot be written.
     """
     names = np.array(list(grids), dtype=np.str_)
-    arrays = {f"cells_{i}": grid for i, grid in enumerate(grids.values())}
+    arrays: dict[str, Any] = {f"cells_{i}": grid for i, grid in enumerate(grids.values())}
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_file(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, names=names, **arrays)

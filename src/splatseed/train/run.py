@@ -216,8 +216,9 @@ class TrainingRun:
         progress("score", 0.0)
         scores = score(self.trainer.render, self.trainer.test_views)
         world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
-        counts = {"num_gaussians": len(world), "model_bytes": world.num_bytes}
-        result = self._result(replace(scores, **counts))
+        result = self._result(
+            replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes)
+        )
         with self.folder.results() as staged:
             write_gaussians(staged.gaussians, world)
             write_curve_csv(staged.curve_csv, self.state.records)
@@ -229,6 +230,7 @@ class TrainingRun:
 
     def _result(self, scores: EvalResult) -> TrainingResult:
         state = self.state
+        capacity = state.strategy.capacity
         return TrainingResult(
             scores,
             tuple(
@@ -239,7 +241,7 @@ class TrainingRun:
             steps=state.step,
             train_seconds=round(state.watch.seconds, 3),
             num_seeds=self.folder.read_config()["seeds"]["count"],
-            held_by_memory_at=state.strategy.capacity and state.strategy.capacity.held_at,
+            held_by_memory_at=capacity.held_at if capacity else None,
         )
 
     def _on_record(self, record: Record) -> None:

@@ -87,7 +87,9 @@ def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, do, tmp_pat
     result, kept = outcome.result, tmp_path / "runs" / "a"
     metrics = json.loads((kept / "metrics.json").read_text())
     assert result.psnr == metrics["psnr"]
-    assert [each.name for each in result.scores.per_image] == [v["name"] for v in metrics["per_image"]]
+    assert [each.name for each in result.scores.per_image] == [
+        v["name"] for v in metrics["per_image"]
+    ]
     assert result.psnr == pytest.approx(np.mean([each.psnr for each in result.scores.per_image]))
     assert [point.step for point in result.curve] == list(range(1, 21))
     assert result.num_seeds == 2 * len(load_scene(specs["linear"].scene_path).points)

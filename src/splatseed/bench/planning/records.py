@@ -61,7 +61,7 @@ class Arm:
     Args:
         method: ``SFM``, or a key of ``splatseed.METHODS``.
         profile: "default" or "paper".
-        ratio: Points in all, per original; ``ANY_RATIO`` where the photographs or the budget say it.
+        ratio: Points in all, per original; ``ANY_RATIO`` where photographs or the budget say it.
         strategy: The densification strategy.
         budget: Gaussians at the end, at most: a number, or a string such as "0.25rho", per pixel
             of a photograph at the size that is trained; empty for no such bound.

@@ -197,9 +197,7 @@ def _finish(
     )
 
 
-def _covisible(
-    spec: RunSpec, target: Path, views: Sequence[View], progress: Progress
-) -> Covisible:
+def _covisible(spec: RunSpec, target: Path, views: Sequence[View], progress: Progress) -> Covisible:
     """The pixels that two training views see: found once per scene, and kept beside the ledger.
 
     The scene is opened anew for it, so that an arm's depth maps make no difference.

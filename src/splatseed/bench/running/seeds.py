@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -65,7 +66,7 @@ def make_seeds(
     return seeds.select(seeds.distinct), max(seconds - sum(compiling), 0.0)
 
 
-def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, float]]:
+def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
     """The method of a run, and how many points it is to make.
 
     Under a budget, a method without a ratio fills what the originals leave of it.

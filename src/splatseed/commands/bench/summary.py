@@ -42,7 +42,16 @@ def _print_arms(done: Sequence[RunRow]) -> None:
     if arms:
         print_table(
             "so far: means over scenes and repeats, and over those that sfm has too",
-            ("seeds", "strategy", "budget", "runs", "PSNR, dB", "against sfm", "Gaussians", "seconds"),
+            (
+                "seeds",
+                "strategy",
+                "budget",
+                "runs",
+                "PSNR, dB",
+                "against sfm",
+                "Gaussians",
+                "seconds",
+            ),
             [_arm_row(rows, _baselines(done)) for rows in arms.values()],
         )
 

@@ -17,8 +17,8 @@ from splatseed.console import StageClock
 from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene
 from splatseed.preview import Tile, write_grid
-from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.scores import TrainingResult
+from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
 
@@ -73,7 +73,7 @@ def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedAr
     clock(stage, 0.0)
     if not run.train(lambda step: clock(stage, step / settings.max_steps)):
         raise KeyboardInterrupt
-    result = run.finish(lambda render, views: evaluate_views(render, views), clock)
+    result = run.finish(evaluate_views, clock)
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
     render = np.asarray(run.trainer.render(shown).cpu().numpy(), np.float32)
     return TrainedArm(arm, result, shown.image, render)
@@ -86,9 +86,7 @@ def total_seconds(each: TrainedArm) -> float:
 
 def psnr_after(seconds: float, each: TrainedArm) -> float | None:
     """The last test PSNR, in dB, of an arm within so many seconds in all; None before its first."""
-    known = [
-        test.psnr for test in each.result.curve if each.arm.seconds + test.seconds <= seconds
-    ]
+    known = [test.psnr for test in each.result.curve if each.arm.seconds + test.seconds <= seconds]
     return known[-1] if known else None
 
 
