@@ -72,7 +72,9 @@ def find_covisible(
             depths.append(grid)
             progress(STAGE, 0.5 * len(depths) / len(views))
         seen = list(zip(train, map(_farthest, depths), strict=False))
-        grids = pool.map(lambda *pair: _covisible(*pair, seen), test, depths[len(train) :])
+        grids = pool.map(
+            lambda view, grid: _covisible(view, grid, seen), test, depths[len(train) :]
+        )
         for view, grid in zip(test, grids, strict=True):
             found[view.name] = grid
             progress(STAGE, 0.5 + 0.5 * len(found) / len(test))

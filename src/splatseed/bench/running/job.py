@@ -128,7 +128,7 @@ def _train(
     scene = scene_of(spec)
     _check_unchanged(scene, spec)
     lpips = _load_lpips() if options.lpips else None
-    seeds, seconds = make_seeds(scene, spec, progress)
+    seeds, seconds = make_seeds(scene, spec, progress, target.parent.parent)
     mark = fingerprint(spec, seeds)
     twin = find_twin(target, mark, seconds, models=options.keep_models, lpips=options.lpips)
     if twin is not None:

@@ -17,11 +17,13 @@ import numpy as np
 
 from splatseed.bench.planning.records import SFM, RunSpec
 from splatseed.bench.planning.scenes import open_scene
+from splatseed.bench.running.made import made_file, read_made, write_made
 from splatseed.kernels.compilation import watched
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.seeding.upsampling import upsample
+from splatseed.seeding.thinning import thin_to
+from splatseed.seeding.upsampling import CELL, DEFAULT_METHOD, upsample
 from splatseed.upsample import Upsampler, chooses_number, configure
 
 __all__ = ["make_seeds", "scene_of"]
@@ -42,7 +44,7 @@ def scene_of(spec: RunSpec) -> Scene:
 
 
 def make_seeds(
-    scene: Scene, spec: RunSpec, progress: Progress = silent
+    scene: Scene, spec: RunSpec, progress: Progress = silent, bench: Path | None = None
 ) -> tuple[PointCloud, float]:
     """The points that a run trains from, and the seconds that making new ones took.
 
@@ -50,6 +52,8 @@ def make_seeds(
         scene: As ``scene_of`` opens it.
         spec: The run.
         progress: Told the stages of upsampling.
+        bench: The benchmark's folder, where points that several runs thin are kept; made anew
+            when left out. Their seconds count in each of these runs.
 
     Raises:
         SplatseedError: As ``splatseed.upsample``.
@@ -57,6 +61,8 @@ def make_seeds(
     if spec.arm.method == SFM and spec.most_seeds is None:
         return scene.points, 0.0
     method, numbers = _asked(scene, spec)
+    if bench is not None and chooses_number(spec.arm.method) and not _is_full(scene, spec):
+        return _thinned(scene, method, spec, bench, progress)
     with _compilation() as compiling:
         start = time.perf_counter()
         seeds = upsample(
@@ -64,6 +70,37 @@ def make_seeds(
         )
         seconds = time.perf_counter() - start
     return seeds.select(seeds.distinct), max(seconds - sum(compiling), 0.0)
+
+
+def _is_full(scene: Scene, spec: RunSpec) -> bool:
+    """Whether ``auto`` makes no points, as the originals fill the budget."""
+    most = spec.most_seeds
+    return spec.arm.method == DEFAULT_METHOD and most is not None and _num_original(scene) >= most
+
+
+def _thinned(
+    scene: Scene, method: Upsampler, spec: RunSpec, bench: Path, progress: Progress
+) -> tuple[PointCloud, float]:
+    """The points that a method makes, new or kept, within the budget."""
+    kept = made_file(bench, spec)
+    made = read_made(kept)
+    with _compilation() as compiling:
+        start = time.perf_counter()
+        if made is None:
+            cloud = upsample(scene, method, seed=spec.repeat, progress=progress)
+            made = cloud, max(time.perf_counter() - start - sum(compiling), 0.0)
+            write_made(kept, *made)
+        start, before = time.perf_counter(), sum(compiling)
+        seeds, seconds = made
+        if spec.most_seeds is not None:
+            hold_out = getattr(method, "hold_out", 0)
+            seeds = thin_to(scene, seeds, spec.most_seeds, CELL, hold_out, spec.repeat, progress)
+        seconds += time.perf_counter() - start - (sum(compiling) - before)
+    return seeds.select(seeds.distinct), seconds
+
+
+def _num_original(scene: Scene) -> int:
+    return int(np.count_nonzero(scene.points.originals.distinct))
 
 
 def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
@@ -79,8 +116,7 @@ def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
         return method, {}
     if arm.ratio or most is None:
         return method, {"ratio": arm.ratio}
-    num_original = int(np.count_nonzero(scene.points.originals.distinct))
-    return (method, {"num_points": most}) if most > num_original else (method, {"ratio": 1.0})
+    return method, {"num_points": most} if most > _num_original(scene) else {"ratio": 1.0}
 
 
 @contextmanager
