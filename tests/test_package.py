@@ -37,6 +37,7 @@ ORDER = (
     "pointcloud",
     "depthmap",
     "scene",
+    "scores",
     "io",
     "views",
     "depth",

@@ -6,13 +6,13 @@ Notation: images are [H, W, 3], values about 0..1.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import conv2d, pad
 
-from splatseed.evaluate.ssim import C1, C2, WINDOW, window_weights
+from splatseed.evaluate.ssim import C1, C2, WINDOW, l1_and_ssim, window_weights
 
-__all__ = ["psnr", "ssim"]
+__all__ = ["psnr", "psnr_within", "ssim", "ssim_of_all"]
 
 
 def ssim(render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
@@ -28,6 +28,30 @@ def ssim(render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> Float
     above = (2 * product + c1) * (2 * (e_xy - product) + c2)
     below = (squares + c1) * (e_2 - squares + c2)
     return (above / below).mean()
+
+
+@torch.no_grad()
+def ssim_of_all(render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
+    """SSIM averaged over all pixels; the mirrored margin lets the window fit at each of them."""
+    margin = [WINDOW // 2] * 4
+    x, y = (
+        pad(image.clamp(0, 1).permute(2, 0, 1), margin, mode="reflect").permute(1, 2, 0)
+        for image in (render, truth)
+    )
+    if render.device.type != "cpu":
+        return float(ssim(x, y))
+    return float(l1_and_ssim(x.contiguous().numpy(), y.contiguous().numpy(), 0.0, 1.0)[1])
+
+
+@torch.no_grad()
+def psnr_within(
+    render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W"]
+) -> float | None:
+    """PSNR in dB over the pixels of a mask; None where it has none."""
+    if not bool(mask.any()):
+        return None
+    error = (render.clamp(0, 1) - truth).square()[mask].mean(dtype=torch.float64)
+    return float(-10 * torch.log10(error))
 
 
 @torch.no_grad()

@@ -6,11 +6,10 @@ goes on where it stopped, with the settings that it began with; results are in t
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -24,6 +23,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
+from splatseed.scores import CurvePoint, EvalResult, TrainingResult
 from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, training_frame
 from splatseed.splat.pictures import beside_truth, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
@@ -45,8 +45,8 @@ from splatseed.views.view import View, load_split, poses_of
 __all__ = ["Render", "RunOptions", "Score", "TrainingRun", "prepare_run"]
 
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
-Score: TypeAlias = Callable[[Render, Sequence[View]], Mapping[str, object]]
-"""Scores renders of views against them; the result goes into metrics.json as it is."""
+Score: TypeAlias = Callable[[Render, Sequence[View]], EvalResult]
+"""Scores renders of views against them, as ``evaluate.evaluate_views`` does."""
 
 SAVE_EVERY = 60.0
 """Least seconds between checkpoints, so that saving stays a small part of the time."""
@@ -204,15 +204,15 @@ class TrainingRun:
             self._save()  # also of a finished run: scoring and writing its results may fail
         return done
 
-    def finish(self, score: Score, progress: Progress = silent) -> dict[str, object]:
+    def finish(self, score: Score, progress: Progress = silent) -> TrainingResult:
         """Score the test views and write the results; the checkpoint, no longer needed, goes.
 
         Args:
-            score: What to put into metrics.json about the test views.
+            score: Scores the test views.
             progress: Told how far writing is.
 
         Returns:
-            The content of metrics.json.
+            What is written to metrics.json.
 
         Raises:
             OutputError: A result cannot be written.
@@ -220,39 +220,37 @@ class TrainingRun:
         with self._told_of_checkpoint():
             return self._finish(score, progress)
 
-    def _finish(self, score: Score, progress: Progress) -> dict[str, object]:
+    def _finish(self, score: Score, progress: Progress) -> TrainingResult:
         progress("score", 0.0)
         scores = score(self.trainer.render, self.trainer.test_views)
         world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
-        metrics = {**scores, **self._facts()}
+        result = self._result(
+            replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes)
+        )
         with self.folder.results() as staged:
             write_gaussians(staged.gaussians, world)
             write_curve_csv(staged.curve_csv, self.state.records)
             write_curve_png(staged.curve_png, self.state.records)
             self._write_renders(staged, progress)
-            write_json(staged.metrics, metrics)
+            write_json(staged.metrics, result.to_dict())
         self.folder.checkpoint.unlink(missing_ok=True)
-        return metrics
+        return result
 
-    def _facts(self) -> dict[str, object]:
+    def _result(self, scores: EvalResult) -> TrainingResult:
         state = self.state
-        return {
-            "steps": state.step,
-            "train_seconds": round(state.watch.seconds, 3),
-            "num_seeds": self.folder.read_config()["seeds"]["count"],
-            "num_gaussians": len(state.params["means"]),
-            "held_by_memory_at": state.strategy.capacity and state.strategy.capacity.held_at,
-            "tests": [
-                {
-                    "step": record.step,
-                    "seconds": record.seconds,
-                    "psnr": record.test_psnr if math.isfinite(record.test_psnr) else None,
-                    "num_gaussians": record.num_gaussians,
-                }
-                for record in state.records
-                if record.test_psnr is not None
-            ],
-        }
+        capacity = state.strategy.capacity
+        return TrainingResult(
+            scores,
+            tuple(
+                CurvePoint(r.step, r.seconds, r.test_psnr, r.num_gaussians, r.test_ssim)
+                for r in state.records
+                if r.test_psnr is not None
+            ),
+            steps=state.step,
+            train_seconds=round(state.watch.seconds, 3),
+            num_seeds=self.folder.read_config()["seeds"]["count"],
+            held_by_memory_at=capacity.held_at if capacity else None,
+        )
 
     def _on_record(self, record: Record) -> None:
         if self._board:
