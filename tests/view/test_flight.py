@@ -62,7 +62,7 @@ def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, capsys
     frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 60}
     (tmp_path / "p.json").write_text(json.dumps({"camera_path": 4 * [frame], "fps": 8}))
     out = tmp_path / "flight.mkv"
-    code, said = _run(capsys, "flight", run_folder, "-o", out, "--path", tmp_path / "p.json", "--depth")  # fmt: skip
+    code, said = _run(capsys, "flight", run_folder, "-o", out, "--path", tmp_path / "p.json", "--transform", "none", "--depth")  # fmt: skip
     assert code == 0, said.err
     frames, fps = _frames(out)
     assert (len(frames), fps) == (4, 8)

@@ -51,7 +51,7 @@ class Options:
     --transform."""
     transform: Annotated[
         TextOrNone,
-        tyro.conf.arg(metavar="FILE|gsplat", help_behavior_hint="(default: the same world)"),
+        tyro.conf.arg(metavar="FILE|gsplat|none", help_behavior_hint="(default: the same world)"),
     ] = None
     """From the model's world to the path's: the dataparser_transforms.json of nerfstudio's run, or
     what else evaluate --transform takes."""
@@ -175,7 +175,7 @@ def _views_of_file(
     path: Path, transform: str | None, shown: Shown, size: tuple[int, int], fps: float
 ) -> tuple[Sequence[View], float]:
     """The cameras of a path's file in the model's world, and how many a second."""
-    from splatseed.evaluate.world import find_transform  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.evaluate.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
     from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415
     from splatseed.scene import Scene  # noqa: PLC0415
     from splatseed.view.paths import check_path, path_of_file, views_from  # noqa: PLC0415
@@ -186,7 +186,9 @@ def _views_of_file(
         world = find_transform(transform, shown.scene or Scene(empty_cloud()))
         views = views if world is None else views_from(world, views)
     assert shown.gaussians is not None  # noqa: S101  (see _open)
-    check_path(path, views, shown.gaussians, poses_of(shown.scene.images) if shown.scene else ())
+    if transform != NO_TRANSFORM:
+        cameras = poses_of(shown.scene.images) if shown.scene else ()
+        check_path(path, views, shown.gaussians, cameras)
     return views, named or fps
 
 

@@ -196,10 +196,10 @@ def check_path(
             found = "cameras far from all that the model was trained from"
     if found:
         raise SceneFormatError(
-            f"{path} to lead past the Gaussians",
+            f"{path} to show the Gaussians",
             found=f"{found}: a path through another world",
             fix="nerfstudio's paths are in a world of its own: name the dataparser_transforms.json "
-            "of its run with --transform.",
+            "of its run with --transform; to follow the path as it is, pass --transform none.",
         )
 
 
