@@ -36,10 +36,11 @@ def main(scene_dir: Path, steps: int) -> None:
             scene.replace(points=points), folder, settings, RunOptions(overwrite=True)
         )
         run.train()
-        metrics = run.finish(lambda render, views: evaluate_views(render, views).to_dict())
+        result = run.finish(evaluate_views)
+        scores = result.scores
         print(
-            f"{name:7s}{metrics['psnr']:6.2f} dB  SSIM {metrics['ssim']:.3f}"
-            f"  {metrics['num_gaussians']:6,} Gaussians  {metrics['train_seconds']:.1f} s"
+            f"{name:7s}{scores.psnr:6.2f} dB  SSIM {scores.ssim:.3f}"
+            f"  {scores.num_gaussians:6,} Gaussians  {result.train_seconds:.1f} s"
         )
 
 

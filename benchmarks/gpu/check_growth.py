@@ -40,7 +40,7 @@ def main() -> None:
                 run.train()
                 count, seconds = len(run.state.params["means"]), run.state.watch.seconds
                 print(
-                    f"{strategy}, {backend}: {run.trainer.test_psnr():.2f} dB, {count:,}, "
+                    f"{strategy}, {backend}: {run.trainer.test_scores()[0]:.2f} dB, {count:,}, "
                     f"{seconds:.1f} s"
                 )
 

@@ -10,12 +10,11 @@ from splatseed.bench.planning.records import (
     SFM,
     SHARED,
     Arm,
-    CurvePoint,
-    ImageScore,
     RunResult,
     RunRow,
     RunSpec,
 )
+from splatseed.scores import CurvePoint, EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
 SCENES = ("bonsai", "fox", "room0", "treehill")
@@ -33,18 +32,13 @@ def result(psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, **chan
         )
         for i in range(points)
     )
+    view = ViewScore("a.png", psnr, 0.8, changes.pop("lpips", None), 0.01, psnr + 0.5, 0.9)
     values = {
-        "psnr": psnr,
-        "ssim": 0.8,
-        "lpips": None,
-        "per_image": (ImageScore("a.png", psnr, 0.8, None),),
+        "scores": EvalResult((view,), num_gaussians=num_gaussians, model_bytes=num_gaussians * 236),
         "curve": curve,
         "num_seeds": num_gaussians,
-        "num_gaussians": num_gaussians,
-        "model_bytes": num_gaussians * 236,
         "upsample_seconds": 0.5,
         "train_seconds": 20.0,
-        "render_seconds": 0.01,
         "peak_bytes": 5 * 10**8,
         "device": "CPU",
     }

@@ -26,7 +26,7 @@ def run_folder(room, tmp_path_factory):
     settings = TrainSettings(max_steps=20, data_factor=2, test_every=4, strategy="none")
     run = prepare_run(load_scene(room), path, settings)
     assert run.train()
-    run.finish(lambda render, views: evaluate_views(render, views).to_dict())
+    run.finish(evaluate_views)
     return path
 
 

@@ -16,6 +16,7 @@ import torch
 from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
+from splatseed.evaluate import evaluate_views
 from splatseed.splat.ply import read_gaussians
 from splatseed.train import device, run as run_module, trainer
 from splatseed.train.averaging import add_to_mean
@@ -27,7 +28,7 @@ RESUME = RunOptions(resume=True)
 
 
 def _score(render, views):
-    return {"shapes": [list(render(view).shape) for view in views]}
+    return evaluate_views(render, views)
 
 
 def _bytes(run):
@@ -56,9 +57,9 @@ SMALL = {"default": {}, "grow": {"cap_max": 4000}, "mcmc": {"cap_max": 4000}, "n
 def test_training_makes_unseen_views_better(begin, strategy, gain):
     """By about half of what it gained when this was written, or more."""
     run = begin(strategy=strategy, max_steps=100, **SMALL[strategy])
-    before = run.trainer.test_psnr()
+    before = run.trainer.test_scores()[0]
     assert run.train()
-    assert run.trainer.test_psnr() > before + gain
+    assert run.trainer.test_scores()[0] > before + gain
 
 
 @pytest.mark.parametrize("strategy", ["default", "grow", "mcmc", "none"])
@@ -110,9 +111,9 @@ def test_a_stray_pose_is_named_and_does_no_harm(room, tmp_path):
     for name, each in scenes.items():
         scene = room.replace(images=tuple(each))
         run = prepare_run(scene, tmp_path / name, settings, note=notes.append)
-        before = run.trainer.test_psnr()
+        before = run.trainer.test_scores()[0]
         run.train()
-        gains[name] = run.trainer.test_psnr() - before
+        gains[name] = run.trainer.test_scores()[0] - before
     assert gains["stray"] > gains["as it is"] - 1.0
     assert [far.name in note for note in notes] == [True]
 
@@ -195,12 +196,14 @@ def test_results_are_whole_and_in_the_scenes_world(begin, room):
     seeds_in_world = run._frame.points_to_world(gaussians_of(run.state.params).means)
     assert np.allclose(seeds_in_world, room.points.xyz, atol=1e-4)
     run.train()
-    metrics = run.finish(_score)
+    result = run.finish(_score)
     folder = run.folder
-    assert json.loads(folder.metrics.read_text()) == metrics
-    assert metrics["shapes"] == [[36, 48, 3]] * 2
-    assert [test["step"] for test in metrics["tests"]] == list(range(1, 21))
-    assert len(read_gaussians(folder.gaussians)) == metrics["num_gaussians"]
+    assert json.loads(folder.metrics.read_text()) == result.to_dict()
+    assert [test.step for test in result.curve] == list(range(1, 21))
+    last = result.curve[-1]
+    assert last.psnr == pytest.approx(result.scores.psnr, abs=1e-4)
+    assert last.ssim == pytest.approx(result.scores.ssim, abs=1e-5)
+    assert len(read_gaussians(folder.gaussians)) == result.scores.num_gaussians
     assert json.loads(folder.config.read_text())["data_factor"] == 2
     rows = list(csv.DictReader(folder.curve_csv.open()))
     assert int(rows[-1]["step"]) == 20
@@ -358,8 +361,8 @@ def test_memory_holds_growth_and_the_run_says_so(begin, monkeypatch, strategy):
     assert held.train()
     most = begun + (grown - begun) // 2
     assert begun < max(r.num_gaussians for r in held.state.records) <= most
-    assert held.finish(_score)["held_by_memory_at"] == most
-    assert free.finish(_score)["held_by_memory_at"] is None
+    assert held.finish(_score).held_by_memory_at == most
+    assert free.finish(_score).held_by_memory_at is None
 
 
 def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(begin, monkeypatch):

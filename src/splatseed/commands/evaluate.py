@@ -38,7 +38,11 @@ CountOrNone = Annotated[
 
 @dataclass(frozen=True)
 class Options:
-    """Score a trained model on the test views of its scene: PSNR, SSIM, LPIPS."""
+    """Score a trained model on the test views of its scene: PSNR, SSIM, LPIPS.
+
+    PSNR is told twice: over all pixels, and over those that at least two training views see, by
+    the scene's points or its own depth maps; errors elsewhere tell of luck.
+    """
 
     model: Annotated[Path, tyro.conf.Positional]
     """A run folder of splatseed train, or a file of Gaussians from any trainer: .ply, .spz, .sog,
@@ -166,6 +170,10 @@ def _evaluate(
         load_model,
         write_renders,
     )
+    from splatseed.evaluate.covisible import (  # noqa: PLC0415  (imports PyTorch)
+        find_covisible,
+        pixel_masks,
+    )
     from splatseed.train.device import pick_device  # noqa: PLC0415  (likewise)
 
     clock("read", 0.0)
@@ -179,7 +187,14 @@ def _evaluate(
         cache_dir=user_cache_dir(),
         progress=clock,
     )
-    result = evaluate_model(model, lpips=lpips, lpips_reason=reason, progress=clock)
+    grids = find_covisible(model.scene, task.test_every, clock)
+    result = evaluate_model(
+        model,
+        lpips=lpips,
+        lpips_reason=reason,
+        covisible=pixel_masks(grids, model.views),
+        progress=clock,
+    )
     if options.renders is not None:
         with output_folder(options.renders, kind="evaluate", overwrite=options.overwrite) as folder:
             write_renders(model, folder, clock)
@@ -203,13 +218,19 @@ def _write_json(path: Path, options: Options, task: _Task, result: EvalResult) -
 def _summarise(options: Options, task: _Task, result: EvalResult) -> None:
     net = f"LPIPS ({result.lpips_net})" if result.lpips_net else "LPIPS"
     rows = [
-        (s.name, *_numbers(s.psnr, s.ssim, s.lpips), f"{1e3 * s.seconds:.1f}")
+        (
+            s.name,
+            *_numbers(s.psnr, s.covisible_psnr, s.covisible_share, s.ssim, s.lpips),
+            f"{1e3 * s.seconds:.1f}",
+        )
         for s in result.per_image
     ]
-    mean = _numbers(result.psnr, result.ssim, result.lpips)
+    mean = _numbers(
+        result.psnr, result.covisible_psnr, result.covisible_share, result.ssim, result.lpips
+    )
     print_table(
         f"{len(rows)} test views of {task.scene}",
-        ("image", "PSNR, dB", "SSIM", net, "render, ms"),
+        ("image", "PSNR, dB", "co-visible, dB", "of pixels", "SSIM", net, "render, ms"),
         [*rows, ("mean", *mean, f"{1e3 * result.render_seconds:.1f}")],
     )
     written = [("scores", options.output), ("renders", options.renders)]
@@ -226,5 +247,11 @@ def _summarise(options: Options, task: _Task, result: EvalResult) -> None:
         print_note(f"LPIPS was not computed: {result.lpips_reason}")
 
 
-def _numbers(psnr: float, ssim: float, lpips: float | None) -> tuple[str, str, str]:
-    return f"{psnr:.2f}", f"{ssim:.4f}", "-" if lpips is None else f"{lpips:.4f}"
+def _numbers(
+    psnr: float, covisible: float | None, share: float | None, ssim: float, lpips: float | None
+) -> tuple[str, ...]:
+    def told(value: float | None, form: str) -> str:
+        return "-" if value is None else format(value, form)
+
+    known = told(covisible, ".2f"), told(share, ".0%")
+    return f"{psnr:.2f}", *known, f"{ssim:.4f}", told(lpips, ".4f")

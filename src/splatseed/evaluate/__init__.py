@@ -10,22 +10,24 @@ from splatseed.requirements import require
 require("torch")  # asked for first, so that its absence is said once and plainly
 
 from splatseed.evaluate.lpips import LPIPS_NETS, Lpips, LpipsNet, load_lpips  # noqa: E402  (after the check that PyTorch is there)
-from splatseed.evaluate.metrics import Render, evaluate_views  # noqa: E402  (after the check that PyTorch is there)
+from splatseed.evaluate.metrics import Covisible, Render, evaluate_views  # noqa: E402  (after the check that PyTorch is there)
 from splatseed.evaluate.model import (  # noqa: E402  (after the check that PyTorch is there)
     TrainedModel,
     evaluate_model,
     load_model,
     write_renders,
 )
-from splatseed.evaluate.result import EvalResult, ViewScore  # noqa: E402  (after the check that PyTorch is there)
+from splatseed.scores import EvalResult, TrainingResult, ViewScore  # noqa: E402  (after the check that PyTorch is there)
 
 __all__ = [
     "LPIPS_NETS",
+    "Covisible",
     "EvalResult",
     "Lpips",
     "LpipsNet",
     "Render",
     "TrainedModel",
+    "TrainingResult",
     "ViewScore",
     "evaluate_model",
     "evaluate_views",

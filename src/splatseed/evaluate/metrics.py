@@ -9,25 +9,26 @@ torchmetrics and so gsplat's trainer report.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeAlias
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import pad
 
 from splatseed.errors import ParameterError
-from splatseed.evaluate.images import psnr, ssim as ssim_inside
+from splatseed.evaluate.images import psnr, psnr_within, ssim_of_all
 from splatseed.evaluate.lpips import Lpips
-from splatseed.evaluate.result import NOT_ASKED, EvalResult, ViewScore
-from splatseed.evaluate.ssim import WINDOW
 from splatseed.progress import Progress, silent
+from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
 from splatseed.splat.rendering import photograph_of
 from splatseed.views.view import View
 
-__all__ = ["Render", "evaluate_views"]
+__all__ = ["Covisible", "Render", "evaluate_views"]
 
+Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
+"""Which pixels of each test view at least two training views see, by the view's name."""
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
 STAGE = "score"
 
@@ -39,6 +40,7 @@ def evaluate_views(
     *,
     lpips: Lpips | None = None,
     lpips_reason: str = NOT_ASKED,
+    covisible: Covisible | None = None,
     progress: Progress = silent,
 ) -> EvalResult:
     """Score renders of views against their photographs.
@@ -50,6 +52,8 @@ def evaluate_views(
         views: Which; at least one.
         lpips: The network to measure LPIPS with; left out, LPIPS is not measured.
         lpips_reason: Why it is left out, for the reader of the result.
+        covisible: The pixels over which PSNR is taken once more, for the views that are in it; see
+            ``evaluate.covisible``.
         progress: Told how far scoring is.
 
     Raises:
@@ -70,7 +74,7 @@ def evaluate_views(
     render(views[0])
     scores = []
     for view in views:
-        scores.append(_score(render, view, lpips))
+        scores.append(_score(render, view, lpips, (covisible or {}).get(view.name)))
         progress(STAGE, len(scores) / len(views))
     return EvalResult(
         tuple(scores),
@@ -79,28 +83,30 @@ def evaluate_views(
     )
 
 
-def _score(render: Render, view: View, lpips: Lpips | None) -> ViewScore:
+def _score(
+    render: Render, view: View, lpips: Lpips | None, seen: Bool[np.ndarray, "H W"] | None
+) -> ViewScore:
     start = _now()
     image = render(view)
     seconds = _now() - start
     _check(image, view)
-    clamped, truth = image.clamp(0.0, 1.0), photograph_of(view, image.device)
+    clamped, photograph = image.clamp(0.0, 1.0), photograph_of(view, image.device)
     return ViewScore(
         view.name,
-        psnr=psnr(clamped, truth),
-        ssim=_ssim(clamped, truth),
-        lpips=None if lpips is None else lpips(clamped, truth),
+        psnr=psnr(clamped, photograph),
+        ssim=ssim_of_all(clamped, photograph),
+        lpips=None if lpips is None else lpips(clamped, photograph),
         seconds=seconds,
+        covisible_psnr=None
+        if seen is None
+        else psnr_within(clamped, photograph, _mask(seen, photograph)),
+        covisible_share=None if seen is None else float(seen.mean()),
     )
 
 
-def _ssim(x: Float[Tensor, "H W 3"], y: Float[Tensor, "H W 3"]) -> float:
-    """SSIM averaged over all pixels; the mirrored margin lets the window fit at each of them."""
-    margin = [WINDOW // 2] * 4
-    mirrored = (
-        pad(image.permute(2, 0, 1), margin, mode="reflect").permute(1, 2, 0) for image in (x, y)
-    )
-    return float(ssim_inside(*mirrored))
+def _mask(seen: Bool[np.ndarray, "H W"], photograph: Tensor) -> Bool[Tensor, "H W"]:
+    """A mask beside the photograph."""
+    return torch.from_numpy(seen).to(photograph.device)
 
 
 def _now() -> float:

@@ -20,8 +20,7 @@ from torch import Tensor
 
 from splatseed.errors import SceneNotFoundError
 from splatseed.evaluate.lpips import Lpips
-from splatseed.evaluate.metrics import Render, evaluate_views
-from splatseed.evaluate.result import NOT_ASKED, EvalResult
+from splatseed.evaluate.metrics import Covisible, Render, evaluate_views
 from splatseed.evaluate.ssim import WINDOW
 from splatseed.evaluate.world import (
     NO_TRANSFORM,
@@ -33,6 +32,7 @@ from splatseed.export import read_model
 from splatseed.io import load_scene
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
+from splatseed.scores import NOT_ASKED, EvalResult
 from splatseed.splat.frame import TrainingFrame, training_frame
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
@@ -57,11 +57,13 @@ class TrainedModel:
         gaussians: In the scene's world.
         views: The scene's test views, in its world.
         render: Renders the Gaussians from a view of the world.
+        scene: The scene.
     """
 
     gaussians: Gaussians
     views: Sequence[View]
     render: Render
+    scene: Scene
 
 
 def load_model(
@@ -116,7 +118,7 @@ def load_model(
         check_world(path, scene, gaussians, world)
     frame = training_frame([view_in(world, view) for view in poses_of(train)])
     render = gaussian_renderer(gaussians, frame, device)
-    return TrainedModel(gaussians, views, lambda view: render(view_in(world, view)))
+    return TrainedModel(gaussians, views, lambda view: render(view_in(world, view)), scene)
 
 
 def evaluate_model(
@@ -124,6 +126,7 @@ def evaluate_model(
     *,
     lpips: Lpips | None = None,
     lpips_reason: str = NOT_ASKED,
+    covisible: Covisible | None = None,
     progress: Progress = silent,
 ) -> EvalResult:
     """Score a model on its test views, and count its Gaussians; see ``evaluate_views``.
@@ -132,7 +135,12 @@ def evaluate_model(
         ParameterError: A render is not finite.
     """
     result = evaluate_views(
-        model.render, model.views, lpips=lpips, lpips_reason=lpips_reason, progress=progress
+        model.render,
+        model.views,
+        lpips=lpips,
+        lpips_reason=lpips_reason,
+        covisible=covisible,
+        progress=progress,
     )
     return dataclasses.replace(
         result, num_gaussians=len(model.gaussians), model_bytes=model.gaussians.num_bytes

@@ -1,6 +1,6 @@
 """L1 and SSIM of two images with their gradient, on the CPU, in one pass over the rows.
 
-Notation: x the render, y the truth, [H, W, 3] with interleaved channels; G the 11 x 11 Gaussian
+Notation: x the render, y the photograph, [H, W, 3] channels interleaved; G the 11 x 11 Gaussian
 window of standard deviation 1.5, applied where it fits whole ("valid"); mu_x = G*x, e_xy = G*(xy),
 e_2 = G*(x^2 + y^2). With A1 = 2 mu_x mu_y + C1, A2 = 2 (e_xy - mu_x mu_y) + C2,
 B1 = mu_x^2 + mu_y^2 + C1, B2 = e_2 - mu_x^2 - mu_y^2 + C2,
@@ -71,7 +71,7 @@ def window_weights() -> Float32[np.ndarray, " 11"]:
 
 def l1_and_ssim(
     render: Float32[np.ndarray, "H W 3"],
-    truth: Float32[np.ndarray, "H W 3"],
+    photograph: Float32[np.ndarray, "H W 3"],
     l1_weight: float,
     ssim_weight: float,
 ) -> tuple[float, float, Float32[np.ndarray, "H W 3"]]:
@@ -79,7 +79,7 @@ def l1_and_ssim(
 
     Args:
         render: x, values about 0..1, contiguous; at least 11 pixels a side.
-        truth: y, likewise.
+        photograph: y, likewise.
         l1_weight: Weight of the mean absolute difference.
         ssim_weight: Weight of 1 - SSIM.
 
@@ -87,7 +87,7 @@ def l1_and_ssim(
         The two means, and d(l1_weight L1 + ssim_weight (1 - SSIM)) / dx.
     """
     height, width = len(render), render.shape[1] * CHANNELS
-    x, y = render.reshape(-1), truth.reshape(-1)
+    x, y = render.reshape(-1), photograph.reshape(-1)
     places = (height - MARGIN) * (width - REACH)
     partials = _framed(height, width)
     ssim_sums = np.empty(-(-(height - MARGIN) // STRIP), np.float64)

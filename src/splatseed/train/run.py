@@ -6,11 +6,10 @@ where it stopped, with its original settings; results are in the scene's world.
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -24,10 +23,12 @@ from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
+from splatseed.scores import CurvePoint, EvalResult, TrainingResult
 from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, training_frame
 from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
+from splatseed.train.known_depths import known_depths
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
 from splatseed.train.record.config import check_same_seeds, make_config, resumed_settings
 from splatseed.train.record.curve import Record, write_curve_csv, write_curve_png
@@ -37,15 +38,15 @@ from splatseed.train.seeds import seeded, usable_seeds
 from splatseed.train.settings import TrainSettings
 from splatseed.train.start import first_gaussians
 from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
-from splatseed.train.strategies import make_strategy
+from splatseed.train.strategies import Strategy, make_strategy
 from splatseed.train.trainer import Trainer
 from splatseed.views.view import View, load_split, poses_of
 
 __all__ = ["Render", "RunOptions", "Score", "TrainingRun", "prepare_run"]
 
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
-Score: TypeAlias = Callable[[Render, Sequence[View]], Mapping[str, object]]
-"""Scores renders against views; the result goes into metrics.json unchanged."""
+Score: TypeAlias = Callable[[Render, Sequence[View]], EvalResult]
+"""Scores renders against views, as ``evaluate.evaluate_views`` does."""
 
 SAVE_EVERY = 60.0
 """Least seconds between checkpoints, so that saving stays a small part of the time."""
@@ -100,7 +101,7 @@ def prepare_run(
     begun = folder.read_config() if options.resume and folder.is_run else None
     settings = resumed_settings(begun, settings)
     device = pick_device(settings.backend)
-    scene = seeded(scene, settings, note, progress)
+    scene, stereo = seeded(scene, settings, note, progress)
     trained = scene.split(settings.test_every)[0]
     seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
     check_fits(len(seeds), device)
@@ -120,8 +121,15 @@ def prepare_run(
     for name in strays:
         note(stray_note(name))
     near = [frame.view(view) for view in views[0] if view.name not in strays]
-    state = _state(folder if begun else None, seeds, frame, near, settings, device)
+    start = time.perf_counter()
+    depths = known_depths(
+        scene, frame, settings, device, stereo=stereo, note=note, progress=progress
+    )
+    seconds = time.perf_counter() - start
+    strategy = make_strategy(settings, device, depths)
+    state = _state(folder if begun else None, seeds, frame, near, settings, strategy, device)
     if not begun:
+        state.watch.seconds += seconds  # what growth needs to know is part of what it costs
         folder.begin(config)
     if state.step:
         note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
@@ -196,15 +204,15 @@ class TrainingRun:
             self._save()  # for a finished run too: scoring and writing results may fail
         return done
 
-    def finish(self, score: Score, progress: Progress = silent) -> dict[str, object]:
+    def finish(self, score: Score, progress: Progress = silent) -> TrainingResult:
         """Score the test views and write the results; the checkpoint, no longer needed, is removed.
 
         Args:
-            score: What to put into metrics.json about the test views.
+            score: Scores the test views.
             progress: Told how far writing is.
 
         Returns:
-            The content of metrics.json.
+            What is written to metrics.json.
 
         Raises:
             OutputError: A result cannot be written.
@@ -212,39 +220,37 @@ class TrainingRun:
         with self._told_of_checkpoint():
             return self._finish(score, progress)
 
-    def _finish(self, score: Score, progress: Progress) -> dict[str, object]:
+    def _finish(self, score: Score, progress: Progress) -> TrainingResult:
         progress("score", 0.0)
         scores = score(self.trainer.render, self.trainer.test_views)
         world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
-        metrics = {**scores, **self._facts()}
+        result = self._result(
+            replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes)
+        )
         with self.folder.results() as staged:
             write_gaussians(staged.gaussians, world)
             write_curve_csv(staged.curve_csv, self.state.records)
             write_curve_png(staged.curve_png, self.state.records)
             self._write_renders(staged, progress)
-            write_json(staged.metrics, metrics)
+            write_json(staged.metrics, result.to_dict())
         self.folder.checkpoint.unlink(missing_ok=True)
-        return metrics
+        return result
 
-    def _facts(self) -> dict[str, object]:
+    def _result(self, scores: EvalResult) -> TrainingResult:
         state = self.state
-        return {
-            "steps": state.step,
-            "train_seconds": round(state.watch.seconds, 3),
-            "num_seeds": self.folder.read_config()["seeds"]["count"],
-            "num_gaussians": len(state.params["means"]),
-            "held_by_memory_at": state.strategy.capacity and state.strategy.capacity.held_at,
-            "tests": [
-                {
-                    "step": record.step,
-                    "seconds": record.seconds,
-                    "psnr": record.test_psnr if math.isfinite(record.test_psnr) else None,
-                    "num_gaussians": record.num_gaussians,
-                }
-                for record in state.records
-                if record.test_psnr is not None
-            ],
-        }
+        capacity = state.strategy.capacity
+        return TrainingResult(
+            scores,
+            tuple(
+                CurvePoint(r.step, r.seconds, r.test_psnr, r.num_gaussians, r.test_ssim)
+                for r in state.records
+                if r.test_psnr is not None
+            ),
+            steps=state.step,
+            train_seconds=round(state.watch.seconds, 3),
+            num_seeds=self.folder.read_config()["seeds"]["count"],
+            held_by_memory_at=capacity.held_at if capacity else None,
+        )
 
     def _on_record(self, record: Record) -> None:
         if self._board:
@@ -301,10 +307,11 @@ def _state(
     frame: TrainingFrame,
     views: Sequence[View],
     settings: TrainSettings,
+    strategy: Strategy,
     device: torch.device,
 ) -> TrainState:
     """The state of a run that left a checkpoint, else the first state."""
-    strategy, schedule = make_strategy(settings, device), settings.schedule
+    schedule = settings.schedule
     if begun and begun.checkpoint.is_file():
         return load_checkpoint(begun.checkpoint, strategy, schedule, device)
     gaussians, lengths = first_gaussians(frame.cloud_from_world(seeds), views, settings)

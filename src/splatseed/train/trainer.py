@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseed.evaluate.images import psnr
+from splatseed.evaluate.images import psnr, ssim_of_all
 from splatseed.process.allocator import keep_freed_memory
 from splatseed.process.interruption import interruption
 from splatseed.splat.rendering import photograph_of, render_view
@@ -130,17 +130,23 @@ class Trainer:
         loss = float(torch.stack(state.losses).mean(dtype=torch.float64))
         state.watch.stop()
         state.losses.clear()
-        tested = round(self.test_psnr(), 4) if self._is_due(TESTS) else None
+        tested = self.test_scores() if self._is_due(TESTS) else None
         count, shown = len(state.params["means"]), round(psnr(render, photograph), 4)
-        record = Record(state.step, round(state.watch.seconds, 3), loss, shown, tested, count)
+        tested_psnr, tested_ssim = tested or (None, None)
+        seconds = round(state.watch.seconds, 3)
+        record = Record(state.step, seconds, loss, shown, tested_psnr, count, tested_ssim)
         state.records.append(record)
         self.on_record(record)
         state.watch.start()
 
-    def test_psnr(self) -> float:
-        """Mean over the test views of each one's PSNR, dB."""
-        values = [psnr(self.render(v), photograph_of(v, self.device)) for v in self.test_views]
-        return sum(values) / len(values)
+    def test_scores(self) -> tuple[float, float]:
+        """Means over the test views of each one's PSNR, dB, and SSIM."""
+        scores = []
+        for view in self.test_views:
+            render, photograph = self.render(view), photograph_of(view, self.device)
+            scores.append((psnr(render, photograph), ssim_of_all(render, photograph)))
+        psnrs, ssims = zip(*scores, strict=True)
+        return round(sum(psnrs) / len(psnrs), 4), round(sum(ssims) / len(ssims), 5)
 
     def _is_due(self, times: int) -> bool:
         """Whether something that happens so many times in a run happens after this step."""

@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene, plan_runs
 from splatseed.bench.planning.plan_file import KINDS, plan_text, read_plan
 from splatseed.bench.planning.records import SFM, SHARED, Arm
-from splatseed.bench.planning.scenes import survey
+from splatseed.bench.planning.scenes import SceneFacts, survey
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.train.settings import StrategyName, TrainSettings
@@ -75,7 +75,7 @@ def test_a_plan_survives_its_file(tmp_path_factory, plan):
 def test_a_file_has_a_key_for_each_field():
     own = {each.name for each in dataclasses.fields(Plan)} - {"training"}
     assert set(KINDS) == own | set(SHARED)
-    text = plan_text(Plan(training=TrainSettings(cap_max=5)))
+    text = plan_text(Plan(training=TrainSettings(cap_max=5), long_side=400))
     assert set(tomllib.loads(text)) == set(KINDS) - {"scenes", "parameters"}
 
 
@@ -224,3 +224,43 @@ def test_the_plan_of_the_published_results_is_the_one_they_tell_of():
     assert f"{scenes} x {kinds} x {strategies} x {plan.repeats} = {runs} runs" in told
     assert f"{plan.training.max_steps} steps" in told
     assert f"{plan.training.cap_max:,} Gaussians" in told
+
+
+FERN = SceneFacts("fern", "ab12", "ab12", 6000, 20, 800 * 600, long_side=800)
+BONSAI = SceneFacts("bonsai", "cd34", "cd34", 110_000, 292, 800 * 533, long_side=800)
+
+
+def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
+    plan = Plan(
+        methods=("sfm", "mls", "auto"), ratios=(), budgets=("0.25RHO", 20000.0),
+        strategies=("default", "grow"), repeats=1, long_side=400,
+    )  # fmt: skip
+    assert plan.budgets == ("0.25rho", "20000")
+    runs = plan_runs(plan, [FERN, BONSAI], "cpu", "1")
+    assert len(runs) == len({run.key for run in runs}) == 2 * 3 * 2 * 2
+    assert [run.arm.method for run in runs[:8]] == ["sfm"] * 8
+    numbers = {(run.scene, run.arm.budget): run.settings.cap for run in runs}
+    assert numbers == {
+        ("fern", "0.25rho"): 30_000, ("fern", "20000"): 20_000,
+        ("bonsai", "0.25rho"): 26_650, ("bonsai", "20000"): 20_000,
+    }  # fmt: skip
+    assert {run.training.data_factor for run in runs} == {2}
+    seeds = {(r.arm.strategy, r.most_seeds) for r in runs if r.scene == "fern"}
+    assert seeds == {("default", 21_000), ("default", 14_000), ("grow", 30_000), ("grow", 20_000)}
+
+
+def test_a_plan_with_budgets_survives_its_file(tmp_path):
+    plan = Plan(ratios=(), budgets=("0.25rho", 20000), long_side=400)
+    (tmp_path / "plan.toml").write_text(plan_text(plan))
+    assert read_plan(tmp_path / "plan.toml") == plan
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"budgets": ("many",)}, {"budgets": ("-1rho",)}, {"budgets": (0.5,)}, {"ratios": ()},
+     {"budgets": (100, "100")}, {"budgets": (100,), "training": TrainSettings(cap_max=9)},
+     {"long_side": 3}],
+)  # fmt: skip
+def test_budgets_out_of_range_are_refused(wrong):
+    with pytest.raises(ParameterError):
+        Plan(**wrong)

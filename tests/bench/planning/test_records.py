@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 
 import pytest
 
-from splatseed.bench.planning.records import SFM, Arm, CurvePoint, ImageScore, RunResult, RunSpec
+from splatseed.bench.planning.records import SFM, Arm, RunResult, RunSpec
+from splatseed.scores import CurvePoint, EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
 ARM = Arm("mls", "default", 8, "none")
@@ -22,10 +24,27 @@ def test_specs_survive_json():
 
 
 def test_results_survive_json():
-    result = RunResult(
-        21.5, 0.8, None, (ImageScore("a.png", 21.5, 0.8, None),), (CurvePoint(5, 0.1, 20.0, 7),),
-        7, 8, 1888, 0.2, 1.5, 0.01, 10**9, "CPU",
-    )  # fmt: skip
+    views = (ViewScore("a.png", math.inf, 0.8, None, 0.01, 22.0, 0.9),)
+    scores = EvalResult(views, num_gaussians=8, model_bytes=1888)
+    curve = (CurvePoint(5, 0.1, 20.0, 7, 0.7),)
+    result = RunResult(scores, curve, 7, 0.2, 1.5, 10**9, "CPU", twin="ab")
+    assert RunResult.from_json(result.to_json()) == result
+
+
+def test_results_of_the_old_layout_are_read():
+    """Scores stood beside the rest, and co-visible pixels were not known."""
+    old = {
+        "psnr": 21.5, "ssim": 0.8, "lpips": None,
+        "per_image": [{"name": "a.png", "psnr": 21.5, "ssim": 0.8, "lpips": None}],
+        "curve": [{"step": 5, "seconds": 0.1, "psnr": 20.0, "num_gaussians": 7}],
+        "num_seeds": 7, "num_gaussians": 8, "model_bytes": 1888, "upsample_seconds": 0.2,
+        "train_seconds": 1.5, "render_seconds": 0.01, "peak_bytes": 10**9, "device": "CPU",
+        "peak_gpu_bytes": None,
+    }  # fmt: skip
+    result = RunResult.from_json(json.dumps(old))
+    assert (result.psnr, result.num_gaussians, result.scores.render_seconds) == (21.5, 8, 0.01)
+    assert result.curve == (CurvePoint(5, 0.1, 20.0, 7),)
+    assert result.scores.covisible_psnr is None
     assert RunResult.from_json(result.to_json()) == result
 
 
@@ -68,6 +87,7 @@ def test_an_older_ledger_keeps_its_keys():
     assert RunSpec.from_json(json.dumps(old)) == SPEC
     where = {"scene_path", "depth_path", "images"}
     told = {name: value for name, value in old.items() if name not in where}
+    del told["arm"]["budget"]
     text = json.dumps(told, sort_keys=True, separators=(",", ":"))
     assert SPEC.key == hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 

@@ -16,7 +16,7 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.bench.planning.plan import plan_runs
 from splatseed.bench.planning.scenes import survey
-from splatseed.bench.running import job
+from splatseed.bench.running import job, seeds as seeds_module
 from splatseed.bench.running.job import JobOptions, run_job
 from splatseed.bench.running.kept import read_result
 from splatseed.bench.running.seeds import make_seeds, scene_of
@@ -65,12 +65,16 @@ def _stop_at(step):
 
 def _same(one, other):
     """Whether two results are the same but for times, memory and the number of threads."""
-    measured = ("upsample_seconds", "train_seconds", "render_seconds", "peak_bytes", "device")
+    measured = ("upsample_seconds", "train_seconds", "peak_bytes", "device")
     one, other = (
         dataclasses.replace(
             r,
             **dict.fromkeys(measured, 0),
             curve=tuple(dataclasses.replace(p, seconds=0) for p in r.curve),
+            scores=dataclasses.replace(
+                r.scores,
+                per_image=tuple(dataclasses.replace(v, seconds=0) for v in r.scores.per_image),
+            ),
         )
         for r in (one, other)
     )
@@ -83,8 +87,10 @@ def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, do, tmp_pat
     result, kept = outcome.result, tmp_path / "runs" / "a"
     metrics = json.loads((kept / "metrics.json").read_text())
     assert result.psnr == metrics["psnr"]
-    assert [each.name for each in result.per_image] == [v["name"] for v in metrics["per_image"]]
-    assert result.psnr == pytest.approx(np.mean([each.psnr for each in result.per_image]))
+    assert [each.name for each in result.scores.per_image] == [
+        v["name"] for v in metrics["per_image"]
+    ]
+    assert result.psnr == pytest.approx(np.mean([each.psnr for each in result.scores.per_image]))
     assert [point.step for point in result.curve] == list(range(1, 21))
     assert result.num_seeds == 2 * len(load_scene(specs["linear"].scene_path).points)
     assert result.model_bytes == 4 * (3 + 3 + 4 + 1 + 3) * result.num_gaussians
@@ -197,3 +203,77 @@ def test_files_of_the_users_are_left_alone(specs, do, tmp_path):
     assert outcome.status == "failed"
     assert "did not write" in outcome.error
     assert [path.name for path in mine.parent.iterdir()] == ["thesis.txt"]
+
+
+@pytest.fixture
+def budgeted(small_plan, room_path):
+    """Runs under a budget below the room's points, by method."""
+    plan = dataclasses.replace(
+        small_plan, methods=("sfm", "linear", "auto"), ratios=(), budgets=(200,), repeats=1
+    )
+    runs = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
+    return {run.arm.method: run for run in runs}
+
+
+def test_seeds_are_thinned_to_the_budget_and_equal_seeds_are_trained_once(
+    budgeted, do, tmp_path, monkeypatch
+):
+    first = do(budgeted["sfm"], "sfm")
+    assert (first.status, first.error) == ("done", "")
+    assert first.result.num_seeds == first.result.num_gaussians == 200
+    assert first.result.upsample_seconds > 0
+    monkeypatch.setattr(job, "_prepare", lambda *_: pytest.fail("trained again"))
+    for method in ("linear", "auto"):
+        twin = do(budgeted[method], method).result
+        assert (twin.twin, twin.scores, twin.curve) == ("sfm", first.result.scores,
+                                                        first.result.curve)  # fmt: skip
+        kept = tmp_path / "runs" / method
+        assert read_result(kept, budgeted[method].key) == twin
+        assert len(list((kept / "renders").iterdir())) == 3
+    monkeypatch.undo()
+    other = do(dataclasses.replace(budgeted["linear"], repeat=1), "other").result
+    assert other.twin == ""  # another seed of training
+
+
+def test_a_method_fills_the_budget(budgeted, room_path):
+    roomy = dataclasses.replace(
+        budgeted["linear"],
+        training=dataclasses.replace(budgeted["linear"].training, cap_max=9000),
+        arm=dataclasses.replace(budgeted["linear"].arm, budget="9000", strategy="default"),
+    )
+    seeds, _ = make_seeds(scene_of(roomy), roomy)
+    assert len(seeds) == roomy.most_seeds == 6300  # what default begins with, of 9,000
+
+
+def test_pixels_that_two_training_views_see_are_found_once(specs, do, tmp_path):
+    result = do(specs["sfm"]).result
+    (kept,) = (tmp_path / "covisible").iterdir()
+    assert 0.3 < result.scores.covisible_share <= 1
+    assert all(view.covisible_psnr is not None for view in result.scores.per_image)
+    from splatseed.evaluate.covisible import read_covisible, write_covisible
+
+    grids = read_covisible(kept)
+    assert set(grids) == {view.name for view in result.scores.per_image}
+    write_covisible(kept, {name: np.zeros_like(grid) for name, grid in grids.items()})
+    blind = do(specs["depth"], "depth").result  # another arm takes what is kept
+    assert blind.scores.covisible_share == 0
+    assert blind.scores.covisible_psnr is None
+
+
+def test_points_of_photographs_are_made_once_for_all_budgets(budgeted, tmp_path, monkeypatch):
+    """And are those that a run without the kept ones begins with."""
+    spec = budgeted["auto"]
+    roomy = dataclasses.replace(
+        spec, training=dataclasses.replace(spec.training, cap_max=3000),
+        arm=dataclasses.replace(spec.arm, budget="3000"),
+    )  # fmt: skip
+    scene = scene_of(roomy)
+    plain, _ = make_seeds(scene, roomy)
+    first, seconds = make_seeds(scene, roomy, bench=tmp_path)
+    assert seeds_digest(first) == seeds_digest(plain)
+    made = []
+    monkeypatch.setattr(seeds_module, "upsample", lambda *_, **__: made.append(1))
+    again, later = make_seeds(scene, roomy, bench=tmp_path)
+    assert seeds_digest(again) == seeds_digest(plain)
+    assert later > 0.3 * seconds
+    assert not made

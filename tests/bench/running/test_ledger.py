@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import shutil
 import signal
@@ -14,19 +15,20 @@ import time
 
 import pytest
 
-from splatseed.bench.planning.records import Arm, ImageScore, RunResult, RunSpec
+from splatseed.bench.planning.records import Arm, RunResult, RunSpec
 from splatseed.bench.running import ledger as ledger_module, worker as worker_module
 from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.worker import STALE_SECONDS, worker_name
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.scores import EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
 ARM = Arm("mls", "default", 8, "none")
 SPECS = [
     RunSpec("room", "ab12", ARM, repeat=r, training=TrainSettings(max_steps=100)) for r in range(5)
 ]
-SCORES = (ImageScore("a.png", 21.5, 0.8, None),)
-RESULT = RunResult(21.5, 0.8, None, SCORES, (), 7, 8, 1888, 0.2, 1.5, 0.01, 10**9, "CPU")
+SCORES = EvalResult((ViewScore("a.png", 21.5, 0.8, None, 0.01),), num_gaussians=8, model_bytes=1888)
+RESULT = RunResult(SCORES, (), 7, 0.2, 1.5, 10**9, "CPU")
 ME = worker_name()
 
 
@@ -55,7 +57,7 @@ def test_only_the_keys_that_are_asked_for_are_handed_out(ledger):
 def test_what_is_done_is_kept_and_never_handed_out_again(ledger):
     first = ledger.claim(ME)
     assert ledger.finish(first.key, RESULT)
-    other = dataclasses.replace(RESULT, psnr=0.0)
+    other = dataclasses.replace(RESULT, num_seeds=0)
     assert not ledger.finish(first.key, other)
     ledger.fail(first.key, ME, "too late")
     ledger.add(SPECS)
@@ -206,3 +208,33 @@ def test_foreign_damaged_and_newer_files_are_refused(ledger, tmp_path):
     assert text.read_text().startswith("not a database")
     with pytest.raises(OutputError, match="ledger"):
         Ledger.open(tmp_path / "no folder" / "ledger.sqlite")
+
+
+def test_a_ledger_of_the_old_layout_is_read_and_marked_when_it_is_written_to(ledger):
+    """Its results have scores beside the rest, its runs no budget."""
+    first = SPECS[0]
+    spec = json.loads(first.to_json())
+    del spec["arm"]["budget"]
+    old = {
+        "psnr": 21.5, "ssim": 0.8, "lpips": None, "curve": [], "num_seeds": 7, "num_gaussians": 8,
+        "per_image": [{"name": "a.png", "psnr": 21.5, "ssim": 0.8, "lpips": None}],
+        "model_bytes": 1888, "upsample_seconds": 0.2, "train_seconds": 1.5,
+        "render_seconds": 0.01, "peak_bytes": 10**9, "device": "CPU", "peak_gpu_bytes": None,
+    }  # fmt: skip
+    with sqlite3.connect(ledger.path) as db:
+        db.execute("PRAGMA user_version = 1")
+        values = (json.dumps(spec), json.dumps(old), first.key)
+        db.execute("UPDATE runs SET spec = ?, result = ?, status = 'done' WHERE key = ?", values)
+    row = _row(Ledger.open(ledger.path, read_only=True), first)
+    assert row.spec == first
+    assert row.result == RESULT
+    Ledger.open(ledger.path)
+    with sqlite3.connect(ledger.path) as db:
+        assert db.execute("PRAGMA user_version").fetchone() == (ledger_module.SCHEMA,)
+
+
+def test_runs_of_an_unknown_layout_are_refused_with_a_sentence(ledger):
+    with sqlite3.connect(ledger.path) as db:
+        db.execute("UPDATE runs SET result = '{}', status = 'done' WHERE position = 1")
+    with pytest.raises(SceneFormatError, match="run of another layout"):
+        ledger.rows()

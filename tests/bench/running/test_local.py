@@ -15,12 +15,13 @@ from pathlib import Path
 
 import pytest
 
-from splatseed.bench.planning.records import Arm, ImageScore, RunResult, RunSpec
+from splatseed.bench.planning.records import Arm, RunResult, RunSpec
 from splatseed.bench.running import child
 from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.local import LocalExecutor, slot_environment
 from splatseed.bench.running.watcher import Watcher
 from splatseed.errors import OutputError
+from splatseed.scores import EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
 ARM = Arm("mls", "default", 8, "none")
@@ -28,8 +29,8 @@ SPECS = [
     RunSpec("room", "ab12", ARM, repeat=r, training=TrainSettings(max_steps=100)) for r in range(4)
 ]
 KEYS = {spec.key for spec in SPECS}
-SCORES = (ImageScore("a.png", 21.5, 0.8, None),)
-RESULT = RunResult(21.5, 0.8, None, SCORES, (), 7, 8, 1888, 0.2, 1.5, 0.01, 10**9, "CPU")
+SCORES = EvalResult((ViewScore("a.png", 21.5, 0.8, None, 0.01),), num_gaussians=8, model_bytes=1888)
+RESULT = RunResult(SCORES, (), 7, 0.2, 1.5, 10**9, "CPU")
 
 START = f"""
 import json, os, signal, sys, time

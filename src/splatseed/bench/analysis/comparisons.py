@@ -12,7 +12,7 @@ from statistics import fmean
 
 from splatseed.bench.analysis.gains import Gains, gains
 from splatseed.bench.analysis.psnr_tables import gain_cell
-from splatseed.bench.analysis.study import Study, Variant
+from splatseed.bench.analysis.study import Study, Variant, budget_words
 from splatseed.bench.analysis.tables import Cell, Table, number, words
 
 __all__ = ["EQUAL", "equal_count_table", "ratio_table", "strategy_table"]
@@ -122,9 +122,8 @@ def _equal_note(study: Study, any_rows: bool) -> str:
     )
     if any_rows:
         return rule
-    capped = (
-        "a cap of {:,}".format(study.settings["cap_max"]) if study.settings["cap_max"] else "no cap"
-    )
+    cap, budget = study.settings["cap_max"], study.settings["budget"]
+    capped = f"a cap of {cap:,}" if cap else budget_words(str(budget)) if budget else "no cap"
     return (
         f"None qualifies (strategies {', '.join(study.strategies)}, {capped}): gains may come from "
         f"the mere number of Gaussians. {rule}"

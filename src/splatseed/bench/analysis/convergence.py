@@ -16,7 +16,8 @@ from statistics import fmean
 from splatseed.bench.analysis.statistics import Difference, adjusted, over_scenes
 from splatseed.bench.analysis.study import BASELINE, Study, Variant
 from splatseed.bench.analysis.tables import Cell, Table, number, words
-from splatseed.bench.planning.records import CurvePoint, RunResult
+from splatseed.bench.planning.records import RunResult
+from splatseed.scores import CurvePoint
 from splatseed.train.settings import StrategyName
 
 __all__ = ["Reached", "convergence_table", "reach", "speed"]

@@ -21,7 +21,8 @@ __all__ = ["cost_table", "mean_of", "quality_table"]
 
 QUALITY_NOTE = (
     "Means over the scenes that a method and sfm both have: compare methods of equally many "
-    "scenes. PSNR and SSIM are better when higher, LPIPS when lower. What is noise, the tables of "
+    "scenes. Co-visible PSNR is over the pixels that at least two training views see. PSNR and "
+    "SSIM are better when higher, LPIPS when lower. What is noise, the tables of "
     "gains say."
 )
 
@@ -42,19 +43,24 @@ COLUMNS = (
     _Column("peak GPU memory, MB", lambda r: _bytes(r.peak_gpu_bytes), 0),
     _Column("Gaussians", lambda r: r.num_gaussians, 0),
     _Column("model, MB", lambda r: r.model_bytes / 1e6, 1),
-    _Column("render a view, ms", lambda r: 1e3 * r.render_seconds, 1),
+    _Column("render a view, ms", lambda r: 1e3 * r.scores.render_seconds, 1),
 )
 """MB are of 1,000,000 bytes."""
 
 QUALITY = (
     _Column("PSNR, dB", lambda r: r.psnr, 2),
+    _Column("co-visible PSNR, dB", lambda r: _known_or_nan(r.scores.covisible_psnr), 2),
     _Column("SSIM", lambda r: r.ssim, 4),
-    _Column("LPIPS", lambda r: math.nan if r.lpips is None else r.lpips, 4),
+    _Column("LPIPS", lambda r: _known_or_nan(r.lpips), 4),
 )
 
 
 def _bytes(count: int | None) -> float:
     return math.nan if count is None else count / 1e6
+
+
+def _known_or_nan(score: float | None) -> float:
+    return math.nan if score is None else score
 
 
 def mean_of(
@@ -81,7 +87,7 @@ def mean_of(
 
 
 def quality_table(study: Study, strategy: StrategyName) -> Table:
-    """PSNR, SSIM and, where it was measured, LPIPS by variant.
+    """PSNR, co-visible PSNR, SSIM and, where it was measured, LPIPS by variant.
 
     Args:
         study: The study.

@@ -20,7 +20,7 @@ from splatseed.bench.planning.records import SFM, SHARED, RunResult, RunRow, Run
 from splatseed.train.settings import StrategyName
 from splatseed.upsample import METHODS
 
-__all__ = ["BASELINE", "Cell", "Study", "Variant", "studies", "variant_of"]
+__all__ = ["BASELINE", "Cell", "Study", "Variant", "budget_words", "studies", "variant_of"]
 
 STRATEGIES: tuple[StrategyName, ...] = get_args(StrategyName)
 
@@ -152,6 +152,7 @@ class Study:
             size,
             f"every {told['test_every']}th view tested",
             f"at most {told['cap_max']:,} Gaussians" if told["cap_max"] else "",
+            budget_words(str(told["budget"])) if told["budget"] else "",
             f"spherical harmonics of degree {told['sh_degree']}" if told["sh_degree"] != 3 else "",
             "opacities reset" if told["opacity_reset"] else "",
             *(name.replace("_", " ") for name in SHARED if name.startswith("seed_") and told[name]),
@@ -181,6 +182,18 @@ class Study:
         return f"{span} repeat{'' if counts[-1] == 1 else 's'}"
 
 
+def budget_words(budget: str) -> str:
+    """A budget in words.
+
+    Example:
+        >>> budget_words("0.25rho")
+        'at most 0.25 Gaussians per pixel of a photograph'
+    """
+    if budget.endswith("rho"):
+        return f"at most {budget.removesuffix('rho')} Gaussians per pixel of a photograph"
+    return f"at most {int(budget):,} Gaussians"
+
+
 def _size(factor: object) -> str:
     return "at full size" if factor == 1 else f"at 1/{factor} of their size"
 
@@ -205,7 +218,9 @@ def studies(rows: Iterable[RunRow]) -> tuple[Study, ...]:
 def _common(spec: RunSpec) -> dict[str, object]:
     """What is the same for all runs of a study; their size may differ from scene to scene."""
     settings = {name: getattr(spec.training, name) for name in SHARED if name != "data_factor"}
-    return {**settings, "version": spec.version}
+    if spec.arm.budget:  # in Gaussians it may differ from scene to scene
+        settings["cap_max"] = None
+    return {**settings, "budget": spec.arm.budget, "version": spec.version}
 
 
 def _by_factor(rows: Sequence[RunRow]) -> list[list[RunRow]]:

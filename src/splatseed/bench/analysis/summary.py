@@ -113,18 +113,25 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
         return text
     if sooner.log_steps is None or sooner.log_seconds is None:
         part = f"{sooner.reached} of {sooner.pairs} runs"
-        return f"{text} {part} reach {BASELINE.label}'s last PSNR."
-    steps, clock = (_ratio(each) for each in (sooner.log_steps, sooner.log_seconds))
+        return f"{text} {part} become as good as {BASELINE.label} is in the end."
+    return f"{text} {_when_as_good(sooner.log_steps, sooner.log_seconds)}"
+
+
+def _when_as_good(steps: Difference, seconds: Difference) -> str:
+    """How soon it is as good as the baseline becomes; NaN of a single pair is not sure."""
+    base = BASELINE.label
+    if not any(each.p <= LEVEL for each in (steps, seconds)):
+        return (
+            f"Whether it is sooner as good as {base} becomes in the end cannot be told from noise."
+        )
+    parts = [
+        f"{math.exp(each.mean):.0%} of the {unit}" + ("" if each.p <= LEVEL else " (may be chance)")
+        for each, unit in ((steps, "steps"), (seconds, "seconds"))
+    ]
     return (
-        f"{text} It is as good as {BASELINE.label} in the end after {steps} the steps and {clock} "
-        f"the seconds that {BASELINE.label} itself takes."
+        f"It is as good as {base} becomes in the end after {parts[0]} and {parts[1]} that {base} "
+        "itself takes to it."
     )
-
-
-def _ratio(log: Difference) -> str:
-    """How many times, and whether that could be once."""
-    sure = log.p <= LEVEL  # NaN of a single pair is not
-    return f"{math.exp(log.mean):.2f} times{'' if sure else ' (within noise)'}"
 
 
 def _pairs(

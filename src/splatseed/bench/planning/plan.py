@@ -8,7 +8,7 @@ is stopped early still compares all of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -20,11 +20,14 @@ from splatseed.errors import ParameterError
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, configure
 
-__all__ = ["DEMO", "Plan", "PlannedScene", "plan_runs"]
+__all__ = ["DEMO", "Plan", "PlannedScene", "budget_number", "plan_runs"]
 
 DEMO = "demo:"
 """The path of the made-up room, which is made in the benchmark's folder when it is needed."""
 DEPTH = "depth"
+RHO = "rho"
+LEAST_SIDE = 11
+"""Pixels of a photograph's side that SSIM's window needs."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,11 @@ class Plan:
     methods: tuple[str, ...] = (SFM, "linear", "mls")
     """How new points are made; ``sfm`` for none, with which all others are compared."""
     ratios: tuple[float, ...] = (8.0,)
-    """Points in all, per original."""
+    """Points in all, per original; none where budgets say how many there are."""
+    budgets: tuple[str, ...] = ()
+    """Gaussians at the end, of every arm alike: numbers, or such as "0.25rho", per pixel of a
+    photograph at the size that is trained. Seeds are thinned to them, or to the share with which a
+    strategy begins that adds to what is there."""
     strategies: tuple[StrategyName, ...] = ("default",)
     """Densification strategies."""
     profiles: tuple[Profile, ...] = ("default",)
@@ -76,6 +83,8 @@ class Plan:
     """How often each is run, with another seed each time."""
     training: TrainSettings = field(default_factory=TrainSettings)
     """How each run is trained; strategy and seed are those of its arm and its repeat."""
+    long_side: int | None = None
+    """Pixels of the longer side of photographs, at most: for each scene its own data factor."""
     keep_models: bool = False
     """Whether trained models are kept."""
     lpips: bool = False
@@ -85,10 +94,18 @@ class Plan:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ratios", tuple(float(ratio) for ratio in self.ratios))
+        object.__setattr__(self, "budgets", tuple(map(_budget, self.budgets)))
         _check_choices("methods", self.methods, (SFM, *METHODS))
         _check_choices("strategies", self.strategies, get_args(StrategyName))
         _check_choices("profiles", self.profiles, get_args(Profile))
-        _check_distinct("ratios", self.ratios)
+        if self.ratios or not self.budgets:
+            _check_distinct("ratios", self.ratios)
+        if self.budgets:
+            _check_distinct("budgets", self.budgets)
+            if self.training.cap_max is not None:
+                raise _out_of_range("budgets or cap_max", "one of them", "both")
+        if self.long_side is not None and self.long_side < LEAST_SIDE:
+            raise _out_of_range("long_side", f"of {LEAST_SIDE} or more", self.long_side)
         for ratio in self.ratios:
             if not 1 < ratio < math.inf:
                 raise _out_of_range("ratios", "above 1 (points in all, per original)", ratio)
@@ -108,20 +125,26 @@ class Plan:
         return MappingProxyType({**held, **self.parameters.get(method, {})})
 
     def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:
-        """The arms of one strategy: the original cloud first.
+        """The arms of one strategy: of each budget, the original cloud first.
 
         A method whose profiles are one and the same has one arm, of the first of them; one that
         makes as many seeds as the photographs need has no ratio.
         """
-        arms = [Arm(SFM, "default", 1, strategy)] if SFM in self.methods else []
-        for method in self.methods:
-            if method != SFM:
-                arms += [
-                    Arm(method, profile, ratio, strategy)
-                    for profile in self._profiles_of(method)
-                    for ratio in ((ANY_RATIO,) if chooses_number(method) else self.ratios)
-                ]
+        arms = []
+        for budget in self.budgets or ("",):
+            if SFM in self.methods:
+                arms.append(Arm(SFM, "default", 1, strategy, budget))
+            for method in self.methods:
+                if method != SFM:
+                    arms += [
+                        Arm(method, profile, ratio, strategy, budget)
+                        for profile in self._profiles_of(method)
+                        for ratio in self._ratios_of(method)
+                    ]
         return tuple(arms)
+
+    def _ratios_of(self, method: str) -> tuple[float, ...]:
+        return (ANY_RATIO,) if chooses_number(method) or not self.ratios else self.ratios
 
     def _profiles_of(self, method: str) -> list[Profile]:
         seen: list[Upsampler] = []
@@ -158,7 +181,7 @@ def plan_runs(
             depth_path=scene.depth_path if arm.method == DEPTH else "",
             scene_path=scene.path,
             images=scene.images,
-            training=replace(plan.training, backend=backend),
+            training=_training(plan, scene, arm, backend),
             version=version,
         )
         for repeat in range(plan.repeats)
@@ -166,12 +189,56 @@ def plan_runs(
     ]
 
 
-def _scene_arms(plan: Plan, scenes: Sequence[SceneFacts]) -> Iterator[tuple[SceneFacts, Arm]]:
-    for scene in scenes:
-        for strategy in plan.strategies:
-            for arm in plan.arms(strategy):
-                if arm.method != DEPTH or scene.depth_digest:
-                    yield scene, arm
+def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> TrainSettings:
+    """The plan's settings, at the size and with the number of Gaussians that this scene has."""
+    factor = plan.training.data_factor
+    if plan.long_side is not None:
+        factor = max(1, -(-scene.long_side // plan.long_side))
+    settings = replace(plan.training, backend=backend, data_factor=factor)
+    if not arm.budget:
+        return settings
+    return replace(settings, cap_max=max(2, budget_number(arm.budget, scene.pixels / factor**2)))
+
+
+def budget_number(budget: str, pixels: float) -> int:
+    """Gaussians that a budget allows.
+
+    Args:
+        budget: A number, or a string such as "0.25rho".
+        pixels: Of a photograph.
+    """
+    per_pixel = budget.endswith(RHO)
+    return round(float(budget.removesuffix(RHO)) * (pixels if per_pixel else 1.0))
+
+
+def _budget(given: object) -> str:
+    """A budget as a plan has it, so that 20000 and "20000.0" are the same.
+
+    Raises:
+        ParameterError: It is none.
+    """
+    text = str(given).strip().lower()
+    try:
+        number = float(text.removesuffix(RHO))
+    except ValueError:
+        number = math.nan
+    per_pixel = text.endswith(RHO)
+    if not (0 < number < math.inf if per_pixel else number >= 2 and number.is_integer()):
+        raise _out_of_range("budgets", "such as 20000, or 0.25rho", given)
+    return f"{number:g}{RHO}" if per_pixel else f"{number:.0f}"
+
+
+def _scene_arms(plan: Plan, scenes: Sequence[SceneFacts]) -> list[tuple[SceneFacts, Arm]]:
+    found = [
+        (scene, arm)
+        for scene in scenes
+        for strategy in plan.strategies
+        for arm in plan.arms(strategy)
+        if arm.method != DEPTH or scene.depth_digest
+    ]
+    if plan.budgets:  # runs that come to the same seeds as sfm's take over their training
+        found.sort(key=lambda pair: pair[1].method != SFM)
+    return found
 
 
 def _check_choices(name: str, given: Sequence[str], known: Sequence[str]) -> None:

@@ -49,6 +49,10 @@ def _all(kind: type | Callable[[Any], bool]) -> Callable[[Any], bool]:
 TEXT = _Kind("text", lambda value: isinstance(value, str))
 TEXTS = _Kind("a list of texts", _all(str))
 NUMBERS = _Kind("a list of numbers", _all(_is_number))
+BUDGETS = _Kind(
+    'a list of budgets such as 20000 or "0.25rho"',
+    _all(lambda value: isinstance(value, str) or _is_number(value)),
+)
 WHOLE = _Kind("a whole number", lambda value: type(value) is int)
 TRUTH = _Kind("true or false", lambda value: isinstance(value, bool))
 TABLE = _Kind("a table", lambda value: isinstance(value, dict))
@@ -65,10 +69,12 @@ def _kind_of(default: object) -> _Kind:
 KINDS: Mapping[str, _Kind] = {
     "methods": TEXTS,
     "ratios": NUMBERS,
+    "budgets": BUDGETS,
     "strategies": TEXTS,
     "profiles": TEXTS,
     "repeats": WHOLE,
     **{name: _kind_of(getattr(TrainSettings, name)) for name in SHARED},
+    "long_side": WHOLE,
     "keep_models": TRUTH,
     "lpips": TRUTH,
     SCENES: TABLES,

@@ -1,9 +1,9 @@
-"""Plans made before: the paper's two data sets, and one that a laptop can run.
+"""Plans made before: the paper's two data sets, and two that a laptop can run.
 
 Notation: a preset's scenes are folders of one folder, the data set. Promise: scenes, folders of
-photographs, ratios and steps are those of the paper's tables 1 and 2 (docs/paper.md), and every
-eighth image is kept for the test; photographs are taken as the data set gives them, not made
-smaller anew.
+photographs, ratios and steps of the papers' presets are those of the paper's tables 1 and 2
+(docs/paper.md), and every eighth image is kept for the test; photographs are taken as the data set
+gives them, not made smaller anew. ``laptop`` compares arms at one number of Gaussians.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from splatseed.train.settings import TrainSettings
 
 __all__ = ["PRESETS", "PresetName", "preset_plan"]
 
-PresetName = Literal["mipnerf360", "replica", "quick"]
-PRESETS: tuple[PresetName, ...] = ("mipnerf360", "replica", "quick")
+PresetName = Literal["mipnerf360", "replica", "laptop", "quick"]
+PRESETS: tuple[PresetName, ...] = ("mipnerf360", "replica", "laptop", "quick")
 
 OUTDOOR = ("bicycle", "flowers", "garden", "stump", "treehill")
 INDOOR = ("bonsai", "counter", "kitchen", "room")
+LAPTOP = ("fern", "fox", "bonsai", "treehill")
 REPLICA = ("office0", "office1", "office2", "office3", "office4", "room0", "room1", "room2")
 PAPER_METHODS = (SFM, "linear", "triangle", "spline", "mls", "voronoi")
 
@@ -52,7 +53,8 @@ def preset_plan(name: PresetName, data: Path | None) -> tuple[Plan, tuple[str, .
         raise ParameterError(
             f"--data DIR, the folder of the scenes of {name}", found="none", fix="Name it."
         )
-    wanted = _mipnerf360(data) if name == "mipnerf360" else _replica(data)
+    makers = {"mipnerf360": _mipnerf360, "replica": _replica, "laptop": _laptop}
+    wanted = makers[name](data)
     there = tuple(scene for scene in wanted.scenes if Path(scene.path).is_dir())
     missing = tuple(scene.label for scene in wanted.scenes if scene not in there)
     if not there:
@@ -75,6 +77,19 @@ def _mipnerf360(data: Path) -> Plan:
 def _replica(data: Path) -> Plan:
     scenes = tuple(PlannedScene(str(data / name), name) for name in REPLICA)
     return Plan(scenes=scenes, methods=(*PAPER_METHODS, "depth"), ratios=(16, 32))
+
+
+def _laptop(data: Path) -> Plan:
+    return Plan(
+        scenes=tuple(PlannedScene(str(data / name), name) for name in LAPTOP),
+        methods=(SFM, "mls", "auto"),
+        ratios=(),
+        budgets=("0.25rho",),
+        strategies=("default", "grow"),
+        repeats=3,
+        training=TrainSettings(max_steps=1500),
+        long_side=400,
+    )
 
 
 def _quick() -> Plan:

@@ -14,6 +14,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal, Self
 
+from splatseed.scores import CurvePoint, EvalResult
+from splatseed.train.seeds import SEEDS_SHARE
 from splatseed.train.settings import StrategyName, TrainSettings
 from splatseed.upsample import Profile
 
@@ -22,8 +24,6 @@ __all__ = [
     "SFM",
     "SHARED",
     "Arm",
-    "CurvePoint",
-    "ImageScore",
     "RunResult",
     "RunRow",
     "RunSpec",
@@ -34,7 +34,8 @@ SFM = "sfm"
 """The method that leaves the cloud of Structure-from-Motion as it is; its ratio is 1."""
 
 ANY_RATIO = 0.0
-"""The ratio of methods that make as many seeds as the photographs need."""
+"""The ratio of methods that make as many seeds as the photographs need, and of all where a budget
+says how many there are."""
 
 RunStatus = Literal["pending", "running", "done", "failed"]
 
@@ -60,14 +61,17 @@ class Arm:
     Args:
         method: ``SFM``, or a key of ``splatseed.METHODS``.
         profile: "default" or "paper".
-        ratio: Points in all, per original; ``ANY_RATIO`` where the photographs say it.
+        ratio: Points in all, per original; ``ANY_RATIO`` where photographs or the budget say it.
         strategy: The densification strategy.
+        budget: Gaussians at the end, at most: a number, or a string such as "0.25rho", per pixel
+            of a photograph at the size that is trained; empty for no such bound.
     """
 
     method: str
     profile: Profile
     ratio: float
     strategy: StrategyName
+    budget: str = ""
 
     def __post_init__(self) -> None:
         # 8 and 8.0 are the same ratio, and must give the same key.
@@ -117,6 +121,8 @@ class RunSpec:
     def key(self) -> str:
         """Fingerprint of what determines the result: 32 hexadecimal digits."""
         told = {k: v for k, v in self._flat().items() if k not in WHERE and self._is_told(k, v)}
+        if not self.arm.budget:  # later than the ledgers of runs without
+            del told["arm"]["budget"]
         text = json.dumps(told, sort_keys=True, separators=(",", ":"))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -124,6 +130,14 @@ class RunSpec:
     def settings(self) -> TrainSettings:
         """How to train, with the arm's strategy and the repeat's seed."""
         return replace(self.training, strategy=self.arm.strategy, seed=self.repeat)
+
+    @property
+    def most_seeds(self) -> int | None:
+        """What seeds are thinned to under a budget; None without one."""
+        if not self.arm.budget or self.training.cap_max is None:
+            return None
+        share = SEEDS_SHARE.get(self.settings.densification, 1.0)
+        return max(2, round(share * self.training.cap_max))
 
     def to_json(self) -> str:
         """As one line of JSON."""
@@ -152,74 +166,83 @@ class RunSpec:
 
 
 @dataclass(frozen=True)
-class ImageScore:
-    """One test view's scores: PSNR in dB, SSIM, LPIPS or None."""
-
-    name: str
-    psnr: float
-    ssim: float
-    lpips: float | None
-
-
-@dataclass(frozen=True)
-class CurvePoint:
-    """The test views on the way: steps done, seconds of training, mean PSNR in dB, Gaussians."""
-
-    step: int
-    seconds: float
-    psnr: float
-    num_gaussians: int
-
-
-@dataclass(frozen=True)
 class RunResult:
     """What a run gave.
 
     Args:
-        psnr: Mean over test images of each one's PSNR, dB.
-        ssim: Mean SSIM.
-        lpips: Mean LPIPS; None where it was not measured.
-        per_image: One score per test view.
+        scores: Of the test views at the end.
         curve: The test views on the way, in order of steps.
         num_seeds: Points that training began with.
-        num_gaussians: Gaussians at the end.
-        model_bytes: Bytes of their parameters as float32.
-        upsample_seconds: Wall time of making the seeds; 0 for ``SFM``.
+        upsample_seconds: Wall time of making the seeds, thinning included; 0 for ``SFM`` as it is.
         train_seconds: Wall time of the training steps alone.
-        render_seconds: Wall time of rendering a test view, on average.
         peak_bytes: Most memory the process held; None where the system does not tell.
         device: Where it was trained, in words.
         peak_gpu_bytes: Most memory that PyTorch held on the GPU; None without one.
+        twin: The key of the run whose training this is, as it began with the same seeds; empty
+            where it was trained for itself.
     """
 
-    psnr: float
-    ssim: float
-    lpips: float | None
-    per_image: tuple[ImageScore, ...]
+    scores: EvalResult
     curve: tuple[CurvePoint, ...]
     num_seeds: int
-    num_gaussians: int
-    model_bytes: int
     upsample_seconds: float
     train_seconds: float
-    render_seconds: float
     peak_bytes: int | None
     device: str
     peak_gpu_bytes: int | None = None
+    twin: str = ""
+
+    @property
+    def psnr(self) -> float:
+        """Mean over test images of each one's PSNR, dB."""
+        return self.scores.psnr
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM."""
+        return self.scores.ssim
+
+    @property
+    def lpips(self) -> float | None:
+        """Mean LPIPS; None where it was not measured."""
+        return self.scores.lpips
+
+    @property
+    def num_gaussians(self) -> int:
+        """Gaussians at the end."""
+        return self.scores.num_gaussians or 0
+
+    @property
+    def model_bytes(self) -> int:
+        """Bytes of their parameters as float32."""
+        return self.scores.model_bytes or 0
+
+    @property
+    def seconds(self) -> float:
+        """Of making the seeds and of training from them."""
+        return self.upsample_seconds + self.train_seconds
 
     def to_json(self) -> str:
         """As one line of JSON."""
-        return json.dumps(asdict(self), sort_keys=True)
+        own = {each.name: getattr(self, each.name) for each in fields(self)}
+        parts = {"scores": self.scores.to_dict(), "curve": [asdict(each) for each in self.curve]}
+        return json.dumps({**own, **parts}, sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """What ``to_json`` wrote."""
+        """What ``to_json`` wrote, or that of a version that kept scores beside the rest."""
         values = json.loads(text)
-        images = tuple(ImageScore(**each) for each in values["per_image"])
-        curve = tuple(CurvePoint(**each) for each in values["curve"])
+        scores = EvalResult.from_dict(values.pop("scores", None) or _early_scores(values))
+        curve = tuple(CurvePoint(**each) for each in values.pop("curve"))
         known = {each.name for each in fields(cls)}
-        rest = {k: v for k, v in values.items() if k in known - {"per_image", "curve"}}
-        return cls(per_image=images, curve=curve, **rest)
+        return cls(scores, curve, **{k: v for k, v in values.items() if k in known})
+
+
+def _early_scores(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The scores of a result of versions before 0.2, which kept the time to render once for all."""
+    seconds = {"seconds": values["render_seconds"]}
+    told = {name: values[name] for name in ("num_gaussians", "model_bytes")}
+    return {**told, "per_image": [{**each, **seconds} for each in values["per_image"]]}
 
 
 @dataclass(frozen=True)

@@ -34,11 +34,12 @@ class SceneFacts:
         digest: Fingerprint of its points, cameras and photographs.
         num_points: Distinct finite points: those that are trained from as they are.
         num_images: Photographs.
-        pixels: Of one of them, as its file is.
+        pixels: Of the first of them, as its file is.
         images: The folder of photographs within the scene's; empty for the one that is found.
         depth_path: Where its depth maps lie, absolute; empty without.
         depth_digest: Their fingerprint; empty without.
         warnings: What is odd about it, one sentence each.
+        long_side: Pixels of its longer side.
     """
 
     name: str
@@ -51,6 +52,7 @@ class SceneFacts:
     depth_path: str = ""
     depth_digest: str = ""
     warnings: tuple[str, ...] = ()
+    long_side: int = 0
 
 
 def open_scene(path: Path, *, images: str = "", depth: Path | None = None) -> Scene:
@@ -117,6 +119,7 @@ def survey(
             *([scene.listed.sentence] if scene.listed else []),
             *map(stray_note, stray_views(poses_of(scene.images))),
         ),
+        long_side=max(size),
     )
 
 

@@ -8,55 +8,41 @@ nothing is drawn for a single run but the run itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from io import BytesIO
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from splatseed.bench.analysis.gains import Gains, gains
 from splatseed.bench.analysis.statistics import Difference
 from splatseed.bench.analysis.study import BASELINE, Cell, Study, Variant
-from splatseed.bench.planning.records import CurvePoint, RunResult
+from splatseed.bench.planning.records import RunResult
+from splatseed.bench.report.drawing import (
+    COLORS,
+    MANY,
+    Plot,
+    legend_of,
+    method_color,
+    new_figure,
+    panels,
+    png,
+)
 from splatseed.preview.fonts import font_families, plain
+from splatseed.scores import CurvePoint
 from splatseed.train.settings import StrategyName
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 __all__ = ["Plot", "curve_figure", "ratio_figure", "scene_figure", "shown_variants",
            "strategy_figure"]  # fmt: skip
 
-COLORS = {
-    "sfm": "#222222",
-    "linear": "#0072B2",
-    "triangle": "#56B4E9",
-    "spline": "#E69F00",
-    "mls": "#D55E00",
-    "voronoi": "#009E73",
-    "depth": "#CC79A7",
-    "random": "#999999",
-}
-"""Colours that can be told apart without seeing red from green (Okabe and Ito)."""
-OTHER = "#7B4FA3"
 MARKERS = {2.0: "v", 4.0: "s", 8.0: "o", 16.0: "^", 32.0: "D"}
 """Marks by ratio; others have a cross."""
-MANY = 8
-"""More curves than this in one picture cannot be told apart."""
-DPI = 120
 LATE = 0.15
 """Curves are shown from this share of the steps on: what is before is the same steep rise for
 all."""
-
-
-class Plot(NamedTuple):
-    """A figure: its file's name without suffix, what it shows, and its PNG."""
-
-    name: str
-    caption: str
-    png: bytes
 
 
 def shown_variants(variants: Sequence[Variant]) -> tuple[Variant, ...]:
@@ -88,18 +74,18 @@ def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
     ]
     if not scenes:
         return None
-    figure, panels = _panels(len(scenes))
-    for scene, axes in zip(scenes, panels, strict=True):
+    figure, parts = panels(len(scenes))
+    for scene, axes in zip(scenes, parts, strict=True):
         _draw_curves(axes, study, strategy, scene, arms, by)
         axes.set_title(plain(scene), family=font_families())
         axes.set_xlabel(by if by == "steps" else "seconds, upsampling included")
         axes.set_ylabel("PSNR, dB")
-    _legend(figure, arms, _marked)
+    legend_of(figure, [(each.label, _marked(each)) for each in arms])
     return Plot(
         f"psnr_{by}_{strategy}",
         f"Test PSNR (dB) over {by}, strategy {strategy}: mean over repeats, and a band from the "
         f"lowest to the highest.{_left_out(arms[1:], variants)}",
-        _png(figure),
+        png(figure),
     )
 
 
@@ -162,7 +148,7 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
         return None
     variants = shown_variants(found.variants)
     names = [*found.scenes, "mean, these scenes"]
-    figure = _figure(7.2, 1.1 + 0.15 * len(names) * (len(variants) + 1.5))
+    figure = new_figure(7.2, 1.1 + 0.15 * len(names) * (len(variants) + 1.5))
     axes = figure.subplots()
     for row, name in enumerate(names):
         for variant, place in zip(variants, _places(row, len(variants)), strict=True):
@@ -176,13 +162,13 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlabel("gain over sfm, dB")
     axes.grid(visible=True, axis="x", alpha=0.25)
-    _legend(figure, variants, _mark_only)
+    legend_of(figure, [(each.label, _mark_only(each)) for each in variants])
     return Plot(
         f"gain_by_scene_{strategy}",
         f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and 95% interval (of "
         "each comparison alone, not adjusted for their "
         f"number).{_left_out(variants, found.variants)}",
-        _png(figure),
+        png(figure),
     )
 
 
@@ -220,8 +206,8 @@ def ratio_figure(study: Study) -> Plot | None:
     """
     if len({variant.ratio for variant in study.variants}) < 2:
         return None
-    figure, panels = _panels(len(study.strategies))
-    for strategy, axes in zip(study.strategies, panels, strict=True):
+    figure, parts = panels(len(study.strategies))
+    for strategy, axes in zip(study.strategies, parts, strict=True):
         found = gains(study, strategy)
         for line in _lines(found.variants):
             means = [found.on_these[variant].mean for variant in line]
@@ -237,11 +223,12 @@ def ratio_figure(study: Study) -> Plot | None:
         axes.set_xlabel("points, per original")
         axes.set_ylabel("gain over sfm, dB")
         axes.grid(visible=True, alpha=0.25)
-    _legend(figure, [replace(line[0], ratio=0.0) for line in _lines(study.variants)], _line)
+    lines = [replace(line[0], ratio=0.0) for line in _lines(study.variants)]
+    legend_of(figure, [(each.label, _line(each)) for each in lines])
     return Plot(
         "gain_by_ratio",
         "Mean gain over sfm (dB) on these scenes by ratio, with 95% interval of training again.",
-        _png(figure),
+        png(figure),
     )
 
 
@@ -261,7 +248,7 @@ def strategy_figure(study: Study) -> Plot | None:
     """
     if len(study.strategies) < 2:
         return None
-    figure = _figure(7.2, 3.6)
+    figure = new_figure(7.2, 3.6)
     axes = figure.subplots()
     variants = shown_variants(study.variants)
     for column, strategy in enumerate(study.strategies):
@@ -273,17 +260,17 @@ def strategy_figure(study: Study) -> Plot | None:
     axes.set_xticks(range(len(study.strategies)), study.strategies)
     axes.set_ylabel("gain over sfm, dB")
     axes.grid(visible=True, axis="y", alpha=0.25)
-    _legend(figure, variants, _mark_only)
+    legend_of(figure, [(each.label, _mark_only(each)) for each in variants])
     return Plot(
         "gain_by_strategy",
         "Mean gain over sfm on these scenes by strategy, with 95% interval of training again."
         f"{_left_out(variants, study.variants)}",
-        _png(figure),
+        png(figure),
     )
 
 
 def _color(variant: Variant) -> str:
-    return COLORS.get(variant.method, OTHER)
+    return method_color(variant.method)
 
 
 def _mark(variant: Variant) -> dict[str, Any]:
@@ -301,46 +288,5 @@ def _marked(variant: Variant) -> dict[str, Any]:
     return {**_mark(variant), **_line(variant), "markersize": 0.0 if variant == BASELINE else 4.5}
 
 
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
-    from matplotlib.figure import Figure  # noqa: PLC0415  (loads with its use)
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _panels(count: int) -> tuple[Figure, list[Axes]]:
-    """A figure of so many panels, up to three a row."""
-    columns = min(count, 3)
-    rows = -(-count // columns)
-    figure = _figure(max(3.6 * columns, 5.0), 2.9 * rows + 0.4)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes in panels[count:]:
-        axes.remove()
-    return figure, list(panels[:count])
-
-
-def _legend(
-    figure: Figure, variants: Sequence[Variant], style: Callable[[Variant], dict[str, Any]]
-) -> None:
-    """Names above the panels, at the left, where a narrow window shows them."""
-    from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to import)
-
-    handles = [Line2D([], [], label=v.label, **style(v)) for v in variants]
-    figure.legend(handles=handles, loc="outside upper left", ncols=min(4, len(handles)),
-                  fontsize="small", frameon=False)  # fmt: skip
-
-
 def _mark_only(variant: Variant) -> dict[str, Any]:
     return {"linestyle": "none", **_mark(variant)}
-
-
-def _png(figure: Figure) -> bytes:
-    """The figure's bytes.
-
-    Without the version of the library, so that the same data give the same.
-    """
-    out = BytesIO()
-    figure.savefig(out, dpi=DPI, format="png", metadata={"Software": None})
-    return out.getvalue()

@@ -12,6 +12,8 @@ from splatseed.bench.analysis.comparisons import equal_count_table, ratio_table,
 from splatseed.bench.analysis.convergence import convergence_table
 from splatseed.bench.analysis.costs import cost_table, quality_table
 from splatseed.bench.analysis.descriptors import Descriptors
+from splatseed.bench.analysis.equal_cost import compared_arms
+from splatseed.bench.analysis.equal_cost_tables import arm_table, scene_arm_table, seconds_table
 from splatseed.bench.analysis.gains import gains
 from splatseed.bench.analysis.guidelines import (
     guideline_table,
@@ -23,8 +25,9 @@ from splatseed.bench.analysis.guidelines import (
 from splatseed.bench.analysis.psnr_tables import gain_table, mean_gain_table, psnr_tables
 from splatseed.bench.analysis.study import Study
 from splatseed.bench.analysis.tables import Table
+from splatseed.bench.report.drawing import Plot
+from splatseed.bench.report.equal_cost_figures import arm_figure, seconds_figure
 from splatseed.bench.report.figures import (
-    Plot,
     curve_figure,
     ratio_figure,
     scene_figure,
@@ -83,15 +86,26 @@ def study_report(
     """
     report = StudyReport(prefix, title)
     strategies = study.strategies
+    report.add("cost", "At equal cost", _equal_cost(study))
     report.add("scores", "Scores", _scores(study))
     if not study.variants:
         report.add("gains", "Gains", [NO_GAINS])
     else:
         _add_gains(report, study)
     report.add("convergence", "Convergence", _convergence(study))
-    report.add("cost", "Cost", (cost_table(study, each) for each in strategies))
+    report.add("resources", "Time and memory", (cost_table(study, each) for each in strategies))
     report.add("guidelines", "Guidelines", _guidelines(study, described))
     return report
+
+
+def _equal_cost(study: Study) -> Iterable[Table | Plot | None]:
+    """All arms beside one baseline, whatever their strategy."""
+    if len(compared_arms(study)) > 1:
+        yield arm_table(study)
+        yield arm_figure(study)
+        yield scene_arm_table(study)
+        yield seconds_figure(study)
+        yield seconds_table(study)
 
 
 def _scores(study: Study) -> Iterable[Table]:

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
+from splatseed.bench.analysis.equal_cost_tables import answer_at_equal_cost
 from splatseed.bench.analysis.study import Study, studies
 from splatseed.bench.analysis.summary import summary
 from splatseed.bench.analysis.tables import Table, write_table
@@ -132,13 +133,15 @@ def _page(rows: Sequence[RunRow], sections: Iterable[Section]) -> str:
 
 def _said(parts: Sequence[_Part]) -> tuple[str, ...]:
     """The answers of all studies."""
-    told = [
-        sentence
-        for part in parts
-        for strategy in part.study.strategies
-        for sentence in summary(part.study, strategy)
-    ]
+    told = [sentence for part in parts for sentence in _answers(part.study)]
     return tuple(told) or ("No run is done yet.",)
+
+
+def _answers(study: Study) -> Iterable[str]:
+    """What a study says: of all arms together first, then strategy by strategy."""
+    yield from answer_at_equal_cost(study)
+    for strategy in study.strategies:
+        yield from summary(study, strategy)
 
 
 def _summary_sections(parts: Sequence[_Part], said: Sequence[str]) -> list[Section]:
@@ -149,8 +152,13 @@ def _summary_sections(parts: Sequence[_Part], said: Sequence[str]) -> list[Secti
         blocks.append(paragraphs([note], "note"))
     for number, part in enumerate(parts, start=1):
         name = f"Set {number}" if len(parts) > 1 else "All runs"
-        blocks += [answer(summary(part.study, strategy)) for strategy in part.study.strategies]
+        said_of_all = answer_at_equal_cost(part.study)
+        blocks += [answer(said_of_all)] if said_of_all else []
         blocks.append(paragraphs([f"{name}: {part.study.description}."], "note"))
+        by_strategy = [answer(summary(part.study, each)) for each in part.study.strategies]
+        if said_of_all:
+            by_strategy = [folded("Strategy by strategy", by_strategy, is_open=False)]
+        blocks += by_strategy
     return [Section("summary", "Summary", blocks)]
 
 

@@ -19,7 +19,14 @@ from splatseed.io.output.staging import MANIFEST, atomic_file, check_output
 __all__ = ["DEMO_FACTS", "check_bench_folder", "make_bench_folder", "make_demo_scene"]
 
 DEMO_FACTS = SceneFacts(
-    "demo", "demo:", "not made yet", 11_364, 40, 400 * 300, depth_digest="not made yet"
+    "demo",
+    "demo:",
+    "not made yet",
+    11_364,
+    40,
+    400 * 300,
+    depth_digest="not made yet",
+    long_side=400,
 )
 """What is known of the made-up room before it is made; the number of points nearly."""
 

@@ -11,13 +11,14 @@ import math
 import shutil
 import sys
 import traceback
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from splatseed.bench.planning.digest import depth_digest, scene_digest
-from splatseed.bench.planning.records import CurvePoint, ImageScore, RunResult, RunSpec
+from splatseed.bench.planning.records import RunResult, RunSpec
+from splatseed.bench.planning.scenes import open_scene
 from splatseed.bench.running.kept import (
     ERROR,
     RESULT,
@@ -27,21 +28,26 @@ from splatseed.bench.running.kept import (
     write_kept,
 )
 from splatseed.bench.running.seeds import make_seeds, scene_of
+from splatseed.bench.running.twins import find_twin, fingerprint, note_training
 from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.output.staging import check_output
 from splatseed.process.interruption import interruption
 from splatseed.process.peak import peak_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
+from splatseed.scores import TrainingResult
 from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
-    from splatseed.evaluate import Lpips
+    from splatseed.evaluate import Covisible, Lpips
     from splatseed.train.run import TrainingRun
+    from splatseed.views.view import View
 
 __all__ = ["JobOptions", "Outcome", "run_job"]
 
 TRAIN = "train"
+COVISIBLE = "covisible"
+"""The folder of what is known of test views' pixels, beside the ledger."""
 
 
 @dataclass(frozen=True)
@@ -122,15 +128,20 @@ def _train(
     scene = scene_of(spec)
     _check_unchanged(scene, spec)
     lpips = _load_lpips() if options.lpips else None
-    seeds, seconds = make_seeds(scene, spec, progress)
+    seeds, seconds = make_seeds(scene, spec, progress, target.parent.parent)
+    mark = fingerprint(spec, seeds)
+    twin = find_twin(target, mark, seconds, models=options.keep_models, lpips=options.lpips)
+    if twin is not None:
+        write_kept(target, {**twin[1], RESULT: result_bytes(spec, twin[0])})
+        return twin[0]
     run = _prepare(scene.replace(points=seeds), work, spec, progress)
     if not run.train(lambda step: progress(TRAIN, step / spec.training.max_steps)):
         return None
     with interruption():
-        metrics = _finish(run, lpips, progress)
-        result = _result(metrics, run, seconds)
+        result = _result(_finish(run, spec, target, lpips, progress), run, seconds)
         files = kept_files(work, models=options.keep_models)
         write_kept(target, {**files, RESULT: result_bytes(spec, result)})
+        note_training(target, mark)
     return result
 
 
@@ -169,46 +180,56 @@ def _load_lpips() -> Lpips:
     return load_lpips()
 
 
-def _finish(run: TrainingRun, lpips: Lpips | None, progress: Progress) -> Mapping[str, Any]:
+def _finish(
+    run: TrainingRun, spec: RunSpec, target: Path, lpips: Lpips | None, progress: Progress
+) -> TrainingResult:
     from splatseed.evaluate import evaluate_views  # noqa: PLC0415  (PyTorch)
 
     return run.finish(
         lambda render, views: evaluate_views(
-            render, views, lpips=lpips, progress=progress
-        ).to_dict(),
+            render,
+            views,
+            lpips=lpips,
+            covisible=_covisible(spec, target, views, progress),
+            progress=progress,
+        ),
         progress,
     )
 
 
-def _result(metrics: Mapping[str, Any], run: TrainingRun, upsample_seconds: float) -> RunResult:
-    from splatseed.train.parameters import gaussians_of  # noqa: PLC0415  (PyTorch)
+def _covisible(spec: RunSpec, target: Path, views: Sequence[View], progress: Progress) -> Covisible:
+    """The pixels that two training views see: found once per scene, and kept beside the ledger.
 
-    scores = tuple(
-        ImageScore(each["name"], _number(each["psnr"]), each["ssim"], each["lpips"])
-        for each in metrics["per_image"]
+    The scene is opened anew for it, so that an arm's depth maps make no difference.
+    """
+    from splatseed.evaluate.covisible import (  # noqa: PLC0415  (PyTorch)
+        find_covisible,
+        pixel_masks,
+        read_covisible,
+        write_covisible,
     )
-    curve = tuple(CurvePoint(**each) for each in metrics["tests"] if each["psnr"] is not None)
+
+    every = spec.training.test_every
+    kept = target.parent.parent / COVISIBLE / f"{spec.scene_digest}_{every}.npz"
+    grids = read_covisible(kept)
+    if grids is None:
+        scene = open_scene(Path(spec.scene_path), images=spec.images)
+        grids = find_covisible(scene, every, progress)
+        write_covisible(kept, grids)
+    return pixel_masks(grids, views)
+
+
+def _result(found: TrainingResult, run: TrainingRun, upsample_seconds: float) -> RunResult:
     return RunResult(
-        psnr=_number(metrics["psnr"]),
-        ssim=metrics["ssim"],
-        lpips=metrics["lpips"],
-        per_image=scores,
-        curve=curve,
-        num_seeds=metrics["num_seeds"],
-        num_gaussians=metrics["num_gaussians"],
-        model_bytes=gaussians_of(run.state.params).num_bytes,
+        scores=found.scores,
+        curve=tuple(point for point in found.curve if math.isfinite(point.psnr)),
+        num_seeds=found.num_seeds,
         upsample_seconds=upsample_seconds,
-        train_seconds=metrics["train_seconds"],
-        render_seconds=metrics["render_seconds"],
+        train_seconds=found.train_seconds,
         peak_bytes=peak_bytes(),
         device=run.device,
         peak_gpu_bytes=run.peak_gpu_bytes,
     )
-
-
-def _number(psnr: float | None) -> float:
-    """JSON has no infinity, which the PSNR of equal images is."""
-    return math.inf if psnr is None else psnr
 
 
 def _keep_error(target: Path, error: Exception) -> str:

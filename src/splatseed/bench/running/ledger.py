@@ -28,8 +28,9 @@ LEDGER = "ledger.sqlite"
 """The ledger's name in the folder of a benchmark."""
 APPLICATION_ID = 0x73706C62
 """What SQLite's header says the file is: "splb"."""
-SCHEMA = 1
-"""To be raised when the tables change, or the fields of a run's specification."""
+SCHEMA = 2
+"""To be raised when the tables change, or the fields of a run's specification or result; ledgers of
+earlier ones are read, and marked with this when they are written to."""
 BUSY_SECONDS = 60.0
 """How long to wait while another process writes."""
 
@@ -92,6 +93,8 @@ class Ledger:
                 db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 db.execute(f"PRAGMA user_version = {SCHEMA}")
             _check_kind(db, path)
+            if not read_only:  # an older splatseed could not read what is written from now on
+                db.execute(f"PRAGMA user_version = {SCHEMA}")
         return ledger
 
     def add(self, specs: Iterable[RunSpec]) -> None:
@@ -220,10 +223,17 @@ class Ledger:
                 "SELECT spec, status, result, error, attempts, worker, started, finished"
                 " FROM runs ORDER BY position"
             ).fetchall()
-        return [
-            RunRow(RunSpec.from_json(spec), status, _result(result), *rest)
-            for spec, status, result, *rest in found
-        ]
+        try:
+            return [
+                RunRow(RunSpec.from_json(spec), status, _result(result), *rest)
+                for spec, status, result, *rest in found
+            ]
+        except (ValueError, KeyError, TypeError) as error:
+            raise SceneFormatError(
+                f"runs in {self.path} as this version of splatseed, or an earlier one, writes them",
+                found=f"a run of another layout ({type(error).__name__}: {error})",
+                fix="Read it with the version that wrote it, or begin a new folder.",
+            ) from None
 
     def note_session(self, facts: Mapping[str, Any]) -> None:
         """Keep what is to be known of a call of the command: its words, versions, machine.

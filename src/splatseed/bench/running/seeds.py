@@ -1,8 +1,8 @@
 """The seeds of a run: what its method makes of its scene, and how long that takes.
 
 Promise: seeds are the points that ``splatseed upsample`` would write for the same scene, method,
-ratio and seed: finite, and no two at one place. The time is that of upsampling alone, without the
-compilation of kernels, which happens once on a machine.
+ratio, budget and seed: finite, and no two at one place. The time is that of upsampling and thinning
+alone, without the compilation of kernels, which happens once on a machine.
 """
 
 from __future__ import annotations
@@ -11,16 +11,25 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from splatseed.bench.planning.records import SFM, RunSpec
 from splatseed.bench.planning.scenes import open_scene
+from splatseed.bench.running.made import made_file, read_made, write_made
 from splatseed.kernels.compilation import watched
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.upsample import chooses_number, configure, upsample
+from splatseed.seeding.thinning import thin_to
+from splatseed.seeding.upsampling import CELL, DEFAULT_METHOD, upsample
+from splatseed.upsample import Upsampler, chooses_number, configure
 
 __all__ = ["make_seeds", "scene_of"]
+
+PLAIN = "linear"
+"""Any method does where no point is to be made."""
 
 
 def scene_of(spec: RunSpec) -> Scene:
@@ -35,7 +44,7 @@ def scene_of(spec: RunSpec) -> Scene:
 
 
 def make_seeds(
-    scene: Scene, spec: RunSpec, progress: Progress = silent
+    scene: Scene, spec: RunSpec, progress: Progress = silent, bench: Path | None = None
 ) -> tuple[PointCloud, float]:
     """The points that a run trains from, and the seconds that making new ones took.
 
@@ -43,19 +52,71 @@ def make_seeds(
         scene: As ``scene_of`` opens it.
         spec: The run.
         progress: Told the stages of upsampling.
+        bench: The benchmark's folder, where points that several runs thin are kept; made anew
+            when left out. Their seconds count in each of these runs.
 
     Raises:
         SplatseedError: As ``splatseed.upsample``.
     """
-    if spec.arm.method == SFM:
+    if spec.arm.method == SFM and spec.most_seeds is None:
         return scene.points, 0.0
-    method = configure(spec.arm.method, spec.arm.profile, **spec.parameters)
-    ratio = None if chooses_number(spec.arm.method) else spec.arm.ratio
+    method, numbers = _asked(scene, spec)
+    if bench is not None and chooses_number(spec.arm.method) and not _is_full(scene, spec):
+        return _thinned(scene, method, spec, bench, progress)
     with _compilation() as compiling:
         start = time.perf_counter()
-        seeds = upsample(scene, method, ratio=ratio, seed=spec.repeat, progress=progress)
+        seeds = upsample(
+            scene, method, **numbers, budget=spec.most_seeds, seed=spec.repeat, progress=progress
+        )
         seconds = time.perf_counter() - start
-    return seeds.select(seeds.distinct), seconds - sum(compiling)
+    return seeds.select(seeds.distinct), max(seconds - sum(compiling), 0.0)
+
+
+def _is_full(scene: Scene, spec: RunSpec) -> bool:
+    """Whether ``auto`` makes no points, as the originals fill the budget."""
+    most = spec.most_seeds
+    return spec.arm.method == DEFAULT_METHOD and most is not None and _num_original(scene) >= most
+
+
+def _thinned(
+    scene: Scene, method: Upsampler, spec: RunSpec, bench: Path, progress: Progress
+) -> tuple[PointCloud, float]:
+    """The points that a method makes, new or kept, within the budget."""
+    kept = made_file(bench, spec)
+    made = read_made(kept)
+    with _compilation() as compiling:
+        start = time.perf_counter()
+        if made is None:
+            cloud = upsample(scene, method, seed=spec.repeat, progress=progress)
+            made = cloud, max(time.perf_counter() - start - sum(compiling), 0.0)
+            write_made(kept, *made)
+        start, before = time.perf_counter(), sum(compiling)
+        seeds, seconds = made
+        if spec.most_seeds is not None:
+            hold_out = getattr(method, "hold_out", 0)
+            seeds = thin_to(scene, seeds, spec.most_seeds, CELL, hold_out, spec.repeat, progress)
+        seconds += time.perf_counter() - start - (sum(compiling) - before)
+    return seeds.select(seeds.distinct), seconds
+
+
+def _num_original(scene: Scene) -> int:
+    return int(np.count_nonzero(scene.points.originals.distinct))
+
+
+def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
+    """The method of a run, and how many points it is to make.
+
+    Under a budget, a method without a ratio fills what the originals leave of it.
+    """
+    arm, most = spec.arm, spec.most_seeds
+    if arm.method == SFM:
+        return configure(PLAIN), {"ratio": 1.0}
+    method = configure(arm.method, arm.profile, **spec.parameters)
+    if chooses_number(arm.method):
+        return method, {}
+    if arm.ratio or most is None:
+        return method, {"ratio": arm.ratio}
+    return method, {"num_points": most} if most > _num_original(scene) else {"ratio": 1.0}
 
 
 @contextmanager

@@ -22,6 +22,7 @@ from splatseed.commands.bench.options import PLAN, Asked, Options, parse_plan
 from splatseed.commands.bench.prepare import Prepared, prepare
 from splatseed.commands.bench.summary import print_summary
 from splatseed.console import OUT, print_note, stage_display
+from splatseed.errors import MissingDependencyError, SceneNotFoundError
 from splatseed.io.output.staging import atomic_file
 from splatseed.literal import visible
 from splatseed.process.interruption import exit_code
@@ -89,12 +90,19 @@ def _folders(plan: Plan) -> list[Path]:
 
 
 def _job_options(plan: Plan) -> JobOptions:
-    """What runs do beside; LPIPS's weights are missed now rather than in every run."""
-    if plan.lpips:
-        from splatseed.evaluate import load_lpips  # noqa: PLC0415  (PyTorch)
+    """What runs do beside: LPIPS wherever its weights are found.
 
+    Where it is asked for, weights are missed now rather than in every run.
+    """
+    from splatseed.evaluate import load_lpips  # noqa: PLC0415  (PyTorch)
+
+    try:
         load_lpips()
-    return JobOptions(keep_models=plan.keep_models, lpips=plan.lpips)
+    except (MissingDependencyError, SceneNotFoundError):
+        if plan.lpips:
+            raise
+        return JobOptions(keep_models=plan.keep_models)
+    return JobOptions(keep_models=plan.keep_models, lpips=True)
 
 
 def _enter(bench: Path, prepared: Prepared, arguments: Sequence[str], *, retry: bool) -> Ledger:

@@ -146,7 +146,9 @@ def run_display(seconds: Mapping[str, float], done: int, jobs: int) -> Iterator[
 
 def describe(spec: RunSpec) -> str:
     """A run in a few words."""
-    return f"{visible(spec.scene)}, {spec.arm.label}, {spec.arm.strategy}, repeat {spec.repeat + 1}"
+    budget = f", {spec.arm.budget}" if spec.arm.budget else ""
+    arm = f"{spec.arm.label}, {spec.arm.strategy}{budget}"
+    return f"{visible(spec.scene)}, {arm}, repeat {spec.repeat + 1}"
 
 
 def spoken_time(seconds: float) -> str:

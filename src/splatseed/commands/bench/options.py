@@ -85,6 +85,10 @@ class Options:
     """Methods of upsampling; sfm is the cloud as it is, with which the others are compared."""
     ratios: Annotated[tuple[float, ...], _hint(_listed(DEFAULT.ratios))] = ()
     """Points in all, per original."""
+    budgets: Annotated[tuple[str, ...], _hint("none")] = ()
+    """Gaussians at the end, the same for every arm: numbers, or such as 0.25rho, per pixel of a
+    photograph at the size that is trained. Methods then fill the budget, unless --ratios are named
+    too."""
     strategies: Annotated[tuple[StrategyName, ...], _hint(_listed(DEFAULT.strategies))] = ()
     """Densification strategies; -3dgs: in 3DGS's own conventions of rates and schedules."""
     profiles: Annotated[tuple[Profile, ...], _hint(_listed(DEFAULT.profiles))] = ()
@@ -93,11 +97,15 @@ class Options:
     """How often, with another seed each time; error bars need at least 3."""
     training: Annotated[PlanTraining, tyro.conf.arg(name="")] = PlanTraining()
     """How each run is trained: its fields are options of their own."""
+    long_side: Annotated[int | None, _one(int, "none")] = None
+    """Make photographs smaller by a whole factor, for each scene its own, until their longer side
+    has at most so many pixels; instead of --data-factor."""
     depth: Annotated[tuple[Path, ...], _hint("the scene's")] = ()
     """For method depth: a folder of maps per scene, or one folder with a subfolder of each one's
     name."""
     preset: Annotated[PresetName | None, _hint("none")] = None
-    """A plan made before: the paper's data sets (with --data), or quick, for a laptop."""
+    """A plan made before: the paper's data sets, laptop (four real scenes within an hour on two
+    cores), both with --data; or quick, on a made-up room."""
     data: Annotated[Path | None, _one(Path, "none")] = None
     """The folder of a preset's scenes."""
     plan: Annotated[Path | None, _one(Path, "none")] = None
@@ -117,7 +125,8 @@ class Options:
     keep_models: bool = False
     """Keep trained models: some 236 bytes per Gaussian."""
     lpips: bool = False
-    """Measure LPIPS too; its weights must be there (see splatseed evaluate)."""
+    """Refuse to run without LPIPS, which is measured wherever its weights are found (see splatseed
+    evaluate)."""
 
 
 @dataclass(frozen=True)
@@ -206,6 +215,8 @@ def _changes(options: Options) -> dict[str, Any]:
     given = {name: getattr(options, name) for name in names}
     changes = {name: value for name, value in given.items() if value not in (None, (), False)}
     changes["training"] = options.training.settings
+    if options.budgets and not options.ratios:
+        changes["ratios"] = ()
     if options.scenes:
         changes["scenes"] = _scenes(options.scenes)
     return changes

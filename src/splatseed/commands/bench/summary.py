@@ -36,13 +36,22 @@ def print_summary(bench: Path, rows: Sequence[RunRow]) -> None:
 
 
 def _print_arms(done: Sequence[RunRow]) -> None:
-    arms: dict[tuple[str, Arm], list[RunRow]] = defaultdict(list)
+    arms: dict[Arm, list[RunRow]] = defaultdict(list)
     for row in done:
-        arms[row.spec.arm.strategy, row.spec.arm].append(row)
+        arms[row.spec.arm].append(row)
     if arms:
         print_table(
             "so far: means over scenes and repeats, and over those that sfm has too",
-            ("seeds", "strategy", "runs", "PSNR, dB", "against sfm", "Gaussians", "seconds"),
+            (
+                "seeds",
+                "strategy",
+                "budget",
+                "runs",
+                "PSNR, dB",
+                "against sfm",
+                "Gaussians",
+                "seconds",
+            ),
             [_arm_row(rows, _baselines(done)) for rows in arms.values()],
         )
 
@@ -57,11 +66,12 @@ def _arm_row(rows: Sequence[RunRow], baselines: dict[tuple[str, ...], float]) ->
     return (
         arm.label,
         arm.strategy,
+        arm.budget,
         f"{len(rows)}",
         f"{fmean(each.psnr for each in results):.2f}",
         f"{fmean(gains):+.2f}" if gains else "",
         f"{fmean(each.num_gaussians for each in results):,.0f}",
-        f"{fmean(each.upsample_seconds + each.train_seconds for each in results):.1f}",
+        f"{fmean(each.seconds for each in results):.1f}",
     )
 
 
@@ -73,7 +83,7 @@ def _baselines(done: Sequence[RunRow]) -> dict[tuple[str, ...], float]:
 
 
 def _pair(row: RunRow) -> tuple[str, ...]:
-    return (row.spec.scene, row.spec.arm.strategy, f"{row.spec.repeat}")
+    return (row.spec.scene, row.spec.arm.strategy, row.spec.arm.budget, f"{row.spec.repeat}")
 
 
 def _print_next(bench: Path, rows: Collection[RunRow], failed: int) -> None:

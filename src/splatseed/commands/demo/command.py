@@ -130,7 +130,7 @@ def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None
     least = min(total_seconds(each) for each in trained)
     print_table(
         f"{options.train_steps:,} training steps, "
-        f"{len(trained[0].metrics['per_image'])} test views",
+        f"{len(trained[0].result.scores.per_image)} test views",
         ("seeds", "Gaussians", "seconds", "PSNR, dB", "SSIM", f"dB after {least:.0f} s"),
         [_row(each, least) for each in trained],
     )
@@ -151,13 +151,13 @@ def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None
 def _row(each: TrainedArm, least: float) -> tuple[str, ...]:
     from splatseed.commands.demo.training import psnr_after, total_seconds  # noqa: PLC0415
 
-    metrics, then = each.metrics, psnr_after(least, each)
+    scores, then = each.result.scores, psnr_after(least, each)
     return (
         each.arm.label,
-        f"{metrics['num_gaussians']:,}",
+        f"{scores.num_gaussians:,}",
         f"{total_seconds(each):.1f}",
-        f"{metrics['psnr']:.2f}",
-        f"{metrics['ssim']:.4f}",
+        f"{scores.psnr:.2f}",
+        f"{scores.ssim:.4f}",
         "not begun" if then is None else f"{then:.2f}",
     )
 

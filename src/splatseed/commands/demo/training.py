@@ -6,10 +6,9 @@ time to make seeds is counted; the view that is shown is chosen before any is re
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, UInt8
@@ -18,6 +17,7 @@ from splatseed.console import StageClock
 from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene
 from splatseed.preview import Tile, write_grid
+from splatseed.scores import TrainingResult
 from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
@@ -48,13 +48,13 @@ class TrainedArm:
 
     Args:
         arm: The arm.
-        metrics: The content of its metrics.json.
+        result: The content of its metrics.json.
         photograph: The photograph of the view that is shown.
         render: The render of that view, 0 to 1.
     """
 
     arm: Arm
-    metrics: Mapping[str, Any]
+    result: TrainingResult
     photograph: UInt8[np.ndarray, "H W 3"]
     render: Float32[np.ndarray, "H W 3"]
 
@@ -73,21 +73,20 @@ def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedAr
     clock(stage, 0.0)
     if not run.train(lambda step: clock(stage, step / settings.max_steps)):
         raise KeyboardInterrupt
-    metrics = run.finish(lambda render, views: evaluate_views(render, views).to_dict(), clock)
+    result = run.finish(evaluate_views, clock)
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
     render = np.asarray(run.trainer.render(shown).cpu().numpy(), np.float32)
-    return TrainedArm(arm, metrics, shown.photograph, render)
+    return TrainedArm(arm, result, shown.photograph, render)
 
 
 def total_seconds(each: TrainedArm) -> float:
     """Seconds of making the seeds and training from them."""
-    return each.arm.seconds + float(each.metrics["train_seconds"])
+    return each.arm.seconds + each.result.train_seconds
 
 
 def psnr_after(seconds: float, each: TrainedArm) -> float | None:
     """The last test PSNR, in dB, of an arm within ``seconds`` in all; None before its first."""
-    tests = each.metrics["tests"]
-    known = [test["psnr"] for test in tests if each.arm.seconds + test["seconds"] <= seconds]
+    known = [test.psnr for test in each.result.curve if each.arm.seconds + test.seconds <= seconds]
     return known[-1] if known else None
 
 
@@ -101,7 +100,7 @@ def write_comparison(arms: Sequence[TrainedArm], path: Path) -> None:
     blank = np.full_like(photograph, 255)
     renders = [
         Tile(
-            f"{each.arm.label}: {each.metrics['psnr']:.2f} dB over all test views",
+            f"{each.arm.label}: {each.result.scores.psnr:.2f} dB over all test views",
             _bytes(each.render),
         )
         for each in arms

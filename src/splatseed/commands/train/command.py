@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.progress import (
@@ -38,6 +39,7 @@ from splatseed.literal import quoted, visible
 from splatseed.process.interruption import exit_code
 from splatseed.requirements import require
 from splatseed.scene import Scene
+from splatseed.scores import TrainingResult
 from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import BUDGET, Seeding, StrategyName, TrainSettings
 from splatseed.views.photographs import user_cache_dir
@@ -120,8 +122,8 @@ def run(arguments: list[str]) -> None:
         _say_how_to_go_on(options, training)
         sys.exit(exit_code())
     with stage_display(clock):
-        metrics = _finish(training, clock)
-    _summarise(options, metrics)
+        result = _finish(training, clock)
+    _summarise(options, result)
 
 
 def _prepare(
@@ -232,11 +234,11 @@ def _line(training: TrainingRun, steps_per_second: float | None) -> str:
     )
 
 
-def _finish(training: TrainingRun, clock: StageClock) -> Mapping[str, Any]:
+def _finish(training: TrainingRun, clock: StageClock) -> TrainingResult:
     from splatseed.evaluate import evaluate_views  # noqa: PLC0415  (imports PyTorch)
 
     return training.finish(
-        lambda render, views: evaluate_views(render, views, progress=clock).to_dict(), clock
+        lambda render, views: evaluate_views(render, views, progress=clock), clock
     )
 
 
@@ -249,22 +251,22 @@ def _say_how_to_go_on(options: Options, training: TrainingRun) -> None:
     )
 
 
-def _summarise(options: Options, metrics: Mapping[str, Any]) -> None:
+def _summarise(options: Options, result: TrainingResult) -> None:
     """Print the final table and the commands to run next."""
-    seconds, steps = metrics["train_seconds"], metrics["steps"]
-    psnr = "infinite" if metrics["psnr"] is None else f"{metrics['psnr']:.2f} dB"
+    scores, seconds = result.scores, result.train_seconds
+    psnr = f"{scores.psnr:.2f} dB" if math.isfinite(scores.psnr) else "infinite"
     print_pairs(
         "splatseed train",
         [
             ("test PSNR", psnr),
-            ("test SSIM", f"{metrics['ssim']:.4f}"),
-            ("Gaussians", f"{metrics['num_gaussians']:,} from {metrics['num_seeds']:,} seeds"),
-            ("training", f"{seconds:.1f} s, {1e3 * seconds / steps:.1f} ms per step"),
+            ("test SSIM", f"{scores.ssim:.4f}"),
+            ("Gaussians", f"{scores.num_gaussians:,} from {result.num_seeds:,} seeds"),
+            ("training", f"{seconds:.1f} s, {1e3 * seconds / result.steps:.1f} ms per step"),
             ("Gaussians in", str(options.output / "point_cloud.ply")),
             ("pictures", f"{options.output / 'renders'}, {options.output / 'curve.png'}"),
         ],
     )
-    if held := metrics["held_by_memory_at"]:
+    if held := result.held_by_memory_at:
         print_note(
             f"memory held the run at {held:,} Gaussians; results may differ on another machine. "
             f"Pass --cap-max {held} for the same result everywhere."

@@ -33,6 +33,8 @@ class Record(NamedTuple):
     test_psnr: float | None
     """Mean over the test views, dB; None if not evaluated."""
     num_gaussians: int
+    test_ssim: float | None = None
+    """Mean over the test views; None where it was not taken."""
 
 
 def write_curve_csv(path: Path, records: Sequence[Record]) -> None:

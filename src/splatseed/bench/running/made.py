@@ -1,0 +1,61 @@
+"""Seeds that were made once for several runs: those of methods that look at photographs.
+
+Budgets and strategies thin the same points, which took a minute or more to make. Notation:
+``BENCH/seeds/PRINT.npz`` holds points before they are thinned, and the seconds that they took.
+Promise: what is read is bit for bit what was written; a file that cannot be read counts for none.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatseed.bench.planning.records import RunSpec
+from splatseed.io.output.staging import atomic_file
+from splatseed.pointcloud import PointCloud
+
+__all__ = ["made_file", "read_made", "write_made"]
+
+SEEDS = "seeds"
+
+
+def made_file(bench: Path, spec: RunSpec) -> Path:
+    """Where the points that a run's method makes are kept, before they are thinned.
+
+    Args:
+        bench: The benchmark's folder.
+        spec: The run.
+    """
+    arm = spec.arm
+    told = [spec.scene_digest, spec.depth_digest, arm.method, arm.profile, arm.ratio, spec.repeat,
+            dict(spec.parameters), spec.version]  # fmt: skip
+    text = json.dumps(told, sort_keys=True)
+    return bench / SEEDS / f"{hashlib.blake2b(text.encode(), digest_size=16).hexdigest()}.npz"
+
+
+def write_made(path: Path, cloud: PointCloud, seconds: float) -> None:
+    """Keep points and the seconds that they took.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    arrays: dict[str, Any] = {"xyz": cloud.xyz, "rgb": cloud.rgb, "source": cloud.source}
+    arrays |= cloud.attributes
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as partial, partial.open("wb") as file:
+        np.savez(file, seconds=np.float64(seconds), **arrays)
+
+
+def read_made(path: Path) -> tuple[PointCloud, float] | None:
+    """What ``write_made`` kept; None where there is nothing that can be read."""
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            arrays = {name: kept[name] for name in kept.files}
+            seconds = float(arrays.pop("seconds"))
+            return PointCloud(**arrays), seconds
+    except (OSError, ValueError, KeyError, TypeError, EOFError):
+        return None

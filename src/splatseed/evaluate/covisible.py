@@ -1,0 +1,213 @@
+"""Which pixels of the test views at least two training views see: where a score measures skill.
+
+What no training view shows can only be guessed, and what one shows has no depth: errors there tell
+of luck. Notation: frames are cut into the cells of ``seeding.coverage``; the geometry is the depth
+of each cell: the scene's own depth map's where there is one, else the lower quartile of the points'
+that fall in it; a cell without any has the median of the cells nearest to it. A training view sees
+a point where it projects into the view and no more than ``NEARER`` behind what that view has there.
+Promise: the answer depends on the capture alone (cameras, points, depth maps), never on a render,
+so that it is one and the same for everything that is scored on a scene.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from splatseed.depthmap import DepthMap, DepthMaps
+from splatseed.errors import SceneFormatError
+from splatseed.io.output.staging import atomic_file
+from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
+from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world, grid_of
+from splatseed.views.view import View, data_factor, poses_of
+
+__all__ = ["LEAST_VIEWS", "find_covisible", "pixel_masks", "read_covisible", "write_covisible"]
+
+LEAST_VIEWS = 2
+"""Training views that must see a pixel."""
+CELL = 8
+MAX_SIZE = 800
+"""Cells are of 8 pixels where the longer side has 800: the SfM points of a capture fill most."""
+NEAREST = 4
+"""Covered cells of which an empty one has the median inverse depth."""
+STAGE = "find co-visible pixels"
+
+Grids = Mapping[str, Bool[np.ndarray, "rows cols"]]
+
+
+def find_covisible(
+    scene: Scene, test_every: int = 8, progress: Progress = silent
+) -> dict[str, Bool[np.ndarray, "rows cols"]]:
+    """The cells of each test view that at least two training views see, by the view's name.
+
+    Args:
+        scene: Whose cameras, original points and depth maps are looked at.
+        test_every: Which views are kept for the test.
+        progress: Told how far it is.
+
+    Returns:
+        Nothing where the scene has neither points nor depth maps.
+
+    Raises:
+        SceneFormatError: A depth map is damaged.
+    """
+    points = scene.points.originals
+    xyz = np.ascontiguousarray(points.xyz[points.finite], np.float32)
+    maps = scene.depths if scene.source and scene.source.format == "rgbd" else None
+    if not scene.images or (maps is None and not len(xyz)):
+        return {}
+    train, test = (_frames(part, maps) for part in scene.split(test_every))
+    views = [*train, *test]
+    found: dict[str, Bool[np.ndarray, "rows cols"]] = {}
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        depths = []
+        for grid in pool.map(lambda view: _depths(view, xyz, maps), views):
+            depths.append(grid)
+            progress(STAGE, 0.5 * len(depths) / len(views))
+        seen = list(zip(train, map(_farthest, depths), strict=False))
+        grids = pool.map(
+            lambda view, grid: _covisible(view, grid, seen), test, depths[len(train) :]
+        )
+        for view, grid in zip(test, grids, strict=True):
+            found[view.name] = grid
+            progress(STAGE, 0.5 + 0.5 * len(found) / len(test))
+    return found
+
+
+def pixel_masks(grids: Grids, views: Sequence[View]) -> dict[str, Bool[np.ndarray, "H W"]]:
+    """The cells as masks of pixels, for the views that are in them, whatever their size.
+
+    Args:
+        grids: As ``find_covisible`` gives them.
+        views: The test views.
+    """
+    return {v.name: _pixels(grids[v.name], v) for v in views if v.name in grids}
+
+
+def _pixels(grid: Bool[np.ndarray, "rows cols"], view: View) -> Bool[np.ndarray, "H W"]:
+    rows, cols = grid.shape
+    i = (np.arange(view.height) + 0.5) * rows / view.height
+    j = (np.arange(view.width) + 0.5) * cols / view.width
+    return grid[np.ix_(i.astype(np.int64), j.astype(np.int64))]
+
+
+def _frames(images: Sequence, maps: DepthMaps | None) -> list[View]:  # type: ignore[type-arg]
+    """The images' frames at the size that cells are stated for; with depth maps, those with one."""
+    known = [image for image in images if maps is None or image.name in maps]
+    return list(poses_of(known, data_factor(known, MAX_SIZE))) if known else []
+
+
+def _depths(
+    view: View, xyz: Float32[np.ndarray, "N 3"], maps: DepthMaps | None
+) -> Float32[np.ndarray, "rows cols"]:
+    """Planar depth of each cell; infinite in all where nothing is known."""
+    rows, cols = grid_of(view, CELL)
+    if maps is None:
+        return _filled(cell_depths(view, xyz, CELL))
+    values = _planar(maps.read(view.name), view)
+    i = ((np.arange(rows) + 0.5) * values.shape[0] / rows).astype(np.int64)
+    j = ((np.arange(cols) + 0.5) * values.shape[1] / cols).astype(np.int64)
+    return _filled(np.nan_to_num(values[np.ix_(i, j)], nan=np.inf))
+
+
+def _planar(found: DepthMap, view: View) -> Float32[np.ndarray, "H W"]:
+    """A depth map's planar depth."""
+    if found.kind == "z":
+        return found.values
+    if found.kind != "ray":
+        raise SceneFormatError(
+            "depth maps of planar depth or of distance along the ray",
+            found=f"{found.kind} for {view.name}",
+            fix="Convert them.",
+        )
+    height, width = found.values.shape
+    K = np.diag([width / view.width, height / view.height, 1.0]) @ view.K
+    v, u = np.indices((height, width)) + 0.5
+    along = np.hypot(np.hypot((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]), 1.0)
+    return np.asarray(found.values / along, np.float32)
+
+
+def _filled(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
+    """The depths, with those of the nearest cells where there was none."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
+
+    known = np.isfinite(depths)
+    if not known.any() or known.all():
+        return depths
+    inverse = 1.0 / depths[known]
+    k = min(NEAREST, len(inverse))
+    _, near = cKDTree(np.argwhere(known)).query(np.argwhere(~known), k=k)
+    filled = depths.copy()
+    filled[~known] = 1.0 / np.median(inverse[near.reshape(-1, k)], axis=1)
+    return filled
+
+
+def _farthest(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
+    """The greatest depth of each cell and its neighbours: at an edge either side is seen."""
+    from scipy.ndimage import maximum_filter  # noqa: PLC0415  (slow to import)
+
+    return np.asarray(maximum_filter(depths, size=3, mode="nearest"))
+
+
+def _covisible(
+    view: View,
+    depths: Float32[np.ndarray, "rows cols"],
+    seen: Sequence[tuple[View, Float32[np.ndarray, "rows cols"]]],
+) -> Bool[np.ndarray, "rows cols"]:
+    xyz1 = _in_world(view, np.where(np.isfinite(depths), depths, -1.0))
+    count = sum((_sees(other, known, xyz1) for other, known in seen), np.zeros(len(xyz1), np.int32))
+    enough = np.asarray(count).reshape(depths.shape) >= LEAST_VIEWS
+    return np.asarray(enough & np.isfinite(depths))
+
+
+def _in_world(view: View, depths: Float64[np.ndarray, "rows cols"]) -> Float64[np.ndarray, "C 4"]:
+    """The cells' centres at their depths, homogeneous."""
+    rows, cols = depths.shape
+    place = np.indices(depths.shape).reshape(2, -1)[::-1] + 0.5
+    grid_from_pixels = np.diag([cols / view.width, rows / view.height, 1.0])
+    rays = np.linalg.inv(grid_from_pixels @ view.K) @ np.vstack([place, np.ones(rows * cols)])
+    in_cam = np.vstack([rays * depths.ravel(), np.ones(rows * cols)])
+    return np.asarray((np.linalg.inv(view.cam_from_world) @ in_cam).T)
+
+
+def _sees(
+    view: View, known: Float32[np.ndarray, "rows cols"], xyz1: Float64[np.ndarray, "C 4"]
+) -> Bool[np.ndarray, " C"]:
+    """Which points a view sees."""
+    column, row, depth = grid_from_world(view, CELL) @ xyz1.T
+    front = depth > 0
+    safe = np.where(front, depth, 1.0)
+    column, row = column / safe, row / safe
+    rows, cols = known.shape
+    inside = front & (column >= 0) & (column < cols) & (row >= 0) & (row < rows)
+    i, j = (np.where(inside, x, 0).astype(np.int64) for x in (row, column))
+    return np.asarray(inside & (known[i, j] >= (1.0 - NEARER) * depth))
+
+
+def write_covisible(path: Path, grids: Grids) -> None:
+    """Keep cells for the next run.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    names = np.array(list(grids), dtype=np.str_)
+    arrays: dict[str, Any] = {f"cells_{i}": grid for i, grid in enumerate(grids.values())}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, names=names, **arrays)
+
+
+def read_covisible(path: Path) -> dict[str, Bool[np.ndarray, "rows cols"]] | None:
+    """What ``write_covisible`` kept; None where there is no such file, or it cannot be read."""
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            return {str(name): kept[f"cells_{i}"] for i, name in enumerate(kept["names"])}
+    except (OSError, ValueError, KeyError, EOFError):
+        return None

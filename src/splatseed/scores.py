@@ -1,0 +1,190 @@
+"""Scores: how well test views were rendered, at the end of a run and on its way there.
+
+Notation: PSNR in dB, SSIM and LPIPS without unit; seconds are wall time. Promise: these are the
+types of results from evaluation through training to a benchmark's ledger; means are means over
+images of per-image values; what was not measured is None, with the reason beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Self
+
+__all__ = ["NOT_ASKED", "CurvePoint", "EvalResult", "TrainingResult", "ViewScore"]
+
+NOT_ASKED = "not asked for"
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One view's scores.
+
+    Args:
+        name: The image's name in its scene.
+        psnr: Peak signal-to-noise ratio in dB; higher is better, infinite for equal images.
+        ssim: Structural similarity, 1 for equal images.
+        lpips: Perceptual distance, 0 for equal images; None where it was not measured.
+        seconds: Time to render it.
+        covisible_psnr: PSNR over the pixels that at least two training views see; None where
+            these are not known or there are none.
+        covisible_share: The share of such pixels; None where they are not known.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None
+    seconds: float
+    covisible_psnr: float | None = None
+    covisible_share: float | None = None
+
+
+@dataclass(frozen=True)
+class EvalResult:
+    """Scores over test views.
+
+    Args:
+        per_image: One score per view, in the views' order; at least one.
+        lpips_net: The network that LPIPS was measured with; None where it was not measured.
+        lpips_reason: Why LPIPS was not measured; empty where it was.
+        num_gaussians: How many Gaussians were rendered; None where the renderer is a black box.
+        model_bytes: Bytes of their parameters as float32; None likewise.
+    """
+
+    per_image: tuple[ViewScore, ...]
+    lpips_net: str | None = None
+    lpips_reason: str = NOT_ASKED
+    num_gaussians: int | None = None
+    model_bytes: int | None = None
+
+    @property
+    def psnr(self) -> float:
+        """Mean of the images' PSNR in dB, not the PSNR of the mean error."""
+        return _mean(score.psnr for score in self.per_image)
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM."""
+        return _mean(score.ssim for score in self.per_image)
+
+    @property
+    def lpips(self) -> float | None:
+        """Mean LPIPS; None where it was not measured."""
+        return _mean_known(score.lpips for score in self.per_image)
+
+    @property
+    def covisible_psnr(self) -> float | None:
+        """Mean over the images that have such pixels; None where none has, or none is known."""
+        return _mean_known(score.covisible_psnr for score in self.per_image)
+
+    @property
+    def covisible_share(self) -> float | None:
+        """Mean share of the pixels that at least two training views see; None if not known."""
+        return _mean_known(score.covisible_share for score in self.per_image)
+
+    @property
+    def render_seconds(self) -> float:
+        """Mean time to render a view."""
+        return _mean(score.seconds for score in self.per_image)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain values; a number that JSON does not know (infinite) is None."""
+        means = {
+            "psnr": self.psnr,
+            "ssim": self.ssim,
+            "lpips": self.lpips,
+            "covisible_psnr": self.covisible_psnr,
+            "covisible_share": self.covisible_share,
+            "render_seconds": self.render_seconds,
+        }
+        return {
+            **_finite(means),
+            **{key: value for key, value in asdict(self).items() if key != "per_image"},
+            "per_image": [_finite(asdict(score)) for score in self.per_image],
+        }
+
+    def to_json(self) -> str:
+        """The result as JSON text."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """What ``to_dict`` gave; means are taken anew, and keys that are not known passed over."""
+        per_image = tuple(_view_score(each) for each in values["per_image"])
+        known = {each.name for each in fields(cls)} - {"per_image"}
+        return cls(per_image, **{key: values[key] for key in known if key in values})
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """The test views on the way.
+
+    Args:
+        step: Steps done.
+        seconds: Spent training until then.
+        psnr: Mean PSNR in dB.
+        num_gaussians: How many there were.
+        ssim: Mean SSIM; None in results of versions that did not measure it.
+    """
+
+    step: int
+    seconds: float
+    psnr: float
+    num_gaussians: int
+    ssim: float | None = None
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """What a training run gave.
+
+    Args:
+        scores: Of the test views at the end.
+        curve: The test views on the way, in order of steps.
+        steps: Steps done.
+        train_seconds: Wall time of the training steps alone.
+        num_seeds: Points that training began with.
+        held_by_memory_at: Gaussians at which a lack of memory ended growth; None where none did.
+    """
+
+    scores: EvalResult
+    curve: tuple[CurvePoint, ...]
+    steps: int
+    train_seconds: float
+    num_seeds: int
+    held_by_memory_at: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As ``metrics.json`` has it: the scores' values and the others side by side."""
+        others = {key: getattr(self, key) for key in ("steps", "train_seconds", "num_seeds")}
+        tests = [_finite(asdict(point)) for point in self.curve]
+        held = {"held_by_memory_at": self.held_by_memory_at}
+        return {**self.scores.to_dict(), **others, **held, "tests": tests}
+
+
+def _view_score(values: Mapping[str, Any]) -> ViewScore:
+    """A view's scores; JSON has no infinity, which the PSNR of equal images is."""
+    known = {each.name for each in fields(ViewScore)}
+    told = {key: value for key, value in values.items() if key in known}
+    psnr = math.inf if told["psnr"] is None else told["psnr"]
+    return ViewScore(**{**told, "psnr": psnr})
+
+
+def _mean(values: Iterable[float] | Sequence[float]) -> float:
+    listed = list(values)
+    return math.fsum(listed) / len(listed) if all(map(math.isfinite, listed)) else sum(listed)
+
+
+def _mean_known(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return _mean(known) if known else None
+
+
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in values.items()
+    }

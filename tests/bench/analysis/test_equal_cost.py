@@ -1,0 +1,105 @@
+"""Arms of any strategy beside one baseline: gains, seconds, and what is said of them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from splatseed.bench.analysis.equal_cost import baseline_of, compared_arms, psnr_at
+from splatseed.bench.analysis.equal_cost_tables import (
+    answer_at_equal_cost,
+    arm_table,
+    scene_arm_table,
+    seconds_table,
+)
+from splatseed.bench.analysis.study import studies
+from splatseed.bench.analysis.tables import to_markdown
+from splatseed.bench.planning.records import RunRow
+
+from ..planted import result, rows
+
+
+def _study(noise=0.02, **changes):
+    """Two strategies of one number of Gaussians: ``grow`` has 0.3 dB more, its seeds take 4 s."""
+    found = []
+    for row in rows(strategies=("default", "grow"), noise=noise, seed=3, **changes):
+        arm = dataclasses.replace(row.spec.arm, budget="5000", ratio=row.spec.arm.ratio)
+        run = dataclasses.replace(row.spec, arm=arm)
+        more = 0.3 if arm.strategy == "grow" else 0.0
+        made = result(row.result.psnr + more, upsample_seconds=0.0 if arm.method == "sfm" else 4.0)
+        found.append(RunRow(run, "done", made, started=0.0, finished=25.0))
+    (study,) = studies(found)
+    return study
+
+
+def test_every_arm_stands_beside_one_baseline():
+    study = _study()
+    base = baseline_of(study)
+    assert base.label == "sfm + default"
+    found = {each.arm.label: each for each in compared_arms(study)}
+    assert len(found) == 10
+    # levels differ by strategy in what is planted, so only gains within one are known
+    within = found["mls 8x + default"]
+    assert within.gain.mean == pytest.approx(0.5, abs=0.05)
+    assert within.gain.verdict == "better"
+    assert within.covisible_gain.mean == pytest.approx(within.gain.mean)
+    assert (within.runs, within.scenes) == (12, study.scenes)
+    assert within.num_gaussians == 5000
+    assert found["random 8x + default"].gain.mean == pytest.approx(-0.4, abs=0.05)
+    assert [each.gain.mean for each in compared_arms(study)] == sorted(
+        (each.gain.mean for each in compared_arms(study)), reverse=True
+    )
+
+
+def test_time_counts_seeding():
+    study = _study(noise=0.0)
+    found = {each.arm.label: each for each in compared_arms(study)}
+    base = found["sfm + default"]
+    assert base.sooner.mean == pytest.approx(0.0)
+    assert base.gain_in_time.mean == pytest.approx(0.0)
+    slower = found["mls 8x + default"]
+    assert slower.seeding == 4.0
+    assert slower.gain_in_time.mean < slower.gain.mean
+    assert slower.reached == slower.runs
+
+
+def test_scores_between_two_tests_of_a_curve():
+    run = result(30.0, upsample_seconds=1.0)  # tests at 2, 4, ... 20 s; 21 dB, 22 dB, ... 30 dB
+    assert psnr_at(run, 2.9) is None
+    assert psnr_at(run, 3.0) == pytest.approx(21.0)
+    assert psnr_at(run, 4.0) == pytest.approx(21.5)
+    assert psnr_at(run, 99.0) == 30.0
+
+
+def test_tables_and_sentences_can_be_read():
+    study = _study()
+    text = "".join(to_markdown(each(study)) for each in (arm_table, scene_arm_table, seconds_table))
+    assert "co-visible" in text
+    assert "baseline" in text
+    assert "90%" in text  # of the pixels are seen by two training views
+    said = " ".join(answer_at_equal_cost(study))
+    assert "comes out best" in said
+    assert "sfm + default" in said
+    assert "seeding counted" in said
+    assert "at most 5,000 Gaussians" in study.description
+
+
+def test_lpips_reaches_the_tables_where_it_was_measured():
+    study = _study()
+    assert "LPIPS" not in arm_table(study).header
+    row = rows(repeats=1)[0]
+    measured = [
+        dataclasses.replace(r, result=result(20.0, lpips=0.2))
+        for r in rows(strategies=("default",), repeats=2)
+    ]
+    (study,) = studies(measured)
+    assert "LPIPS" in arm_table(study).header
+    assert row.result.lpips is None
+
+
+def test_a_ledger_without_the_scenes_own_points_has_no_baseline():
+    (study,) = studies(rows(gains={("mls", 8): 0.5}))
+    assert baseline_of(study) is None
+    assert compared_arms(study) == ()
+    assert answer_at_equal_cost(study) == ()
