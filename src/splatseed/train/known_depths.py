@@ -61,7 +61,7 @@ def known_depths(
     share = np.mean([each.known_share for each in maps])
     took = "" if stereo else f" ({time.perf_counter() - start:.0f} s)"
     note(
-        f"Stereo knows the depth of {share:.0%} of the pixels{took}: strategy grow places half of "
+        f"Stereo knows the depth of {share:.0%} of the pixels{took}: strategy grow places most of "
         "what it adds there. --placing none only splits."
     )
     return {

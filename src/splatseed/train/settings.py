@@ -82,7 +82,7 @@ class TrainSettings:
     test_every: int = 8
     """Keep every n-th image, sorted by name, for testing."""
     placing: Placing = "stereo"
-    """Strategy grow: put half of the new Gaussians on wrong pixels, at the depth that stereo finds
+    """Strategy grow: put most of the new Gaussians on wrong pixels, at the depth that stereo finds
     there (stereo), or only split Gaussians (none)."""
     opacity_reset: bool = False
     """Lower all opacities from time to time, as 3DGS does (strategy default; gsplat 1.5.3 does

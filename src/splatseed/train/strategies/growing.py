@@ -2,12 +2,12 @@
 
 Notation: for each Gaussian, over the views looked at since the last round: *pixels* c = sum w,
 *error* E = sum w e with e the absolute error of a pixel (see ``contributions``), and *most pixels*,
-c in the one view where it is largest. Half of the added Gaussians come from splitting those that
-contribute to wrong pixels, half are new, on wrong pixels whose depth is known (see ``placing``).
-Promise: the number of Gaussians never exceeds the budget; which ones grow depends only on the views
-and the seed. Growing by the error that a Gaussian contributes to follows S. Rota Bulo et al.,
-"Revising Densification in Gaussian Splatting" (2024); what is removed, when, and the normalisation
-of the error were chosen on held-out training views: see benchmarks/README.md.
+c in the one view where it is largest. A quarter of the added Gaussians come from splitting those
+that contribute to wrong pixels; the others are new, on wrong pixels whose depth is known (see
+``placing``). Promise: the number of Gaussians never exceeds the budget; which ones grow depends
+only on the views and the seed. Growing by the error that a Gaussian contributes to follows S. Rota
+Bulo et al., "Revising Densification in Gaussian Splatting" (2024); what is removed, when, and the
+normalisation of the error were chosen on held-out training views: see benchmarks/README.md.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from splatseed.train.strategies.contributions import contributions
 from splatseed.train.strategies.placing import add_candidates, draw_candidates, join_candidates
 from splatseed.views.view import View
 
-__all__ = ["NOWHERE", "Growing"]
+__all__ = ["NOWHERE", "PLACED", "Growing"]
 
 LOOK_EVERY = 2
 """Steps between looks at contributions: a look costs half a step."""
@@ -49,7 +49,7 @@ FULL_AT = 0.35
 """Fraction of the run by which the budget is spent."""
 FASTEST = 0.5
 """Most Gaussians added in a round, as a fraction of the existing ones."""
-PLACED = 0.5
+PLACED = 0.75
 """Fraction of the added Gaussians that goes to wrong pixels of known depth."""
 NOWHERE: Mapping[str, Tensor] = MappingProxyType({})
 """No view's depth is known."""

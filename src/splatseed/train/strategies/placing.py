@@ -24,8 +24,8 @@ __all__ = ["Candidates", "add_candidates", "draw_candidates", "join_candidates"]
 Candidates = Mapping[str, Tensor]
 """``means`` [M, 3], ``colors`` [M, 3] as the photograph has them, 0 to 1, ``depths`` [M], and
 ``sizes`` [M], standard deviations: training units."""
-OPACITY = 0.3
-"""Of a new Gaussian: enough to show, and it can be lost again."""
+OPACITY = 0.6
+"""Of a new Gaussian. It stands on a surface: what is fainter takes the rest of the run to show."""
 SIZE = 1.0
 """Standard deviation of a new Gaussian, in pixels of the view that it is drawn in."""
 
