@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from splatseed.bench.analysis.arms.compared import compared_arms
+from splatseed.bench.analysis.arms.tables import arm_table, scene_arm_table, seconds_table
 from splatseed.bench.analysis.comparisons import equal_count_table, ratio_table, strategy_table
 from splatseed.bench.analysis.convergence import convergence_table
 from splatseed.bench.analysis.costs import cost_table, quality_table
 from splatseed.bench.analysis.descriptors import Descriptors
-from splatseed.bench.analysis.equal_cost import compared_arms
-from splatseed.bench.analysis.equal_cost_tables import arm_table, scene_arm_table, seconds_table
 from splatseed.bench.analysis.gains import gains
 from splatseed.bench.analysis.guidelines import (
     guideline_table,
