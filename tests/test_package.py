@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 import splatseed
+from splatseed.cli import VERBS
 from splatseed.requirements import INSTALL
 
 ROOT = Path(__file__).parents[1]
@@ -173,10 +174,58 @@ def test_help_does_not_wait_for_what_computes():
     assert run.returncode == 0, run.stderr
 
 
+def test_imports_close_no_circle():
+    """So any module can be imported first: none ever meets another that is half loaded.
+
+    A module that is being loaded waits for those it imports and for the packages they are in, but
+    for the packages it is in itself, which Python has begun before: it may ask nothing of them.
+    """
+    waits = {}
+    paths = _paths()
+    for name, path in paths.items():
+        wanted = set(_imported_on_loading(path, paths))
+        assert not wanted & _packages_above(name), f"{name} imports a package that it is in"
+        wanted |= {package for each in wanted for package in _packages_above(each)}
+        waits[name] = wanted - _packages_above(name) - {name}
+    TopologicalSorter(waits).prepare()  # raises CycleError, which names the circle
+
+
+def _paths():
+    """Our modules' files by their names."""
+    parts = {path: path.relative_to(SOURCE.parent).with_suffix("").parts for path in _files(".")}
+    return {".".join(p[:-1] if p[-1] == "__init__" else p): path for path, p in parts.items()}
+
+
+def _packages_above(name):
+    parts = name.split(".")
+    return {".".join(parts[:count]) for count in range(1, len(parts))}
+
+
+def _imported_on_loading(path, modules):
+    """Which of our modules a file imports when it is loaded itself, not when a function runs."""
+    for node in _run_on_loading(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from {alias.name for alias in node.names} & modules.keys()
+        elif isinstance(node, ast.ImportFrom) and node.module in modules:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                yield inner if inner in modules else node.module
+
+
+def _run_on_loading(node):
+    """All below a node but what is in functions or for type checkers alone."""
+    for each in ast.iter_child_nodes(node):
+        if isinstance(each, ast.If) and "TYPE_CHECKING" in ast.dump(each.test):
+            continue
+        if not isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield each
+            yield from _run_on_loading(each)
+
+
 @pytest.mark.slow
-def test_every_module_can_be_imported_first():
-    """Each in a process of its own, forked from one that has loaded what is not ours, and the front
-    door, which Python loads before any module behind it."""
+def test_every_part_can_be_imported_first():
+    """And every verb: each in a process of its own, forked from one that has loaded what is not
+    ours, and the front door, which Python loads before any module behind it."""
     code = """
 import contextlib, gc, importlib, os, sys
 import numpy, jaxtyping, numba, scipy.sparse.linalg, scipy.spatial, rich.progress, tyro
@@ -192,7 +241,9 @@ for name in sys.argv[1:]:
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0, name
 """
-    words = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", code, *MODULES]
+    names = [f"splatseed.{part}" for part in ORDER]
+    names += [f"splatseed.commands.{verb}" for verb in VERBS]
+    words = [sys.executable, "-W", "ignore::DeprecationWarning", "-c", code, *names]
     run = subprocess.run(words, capture_output=True, check=False, text=True)
     assert run.returncode == 0, run.stderr
 

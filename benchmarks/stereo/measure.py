@@ -1,12 +1,13 @@
 """Depth from photographs alone: how fast, how near the truth, and what each choice gives.
 
-Notation: see ``stereo_speed``, ``stereo_truth`` and ``stereo_points``, where the measuring is done.
+Notation: see ``speed``, ``truth``, ``points`` and ``semi_global``, where the measuring is done.
 Promise: every measurement has a process of its own; each table is Markdown. What needs captures is
 left out, with the reason, where there are none. See README.md for what is and is not measured.
 """
 
 from __future__ import annotations
 
+import importlib.util
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from benchmarks.common.clouds import find_scenes
 from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
 from benchmarks.seeds.depth import at_hand
-from benchmarks.stereo.arms import ARMS, FOLIAGE, scores_of
+from benchmarks.stereo.arms import ARMS, FOLIAGE, Arm, scores_of
 from benchmarks.stereo.points import PointScore
 from benchmarks.stereo.speed import NUM_VIEWS, prepare_views
 from benchmarks.stereo.truth import TRUE_SCENES, Score, prepare
@@ -36,7 +37,7 @@ WHOLE_TARGET = "30 s, 2 GB"
 THREADS = 2
 PEER_ROWS = 40
 POINTS_OF = ("treehill", "fern", "fox", "bonsai")
-PARTS = ("speed", "whole", "truth", "points", "bare", "foliage")
+PARTS = ("speed", "whole", "truth", "pairs", "points", "bare", "foliage")
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class Settings:
     """What to measure."""
 
     parts: tuple[str, ...] = PARTS
-    """speed: a hypothesis; whole: 100 views; truth: against true depth; points: against SfM's
-    points; bare: without any points; foliage: treehill."""
+    """speed: a hypothesis; whole: 100 views; truth: against true depth; pairs: OpenCV's semi-global
+    matching, likewise; points: against SfM's points; bare: without points; foliage: treehill."""
     scenes: tuple[str, ...] = TRUE_SCENES
     """Where depth is known."""
     arms: tuple[str, ...] = tuple(ARMS)
@@ -128,6 +129,28 @@ def print_truth(settings: Settings) -> None:
     _print_arms("benchmarks.stereo.truth:score_all", Score, names, settings.arms, header, arguments)
 
 
+def print_pairs(settings: Settings) -> None:
+    """Ours beside OpenCV's semi-global matching of rectified pairs, against true depth."""
+    if importlib.util.find_spec("cv2") is None:
+        print("No peer: OpenCV is not installed (pip install opencv-python-headless).\n")
+        return
+    names = at_hand(settings.scenes)
+    prepare(names, settings.cache)
+    arguments: dict[str, Any] = {
+        "names": names, "cache": str(settings.cache), "limit": settings.limit,
+    }  # fmt: skip
+    pairs = "benchmarks.stereo.semi_global:score_pairs"
+    scores = {
+        "stereo": scores_of(ARMS["stereo"], "benchmarks.stereo.truth:score_all", **arguments),
+        "one rectified pair": scores_of(Arm(), pairs, pairs=1, **arguments),
+        "two that agree": scores_of(Arm(), pairs, pairs=2, **arguments),
+    }
+    header = ["kept", "within 1%", "within 5%", "reached", "CPU s"]
+    for name in names:
+        rows = [[label, *Score(**each[name]).cells()] for label, each in scores.items()]
+        print(f"{table([name, *header], rows)}\n", flush=True)
+
+
 def print_points(settings: Settings) -> None:
     """Every arm against SfM's points."""
     _print_against_points(settings, settings.captures, settings.arms)
@@ -185,6 +208,7 @@ PRINTERS: dict[str, Callable[[Settings], None]] = {
     "speed": print_speed,
     "whole": print_whole,
     "truth": print_truth,
+    "pairs": print_pairs,
     "points": print_points,
     "bare": print_bare,
     "foliage": print_foliage,

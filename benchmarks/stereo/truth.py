@@ -33,7 +33,17 @@ from splatseed.synthetic.room import Room
 from splatseed.synthetic.texture import Plain
 from splatseed.views.view import data_factor, load_views
 
-__all__ = ["TRUE_SCENES", "Score", "prepare", "score_all"]
+__all__ = [
+    "MADE_STEP",
+    "TRUE_SCENES",
+    "Score",
+    "first",
+    "load",
+    "prepare",
+    "reached",
+    "relative_error",
+    "score_all",
+]
 
 TRUE_SCENES = ("replica/room0", "7scenes_redkitchen", "made room", "made, no texture")
 CELL = 4.0
@@ -100,7 +110,7 @@ def score_all(
 
 
 def _score(name: str, cache: Path, settings: StereoSettings, limit: int, without: str) -> Score:
-    scene = _first(_load(name, cache), limit)
+    scene = first(load(name, cache), limit)
     truth = Truth.of(scene, CAPTURES.get(name, MADE_STEP))
     images = scene.split(HELD_OUT)[0]
     seen = scene
@@ -118,10 +128,11 @@ def _score(name: str, cache: Path, settings: StereoSettings, limit: int, without
     seeds = fuse(stereo, CELL)
     seconds = time.process_time() - started
     kept, one, five = _map_shares(stereo, scene)
-    return Score(kept, one, five, _reached(seeds.xyz, truth), len(seeds), seconds)
+    return Score(kept, one, five, reached(seeds.xyz, truth), len(seeds), seconds)
 
 
-def _load(name: str, cache: Path) -> Scene:
+def load(name: str, cache: Path) -> Scene:
+    """A scene of known depth, with its depth maps."""
     if name in CAPTURES:
         return triangulated(name, cache)
     folder = _made_folder(name, cache)
@@ -140,7 +151,8 @@ def _bare_images(capture: Any) -> np.ndarray:
     return render_views(bare, [image.camera for image in capture.scene.images])[0]
 
 
-def _first(scene: Scene, limit: int) -> Scene:
+def first(scene: Scene, limit: int) -> Scene:
+    """The scene with its first photographs by name."""
     ordered = sorted(scene.images, key=lambda image: image.name)
     return scene.replace(images=tuple(ordered[:limit]))
 
@@ -172,7 +184,7 @@ def relative_error(depth: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.abs(depth / around - 1.0).min(axis=0)
 
 
-def _reached(xyz: np.ndarray, truth: Truth) -> float:
+def reached(xyz: np.ndarray, truth: Truth) -> float:
     """The share of the held-out surface with a point within ``FAR``."""
     if not len(xyz):
         return 0.0

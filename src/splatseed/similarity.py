@@ -45,6 +45,12 @@ class Similarity:
         return cam_from_target
 
     @property
+    def inverse(self) -> Similarity:
+        """From the target to the source."""
+        rotation = self.rotation.T
+        return Similarity(1 / self.scale, rotation, -rotation @ self.translation / self.scale)
+
+    @property
     def matrix(self) -> Float64[np.ndarray, "3 4"]:
         """As an affine map."""
         return np.column_stack([self.scale * self.rotation, self.translation])

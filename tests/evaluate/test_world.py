@@ -14,7 +14,7 @@ from splatseed.camera import quat_from_rotation, rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.evaluate import evaluate_model, load_model
 from splatseed.evaluate.world import find_transform
-from splatseed.io import load_scene
+from splatseed.io import load_scene, write_scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.ply import write_gaussians
@@ -96,6 +96,19 @@ def test_a_file_tells_the_transform(kind, room, gaussians, psnr, other, tmp_path
         load_model(path, room)
     result = evaluate_model(load_model(path, room, transform=str(file)))
     assert result.psnr == pytest.approx(psnr, abs=0.05)
+
+
+def test_nerfstudios_transform_begins_at_colmaps_world(room, tmp_path):
+    """Which is not that of a scene that was read from transforms.json."""
+    write_scene(load_scene(room), tmp_path / "nerf", format="transforms")
+    scene = load_scene(tmp_path / "nerf")
+    turned = Similarity(0.5, np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), np.array([1.0, 2, 3]))
+    unscaled = np.column_stack([turned.rotation, turned.translation / 0.5]).tolist()
+    file = tmp_path / "dataparser_transforms.json"
+    file.write_text(json.dumps({"transform": unscaled, "scale": 0.5}))
+    wanted = turned.points(load_scene(room).points.xyz)
+    found = find_transform(str(file), scene).points(scene.points.xyz)
+    np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize(

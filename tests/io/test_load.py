@@ -269,3 +269,9 @@ def test_system_errors_become_ours(scene_dir, model):
     colmap_binary.write_images(scene_dir / "sparse/0/images.bin", images)
     with pytest.raises(SceneFormatError, match="too long"):
         load_scene(scene_dir)
+
+
+def test_a_video_is_to_be_made_a_scene_first(tmp_path):
+    (tmp_path / "a walk.mp4").write_bytes(bytes(100))
+    with pytest.raises(SceneFormatError, match=r"found a video.*splatseed sfm '.*/a walk.mp4' -o"):
+        load_scene(tmp_path / "a walk.mp4")

@@ -9,7 +9,8 @@ from scipy.ndimage import gaussian_filter
 
 from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.sfm.video import choose, is_video, pick_frames, shift
+from splatseed.io.files import is_video
+from splatseed.sfm.video import choose, pick_frames, shift
 from splatseed.view.video import write_video
 
 HEIGHT, WIDTH = 120, 160

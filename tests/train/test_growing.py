@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
+from scipy.spatial.transform import Rotation
 
-from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.gaussians import SH_C0, Gaussians
 from splatseed.splat.rendering import render_features
 from splatseed.train.parameters import make_optimizers, make_parameters
 from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies import make_strategy
 from splatseed.train.strategies.contributions import contributions
+from splatseed.train.strategies.placing import draw_candidates
 from splatseed.views.view import View
 
 SIDE = 32
@@ -47,10 +49,10 @@ def row(count, depth=2.0):
     return [[x, 0.0, depth] for x in np.linspace(-0.8, 0.8, count)]
 
 
-def grow(params, view, truth, budget, steps=range(101)):
+def grow(params, view, truth, budget, steps=range(101), depth=None):
     """A run's rounds on one view, with nothing learnt; the first round ends at step 100."""
     asked = TrainSettings(strategy="grow", max_steps=1500, cap_max=budget)
-    strategy = make_strategy(asked)
+    strategy = make_strategy(asked, depths={} if depth is None else {view.name: depth})
     optimizers = make_optimizers(params, asked.schedule)
     torch.manual_seed(0)
     grey = torch.full((SIDE, SIDE, 3), 0.5)
@@ -135,3 +137,80 @@ def test_the_budget_is_never_exceeded(count, budget):
     rounds = [step for end in range(100, 800, 100) for step in (end - 4, end - 2, end)]
     grow(params, view, torch.ones((SIDE, SIDE, 3)), budget, rounds)
     assert len(params["means"]) <= max(count, budget)
+
+
+def wrong_on_the_left(value=1.0):
+    truth = torch.full((SIDE, SIDE, 3), 0.5)
+    truth[:, : SIDE // 4] = value
+    return truth
+
+
+def test_half_of_what_is_added_goes_to_wrong_pixels_at_their_depth(view):
+    """Depth is a wall at 3, behind the Gaussians at 2; what is added there is white, as it is."""
+    params = planted(row(12), [0.06] * 12)
+    before = {tuple(mean.tolist()) for mean in params["means"].detach()}
+    grow(params, view, wrong_on_the_left(), budget=100, depth=torch.full((8, 8), 3.0))
+    means = params["means"].detach()
+    placed = (means[:, 2] - 3.0).abs() < 1e-4
+    added = len(means) - len(before)
+    assert added >= 4
+    assert int(placed.sum()) == round(added / 2)
+    u = SIDE * means[placed, 0] / 3.0 + SIDE / 2
+    assert u.max() < SIDE // 4
+    colors = 0.5 + SH_C0 * params["sh0"].detach()[placed, 0]
+    torch.testing.assert_close(colors, torch.ones_like(colors))
+    sizes = torch.exp(params["scales"].detach())[placed]
+    torch.testing.assert_close(sizes, torch.full_like(sizes, 3.0 / SIDE))  # a pixel, at depth 3
+    torch.testing.assert_close(params["near_depths"].detach()[placed], means[placed, 2])
+
+
+def test_nothing_is_placed_where_the_depth_is_unknown(view):
+    depth = torch.zeros((SIDE, SIDE))
+    depth[:, SIDE // 2 :] = 3.0  # where nothing is wrong
+    params = planted(row(12), [0.06] * 12)
+    grow(params, view, wrong_on_the_left(), budget=100, depth=depth)
+    assert len(params["means"]) > 12
+    assert params["means"].detach()[:, 2].max() < 2.5
+
+
+@settings(deadline=None)
+@given(
+    height=st.integers(1, 9), width=st.integers(1, 9), count=st.integers(1, 50),
+    seed=st.integers(0, 9),
+)  # fmt: skip
+def test_candidates_lie_on_wrong_pixels_of_known_depth(height, width, count, seed):
+    """Where they fall in the picture is found by projecting them, turned camera and all."""
+    rng = np.random.default_rng(seed)
+    matrix = np.array([[7.0, 0, width / 3], [0, 5.0, height / 3], [0, 0, 1]])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.random(random_state=seed).as_matrix(), rng.normal(size=3)
+    view = View(
+        "a", K=matrix, cam_from_world=pose, width=width, height=height,
+        image=np.zeros((height, width, 3), np.uint8),
+    )  # fmt: skip
+    error = torch.as_tensor(rng.choice([0.0, 0.3, 1.0], (height, width)))
+    depth = torch.as_tensor(rng.choice([0.0, 1.0, 2.5], (height, width)).astype(np.float32))
+    photograph = torch.as_tensor(rng.random((height, width, 3)).astype(np.float32))
+    torch.manual_seed(seed)
+    drawn = draw_candidates(view, depth, error, photograph, count)
+    assert len(drawn["depths"]) <= count
+    assert (len(drawn["depths"]) > 0) == bool(((error > 0) & (depth > 0)).any())
+    x, y, z = pose[:3, :3] @ drawn["means"].double().numpy().T + pose[:3, 3:]
+    columns = np.floor(matrix[0, 0] * x / z + matrix[0, 2]).astype(int)
+    rows = np.floor(matrix[1, 1] * y / z + matrix[1, 2]).astype(int)
+    assert (error[rows, columns] > 0).all()
+    np.testing.assert_allclose(depth[rows, columns], z, rtol=1e-4)
+    np.testing.assert_array_equal(photograph[rows, columns], drawn["colors"])
+    assert len(set(zip(rows, columns, strict=True))) == len(rows)
+
+
+def test_more_wrong_pixels_are_drawn_more_often(view):
+    error = torch.zeros((SIDE, SIDE))
+    error[0, :10], error[1, :10] = 0.1, 1.0
+    torch.manual_seed(0)
+    rows = [
+        draw_candidates(view, torch.ones((1, 1)), error, torch.zeros((SIDE, SIDE, 3)), 1)["means"]
+        for _ in range(200)
+    ]
+    lower = torch.cat(rows)[:, 1] > (1 - SIDE / 2) / SIDE
+    assert 0.9 < float(lower.double().mean()) < 1.0  # 1 in 101 is of the upper row

@@ -104,21 +104,21 @@ def test_asking_for_what_is_not_known_is_told(points):
 
 def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
     notes: list[str] = []
-    points = seeded(room, TrainSettings(seeding="auto"), notes.append, silent).points
+    points = seeded(room, TrainSettings(seeding="auto"), notes.append, silent)[0].points
     assert len(points) > len(room.points)
     assert np.array_equal(points.originals.xyz, room.points.xyz)
     assert "--seeds scene" in notes[-1]
     bounded = TrainSettings(seeding="auto", strategy="none", cap_max=len(room.points) + 10)
-    assert len(seeded(room, bounded, notes.append, silent).points) == len(room.points) + 10
+    assert len(seeded(room, bounded, notes.append, silent)[0].points) == len(room.points) + 10
 
 
 def test_what_upsample_only_thinned_is_left_alone(room, tmp_path):
     write_scene(room.replace(points=room.points.select(slice(100))), tmp_path / "thin")
     thin, asked = load_scene(tmp_path / "thin"), TrainSettings(seeding="auto")
     (tmp_path / "thin" / MANIFEST).write_text('{"command": "upsample"}')
-    assert seeded(thin, asked, print, silent) is thin
+    assert seeded(thin, asked, print, silent) == (thin, None)
     (tmp_path / "thin" / MANIFEST).write_text('{"command": "sfm"}')
-    assert len(seeded(thin, asked, lambda _: None, silent).points) > len(thin.points)
+    assert len(seeded(thin, asked, lambda _: None, silent)[0].points) > len(thin.points)
 
 
 @pytest.mark.parametrize(
@@ -132,5 +132,5 @@ def test_other_points_are_left_alone(settings, room):
     )
     scene = touched if settings == {"seeding": "auto"} else room
     notes: list[str] = []
-    assert seeded(scene, TrainSettings(**settings), notes.append, silent) is scene
+    assert seeded(scene, TrainSettings(**settings), notes.append, silent)[0] is scene
     assert not notes

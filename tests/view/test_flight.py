@@ -11,6 +11,11 @@ torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
 
 from splatseed.cli import main
+from splatseed.io import load_scene
+from splatseed.similarity import Similarity
+from splatseed.splat.ply import read_gaussians
+from splatseed.view.renderer import ModelRenderer, model_frame
+from splatseed.views.view import poses_of
 
 
 def _run(capsys, *words):
@@ -57,10 +62,35 @@ def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, capsys
     frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 60}
     (tmp_path / "p.json").write_text(json.dumps({"camera_path": 4 * [frame], "fps": 8}))
     out = tmp_path / "flight.mkv"
-    code, said = _run(capsys, "flight", run_folder, "-o", out, "--path", tmp_path / "p.json", "--depth")  # fmt: skip
+    code, said = _run(capsys, "flight", run_folder, "-o", out, "--path", tmp_path / "p.json", "--transform", "none", "--depth")  # fmt: skip
     assert code == 0, said.err
     frames, fps = _frames(out)
     assert (len(frames), fps) == (4, 8)
+
+
+def test_a_path_through_nerfstudios_world_needs_its_transform(room, run_folder, tmp_path, capsys):
+    """Turned, moved and scaled: as it is, it leads past the model; with the transform it does
+    not."""
+    turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    world = Similarity(0.01, turn, np.array([0.2, 40.0, 0.1]))
+    content = {"transform": np.column_stack([turn, world.translation / 0.01]).tolist(), "scale": 0.01}  # fmt: skip
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(content))
+    camera = load_scene(room).images[3].camera
+    pose = np.linalg.inv(world.camera(camera.cam_from_world)) @ np.diag([1.0, -1, -1, 1])
+    fov = np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1]))
+    frames = 2 * [{"camera_to_world": pose.reshape(-1).tolist(), "fov": fov}]
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"camera_path": frames, "fps": 8}))
+    words = ("flight", run_folder, "-o", tmp_path / "flight.mp4", "--path", path)
+    code, said = _run(capsys, *words)
+    assert code == 2
+    assert "--transform" in said.err
+    code, said = _run(capsys, *words, "--transform", tmp_path / "dataparser_transforms.json")
+    assert code == 0, said.err
+    gaussians = read_gaussians(run_folder / "point_cloud.ply")
+    wanted = ModelRenderer(gaussians, model_frame(gaussians, None)).color(poses_of([load_scene(room).images[3]])[0])  # fmt: skip
+    shown = _frames(tmp_path / "flight.mp4")[0][0] / 255
+    assert np.abs(shown - wanted).mean() < 0.03
 
 
 @pytest.mark.parametrize(
@@ -71,6 +101,7 @@ def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, capsys
         (("-o", "a.mp4", "--fps", "0"), "--fps"),
         (("-o", "a.mp4", "--orbit", "--path", "p.json"), "both"),
         (("-o", "a.mp4", "--path", "none.json"), "none.json"),
+        (("-o", "a.mp4", "--transform", "gsplat"), "--path"),
         (("-o", "a.mp4", "--compare", "nowhere"), "nowhere"),
         (("-o", "a.mp4", "--crop=5,5,5,1,1,1"), "--crop"),
         (("-o", "x" * 300 + ".mp4", "--seconds", "0.1"), "name too long"),

@@ -95,6 +95,41 @@ def test_a_run_is_seen_offline_and_a_click_flies(viewer, run_folder, tmp_path):
 
 
 @needs_browser
+def test_a_click_of_the_mouse_on_a_camera_flies_there(room, tmp_path):
+    port = free_port("127.0.0.1", 0)
+    served = Viewer([open_shown(room)], "127.0.0.1", port)
+    with served_page(tmp_path, f"http://127.0.0.1:{port}") as page:
+        session = _session(served)
+        assert waits_for(lambda: "Show cameras" in text(page))
+        image, handle, at = _camera_in_sight(session)
+        clicked = {"x": at[0], "y": at[1], "button": "left", "clickCount": 1}
+
+        def arrived():
+            """It may be clicked before the browser has drawn it."""
+            for kind, buttons in (("mouseMoved", 0), ("mousePressed", 1), ("mouseReleased", 0)):
+                page.call("Input.dispatchMouseEvent", type=kind, buttons=buttons, **clicked)
+            return waits_for(lambda: session.at, 3)
+
+        assert waits_for(arrived) is image
+        assert waits_for(lambda: not handle.visible)  # it does not stand in its own way
+        session._client.camera.position = np.asarray(session._client.camera.position) + 0.1
+        assert waits_for(lambda: handle.visible)
+    served.stop()
+
+
+def _camera_in_sight(session):
+    """The nearest image beside the controls, its frustum, and where on the page its middle is."""
+    canvas, found = session._canvas(1.0), []
+    for image, handle in session._cameras:
+        camera = image.camera
+        ahead = camera.world_from_cam[:3, 2] * handle.scale / session._entry.frame.scale
+        u, v, depth = canvas.K @ (canvas.cam_from_world @ [*(camera.center + ahead), 1])[:3]
+        if depth > 0 and 50 < u / depth < 350 and 160 < v / depth < 550:
+            found.append((depth, image, handle, (u / depth, v / depth)))
+    return min(found, key=lambda each: each[0])[1:]
+
+
+@needs_browser
 def test_switches_of_the_page_act(viewer, tmp_path):
     with served_page(tmp_path, viewer.url) as page:
         session = _session(viewer)

@@ -47,7 +47,14 @@ class Options:
     scene: PathOrNone = None
     """The scene that a file of Gaussians is of, for its cameras; a run knows its own."""
     path: PathOrNone = None
-    """A camera path in nerfstudio's JSON, in the model's world, to follow instead."""
+    """A camera path in nerfstudio's JSON to follow instead, in the model's world or that of
+    --transform."""
+    transform: Annotated[
+        TextOrNone,
+        tyro.conf.arg(metavar="FILE|gsplat|none", help_behavior_hint="(default: the same world)"),
+    ] = None
+    """From the model's world to the path's: the dataparser_transforms.json of nerfstudio's run, or
+    what else evaluate --transform takes."""
     orbit: bool = False
     """Circle around what the cameras look at instead."""
     compare: PathOrNone = None
@@ -102,6 +109,8 @@ def _check(options: Options) -> None:
         raise OutputError(f"no file at {options.output}", found="one", fix=fix)
     if options.path is not None and options.orbit:
         raise ParameterError("--path or --orbit", found="both", fix="Leave one out.")
+    if options.path is None and options.transform is not None:
+        raise ParameterError("--path with --transform", found="none", fix="Leave it out.")
     frames = options.seconds * options.fps
     if not (options.fps > 0 and 1 <= frames <= MOST_FRAMES):
         raise ParameterError(
@@ -148,12 +157,11 @@ def _size(options: Options, shown: Shown) -> tuple[int, int]:
 
 def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Sequence[View], float]:
     """The cameras, one a frame, and how many a second."""
-    from splatseed.view.paths import orbit, path_of_file, smooth_path  # noqa: PLC0415
+    from splatseed.view.paths import orbit, smooth_path  # noqa: PLC0415
     from splatseed.views.view import poses_of  # noqa: PLC0415
 
     if options.path is not None:
-        views, fps = path_of_file(options.path, size)
-        return views, fps or options.fps
+        return _views_of_file(options.path, options.transform, shown, size, options.fps)
     frames = max(1, round(options.seconds * options.fps))
     images = shown.scene.split(shown.test_every)[0] if shown.scene else ()
     cameras = poses_of(images, shown.data_factor)
@@ -161,6 +169,27 @@ def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Seque
     if options.orbit or len(cameras) < 2:
         return orbit(cameras, shown.gaussians, frames, size), options.fps
     return smooth_path(cameras, frames, size), options.fps
+
+
+def _views_of_file(
+    path: Path, transform: str | None, shown: Shown, size: tuple[int, int], fps: float
+) -> tuple[Sequence[View], float]:
+    """The cameras of a path's file in the model's world, and how many a second."""
+    from splatseed.evaluate.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415
+    from splatseed.scene import Scene  # noqa: PLC0415
+    from splatseed.view.paths import check_path, path_of_file, views_from  # noqa: PLC0415
+    from splatseed.views.view import poses_of  # noqa: PLC0415
+
+    views, named = path_of_file(path, size)
+    if transform is not None:
+        world = find_transform(transform, shown.scene or Scene(empty_cloud()))
+        views = views if world is None else views_from(world, views)
+    assert shown.gaussians is not None  # noqa: S101  (see _open)
+    if transform != NO_TRANSFORM:
+        cameras = poses_of(shown.scene.images) if shown.scene else ()
+        check_path(path, views, shown.gaussians, cameras)
+    return views, named or fps
 
 
 def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> list[ModelRenderer]:

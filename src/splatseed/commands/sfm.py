@@ -13,10 +13,11 @@ from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_commands, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
+from splatseed.io.files import is_video
 from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
 from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, triangulate
-from splatseed.sfm.video import is_video, pick_frames
+from splatseed.sfm.video import pick_frames
 
 __all__ = ["run"]
 

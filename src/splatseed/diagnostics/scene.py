@@ -6,6 +6,7 @@ lengths count images, reprojection errors are in px. Shares are of all points un
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,7 +78,7 @@ class EmptyRegions:
 
 def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatistics:
     """Count, measure and check the points of a scene; an empty cloud has NaN bounds."""
-    from splatseed.upsample.neighbors import prepare, sound_bases  # noqa: PLC0415  (Numba)
+    from splatseed.upsample.neighbors import prepare, sound_bases  # noqa: PLC0415  (SciPy)
 
     xyz = scene.points.xyz
     finite = xyz[scene.points.finite].astype(np.float64)
@@ -134,7 +135,7 @@ def empty_regions(scene: Scene, progress: Progress = silent) -> EmptyRegions | N
     """
     if not scene.images or not len(scene.points):
         return None
-    xyz = scene.points.xyz[scene.points.finite]
+    xyz = np.ascontiguousarray(scene.points.xyz[scene.points.finite].T, np.float64)
     shares = []
     for i, image in enumerate(scene.images):
         shares.append(_empty_share(image, xyz))
@@ -163,16 +164,22 @@ def find_problems(
     return tuple(found)
 
 
-def _empty_share(image: Image, xyz: Float64[np.ndarray, "N 3"]) -> float:
+def _empty_share(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> float:
     """Share of a grid's cells that no point projects into."""
     camera = image.camera
-    size = np.array([camera.width, camera.height])
-    cell = max(camera.width, camera.height) / EMPTY_CELLS
-    shape = np.maximum(np.ceil(size / cell).astype(int), 1)
-    uv, _ = camera.project(xyz)
-    inside = ((uv >= 0) & (uv < size)).all(axis=1)
-    column, row = (uv[inside] / cell).astype(int).T
-    return 1.0 - len(np.unique(row * shape[0] + column)) / int(shape.prod())
+    width, height = camera.width, camera.height
+    cell = max(width, height) / EMPTY_CELLS
+    columns, rows = max(math.ceil(width / cell), 1), max(math.ceil(height / cell), 1)
+    pixel_from_world = camera.K @ camera.cam_from_world[:3]
+    # Ten times as fast as @, whose routines are made for matrices that are large both ways.
+    u, v, depth = np.einsum("ij,jn->in", pixel_from_world[:, :3], xyz) + pixel_from_world[:, 3:]
+    # Before the division, which most points are spared; what is behind the camera fails it too.
+    inside = (u >= 0) & (u < width * depth) & (v >= 0) & (v < height * depth)
+    scale = 1.0 / (cell * depth[inside])
+    seen = np.zeros((rows, columns), bool)
+    row = np.minimum((v[inside] * scale).astype(int), rows - 1)  # rounding may reach the border
+    seen[row, np.minimum((u[inside] * scale).astype(int), columns - 1)] = True
+    return 1.0 - np.count_nonzero(seen) / seen.size
 
 
 def _percentiles(values: np.ndarray) -> tuple[float, ...]:

@@ -47,7 +47,8 @@ SAMPLES = 3000
 LEAST = 20
 VISIBLE = -2.2
 """Logit of the least opacity that counts, a tenth."""
-FILES = ("dataparser_transforms.json", "cameras.json")
+NERFSTUDIO = "dataparser_transforms.json"
+FILES = (NERFSTUDIO, "cameras.json")
 """Files of nerfstudio and graphdeco, in the model's folder or up to three above, that tell a
 transform."""
 _FIX = "Name another file, or a word: gsplat, none."
@@ -156,7 +157,10 @@ def _of_file(path: Path, scene: Scene) -> Similarity:
     rows = content.get("transform") if isinstance(content, dict) else content
     try:
         matrix = np.atleast_1d(np.array(rows, np.float64))
-        world = similarity_of(np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]]))
+        matrix = np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]])
+        if path.name == NERFSTUDIO:
+            matrix = matrix @ _unapplied(scene)
+        world = similarity_of(matrix)
     except (TypeError, ValueError):
         world = None
     if world is None:
@@ -167,6 +171,18 @@ def _of_file(path: Path, scene: Scene) -> Similarity:
             fix=_FIX,
         )
     return world
+
+
+def _unapplied(scene: Scene) -> Float64[np.ndarray, "4 4"]:
+    """From the scene's world to the one that nerfstudio's transform begins from, COLMAP's own.
+
+    A scene read from transforms.json is in that file's world, to which ``applied_transform`` leads.
+    """
+    path = None if scene.source is None else scene.source.transforms_path
+    if path is None:
+        return np.eye(4)
+    applied = _json(path).get("applied_transform", np.eye(4)[:3])
+    return np.linalg.inv(np.vstack([np.array(applied, np.float64)[:3], np.eye(4)[3:]]))
 
 
 def _json(path: Path) -> Any:

@@ -17,7 +17,9 @@ from typing import BinaryIO
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.process.memory import free_memory
 
-__all__ = ["open_file", "read_bytes", "read_file"]
+__all__ = ["is_video", "open_file", "read_bytes", "read_file"]
+
+_VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 
 _KINDS = (
     (stat.S_ISDIR, errno.EISDIR, "a folder"),
@@ -26,6 +28,11 @@ _KINDS = (
     (lambda _: True, errno.EINVAL, "a device, not a file"),
 )
 _WAIT_NOT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path is a video file, by its name."""
+    return path.suffix.lower() in _VIDEO_SUFFIXES and path.is_file()
 
 
 def open_file(path: Path) -> BinaryIO:

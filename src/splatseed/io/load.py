@@ -13,6 +13,7 @@ from pathlib import Path
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.cloud import clean_scene, cloud_warnings
 from splatseed.io.colmap.scene import find_model, read_colmap_scene, scene_root
+from splatseed.io.files import is_video
 from splatseed.io.nerfstudio.blender import is_blender, read_blender
 from splatseed.io.nerfstudio.scene import read_transforms_scene
 from splatseed.io.output.earlier import recall_seeds
@@ -21,6 +22,7 @@ from splatseed.io.ply.foreign import refuse_foreign
 from splatseed.io.ply.points import read_ply
 from splatseed.io.rgbd.tum import is_tum, load_tum
 from splatseed.io.split import follow_lists
+from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneSource
 
 __all__ = ["load_scene"]
@@ -104,6 +106,12 @@ def _read_file(path: Path) -> Scene:
         ".json": read_transforms_scene,
     }
     refuse_foreign(path)
+    if is_video(path):
+        raise SceneFormatError(
+            f"{path} to be a scene folder, a .ply or a .json file",
+            found="a video",
+            fix=f"Make a scene of it first: splatseed sfm {quoted(path)} -o SCENE.",
+        )
     reader = readers.get(path.suffix.lower())
     if reader is None and find_model(path.parent) is not None:
         raise SceneFormatError(

@@ -131,19 +131,20 @@ class Stereo(PhotographMethod):
             progress: Told how far it is.
         """
         given = self._read(scene, np.random.default_rng(seed), progress)
-        found = self._find(given, only)
+        found = self.find(given, only)
         return tuple(found.map(i) for i in only)
 
     def _look(self, given: _Given) -> NewPoints:
         from splatseed.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
 
-        seeds = fuse(self._find(given), self.spacing, given.progress)
+        seeds = fuse(self.find(given), self.spacing, given.progress)
         source = np.full(len(seeds), source_code("stereo"), np.uint8)
         return NewPoints(
             seeds.xyz, seeds.rgb, (), seeds.normals, seeds.sizes, seeds.confidence, source
         )
 
-    def _find(self, given: _Given, only: Sequence[int] | None = None) -> FoundStereo:
+    def find(self, given: _Given, only: Sequence[int] | None = None) -> FoundStereo:
+        """Compare the photographs, or what some of them need."""
         from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
         from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
         from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415  (loads with its use)

@@ -23,9 +23,8 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 
-__all__ = ["VIDEO_SUFFIXES", "PickedFrames", "is_video", "pick_frames"]
+__all__ = ["PickedFrames", "pick_frames"]
 
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 LOOK_WIDTH = 256
 """Width at which frames are looked at, px."""
 BLOCK = 64
@@ -49,11 +48,6 @@ class PickedFrames:
     numbers: tuple[int, ...]
     total: int
     way: float
-
-
-def is_video(path: Path) -> bool:
-    """Whether a path is a video file, by its name."""
-    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def pick_frames(

@@ -28,6 +28,7 @@ from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, traini
 from splatseed.splat.pictures import beside_truth, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
+from splatseed.train.known_depths import known_depths
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
 from splatseed.train.record.config import check_same_seeds, make_config, resumed_settings
 from splatseed.train.record.curve import Record, write_curve_csv, write_curve_png
@@ -37,7 +38,7 @@ from splatseed.train.seeds import seeded, usable_seeds
 from splatseed.train.settings import TrainSettings
 from splatseed.train.start import first_gaussians
 from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
-from splatseed.train.strategies import make_strategy
+from splatseed.train.strategies import Strategy, make_strategy
 from splatseed.train.trainer import Trainer
 from splatseed.views.view import View, load_split, poses_of
 
@@ -100,7 +101,7 @@ def prepare_run(
     begun = folder.read_config() if options.resume and folder.is_run else None
     settings = resumed_settings(begun, settings)
     device = pick_device(settings.backend)
-    scene = seeded(scene, settings, note, progress)
+    scene, stereo = seeded(scene, settings, note, progress)
     trained = scene.split(settings.test_every)[0]
     seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
     check_fits(len(seeds), device)
@@ -120,8 +121,15 @@ def prepare_run(
     for name in strays:
         note(stray_note(name))
     near = [frame.view(view) for view in views[0] if view.name not in strays]
-    state = _state(folder if begun else None, seeds, frame, near, settings, device)
+    start = time.perf_counter()
+    depths = known_depths(
+        scene, frame, settings, device, stereo=stereo, note=note, progress=progress
+    )
+    seconds = time.perf_counter() - start
+    strategy = make_strategy(settings, device, depths)
+    state = _state(folder if begun else None, seeds, frame, near, settings, strategy, device)
     if not begun:
+        state.watch.seconds += seconds  # what growth needs to know is part of what it costs
         folder.begin(config)
     if state.step:
         note(f"Going on after step {state.step:,} of {settings.max_steps:,}.")
@@ -301,10 +309,11 @@ def _state(
     frame: TrainingFrame,
     views: Sequence[View],
     settings: TrainSettings,
+    strategy: Strategy,
     device: torch.device,
 ) -> TrainState:
     """The state of a run that has begun, if it left a checkpoint, else the first state."""
-    strategy, schedule = make_strategy(settings, device), settings.schedule
+    schedule = settings.schedule
     if begun and begun.checkpoint.is_file():
         return load_checkpoint(begun.checkpoint, strategy, schedule, device)
     gaussians, lengths = first_gaussians(frame.cloud_from_world(seeds), views, settings)

@@ -10,6 +10,7 @@ import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from splatseed.scene import Scene
 from splatseed.train.settings import AS_3DGS, TrainSettings
 from splatseed.views.view import View
 
+if TYPE_CHECKING:
+    from splatseed.stereo.result import Stereo
+
 __all__ = ["SEEDS_SHARE", "seeded", "seeds_digest", "usable_seeds"]
 
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
@@ -29,8 +33,10 @@ of it."""
 
 def seeded(
     scene: Scene, settings: TrainSettings, note: Callable[[str], None], progress: Progress
-) -> Scene:
+) -> tuple[Scene, Stereo | None]:
     """The scene with the points that method ``auto`` gives it, where the settings ask for them.
+
+    And the depth maps that it found on the way, if any: growth looks at them too.
 
     Args:
         scene: Where no point is one that splatseed added.
@@ -44,15 +50,22 @@ def seeded(
     """
     as_it_is = settings.seeding == "scene" or settings.strategy.endswith(AS_3DGS)
     if as_it_is or _was_seeded(scene):
-        return scene
+        return scene, None
+    from splatseed.seeding.photographs import Auto  # noqa: PLC0415  (loads with its use)
     from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
-    from splatseed.upsample import configure  # noqa: PLC0415  (loads with its use)
+
+    found: list[Stereo] = []
+
+    class Remembering(Auto):
+        def find(self, *given: Any) -> Stereo:
+            found.append(super().find(*given))
+            return found[-1]
 
     start = time.perf_counter()
     part = SEEDS_SHARE.get(settings.densification, 1.0)
     cloud = upsample(
         scene,
-        configure("auto", hold_out=settings.test_every),
+        Remembering(hold_out=settings.test_every),
         budget=None if settings.cap is None else max(2, round(part * settings.cap)),
         progress=progress,
         note=note,
@@ -63,7 +76,7 @@ def seeded(
         f"in {time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as "
         "they are."
     )
-    return scene.replace(points=cloud)
+    return scene.replace(points=cloud), found[-1] if found else None
 
 
 def _was_seeded(scene: Scene) -> bool:

@@ -14,12 +14,22 @@ import tyro
 from splatseed.errors import ParameterError
 from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule
 
-__all__ = ["AS_3DGS", "BUDGET", "BYTES_EACH", "Backend", "Seeding", "StrategyName", "TrainSettings"]
+__all__ = [
+    "AS_3DGS",
+    "BUDGET",
+    "BYTES_EACH",
+    "Backend",
+    "Placing",
+    "Seeding",
+    "StrategyName",
+    "TrainSettings",
+]
 
 StrategyName = Literal[
     "auto", "default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"
 ]
 Backend = Literal["auto", "cpu", "cuda"]
+Placing = Literal["stereo", "none"]
 Seeding = Literal["auto", "scene"]
 
 BUDGET = 1_000_000
@@ -70,6 +80,9 @@ class TrainSettings:
     """Degree of the spherical harmonics: how finely colours depend on the direction, 0 to 3."""
     test_every: int = 8
     """Keep every n-th image, sorted by name, for the test."""
+    placing: Placing = "stereo"
+    """Strategy grow: put half of the new Gaussians on wrong pixels, at the depth that stereo finds
+    there (stereo), or split Gaussians alone (none)."""
     opacity_reset: bool = False
     """Lower all opacities from time to time, as 3DGS does (strategy default; gsplat 1.5.3 does
     not)."""
@@ -85,7 +98,7 @@ class TrainSettings:
     are left alone."""
 
     def __post_init__(self) -> None:
-        for name, kind in (("backend", Backend), ("seeding", Seeding)):
+        for name, kind in (("backend", Backend), ("placing", Placing), ("seeding", Seeding)):
             known = get_args(kind)
             self._require(name, getattr(self, name) in known, f"one of {', '.join(known)}")
         for name, least in (("max_steps", 1), ("data_factor", 1), ("seed", 0), ("test_every", 2)):

@@ -18,7 +18,6 @@ from jaxtyping import Bool, Float64, Int32, Int64, UInt8
 from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
-from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
@@ -212,29 +211,20 @@ def sound_bases(cloud: PreparedCloud, neighbors: Neighbors) -> Float64[np.ndarra
     A row is isolated when its spacing is over 3 times the lower quartile of its neighbours'
     spacings: local, so that a sparse background is not taken for noise as a global filter would.
     """
-    lonely = _isolated(neighbors.idx, neighbors.spacing, OUTLIER_FACTOR, OUTLIER_NEIGHBORS)
+    lonely = _isolated(neighbors.idx[:, :OUTLIER_NEIGHBORS], neighbors.spacing)
     return np.asarray(cloud.trusted & ~lonely, np.float64)
 
 
-@kernel
-def _isolated(idx, spacing, factor, max_neighbors):  # type: ignore[no-untyped-def]
-    """Rows whose spacing exceeds ``factor`` times the lower quartile of their neighbours'."""
-    n, k = idx.shape
-    k = min(k, max_neighbors)
-    isolated = np.empty(n, np.bool_)
-    for i in parallel_range(n):
-        isolated[i] = spacing[i] > factor * _lower_quartile(idx[i, :k], spacing)
+def _isolated(
+    idx: Int32[np.ndarray, "n k"], spacing: Float64[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """Rows whose spacing exceeds 3 times the lower quartile of their neighbours'."""
+    isolated = np.empty(len(idx), bool)
+    nth = idx.shape[1] // 4
+
+    def judge(start: int, stop: int) -> None:
+        quartile = np.partition(spacing[idx[start:stop]], nth, axis=1)[:, nth]
+        isolated[start:stop] = spacing[start:stop] > OUTLIER_FACTOR * quartile
+
+    in_threads(judge, len(idx), QUERY_BLOCK, "isolated points", silent)
     return isolated
-
-
-@inline
-def _lower_quartile(rows, spacing):  # type: ignore[no-untyped-def]
-    """Element len // 4 in order of size, by selecting that many smallest: the lists are short."""
-    values = spacing[rows]
-    for a in range(values.size // 4 + 1):
-        least = a
-        for b in range(a + 1, values.size):
-            if values[b] < values[least]:
-                least = b
-        values[a], values[least] = values[least], values[a]
-    return values[values.size // 4]

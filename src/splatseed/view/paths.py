@@ -20,13 +20,14 @@ from scipy.ndimage import gaussian_filter1d
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_bytes
+from splatseed.similarity import Similarity
 from splatseed.splat.frame import stray_views
 from splatseed.splat.gaussians import Gaussians
 from splatseed.view.renderer import resized
 from splatseed.views.view import View
 from splatseed.views.viewpoint import look_at
 
-__all__ = ["focus_of", "orbit", "path_of_file", "smooth_path"]
+__all__ = ["check_path", "focus_of", "orbit", "path_of_file", "smooth_path", "views_from"]
 
 SMOOTHING = 0.02
 """Standard deviation of the filter along a path, as a part of its length."""
@@ -36,6 +37,12 @@ DETOUR = 2.0
 """A path in the order of names that is so many times as long as from neighbour to neighbour is in no order."""
 MOST_FRAMES = 100_000
 MADE_UP_SIZE = (960, 720)
+LOOKS, LOOKED_AT = 60, 5000
+"""How many views and Gaussians tell whether a path leads past the model."""
+LEAST_SEEN, HALF = 0.002, 0.5
+"""Less of the Gaussians is next to none of them; in more of the views than this it is no chance."""
+FAR_AWAY = 10.0
+"""Times the reach of the cameras."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -83,7 +90,7 @@ def orbit(
         size: Their width and height.
     """
     if len(views) > 1:
-        centers = np.array([_pose_vector(view)[:3] for view in views])
+        centers = _centers(views)
         up = -np.mean([view.cam_from_world[1, :3] for view in views], axis=0)
         focus, model = focus_of(views), _median_camera(views)
     else:
@@ -110,7 +117,7 @@ def orbit(
 
 def focus_of(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
     """The point nearest to all cameras' axes; where these are parallel, ahead of the cameras' middle."""
-    centers = np.array([_pose_vector(view)[:3] for view in views])
+    centers = _centers(views)
     axes = np.array([view.cam_from_world[2, :3] for view in views])
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     middle, spread = centers.mean(axis=0), np.linalg.norm(centers - centers.mean(axis=0), axis=1)
@@ -148,6 +155,66 @@ def path_of_file(path: Path, size: tuple[int, int]) -> tuple[list[View], float |
     return views, fps
 
 
+def views_from(world: Similarity, views: Sequence[View]) -> list[View]:
+    """Views of another world, in the model's.
+
+    Args:
+        world: From the model's world to that of the views.
+        views: There.
+    """
+    back = world.inverse
+    return [
+        dataclasses.replace(view, cam_from_world=back.camera(view.cam_from_world)) for view in views
+    ]
+
+
+def check_path(
+    path: Path, views: Sequence[View], gaussians: Gaussians, cameras: Sequence[View]
+) -> None:
+    """Refuse a path that leads through another world: far from all cameras, or past the model.
+
+    Args:
+        path: Its file.
+        views: Its cameras.
+        gaussians: The model.
+        cameras: Those that the model was trained from, or none.
+
+    Raises:
+        SceneFormatError: Most of the views see next to nothing, or are out of reach.
+    """
+    some = [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), LOOKS)).astype(int)]
+    xyz = gaussians.means[:: max(1, len(gaussians) // LOOKED_AT)].astype(np.float64)
+    seen = np.array([_share_seen(view, xyz) for view in some])
+    found = ""
+    if np.mean(seen < LEAST_SEEN) > HALF:
+        found = "next to none of them in most of its pictures"
+    elif len(cameras) > 1:
+        known, asked = _centers(cameras), _centers(some)
+        middle = np.median(known, axis=0)
+        reach = np.linalg.norm(known - middle, axis=1).max()
+        if np.median(np.linalg.norm(asked - middle, axis=1)) > FAR_AWAY * reach > 0:
+            found = "cameras far from all that the model was trained from"
+    if found:
+        raise SceneFormatError(
+            f"{path} to show the Gaussians",
+            found=f"{found}: a path through another world",
+            fix="nerfstudio's paths are in a world of its own: name the dataparser_transforms.json "
+            "of its run with --transform; to follow the path as it is, pass --transform none.",
+        )
+
+
+def _share_seen(view: View, xyz: Float64[np.ndarray, "N 3"]) -> float:
+    """Which share of the points is in the picture."""
+    cam = xyz @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+    u, v, depth = view.K @ cam.T
+    inside = (u >= 0) & (u < view.width * depth) & (v >= 0) & (v < view.height * depth)
+    return float(inside.mean())
+
+
+def _centers(views: Sequence[View]) -> Float64[np.ndarray, "N 3"]:
+    return np.array([_pose_vector(view)[:3] for view in views])
+
+
 def _no_path(path: Path, found: str) -> SceneFormatError:
     return SceneFormatError(
         f"{path} to be a camera path as nerfstudio's viewer writes it: camera_path, with camera_to_world and fov",
@@ -176,7 +243,7 @@ def _in_order(views: Sequence[View]) -> list[View]:
     by_name = sorted(views, key=lambda view: view.name)
     if len(views) < 3:
         return by_name
-    centers = np.array([_pose_vector(view)[:3] for view in by_name])
+    centers = _centers(by_name)
     gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     np.fill_diagonal(gaps, np.inf)
     at, tour = 0, [0]

@@ -176,9 +176,15 @@ class Session:
                 colors = np.broadcast_to(np.array(cloud.color, np.uint8), cloud.rgb.shape)
             if not np.array_equal(node.colors[:1], colors[:1]) or self._by_origin.value:
                 node.colors = colors
-        for _, handle in self._cameras:
-            handle.visible = self._cameras_on.value
+        self._show_cameras()
         self._legend.content = self._legend_html() if self._nodes else ""
+
+    def _show_cameras(self) -> None:
+        """All but the one that the browser's stands in: its photograph would hide what is seen."""
+        on, at = self._cameras_on.value, self.at
+        for image, handle in self._cameras:
+            if handle.visible != (wanted := on and image is not at):
+                handle.visible = wanted
 
     def _legend_html(self) -> str:
         rows = []
@@ -256,6 +262,7 @@ class Session:
 
     def _drawn(self, scale: float) -> int:
         kind, second = self._kind.value, self._seconds.get(self._second.value)
+        self._show_cameras()
         if kind == NOTHING and second is None:
             self._show(None, 0)
             self._say("")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -35,6 +37,22 @@ def test_a_colmap_scene(room, splatseed):
     low = [float(x) for x in rows["bounding box"].split()[:3]]
     np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
     assert run.out.splitlines()[-1].strip().startswith("splatseed upsample")
+
+
+WITHOUT_NUMBA = """
+import sys
+from splatseed.cli import main
+main(sys.argv[1:])
+assert "numba" not in sys.modules
+assert "torch" not in sys.modules
+"""
+
+
+def test_info_does_not_wait_for_numba(room):
+    words = [sys.executable, "-c", WITHOUT_NUMBA, "info", str(room)]
+    run = subprocess.run(words, capture_output=True, check=False, text=True, timeout=60)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert "image area without points" in run.stdout
 
 
 def test_a_transforms_scene(room, tmp_path, splatseed):

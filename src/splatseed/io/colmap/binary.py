@@ -2,8 +2,9 @@
 
 Notation: ``_id`` comes from the file. Layouts as COLMAP's documentation of its output format gives
 them, little-endian. Promise: a file that was read is written back byte for byte; a malformed one
-raises a single error that names the file, the record and the byte; points are never looped over in
-Python. Writers write straight to ``path`` and let ``OSError`` pass: their caller stages the output.
+raises a single error that names the file, the record and the byte; points are looped over in
+Python only to find where each record begins. Writers write straight to ``path`` and let ``OSError``
+pass: their caller stages the output.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from splatseed.io.colmap.model import (
     make_points,
     point_columns,
 )
+from splatseed.io.colmap.records import join_records, scan_records, split_records
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
@@ -151,10 +153,8 @@ def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
 
 def _scan_points(reader: ByteReader, count: int) -> Int64[np.ndarray, " N+1"]:
     """The byte offset of each point record, then the end of the last; consumes the file."""
-    from splatseed.io.colmap.records import scan_records  # noqa: PLC0415  (imports Numba)
-
-    starts = np.empty(count + 1, np.int64)
-    complete = scan_records(np.frombuffer(reader.data, np.uint8), reader.offset, starts)
+    starts = scan_records(reader.data, reader.offset, count)
+    complete = len(starts) - 1
     reader.offset = int(starts[complete])
     if complete < count:
         reader.record = f"{_record(complete)} of {count}"
@@ -167,14 +167,8 @@ def _split_points(
     reader: ByteReader, starts: Int64[np.ndarray, " N+1"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The heads [N] as ``_POINT`` and the track elements [T] as ``_OBSERVATION``."""
-    from splatseed.io.colmap.records import split_records  # noqa: PLC0415  (imports Numba)
-
-    points = np.empty(len(starts) - 1, _POINT)
-    observations = np.empty(_track_offsets(starts)[-1], _OBSERVATION)
-    split_records(
-        np.frombuffer(reader.data, np.uint8), starts, _rows_of(points), observations.view(np.uint8)
-    )
-    return points, observations
+    heads, pairs = split_records(np.frombuffer(reader.data, np.uint8), starts)
+    return heads.view(_POINT), pairs.view(_OBSERVATION)
 
 
 def _track_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " N+1"]:
@@ -283,21 +277,13 @@ def _joined_records(
     heads: np.ndarray, tracks: Tracks, start: int, stop: int
 ) -> UInt8[np.ndarray, " B"]:
     """The bytes of the records of points ``start`` to ``stop``, which have tracks."""
-    from splatseed.io.colmap.records import join_records  # noqa: PLC0415  (imports Numba)
-
     first, last = tracks.offsets[start], tracks.offsets[stop]
     observations = np.empty(last - first, _OBSERVATION)
     observations["image_id"] = tracks.image_ids[first:last]
     observations["point2d_idx"] = tracks.point2d_idx[first:last]
     record_offsets = (tracks.offsets[start : stop + 1] - first) * _OBSERVATION.itemsize
     record_offsets += np.arange(len(record_offsets)) * _POINT.itemsize
-    buffer = np.empty(record_offsets[-1], np.uint8)
-    join_records(_rows_of(heads), observations.view(np.uint8), record_offsets, buffer)
-    return buffer
-
-
-def _rows_of(heads: np.ndarray) -> UInt8[np.ndarray, "N 51"]:
-    return heads.view(np.uint8).reshape(len(heads), _POINT.itemsize)
+    return join_records(heads.view(np.uint8), observations.view(np.uint8), record_offsets)
 
 
 def _record(idx: int) -> str:

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from splatseed.train.device import Capacity
 from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies.base import Strategy
 from splatseed.train.strategies.densification import Default, Fixed, Mcmc
-from splatseed.train.strategies.growing import Growing
+from splatseed.train.strategies.growing import NOWHERE, Growing
 
 __all__ = ["make_strategy"]
 
 
-def make_strategy(settings: TrainSettings, device: torch.device | None = None) -> Strategy:
+def make_strategy(
+    settings: TrainSettings,
+    device: torch.device | None = None,
+    depths: Mapping[str, Float[Tensor, "h w"]] = NOWHERE,
+) -> Strategy:
     """The strategy that the settings name, on their schedule.
 
     Args:
         settings: How to train.
         device: Whose memory bounds the number of Gaussians; the CPU's by default.
+        depths: What is known of the training views' depth; see ``Growing``.
     """
     capacity = Capacity(settings.cap, device or torch.device("cpu"))
     match settings.densification:
@@ -27,6 +36,6 @@ def make_strategy(settings: TrainSettings, device: torch.device | None = None) -
         case "mcmc":
             return Mcmc(settings, capacity)
         case "grow":
-            return Growing(settings, capacity)
+            return Growing(settings, capacity, depths)
         case "none":
             return Fixed()

@@ -2,15 +2,19 @@
 
 Notation: of each Gaussian, over the views looked at since the last round: *pixels* c = sum w,
 *error* E = sum w e with e the absolute error of a pixel (see ``contributions``), and *most pixels*,
-c in the one view where it is largest. Promise: the number of Gaussians never exceeds the budget;
-which ones grow depends on the views and the seed alone. The idea of growing by the error that a
-Gaussian paints is that of S. Rota Bulo et al., "Revising Densification in Gaussian Splatting"
-(2024); what is taken away, when, and by what the error is divided were chosen on held-out training
-views: see benchmarks/README.md.
+c in the one view where it is largest. Half of what is added comes from splitting Gaussians that
+paint wrong pixels, half is new, on wrong pixels whose depth is known (see ``placing``). Promise:
+the number of Gaussians never exceeds the budget; which ones grow depends on the views and the seed
+alone. The idea of growing by the error that a Gaussian paints is that of S. Rota Bulo et al.,
+"Revising Densification in Gaussian Splatting" (2024); what is taken away, when, and by what the
+error is divided were chosen on held-out training views: see benchmarks/README.md.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -23,9 +27,10 @@ from splatseed.train.parameters import Optimizers, Parameters, yardsticks
 from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies.base import Strategy
 from splatseed.train.strategies.contributions import contributions
+from splatseed.train.strategies.placing import add_candidates, draw_candidates, join_candidates
 from splatseed.views.view import View
 
-__all__ = ["Growing"]
+__all__ = ["NOWHERE", "Growing"]
 
 LOOK_EVERY = 2
 """Steps from one look at contributions to the next: a look costs half a step."""
@@ -44,6 +49,10 @@ FULL_AT = 0.35
 """Part of the run by which the budget is spent."""
 FASTEST = 0.5
 """Gaussians that are added in a round at most, as a part of those there are."""
+PLACED = 0.5
+"""Part of what is added in a round that goes to wrong pixels of known depth."""
+NOWHERE: Mapping[str, Tensor] = MappingProxyType({})
+"""No view's depth is known."""
 LEAST_VIEWS = 2
 """Looks that must have shown a Gaussian before it is taken away for what it paints."""
 
@@ -54,13 +63,21 @@ class Growing(Strategy):
     Args:
         settings: How to train.
         capacity: The budget.
+        depths: Of each training view, by its name, planar depth in training units, 0 where it is
+            unknown; see ``placing``. Without them all that is added are halves.
     """
 
     capacity: Capacity
 
-    def __init__(self, settings: TrainSettings, capacity: Capacity) -> None:
+    def __init__(
+        self,
+        settings: TrainSettings,
+        capacity: Capacity,
+        depths: Mapping[str, Float[Tensor, "h w"]] = NOWHERE,
+    ) -> None:
         super().__init__(capacity)
         self.schedule = settings.schedule
+        self.depths = depths
 
     def observe(
         self,
@@ -73,12 +90,18 @@ class Growing(Strategy):
         """Add what this view says of each Gaussian to the sums."""
         if step % LOOK_EVERY or step > self.schedule.refine_stop:
             return
-        pixels, errors = contributions(params, view, (render.detach() - truth).abs().mean(dim=-1))
+        error = (render.detach() - truth).abs().mean(dim=-1)
+        pixels, errors = contributions(params, view, error)
         sums = self._sums(params)
         sums["errors"] += errors
         sums["pixels"] += pixels
         sums["views"] += pixels > 0
         torch.maximum(sums["most_pixels"], pixels, out=sums["most_pixels"])
+        if view.name in self.depths:
+            drawn = draw_candidates(
+                view, self.depths[view.name], error, truth, self._drawn_each(len(pixels), step)
+            )
+            self.state["candidates"] = join_candidates(self.state.get("candidates"), drawn)
 
     def after(
         self,
@@ -97,8 +120,14 @@ class Growing(Strategy):
         needless = self._needless(params)
         if bool(needless.all()):
             return  # the run is lost either way, and an empty scene cannot be rendered
+        candidates = self.state.pop("candidates", None)
         remove(params, optimizers, self.state, needless)
-        self._grow(params, optimizers, step)
+        count = len(params["means"])
+        wanted = self._room(count, step)
+        placed = min(round(PLACED * wanted), len(candidates["depths"])) if candidates else 0
+        self._split(params, optimizers, wanted - placed)
+        if candidates:
+            add_candidates(params, optimizers, candidates, placed)
         self.state = {"first": self.state["first"]}
 
     def _sums(self, params: Parameters) -> dict[str, Any]:
@@ -125,17 +154,23 @@ class Growing(Strategy):
             needless[least] = True
         return needless
 
-    def _grow(self, params: Parameters, optimizers: Optimizers, step: int) -> None:
+    def _split(self, params: Parameters, optimizers: Optimizers, wanted: int) -> None:
         """Split where E / sqrt(c) is largest: E alone favours the large, E / c the accidental."""
         sums = self._sums(params)
         scores = sums["errors"] / sums["pixels"].clamp_min(1e-6).sqrt()
-        wanted = self._room(len(scores), step)
         number = min(wanted, int((scores > 0).sum()))
         if number > 0:
             chosen = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
             chosen[torch.topk(scores, number).indices] = True
             # The opacity of both halves together is that of the whole.
             split(params, optimizers, {}, chosen, revised_opacity=True)
+
+    def _drawn_each(self, count: int, step: int) -> int:
+        """Candidates to draw in a look: what the next round may ask for, shared by its looks."""
+        every = self.schedule.refine_every
+        end = max(self.schedule.refine_start, math.ceil(step / every) * every)
+        wanted = self._room(count, end) + round(RECYCLED * count)
+        return math.ceil(PLACED * wanted / max(1, every // LOOK_EVERY))
 
     def _room(self, count: int, step: int) -> int:
         """How many may be added now: the budget is reached evenly, at ``FULL_AT`` of the run."""

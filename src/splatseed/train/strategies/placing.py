@@ -1,0 +1,116 @@
+"""New Gaussians on wrong pixels, at the depth that stereo knows there.
+
+Notation: of a pixel p, e its absolute error and d its planar depth, training units. A *candidate*
+is such a pixel, drawn as a place for a Gaussian. Promise: candidates lie on pixels whose depth is
+known and whose error is not 0, and which ones depends on PyTorch's generator alone. Splitting adds
+only beside what is there; a leaf, a rod, or a piece of wall that no seed stands on is reached so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from gsplat.strategy.ops import duplicate
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from splatseed.splat.gaussians import SH_C0
+from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters
+from splatseed.views.view import View
+
+__all__ = ["Candidates", "add_candidates", "draw_candidates", "join_candidates"]
+
+Candidates = Mapping[str, Tensor]
+"""``means`` [M, 3], ``colors`` [M, 3] as the photograph has them, 0 to 1, ``depths`` [M], and
+``sizes`` [M], standard deviations: training units."""
+OPACITY = 0.3
+"""Of a new Gaussian: enough to show, and it can be lost again."""
+SIZE = 1.0
+"""Standard deviation of a new Gaussian, in pixels of the view that it is drawn in."""
+
+
+def draw_candidates(
+    view: View,
+    depth: Float[Tensor, "h w"],
+    error: Float[Tensor, "H W"],
+    photograph: Float[Tensor, "H W 3"],
+    count: int,
+) -> Candidates:
+    """Draw pixels with a probability of e^2, where the depth is known.
+
+    Args:
+        view: Whose pixels, in the training frame.
+        depth: d, 0 where unknown; of any size, over all of the picture.
+        error: e.
+        photograph: What new Gaussians are coloured by, 0 to 1.
+        count: At most so many; a pixel that is drawn twice counts once.
+    """
+    height, width = error.shape
+    rows = torch.arange(height, device=depth.device) * depth.shape[0] // height
+    columns = torch.arange(width, device=depth.device) * depth.shape[1] // width
+    d = depth[rows[:, None], columns].flatten()
+    # In float64: the sum over a large photograph must still grow with its last pixels.
+    worth = torch.where(d > 0, error.flatten() ** 2, 0.0).double().cumsum(0)
+    drawn = torch.rand(count, dtype=torch.float64, device=worth.device) * worth[-1]
+    pixels = torch.unique(torch.searchsorted(worth, drawn, right=True))
+    pixels = pixels[(pixels < len(d)) & (worth[-1] > 0)]
+    d = d[pixels]
+    return {
+        "means": _unproject(view, pixels, d),
+        "colors": photograph.reshape(-1, 3)[pixels],
+        "depths": d,
+        "sizes": SIZE * d / float(view.K[0, 0]),
+    }
+
+
+def _unproject(
+    view: View, pixels: Int[Tensor, " M"], d: Float[Tensor, " M"]
+) -> Float[Tensor, "M 3"]:
+    """The pixels' centres in the training frame: x = R^T (d K^-1 (u, v, 1) - t)."""
+    u = (pixels % view.width + 0.5 - float(view.K[0, 2])) / float(view.K[0, 0])
+    v = (pixels // view.width + 0.5 - float(view.K[1, 2])) / float(view.K[1, 1])
+    pose = torch.as_tensor(view.cam_from_world, dtype=torch.float64, device=d.device)
+    in_camera = torch.stack([u * d, v * d, d], dim=1).double()
+    return ((in_camera - pose[:3, 3]) @ pose[:3, :3]).float()
+
+
+def join_candidates(first: Candidates | None, second: Candidates) -> Candidates:
+    """Both, in order."""
+    if first is None:
+        return second
+    return {name: torch.cat([first[name], second[name]]) for name in first}
+
+
+@torch.no_grad()
+def add_candidates(
+    params: Parameters, optimizers: Optimizers, candidates: Candidates, count: int
+) -> int:
+    """Make Gaussians of ``count`` candidates, drawn evenly; balls of one colour.
+
+    Returns:
+        How many were made: fewer where there are not so many candidates, or Gaussians.
+    """
+    number = len(params["means"])
+    count = min(count, len(candidates["depths"]), number)
+    if count <= 0:
+        return 0
+    device = params["means"].device
+    some = torch.randperm(len(candidates["depths"]), device=device)[:count]
+    chosen = {name: values.to(device)[some] for name, values in candidates.items()}
+    # Copies of any others have the right shapes, and moments of 0; then they get their own values.
+    copied = torch.zeros(number, dtype=torch.bool, device=device)
+    copied[:count] = True
+    duplicate(params, optimizers, {}, copied)
+    new = {
+        "means": chosen["means"],
+        "scales": torch.log(chosen["sizes"])[:, None].expand(-1, 3),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).expand(count, 4),
+        "opacities": torch.logit(torch.full((count,), OPACITY, device=device)),
+        "sh0": ((chosen["colors"] - 0.5) / SH_C0)[:, None],
+        "shN": torch.zeros_like(params["shN"][:count]),
+        NEAR_DEPTHS: chosen["depths"],
+    }
+    for name, value in params.items():
+        value[number:] = new[name]
+    return count

@@ -1,0 +1,90 @@
+"""Every command in the documentation is one that the command line takes."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from contextlib import suppress
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from splatseed.cli import VERBS
+from splatseed.commands.bench.options import parse_plan
+from splatseed.commands.bench.report import CompareOptions, ReportOptions
+from splatseed.commands.options import known_options, parse_options
+from splatseed.commands.upsample.command import HELP_ALL, parse
+from splatseed.errors import SceneNotFoundError
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+OWN_METHOD = "jitter"
+"""Of an example, which has to be installed first."""
+OTHERS = {"--max-2D-matches-per-3D-point"}
+"""Options of other programs that our pages name."""
+BENCH = {"report": ReportOptions, "compare": CompareOptions}
+
+
+def _blocks(page):
+    return re.findall(r"```sh\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+
+
+def _commands():
+    """The words of each whole command in a page's blocks, after ``splatseed``."""
+    for page in (*PAGES, ROOT / "benchmarks/README.md"):
+        for line in "".join(_blocks(page)).replace("\\\n", " ").splitlines():
+            words = shlex.split(line.partition(">")[0], comments=True)
+            if words and Path(words[0]).name == "splatseed" and OWN_METHOD not in words:
+                yield pytest.param(words[1:], id=f"{page.name}: {' '.join(words[1:])}")
+
+
+@pytest.mark.parametrize("words", list(_commands()))
+def test_whole_commands_are_understood(words, tmp_path, monkeypatch):
+    """Their files need not be there."""
+    monkeypatch.chdir(tmp_path)
+    verb, *rest = words
+    assert verb in VERBS
+    if {"--help", HELP_ALL} & set(rest):
+        return
+    if verb == "upsample":
+        parse(rest)
+    elif verb == "bench" and rest[0] in BENCH:
+        parse_options(BENCH[rest[0]], verb, rest[1:])
+    elif verb == "bench":
+        with suppress(SceneNotFoundError):  # a plan that the reader has
+            parse_plan(rest)
+    else:
+        parse_options(import_module(f"splatseed.commands.{verb}").Options, verb, rest)
+
+
+@cache
+def _options(verb):
+    if verb == "upsample":
+        return {HELP_ALL, *known_options(_whole_upsample())}
+    kinds = [import_module(f"splatseed.commands.{verb}").Options]
+    kinds += BENCH.values() if verb == "bench" else ()
+    more = {"--config"} if verb == "train" else set()
+    return {option for kind in kinds for option in known_options(kind)} | more
+
+
+def _whole_upsample():
+    """The options with those of all methods."""
+    options, _ = parse(["SCENE", "-o", "OUT"])
+    return type(options)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_options_in_the_text_are_there(page):
+    text = re.sub(r"```.*?```", "", page.read_text("utf-8"), flags=re.DOTALL)
+    for code in re.findall(r"`([^`]+)`", text):
+        named = re.match(r"\s*splatseed\s+([a-z]+)\b", code)
+        if named:
+            assert named[1] in VERBS, code
+        elif not code.startswith("--"):
+            continue  # another program's
+        known = [_options(verb) for verb in ([named[1]] if named else VERBS)]
+        for option in re.findall(r"(?<![\w-])--[a-z][\w.-]*", code):
+            everywhere = OTHERS | {"--help", "--version", "--completion"}
+            assert any(option in each for each in known) or option in everywhere, code

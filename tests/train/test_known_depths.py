@@ -1,0 +1,90 @@
+"""The depth that growth places Gaussians at: true, of training views alone, found once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from splatseed.io import load_scene
+from splatseed.progress import silent
+from splatseed.splat.frame import TrainingFrame
+from splatseed.stereo.depths import find_stereo
+from splatseed.synthetic import make_capture, write_capture
+from splatseed.train.known_depths import known_depths
+from splatseed.train.run import prepare_run
+from splatseed.train.seeds import seeded
+from splatseed.train.settings import TrainSettings
+
+FRAME = TrainingFrame(np.array([1.0, 2.0, 3.0]), 0.25)
+GROW = TrainSettings(strategy="grow", max_steps=60)
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def capture():
+    return make_capture(0, num_views=16, width=160, height=120)
+
+
+@pytest.fixture(scope="module")
+def scene(capture, tmp_path_factory):
+    return load_scene(write_capture(capture, tmp_path_factory.mktemp("room") / "room"))
+
+
+def test_depths_are_those_of_the_surfaces_in_training_units(capture, scene):
+    notes: list[str] = []
+    depths = known_depths(scene, FRAME, GROW, CPU, note=notes.append)
+    truths = {image.name: truth for image, truth in zip(scene.images, capture.depths, strict=True)}
+    errors = []
+    for name, depth in depths.items():
+        rows, columns = (
+            (np.arange(n) * m // n + m // n // 2)
+            for n, m in zip(depth.shape, truths[name].shape, strict=True)
+        )
+        world = depth.numpy() / FRAME.scale
+        truth = truths[name][np.ix_(rows, columns)]
+        errors.append((np.abs(world / truth - 1))[world > 0])
+    errors = np.concatenate(errors)
+    assert len(errors) > 2000
+    assert np.median(errors) < 0.02
+    assert "--placing none" in notes[0]
+
+
+def test_test_views_are_not_looked_at(scene):
+    train, test = scene.split(8)
+    names = known_depths(scene, FRAME, GROW, CPU).keys()
+    assert names <= {image.name for image in train}
+    assert not names & {image.name for image in test}
+
+
+@pytest.mark.parametrize(
+    "settings", [{"strategy": "default"}, {"strategy": "grow", "placing": "none"}]
+)
+def test_nobody_looks_where_there_is_no_use(scene, settings):
+    assert known_depths(scene, FRAME, TrainSettings(**settings), CPU) == {}
+
+
+def test_a_single_photograph_has_no_depth(scene):
+    one = scene.replace(images=scene.images[:2])  # the first is a test view
+    assert known_depths(one, FRAME, GROW, CPU) == {}
+
+
+def test_photographs_are_compared_once_for_seeds_and_growth(scene, tmp_path, monkeypatch):
+    calls = []
+
+    def counted(*arguments, **options):
+        calls.append(1)
+        return find_stereo(*arguments, **options)
+
+    monkeypatch.setattr("splatseed.stereo.depths.find_stereo", counted)
+    settings = TrainSettings(strategy="grow", max_steps=60, data_factor=2, seeding="auto")
+    run = prepare_run(scene, tmp_path / "run", settings)
+    assert len(calls) == 1
+    assert len(run.state.strategy.depths) > 10
+
+
+def test_seeding_hands_on_what_stereo_found(scene):
+    asked = TrainSettings(strategy="grow", max_steps=60, seeding="auto")
+    stereo = seeded(scene, asked, lambda _: None, silent)[1]
+    assert stereo is not None
+    assert [view.name for view in stereo.views] == [image.name for image in scene.split(8)[0]]
