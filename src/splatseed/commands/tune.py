@@ -219,7 +219,7 @@ def _seconds(study: _Study, rung: Rung, estimator: Estimator) -> float:
     """What a rung takes, if its arms are like the mean of all."""
     specs = study.specs(rung)
     share = rung.arms / len({spec.arm for spec in specs})
-    return share * sum(map(estimator.seconds, specs)) / study.machine.jobs
+    return share * sum(estimator.of_all(specs).values()) / study.machine.jobs
 
 
 def _announce(study: _Study, rungs: Sequence[Rung]) -> None:
@@ -262,7 +262,7 @@ def _do(study: _Study, specs: Sequence[RunSpec]) -> bool:
     if not left:
         return True
     estimator = _estimator(study)
-    expected = {spec.key: estimator.seconds(spec) for spec in left}
+    expected = estimator.of_all(left)
     with run_display(expected, len(specs) - len(left), study.machine.jobs) as display:
         return study.machine.run(study.ledger, study.folder, keys, JobOptions(), display)
 

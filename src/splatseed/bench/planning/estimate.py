@@ -120,6 +120,14 @@ class Estimator:
         self._threads = threads
         done = [row for row in rows if row.result and row.spec.scene_digest in self._scenes]
         self.num_measured = len(done)
+        self._known = {
+            (kind, *shared)
+            for row in done
+            for kind, shared in [
+                ("seeds", _shared(row.spec) if _makes(row.spec) else ()),
+                ("depths", _shared(row.spec)[::2] if self._compares(row.spec) else ()),
+            ]
+        }
         self._growth = _measured_growth(done)
         trained = [row for row in done if row.result and not row.result.twin]
         self._training = _Factors(
@@ -141,7 +149,7 @@ class Estimator:
         self._around = _Factors(
             [
                 (_by_scene(row.spec), took / said)
-                for row in trained
+                for row in ([row for row in trained if not _shares(row.spec)] or trained)
                 for took, said in [(_seconds_around(row), self._modelled_around(*_of(row)))]
                 if took > LEAST
             ]
@@ -155,6 +163,27 @@ class Estimator:
         training = self._training.of(_by_strategy(spec)) * self._modelled_training(spec)
         around = self._around.of(_by_scene(spec)) * self._modelled_around(spec)
         return seeding + training + around
+
+    def of_all(self, specs: Iterable[RunSpec]) -> dict[str, float]:
+        """Seconds of several runs by their keys; what they share takes time in the first alone.
+
+        Args:
+            specs: In the order in which they are run.
+        """
+        known, found = set(self._known), {}
+        for spec in specs:
+            shared = _shared(spec)
+            found[spec.key] = self.seconds(spec)
+            if ("seeds", *shared) in known:
+                found[spec.key] -= self._seeding.of(_by_method(spec)) * self._modelled_seeding(spec)
+            if self._compares(spec):
+                if ("depths", *shared[::2]) in known:
+                    pace = self._training.of(_by_strategy(spec))
+                    found[spec.key] -= pace * self._comparing(spec)
+                known.add(("depths", *shared[::2]))
+            if _makes(spec):
+                known.add(("seeds", *shared))
+        return found
 
     def is_twin(self, spec: RunSpec) -> bool:
         """Whether a run will take over the training of one that begins with the same seeds."""
@@ -182,10 +211,12 @@ class Estimator:
             self._counts(spec) if result is None else (result.num_seeds, result.num_gaussians)
         )
         training = self._step(spec, (first + last) / 2) * spec.training.max_steps
+        return training + (self._comparing(spec) if self._compares(spec) else 0.0)
+
+    def _compares(self, spec: RunSpec) -> bool:
+        """Whether training looks for depth in the photographs, which seeding has not paid for."""
         looks = spec.settings.densification == "grow" and spec.settings.placing == "stereo"
-        if looks and not (spec.arm.method == AUTO and spec.most_seeds and not self.is_twin(spec)):
-            training += self._comparing(spec)
-        return training
+        return looks and not self.is_twin(spec) and spec.arm.method != AUTO
 
     def _modelled_around(self, spec: RunSpec, result: RunResult | None = None) -> float:
         last = self._counts(spec)[1] if result is None else result.num_gaussians
@@ -250,6 +281,21 @@ READING = 3.0
 
 def _densification(spec: RunSpec) -> Densification:
     return spec.settings.densification
+
+
+def _makes(spec: RunSpec) -> bool:
+    """Whether a run's method looks at photographs, so that what it makes is kept for others."""
+    return spec.arm.method in METHODS and chooses_number(spec.arm.method)
+
+
+def _shares(spec: RunSpec) -> bool:
+    """Whether a run may have taken less time than it counts."""
+    return _makes(spec) or spec.settings.densification == "grow"
+
+
+def _shared(spec: RunSpec) -> tuple[object, ...]:
+    """What runs of the same seeds have in common; every other word of it, of the same depth."""
+    return spec.scene_digest, spec.arm.method, spec.repeat
 
 
 def _by_strategy(spec: RunSpec) -> Names:
