@@ -93,6 +93,8 @@ def _world(spec, scene):
     pace = {"default": 1.0, "grow": 1.3, "mcmc": 1.6}[spec.arm.strategy]
     train = 2.0 * pace * 1500 * (5e-3 + 0.3e-6 * gaussians + 0.05e-6 * scene.pixels / 4)
     seeding = {"sfm": 0.1, "mls": 2.0, "auto": 1.9 * scene.num_images}[spec.arm.method]
+    if spec.arm.strategy == "grow" and spec.arm.method != "auto":  # which has found depth already
+        train += 1.9 * scene.num_images
     return train, seeding, 12.0 + 0.3 * scene.num_images / 8
 
 

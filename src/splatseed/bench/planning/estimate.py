@@ -100,6 +100,9 @@ class _Factors:
                     self._effects[name] += effect
                     rest[which] -= effect
 
+    def knows(self, name: str) -> bool:
+        return name in self._effects
+
     def of(self, names: Names) -> float:
         return math.exp(self._level + sum(self._effects.get(name, 0.0) for name in names))
 
@@ -130,13 +133,6 @@ class Estimator:
         }
         self._growth = _measured_growth(done)
         trained = [row for row in done if row.result and not row.result.twin]
-        self._training = _Factors(
-            [
-                (_by_strategy(row.spec), took / said)
-                for row in trained
-                for took, said in [(_train_seconds(row), self._modelled_training(*_of(row)))]
-            ]
-        )
         self._seeding = _Factors(
             [
                 (_by_method(row.spec), took / said)
@@ -145,6 +141,13 @@ class Estimator:
                 if took > LEAST and said > 0
             ],
             level=False,
+        )
+        self._training = _Factors(
+            [
+                (_by_strategy(row.spec), took / said)
+                for row in trained
+                for took, said in [(self._stepping(row), self._modelled_training(*_of(row)))]
+            ]
         )
         self._around = _Factors(
             [
@@ -162,7 +165,7 @@ class Estimator:
             return seeding + READING
         training = self._training.of(_by_strategy(spec)) * self._modelled_training(spec)
         around = self._around.of(_by_scene(spec)) * self._modelled_around(spec)
-        return seeding + training + around
+        return seeding + training + self._looking(spec) + around
 
     def of_all(self, specs: Iterable[RunSpec]) -> dict[str, float]:
         """Seconds of several runs by their keys; what they share takes time in the first alone.
@@ -178,8 +181,7 @@ class Estimator:
                 found[spec.key] -= self._seeding.of(_by_method(spec)) * self._modelled_seeding(spec)
             if self._compares(spec):
                 if ("depths", *shared[::2]) in known:
-                    pace = self._training.of(_by_strategy(spec))
-                    found[spec.key] -= pace * self._comparing(spec)
+                    found[spec.key] -= self._looking(spec)
                 known.add(("depths", *shared[::2]))
             if _makes(spec):
                 known.add(("seeds", *shared))
@@ -210,8 +212,19 @@ class Estimator:
         first, last = (
             self._counts(spec) if result is None else (result.num_seeds, result.num_gaussians)
         )
-        training = self._step(spec, (first + last) / 2) * spec.training.max_steps
-        return training + (self._comparing(spec) if self._compares(spec) else 0.0)
+        return self._step(spec, (first + last) / 2) * spec.training.max_steps
+
+    def _stepping(self, row: RunRow) -> float:
+        """Seconds of a finished run's steps, without looking for depth, as far as that is known."""
+        took = _train_seconds(row)
+        return max(took - self._looking(row.spec), LEAST_STEPPING * took)
+
+    def _looking(self, spec: RunSpec) -> float:
+        """Seconds of training that go into looking for depth, which growth does."""
+        if not self._compares(spec):
+            return 0.0
+        known = next((name for name in COMPARING if self._seeding.knows(name)), AUTO)
+        return self._seeding.of((known,)) * self._comparing(spec)
 
     def _compares(self, spec: RunSpec) -> bool:
         """Whether training looks for depth in the photographs, which seeding has not paid for."""
@@ -270,6 +283,10 @@ class Estimator:
 
 AUTO, COVER = "auto", "cover"
 PHOTOGRAPHS = frozenset({AUTO, COVER})
+COMPARING = ("stereo", AUTO)
+"""Methods whose time tells how long comparing photographs takes."""
+LEAST_STEPPING = 0.3
+"""Of training's time, what steps take at least."""
 COVERING = 0.1
 """What looking for gaps takes, as a share of comparing photographs."""
 FILLING = frozenset({SFM, *PHOTOGRAPHS, "linear", "triangle", "spline", "mls", "voronoi", "random",

@@ -67,7 +67,8 @@ class Planned:
             ParameterError: One of them is out of its range.
         """
         sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
-        number = max(2, round(float(np.median(sizes)))) if sizes else BUDGET
+        pixels = round(float(np.median(sizes))) if sizes else BUDGET
+        number = max(2, min(BUDGET, pixels))
         if budget is not None:
             from splatseed.seeding.thinning import points_within  # noqa: PLC0415  (loads Numba)
 
