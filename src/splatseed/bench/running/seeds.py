@@ -61,7 +61,8 @@ def make_seeds(
     if spec.arm.method == SFM and spec.most_seeds is None:
         return scene.points, 0.0
     method, numbers = _asked(scene, spec)
-    if bench is not None and chooses_number(spec.arm.method) and not is_full(scene, spec):
+    looks = spec.arm.method != SFM and chooses_number(spec.arm.method)
+    if bench is not None and looks and not is_full(scene, spec):
         return _thinned(scene, method, spec, bench, progress)
     with _compilation() as compiling:
         start = time.perf_counter()
