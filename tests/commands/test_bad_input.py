@@ -281,7 +281,7 @@ def test_bad_words_are_named(words, says, room, tmp_path, splatseed):
     [
         ([], "splatseed --help"),
         (["upsample"], "--output"),
-        (["upsample", "somewhere"], "--output"),
+        (["upsample", "somewhere"], "somewhere"),
         (["info"], "PATH"),
         (["info", "somewhere", "--bogus"], "--bogus"),
         (["sfm"], "--output"),

@@ -32,9 +32,10 @@ __all__ = ["LEAST_VIEWS", "find_covisible", "pixel_masks", "read_covisible", "wr
 
 LEAST_VIEWS = 2
 """Training views that must see a pixel."""
-CELL = 8
+CELLS = 100
+"""Along the longer side: 8 pixels of 800. The SfM points of a capture fill most of such cells."""
+LEAST_CELL = 2.0
 MAX_SIZE = 800
-"""Cells are of 8 pixels where the longer side has 800: the SfM points of a capture fill most."""
 NEAREST = 4
 """Covered cells of which an empty one has the median inverse depth."""
 STAGE = "find co-visible pixels"
@@ -98,6 +99,11 @@ def _pixels(grid: Bool[np.ndarray, "rows cols"], view: View) -> Bool[np.ndarray,
     return grid[np.ix_(i.astype(np.int64), j.astype(np.int64))]
 
 
+def _cell(view: View) -> float:
+    """Side of a view's cells in pixels."""
+    return max(max(view.width, view.height) / CELLS, LEAST_CELL)
+
+
 def _frames(images: Sequence, maps: DepthMaps | None) -> list[View]:  # type: ignore[type-arg]
     """The images' frames at the size that cells are stated for; with depth maps, those with one."""
     known = [image for image in images if maps is None or image.name in maps]
@@ -108,9 +114,9 @@ def _depths(
     view: View, xyz: Float32[np.ndarray, "N 3"], maps: DepthMaps | None
 ) -> Float32[np.ndarray, "rows cols"]:
     """Planar depth of each cell; infinite in all where nothing is known."""
-    rows, cols = grid_of(view, CELL)
+    rows, cols = grid_of(view, _cell(view))
     if maps is None:
-        return _filled(cell_depths(view, xyz, CELL))
+        return _filled(cell_depths(view, xyz, _cell(view)))
     values = _planar(maps.read(view.name), view)
     i = ((np.arange(rows) + 0.5) * values.shape[0] / rows).astype(np.int64)
     j = ((np.arange(cols) + 0.5) * values.shape[1] / cols).astype(np.int64)
@@ -181,7 +187,7 @@ def _sees(
     view: View, known: Float32[np.ndarray, "rows cols"], xyz1: Float64[np.ndarray, "C 4"]
 ) -> Bool[np.ndarray, " C"]:
     """Which points a view sees."""
-    column, row, depth = grid_from_world(view, CELL) @ xyz1.T
+    column, row, depth = grid_from_world(view, _cell(view)) @ xyz1.T
     front = depth > 0
     safe = np.where(front, depth, 1.0)
     column, row = column / safe, row / safe

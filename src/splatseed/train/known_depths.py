@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from torch import Tensor
 
+from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.splat.frame import TrainingFrame
@@ -22,7 +25,7 @@ from splatseed.stereo.of_scene import stereo_depths
 from splatseed.stereo.result import Stereo
 from splatseed.train.settings import TrainSettings
 
-__all__ = ["known_depths"]
+__all__ = ["known_depths", "seconds_of"]
 
 
 def known_depths(
@@ -32,6 +35,7 @@ def known_depths(
     device: torch.device,
     *,
     stereo: Stereo | None = None,
+    kept: Path | None = None,
     note: Callable[[str], None] = lambda _: None,
     progress: Progress = silent,
 ) -> Mapping[str, Float[Tensor, "h w"]]:
@@ -43,6 +47,8 @@ def known_depths(
         settings: Whose strategy, seed and test views count.
         device: Where the maps are wanted.
         stereo: What seeding found already.
+        kept: A file that holds what was found for the same photographs and seed, or is to hold it
+            for the next run.
         note: Told what was found.
         progress: Told how far it is.
 
@@ -54,18 +60,63 @@ def known_depths(
     if not wanted or len(images) < 2:
         return {}
     start = time.perf_counter()
-    if stereo:
-        maps = tuple(stereo.map(i) for i in range(len(stereo.views)))
-    else:
-        maps = stereo_depths(scene.replace(images=images), seed=settings.seed, progress=progress)
-    share = np.mean([each.known_share for each in maps])
-    took = "" if stereo else f" ({time.perf_counter() - start:.0f} s)"
+    known = _read(kept)
+    if known is None:
+        if stereo:
+            maps = tuple(stereo.map(i) for i in range(len(stereo.views)))
+        else:
+            maps = stereo_depths(
+                scene.replace(images=images), seed=settings.seed, progress=progress
+            )
+        known = {each.name: each.depth for each in maps}
+        _write(kept, known, time.perf_counter() - start)
+    share = np.mean([np.isfinite(depth).mean() for depth in known.values()])
+    took = "" if stereo else f" ({seconds_of(kept, time.perf_counter() - start):.0f} s)"
     note(
         f"Stereo knows the depth of {share:.0%} of the pixels{took}: strategy grow places most of "
         "what it adds there. --placing none only splits."
     )
     return {
-        each.name: torch.as_tensor(np.nan_to_num(each.depth * frame.scale)).to(device)
-        for each in maps
-        if each.known_share
+        name: torch.as_tensor(np.nan_to_num(depth * frame.scale)).to(device)
+        for name, depth in known.items()
+        if np.isfinite(depth).any()
     }
+
+
+def seconds_of(kept: Path | None, took: float) -> float:
+    """What finding the maps of a file took when they were found, or else what reading took.
+
+    Args:
+        kept: The file, if there is to be one.
+        took: Seconds of this call.
+    """
+    if kept is None:
+        return took
+    try:
+        with np.load(kept, allow_pickle=False) as file:
+            return float(file["seconds"])
+    except (OSError, ValueError, KeyError, EOFError):
+        return took
+
+
+def _read(kept: Path | None) -> dict[str, Float32[np.ndarray, "h w"]] | None:
+    """Depth by name; None where nothing is kept that can be read."""
+    if kept is None:
+        return None
+    try:
+        with np.load(kept, allow_pickle=False) as file:
+            return {str(name): file[f"depth_{i}"] for i, name in enumerate(file["names"])}
+    except (OSError, ValueError, KeyError, EOFError):
+        return None
+
+
+def _write(
+    kept: Path | None, known: Mapping[str, Float32[np.ndarray, "h w"]], seconds: float
+) -> None:
+    if kept is None:
+        return
+    arrays: dict[str, Any] = {f"depth_{i}": depth for i, depth in enumerate(known.values())}
+    names = np.array(list(known), dtype=np.str_)
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_file(kept) as partial, partial.open("wb") as file:
+        np.savez(file, names=names, seconds=np.float64(seconds), **arrays)

@@ -28,7 +28,7 @@ from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, traini
 from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
-from splatseed.train.known_depths import known_depths
+from splatseed.train.known_depths import known_depths, seconds_of
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
 from splatseed.train.record.config import check_same_seeds, make_config, resumed_settings
 from splatseed.train.record.curve import Record, write_curve_csv, write_curve_png
@@ -61,12 +61,19 @@ class RunOptions:
         overwrite: Replace an earlier run in the folder.
         tensorboard: Also write TensorBoard's log.
         cache_dir: Where smaller photographs are cached; nowhere when left out.
+        depths: The file in which the depth that stereo finds, for growth, is kept for other runs
+            on the same photographs with the same seed; nowhere when left out. Each run's time
+            counts what finding it took.
+        seeding_knew: Whether making the seeds took that time already, so that it counts for
+            nothing.
     """
 
     resume: bool = False
     overwrite: bool = False
     tensorboard: bool = False
     cache_dir: Path | None = None
+    depths: Path | None = None
+    seeding_knew: bool = False
 
 
 def prepare_run(
@@ -123,9 +130,12 @@ def prepare_run(
     near = [frame.view(view) for view in views[0] if view.name not in strays]
     start = time.perf_counter()
     depths = known_depths(
-        scene, frame, settings, device, stereo=stereo, note=note, progress=progress
-    )
+        scene, frame, settings, device, stereo=stereo, kept=options.depths, note=note,
+        progress=progress,
+    )  # fmt: skip
     seconds = time.perf_counter() - start
+    if depths:
+        seconds = 0.0 if options.seeding_knew else seconds_of(options.depths, seconds)
     strategy = make_strategy(settings, device, depths)
     state = _state(folder if begun else None, seeds, frame, near, settings, strategy, device)
     if not begun:

@@ -6,8 +6,8 @@ import dataclasses
 
 import pytest
 
-from splatseed.bench.analysis.equal_cost import baseline_of, compared_arms, psnr_at
-from splatseed.bench.analysis.equal_cost_tables import (
+from splatseed.bench.analysis.arms.compared import baseline_of, compared_arms, psnr_at
+from splatseed.bench.analysis.arms.tables import (
     answer_at_equal_cost,
     arm_table,
     scene_arm_table,

@@ -209,7 +209,7 @@ def test_files_of_the_users_are_left_alone(specs, do, tmp_path):
 def budgeted(small_plan, room_path):
     """Runs under a budget below the room's points, by method."""
     plan = dataclasses.replace(
-        small_plan, methods=("sfm", "linear", "auto"), ratios=(), budgets=(200,), repeats=1
+        small_plan, methods=("sfm", "linear", "auto"), ratios=(), budgets=(60,), repeats=1
     )
     runs = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
     return {run.arm.method: run for run in runs}
@@ -220,7 +220,7 @@ def test_seeds_are_thinned_to_the_budget_and_equal_seeds_are_trained_once(
 ):
     first = do(budgeted["sfm"], "sfm")
     assert (first.status, first.error) == ("done", "")
-    assert first.result.num_seeds == first.result.num_gaussians == 200
+    assert first.result.num_seeds == first.result.num_gaussians == 60
     assert first.result.upsample_seconds > 0
     monkeypatch.setattr(job, "_prepare", lambda *_: pytest.fail("trained again"))
     for method in ("linear", "auto"):

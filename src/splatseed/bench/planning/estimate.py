@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
 from types import MappingProxyType
@@ -44,9 +44,8 @@ SECONDS_A_POINT = 5e-6
 """Of methods that interpolate, for each point of the scene and each new one."""
 LEAST = 0.05
 """Seconds below which a part counts for nothing, and its factor would be noise."""
-DOUBT = 0.3
-"""How strongly factors of a scene, a strategy or a method are drawn to none: the more runs, the
-less."""
+SWEEPS = 3
+"""Of median polish: enough for two kinds of names."""
 
 
 @dataclass(frozen=True)
@@ -74,32 +73,38 @@ GROWTH: Mapping[Densification, float] = MappingProxyType(
 )
 """Gaussians at the end of a run, per seed; with default and mcmc, a guess."""
 
-Labels: TypeAlias = Sequence[tuple[str, str]]
+Names: TypeAlias = tuple[str, ...]
 
 
 class _Factors:
-    """Factors by scene, strategy and method: their logarithms add up, fitted by ridge regression.
+    """Factors by the names of a run, such as its scene and strategy, by median polish.
+
+    The logarithm of a factor is a level, and an effect of each name: the median of what is left of
+    the runs that have it. A slow run or two change neither.
 
     Args:
-        seen: What a run is labelled by, and its factor.
+        seen: The names of each run, as many for each, and its factor.
+        level: Whether a run of names that are not known has the level of all; else the model's.
     """
 
-    def __init__(self, seen: Sequence[tuple[Labels, float]]) -> None:
-        self._names = {
-            name: i for i, name in enumerate(dict.fromkeys(x for s, _ in seen for x in s))
-        }
-        if not seen:
-            self._level, self._effects = 0.0, np.zeros(0)
-            return
+    def __init__(self, seen: Sequence[tuple[Names, float]], *, level: bool = True) -> None:
         logs = np.log([factor for _, factor in seen])
-        self._level = float(np.median(logs))
-        design = np.array([[name in set(labels) for name in self._names] for labels, _ in seen])
-        normal = design.T @ design + DOUBT * np.eye(len(self._names))
-        self._effects = np.linalg.solve(normal, design.T @ (logs - self._level))
+        self._level = float(np.median(logs)) if level and seen else 0.0
+        self._effects: dict[str, float] = defaultdict(float)
+        rest = logs - self._level
+        for _ in range(SWEEPS):
+            for kind in range(len(seen[0][0]) if seen else 0):
+                for name in {names[kind] for names, _ in seen}:
+                    which = [names[kind] == name for names, _ in seen]
+                    effect = float(np.median(rest[which]))
+                    self._effects[name] += effect
+                    rest[which] -= effect
 
-    def of(self, labels: Labels) -> float:
-        known = [self._effects[self._names[name]] for name in labels if name in self._names]
-        return math.exp(self._level + float(sum(known)))
+    def knows(self, name: str) -> bool:
+        return name in self._effects
+
+    def of(self, names: Names) -> float:
+        return math.exp(self._level + sum(self._effects.get(name, 0.0) for name in names))
 
 
 class Estimator:
@@ -118,20 +123,69 @@ class Estimator:
         self._threads = threads
         done = [row for row in rows if row.result and row.spec.scene_digest in self._scenes]
         self.num_measured = len(done)
+        self._known = {
+            (kind, *shared)
+            for row in done
+            for kind, shared in [
+                ("seeds", _shared(row.spec) if _makes(row.spec) else ()),
+                ("depths", _shared(row.spec)[::2] if self._compares(row.spec) else ()),
+            ]
+        }
         self._growth = _measured_growth(done)
         trained = [row for row in done if row.result and not row.result.twin]
-        self._training = self._fitted(trained, _train_seconds, self._modelled_training)
-        self._seeding = self._fitted(done, _seed_seconds, self._modelled_seeding)
-        self._around = self._fitted(trained, _seconds_around, self._modelled_around)
+        self._seeding = _Factors(
+            [
+                (_by_method(row.spec), took / said)
+                for row in done
+                for took, said in [(_seed_seconds(row), self._modelled_seeding(row.spec))]
+                if took > LEAST and said > 0
+            ],
+            level=False,
+        )
+        self._training = _Factors(
+            [
+                (_by_strategy(row.spec), took / said)
+                for row in trained
+                for took, said in [(self._stepping(row), self._modelled_training(*_of(row)))]
+            ]
+        )
+        self._around = _Factors(
+            [
+                (_by_scene(row.spec), took / said)
+                for row in ([row for row in trained if not _shares(row.spec)] or trained)
+                for took, said in [(_seconds_around(row), self._modelled_around(*_of(row)))]
+                if took > LEAST
+            ]
+        )
 
     def seconds(self, spec: RunSpec) -> float:
         """Of a run, from its start to its end."""
-        labels = _labels(spec)
-        seeding = self._seeding.of(labels) * self._modelled_seeding(spec, None)
+        seeding = self._seeding.of(_by_method(spec)) * self._modelled_seeding(spec)
         if self.is_twin(spec):
             return seeding + READING
-        training = self._training.of(labels) * self._modelled_training(spec, None)
-        return seeding + training + self._around.of(labels) * self._modelled_around(spec, None)
+        training = self._training.of(_by_strategy(spec)) * self._modelled_training(spec)
+        around = self._around.of(_by_scene(spec)) * self._modelled_around(spec)
+        return seeding + training + self._looking(spec) + around
+
+    def of_all(self, specs: Iterable[RunSpec]) -> dict[str, float]:
+        """Seconds of several runs by their keys; what they share takes time in the first alone.
+
+        Args:
+            specs: In the order in which they are run.
+        """
+        known, found = set(self._known), {}
+        for spec in specs:
+            shared = _shared(spec)
+            found[spec.key] = self.seconds(spec)
+            if ("seeds", *shared) in known:
+                found[spec.key] -= self._seeding.of(_by_method(spec)) * self._modelled_seeding(spec)
+            if self._compares(spec):
+                if ("depths", *shared[::2]) in known:
+                    found[spec.key] -= self._looking(spec)
+                known.add(("depths", *shared[::2]))
+            if _makes(spec):
+                known.add(("seeds", *shared))
+        return found
 
     def is_twin(self, spec: RunSpec) -> bool:
         """Whether a run will take over the training of one that begins with the same seeds."""
@@ -154,26 +208,35 @@ class Estimator:
         """Bytes that a run needs meanwhile: its Gaussians, and two moments of each number."""
         return 3.0 * self._counts(spec)[1] * _bytes_each(spec.settings)
 
-    def _fitted(self, rows: Sequence[RunRow], measured: Measured, modelled: Modelled) -> _Factors:
-        seen = []
-        for row in rows:
-            took, said = measured(row), modelled(row.spec, row.result)
-            if took > LEAST and said > 0:
-                seen.append((_labels(row.spec), took / said))
-        return _Factors(seen)
-
-    def _modelled_training(self, spec: RunSpec, result: RunResult | None) -> float:
+    def _modelled_training(self, spec: RunSpec, result: RunResult | None = None) -> float:
         first, last = (
             self._counts(spec) if result is None else (result.num_seeds, result.num_gaussians)
         )
         return self._step(spec, (first + last) / 2) * spec.training.max_steps
 
-    def _modelled_around(self, spec: RunSpec, result: RunResult | None) -> float:
+    def _stepping(self, row: RunRow) -> float:
+        """Seconds of a finished run's steps, without looking for depth, as far as that is known."""
+        took = _train_seconds(row)
+        return max(took - self._looking(row.spec), LEAST_STEPPING * took)
+
+    def _looking(self, spec: RunSpec) -> float:
+        """Seconds of training that go into looking for depth, which growth does."""
+        if not self._compares(spec):
+            return 0.0
+        known = next((name for name in COMPARING if self._seeding.knows(name)), AUTO)
+        return self._seeding.of((known,)) * self._comparing(spec)
+
+    def _compares(self, spec: RunSpec) -> bool:
+        """Whether training looks for depth in the photographs, which seeding has not paid for."""
+        looks = spec.settings.densification == "grow" and spec.settings.placing == "stereo"
+        return looks and not self.is_twin(spec) and spec.arm.method != AUTO
+
+    def _modelled_around(self, spec: RunSpec, result: RunResult | None = None) -> float:
         last = self._counts(spec)[1] if result is None else result.num_gaussians
         tests = -(-self._scenes[spec.scene_digest].num_images // spec.training.test_every)
         return self._speed(spec).around + TESTS * tests * RENDER_SHARE * self._step(spec, last)
 
-    def _modelled_seeding(self, spec: RunSpec, _result: RunResult | None) -> float:
+    def _modelled_seeding(self, spec: RunSpec) -> float:
         scene, method = self._scenes[spec.scene_digest], spec.arm.method
         points = scene.num_points
         if method == SFM:
@@ -182,7 +245,12 @@ class Estimator:
             return SECONDS_A_POINT * (points + self._made(spec))
         if self.is_twin(spec) and method == AUTO:  # it looks at no photograph then
             return SECONDS_A_POINT * points
-        return SECONDS_A_VIEW * scene.num_images * CORES_MEASURED / self._threads
+        return self._comparing(spec) * (COVERING if method == COVER else 1.0)
+
+    def _comparing(self, spec: RunSpec) -> float:
+        """Seconds of comparing a scene's photographs with each other."""
+        images = self._scenes[spec.scene_digest].num_images
+        return SECONDS_A_VIEW * images * CORES_MEASURED / self._threads
 
     def _made(self, spec: RunSpec) -> float:
         """Points in all that a method makes, before they are thinned."""
@@ -213,11 +281,14 @@ class Estimator:
         return cores * self._speed(spec).step(gaussians, self._pixels(spec))
 
 
-Measured: TypeAlias = Callable[[RunRow], float]
-Modelled: TypeAlias = Callable[[RunSpec, RunResult | None], float]
-
-AUTO = "auto"
-PHOTOGRAPHS = frozenset({AUTO, "cover"})
+AUTO, COVER = "auto", "cover"
+PHOTOGRAPHS = frozenset({AUTO, COVER})
+COMPARING = ("stereo", AUTO)
+"""Methods whose time tells how long comparing photographs takes."""
+LEAST_STEPPING = 0.3
+"""Of training's time, what steps take at least."""
+COVERING = 0.1
+"""What looking for gaps takes, as a share of comparing photographs."""
 FILLING = frozenset({SFM, *PHOTOGRAPHS, "linear", "triangle", "spline", "mls", "voronoi", "random",
                      "depth"})  # fmt: skip
 """Methods that add nothing where the originals fill the budget."""
@@ -229,13 +300,35 @@ def _densification(spec: RunSpec) -> Densification:
     return spec.settings.densification
 
 
-def _labels(spec: RunSpec) -> Labels:
-    return (
-        ("scene", spec.scene_digest),
-        ("strategy", spec.arm.strategy),
-        ("method", spec.arm.method),
-        ("budget", spec.arm.budget),
-    )
+def _makes(spec: RunSpec) -> bool:
+    """Whether a run's method looks at photographs, so that what it makes is kept for others."""
+    return spec.arm.method in METHODS and chooses_number(spec.arm.method)
+
+
+def _shares(spec: RunSpec) -> bool:
+    """Whether a run may have taken less time than it counts."""
+    return _makes(spec) or spec.settings.densification == "grow"
+
+
+def _shared(spec: RunSpec) -> tuple[object, ...]:
+    """What runs of the same seeds have in common; every other word of it, of the same depth."""
+    return spec.scene_digest, spec.arm.method, spec.repeat
+
+
+def _by_strategy(spec: RunSpec) -> Names:
+    return spec.scene_digest, spec.arm.strategy
+
+
+def _by_method(spec: RunSpec) -> Names:
+    return (spec.arm.method,)
+
+
+def _by_scene(spec: RunSpec) -> Names:
+    return (spec.scene_digest,)
+
+
+def _of(row: RunRow) -> tuple[RunSpec, RunResult | None]:
+    return row.spec, row.result
 
 
 def _measured_growth(done: Sequence[RunRow]) -> dict[tuple[str, float | None], float]:

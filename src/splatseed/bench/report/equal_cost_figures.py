@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from splatseed.bench.analysis.equal_cost import Arm, Compared, baseline_of, compared_arms
+from splatseed.bench.analysis.arms.compared import Arm, Compared, baseline_of, compared_arms
 from splatseed.bench.analysis.study import Cell as Runs, Study
 from splatseed.bench.report.drawing import (
     MANY,

@@ -8,14 +8,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
+from splatseed.bench.analysis.arms.advice import advice_table, score_advice
+from splatseed.bench.analysis.arms.compared import compared_arms
+from splatseed.bench.analysis.arms.tables import arm_table, scene_arm_table, seconds_table
 from splatseed.bench.analysis.comparisons import equal_count_table, ratio_table, strategy_table
 from splatseed.bench.analysis.convergence import convergence_table
 from splatseed.bench.analysis.costs import cost_table, quality_table
 from splatseed.bench.analysis.descriptors import Descriptors
-from splatseed.bench.analysis.equal_cost import compared_arms
-from splatseed.bench.analysis.equal_cost_tables import arm_table, scene_arm_table, seconds_table
 from splatseed.bench.analysis.gains import gains
 from splatseed.bench.analysis.guidelines import (
+    FEWEST,
     guideline_table,
     guidelines,
     scene_table,
@@ -148,5 +150,8 @@ def _guidelines(study: Study, described: Mapping[str, Descriptors]) -> Iterable[
         yield winner_table(found, described)
         if derived:
             yield guideline_table(derived, strategy)
+    if study.settings["budget"]:
+        scores = [score_advice(study, strategy) for strategy in study.strategies]
+        yield from (advice_table(each) for each in scores if len(each.scenes) >= FEWEST)
     if described:
         yield scene_table(described)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseed.bench.analysis.equal_cost_tables import answer_at_equal_cost
+from splatseed.bench.analysis.arms.tables import answer_at_equal_cost
 from splatseed.bench.analysis.study import Study, studies
 from splatseed.bench.analysis.summary import summary
 from splatseed.bench.analysis.tables import Table, write_table

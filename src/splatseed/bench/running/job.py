@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from splatseed.bench.planning.digest import depth_digest, scene_digest
 from splatseed.bench.planning.records import RunResult, RunSpec
@@ -27,7 +27,7 @@ from splatseed.bench.running.kept import (
     result_bytes,
     write_kept,
 )
-from splatseed.bench.running.seeds import make_seeds, scene_of
+from splatseed.bench.running.seeds import is_full, make_seeds, scene_of
 from splatseed.bench.running.twins import find_twin, fingerprint, note_training
 from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.output.staging import check_output
@@ -36,6 +36,7 @@ from splatseed.process.peak import peak_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
+from splatseed.seeding.upsampling import DEFAULT_METHOD
 from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
@@ -46,8 +47,8 @@ if TYPE_CHECKING:  # PyTorch, which takes a while
 __all__ = ["JobOptions", "Outcome", "run_job"]
 
 TRAIN = "train"
-COVISIBLE = "covisible"
-"""The folder of what is known of test views' pixels, beside the ledger."""
+COVISIBLE, DEPTHS = "covisible", "depths"
+"""The folders of what is known of test views' pixels and of depth by stereo, beside the ledger."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,8 @@ def _train(
     if twin is not None:
         write_kept(target, {**twin[1], RESULT: result_bytes(spec, twin[0])})
         return twin[0]
-    run = _prepare(scene.replace(points=seeds), work, spec, progress)
+    bench = target.parent.parent
+    run = _prepare(scene.replace(points=seeds), work, spec, bench, progress)
     if not run.train(lambda step: progress(TRAIN, step / spec.training.max_steps)):
         return None
     with interruption():
@@ -159,18 +161,29 @@ def _check_unchanged(scene: Scene, spec: RunSpec) -> None:
         )
 
 
-def _prepare(scene: Scene, work: Path, spec: RunSpec, progress: Progress) -> TrainingRun:
-    """A run that goes on where it stopped; if it cannot, one that begins."""
+def _prepare(
+    scene: Scene, work: Path, spec: RunSpec, bench: Path, progress: Progress
+) -> TrainingRun:
+    """A run that goes on where it stopped; if it cannot, one that begins.
+
+    What stereo knows, for growth, is found once for all runs of a repeat, and its time counts in
+    each; not where seeds by ``auto`` have paid for it, as ``splatseed train`` shares the two.
+    """
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (PyTorch)
 
-    cache = user_cache_dir()
+    every = spec.training.test_every
+    ways: dict[str, Any] = {
+        "cache_dir": user_cache_dir(),
+        "depths": bench / DEPTHS / f"{spec.scene_digest}_{every}_{spec.repeat}.npz",
+        "seeding_knew": spec.arm.method == DEFAULT_METHOD and not is_full(scene, spec),
+    }
     try:
-        resume = RunOptions(resume=True, cache_dir=cache)
+        resume = RunOptions(resume=True, **ways)
         return prepare_run(scene, work, spec.settings, resume, progress=progress)
     except SplatseedError:
         if not work.exists():
             raise
-    anew = RunOptions(overwrite=True, cache_dir=cache)
+    anew = RunOptions(overwrite=True, **ways)
     return prepare_run(scene, work, spec.settings, anew, progress=progress)
 
 

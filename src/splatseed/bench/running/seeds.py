@@ -26,7 +26,7 @@ from splatseed.seeding.thinning import thin_to
 from splatseed.seeding.upsampling import CELL, DEFAULT_METHOD, upsample
 from splatseed.upsample import Upsampler, chooses_number, configure
 
-__all__ = ["make_seeds", "scene_of"]
+__all__ = ["is_full", "make_seeds", "scene_of"]
 
 PLAIN = "linear"
 """Any method does where no point is to be made."""
@@ -61,7 +61,8 @@ def make_seeds(
     if spec.arm.method == SFM and spec.most_seeds is None:
         return scene.points, 0.0
     method, numbers = _asked(scene, spec)
-    if bench is not None and chooses_number(spec.arm.method) and not _is_full(scene, spec):
+    looks = spec.arm.method != SFM and chooses_number(spec.arm.method)
+    if bench is not None and looks and not is_full(scene, spec):
         return _thinned(scene, method, spec, bench, progress)
     with _compilation() as compiling:
         start = time.perf_counter()
@@ -72,7 +73,7 @@ def make_seeds(
     return seeds.select(seeds.distinct), max(seconds - sum(compiling), 0.0)
 
 
-def _is_full(scene: Scene, spec: RunSpec) -> bool:
+def is_full(scene: Scene, spec: RunSpec) -> bool:
     """Whether ``auto`` makes no points, as the originals fill the budget."""
     most = spec.most_seeds
     return spec.arm.method == DEFAULT_METHOD and most is not None and _num_original(scene) >= most

@@ -79,7 +79,7 @@ def _run_all(
     _announce(bench, prepared, machine, rows, estimator)
     if not to_do:
         return True
-    expected = {spec.key: estimator.seconds(spec) for spec in to_do}
+    expected = estimator.of_all(to_do)
     with run_display(expected, len(rows) - len(to_do), machine.jobs) as display:
         return machine.run(ledger, bench, prepared.keys, options, display)
 
@@ -155,7 +155,7 @@ def _estimates(
     left = [row.spec for row in rows if row.status in {"pending", "running"}]
     if not left:
         return []
-    seconds = sum(map(estimator.seconds, left)) / min(machine.jobs, len(left))
+    seconds = sum(estimator.of_all(left).values()) / min(machine.jobs, len(left))
     measured = estimator.num_measured
     by = f"by {measured} finished runs" if measured else "by a rough model, until runs are finished"
     return [f"about {spoken_time(seconds)} ({by}), {_disk(plan, left, machine.jobs, estimator)}"]

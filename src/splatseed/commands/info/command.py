@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from splatseed.commands.info.advice import Planned, advice_commands, advice_for, advice_rows
 from splatseed.commands.info.as_json import print_json
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
@@ -27,6 +28,7 @@ from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
 from splatseed.literal import quoted
 from splatseed.scene import Scene
+from splatseed.train.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth import Alignment
@@ -62,6 +64,16 @@ class Options:
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
     picture: Annotated[Path | None, _path("FILE")] = None
     """Write a PNG of depth beside photographs, and of where the two disagree."""
+    budget: Annotated[
+        str | None,
+        tyro.conf.arg(
+            constructor=str, metavar="N|Xrho", help_behavior_hint="(default: as splatseed train's)"
+        ),
+    ] = None
+    """Gaussians that you plan to end with: a number, or per pixel of a photograph. The advice
+    depends on it."""
+    max_steps: int = FULL_RUN
+    """Steps that you plan to train; the advice depends on them."""
     list_all: Annotated[bool, tyro.conf.arg(name="all")] = False
     """List the depth of all images, not only of the worst."""
     json: bool = False
@@ -82,7 +94,7 @@ def run(arguments: list[str]) -> None:
         print_json(scene, cloud, tracks, regions, alignments, find_problems(scene, cloud, regions))
         return
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
-    rows += _method_rows(options, scene)
+    rows += _advice_rows(options, scene, regions)
     print_pairs(str(options.scene), rows)
     if alignments is not None:
         from splatseed.commands.info.depth_numbers import print_depth  # noqa: PLC0415  (loads Numba)
@@ -135,7 +147,8 @@ def _next_command(options: Options, scene: Scene) -> str:
         maps = quoted(options.depth)
         return f"splatseed upsample {scene_dir} --method depth --depth {maps} --ratio 16 -o OUT"
     if len(scene.points) and scene.has_photographs:
-        return f"splatseed upsample {scene_dir} -o OUT"
+        planned = Planned.of(scene, options.budget, options.max_steps)
+        return advice_commands(options.scene, advice_for(scene, planned, None)[0], planned)[0][1]
     if len(scene.points):
         return f"splatseed upsample {scene_dir} --method mls --ratio 8 -o OUT"
     images = scene.source.image_dir if scene.source else None
@@ -190,15 +203,15 @@ def _spread(mean: float, percentiles: tuple[float, ...], style: str) -> str:
     return f"mean {mean:{style}}, 5/25/50/75/95% {spread}"
 
 
-def _method_rows(options: Options, scene: Scene) -> list[tuple[str, str]]:
-    """The method that would make the best points for this scene, and why."""
+def _advice_rows(
+    options: Options, scene: Scene, regions: EmptyRegions | None
+) -> list[tuple[str, str]]:
+    """What to do before training, and why; photographs are not looked at for it."""
     if not len(scene.points):
         return []
-    if options.depth is not None:
-        return [("method", "depth: there are depth maps")]
-    if not scene.has_photographs:
-        return [("method", "mls: the scene has no photographs")]
-    return [("method", "auto: stereo between the photographs, and a seed where no point is seen")]
+    planned = Planned.of(scene, options.budget, options.max_steps)
+    empty = None if regions is None else regions.mean
+    return advice_rows(*advice_for(scene, planned, empty), planned)
 
 
 def _region_rows(regions: EmptyRegions | None) -> list[tuple[str, str]]:

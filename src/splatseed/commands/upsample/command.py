@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from splatseed.commands.info.advice import run_advice
 from splatseed.commands.options import parse_options
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
 from splatseed.commands.upsample.start import check_start, write_start
@@ -181,6 +182,9 @@ def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
 
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
+    if _asks_what_to_do(arguments):
+        run_advice(arguments)
+        return
     options, methods = parse(arguments)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     inputs = [path for path in (options.scene, options.depth_maps) if path is not None]
@@ -215,6 +219,12 @@ def run(arguments: list[str]) -> None:
     summarise(scene, seeds, report, seconds, checks, options.output, options.preview)
     for sentence in notes:
         print_note(sentence)
+
+
+def _asks_what_to_do(arguments: Sequence[str]) -> bool:
+    """Whether neither an output nor a method is named, but a scene."""
+    named = ("-o", "--output", "--method", "-h", "--help", HELP_ALL)
+    return bool(arguments) and not any(word.partition("=")[0] in named for word in arguments)
 
 
 def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:

@@ -1,6 +1,6 @@
 """Tables of arms at equal numbers of Gaussians and at equal seconds, and what they say in words.
 
-Notation and promise: see ``splatseed.bench.analysis.equal_cost``.
+Notation and promise: see ``splatseed.bench.analysis.arms.compared``.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from splatseed.bench.analysis.equal_cost import Arm, Compared, baseline_of, compared_arms
+from splatseed.bench.analysis.arms.compared import Arm, Compared, baseline_of, compared_arms
 from splatseed.bench.analysis.psnr_tables import gain_cell
 from splatseed.bench.analysis.statistics import Difference
 from splatseed.bench.analysis.study import BASELINE, Study

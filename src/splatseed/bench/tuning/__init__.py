@@ -1,0 +1,1 @@
+"""Tuning: which seeds and which strategy are best for one scene, by short runs on that scene."""

@@ -1,0 +1,160 @@
+"""Successive halving: many arms in short runs, the best of them in longer ones.
+
+Notation: a *rung* trains some arms for a number of steps; the best go on to the next, which has
+twice the steps. The *baseline* (the scene's own points with ``default``) is in every rung. Promise:
+arms are ranked by validation views alone; what is said at the end rests on the last rung that is
+done, paired by view and repeat (Jamieson and Talwalkar 2016; here every rung trains anew, as a
+run's schedule depends on its length).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+
+import numpy as np
+
+from splatseed.bench.analysis.statistics import Difference, over_scenes
+from splatseed.bench.planning.records import SFM, Arm, RunResult
+
+__all__ = ["BASELINE", "Rung", "Verdict", "best_arms", "is_baseline", "plan_rungs", "verdict"]
+
+BASELINE = (SFM, "default")
+"""Method and strategy that all else is compared with."""
+KEPT = (1.0, 1 / 3, 1 / 6)
+"""Shares of the arms in each rung; the last repeats its runs."""
+LAST_REPEATS = 2
+LEAST_STEPS = 100
+Results = Mapping[Arm, Mapping[int, RunResult]]
+"""Results by arm and repeat."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """A rung.
+
+    Args:
+        steps: Of each run.
+        arms: How many arms it has, the baseline among them.
+        repeats: Runs of each.
+    """
+
+    steps: int
+    arms: int
+    repeats: int
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the last rung says.
+
+    Args:
+        winner: The arm with the highest mean PSNR.
+        gain: Its PSNR less the baseline's, dB: mean over validation views, with its error over
+            them.
+        steps: Of the runs it rests on.
+        views: Validation views.
+        repeats: Runs of each arm.
+        ranking: All arms of that rung with their mean PSNR in dB, the best first.
+    """
+
+    winner: Arm
+    gain: Difference
+    steps: int
+    views: int
+    repeats: int
+    ranking: tuple[tuple[Arm, float], ...]
+
+
+def is_baseline(arm: Arm) -> bool:
+    """Whether an arm is what all others are compared with."""
+    return (arm.method, arm.strategy) == BASELINE
+
+
+def plan_rungs(
+    num_arms: int, seconds: float, most_steps: int, cost: Callable[[Sequence[Rung]], float]
+) -> tuple[Rung, ...]:
+    """Rungs that fit a time, as long as they can be.
+
+    Args:
+        num_arms: Arms in all.
+        seconds: The time.
+        most_steps: Steps of the last rung, at most.
+        cost: Seconds that some rungs take.
+
+    Returns:
+        At least the shortest that there are, also where these do not fit.
+    """
+
+    def rungs(steps: int) -> tuple[Rung, ...]:
+        counts = [max(2, round(part * num_arms)) for part in KEPT]
+        last = len(KEPT) - 1
+        return tuple(
+            Rung(steps << i, min(count, num_arms), LAST_REPEATS if i == last else 1)
+            for i, count in enumerate(counts)
+        )
+
+    low, high = LEAST_STEPS, max(most_steps >> (len(KEPT) - 1), LEAST_STEPS)
+    while high - low > LEAST_STEPS // 10:
+        middle = (low + high) // 2
+        low, high = (middle, high) if cost(rungs(middle)) <= seconds else (low, middle)
+    return rungs(low)
+
+
+def best_arms(results: Results, count: int) -> tuple[Arm, ...]:
+    """So many arms with the highest mean PSNR; the baseline is one of them in any case.
+
+    Args:
+        results: Of a rung.
+        count: How many, at least 2.
+    """
+    ranked = [arm for arm, _ in _ranking(results)]
+    chosen = ranked[:count]
+    base = [arm for arm in ranked if is_baseline(arm)]
+    return tuple(chosen if set(base) <= set(chosen) else [*chosen[: count - 1], *base])
+
+
+def _ranking(results: Results) -> list[tuple[Arm, float]]:
+    means = [(arm, fmean(r.psnr for r in runs.values())) for arm, runs in results.items() if runs]
+    return sorted(means, key=lambda pair: -pair[1])
+
+
+def verdict(results: Results, steps: int) -> Verdict | None:
+    """What a rung says; None where it has no run of the baseline, or no other.
+
+    Args:
+        results: Of the rung.
+        steps: Of its runs.
+    """
+    ranking = _ranking(results)
+    base = next((arm for arm, _ in ranking if is_baseline(arm)), None)
+    if base is None or len(ranking) < 2:
+        return None
+    winner = ranking[0][0]
+    gains = _by_view(results[base], results[winner])
+    if not len(gains):
+        return None
+    return Verdict(
+        winner,
+        over_scenes(gains),
+        steps,
+        len(gains),
+        len(results[winner].keys() & results[base].keys()),
+        tuple(ranking),
+    )
+
+
+def _by_view(base: Mapping[int, RunResult], own: Mapping[int, RunResult]) -> np.ndarray:
+    """Differences of PSNR by view, mean over the repeats that both have, [V]."""
+    shared = sorted(base.keys() & own.keys())
+    gains = [_of_views(own[r]) - _of_views(base[r]) for r in shared]
+    mean = np.mean(gains, axis=0) if gains else np.zeros(0)
+    return np.asarray(mean[np.isfinite(mean)])
+
+
+def _of_views(result: RunResult) -> np.ndarray:
+    scores = {view.name: view.psnr for view in result.scores.per_image}
+    values = np.array([scores[name] for name in sorted(scores)])
+    return np.where(np.isfinite(values), values, math.nan)

@@ -1,0 +1,164 @@
+"""What to do with a scene before training, as ``info`` and ``upsample`` say it.
+
+Promise: nothing is written; without ``looked_at`` no photograph is opened.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from splatseed.commands.options import parse_options
+from splatseed.console import OUT, print_commands, print_pairs, stage_display
+from splatseed.diagnostics.scene import empty_regions
+from splatseed.io import load_scene
+from splatseed.literal import quoted
+from splatseed.progress import Progress
+from splatseed.scene import Scene
+from splatseed.seeding.advice import (
+    AS_IT_IS,
+    Advice,
+    Measured,
+    advise,
+    measure,
+    stereo_agreement,
+)
+from splatseed.train.schedule import FULL_RUN
+from splatseed.train.seeds import SEEDS_SHARE
+from splatseed.train.settings import BUDGET, TrainSettings
+
+__all__ = ["Planned", "advice_commands", "advice_for", "advice_rows", "run_advice"]
+
+Budget = Annotated[
+    str | None,
+    tyro.conf.arg(
+        constructor=str,
+        metavar="N|Xrho",
+        help_behavior_hint="(default: 1rho, as splatseed train's)",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Planned:
+    """How a scene is to be trained.
+
+    Args:
+        budget: Gaussians at the end, at most.
+        max_steps: Training steps.
+        strategy: What ``splatseed train`` takes for so many steps.
+        most_seeds: Seeds that it begins with at most.
+    """
+
+    budget: int
+    max_steps: int
+    strategy: str
+    most_seeds: int
+
+    @classmethod
+    def of(cls, scene: Scene, budget: str | None, max_steps: int) -> Planned:
+        """The plan that the options make for a scene.
+
+        Raises:
+            ParameterError: One of them is out of its range.
+        """
+        sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
+        pixels = round(float(np.median(sizes))) if sizes else BUDGET
+        number = max(2, min(BUDGET, pixels))
+        if budget is not None:
+            from splatseed.seeding.thinning import points_within  # noqa: PLC0415  (loads Numba)
+
+            number = max(2, points_within(scene, budget))
+        settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
+        share = SEEDS_SHARE.get(settings.densification, 1.0)
+        return cls(number, max_steps, settings.densification, max(2, round(share * number)))
+
+
+def advice_for(
+    scene: Scene, planned: Planned, empty: float | None, progress: Progress | None = None
+) -> tuple[Advice, Measured]:
+    """What to do, and what it rests on.
+
+    Args:
+        scene: The scene.
+        planned: How it is to be trained.
+        empty: Share of the pictures without points, if known.
+        progress: Told how far it is; where it is given, stereo is tried on a few photographs, if
+            there is room for what it may find.
+    """
+    found = measure(scene, empty)
+    said = advise(found, planned.most_seeds)
+    if progress is not None and said.method == "auto" and found.num_points:
+        found = replace(found, agreement=stereo_agreement(scene, progress=progress))
+        said = advise(found, planned.most_seeds)
+    return said, found
+
+
+def advice_rows(advice: Advice, found: Measured, planned: Planned) -> list[tuple[str, str]]:
+    """The advice as a table's rows: what, why, and for which training."""
+    layout = [("cameras stand", found.layout)] if found.layout else []
+    why = [("why" if i == 0 else "", reason) for i, reason in enumerate(advice.reasons)]
+    plan = (
+        f"{planned.budget:,} Gaussians at most, {planned.max_steps:,} steps, strategy "
+        f"{planned.strategy}"
+    )
+    return [*layout, ("planned", plan), ("advice", advice.sentence), *why]
+
+
+def advice_commands(scene: Path, advice: Advice, planned: Planned) -> list[tuple[str, str]]:
+    """The commands that follow the advice."""
+    source = quoted(scene)
+    training = f"--cap-max {planned.budget} --max-steps {planned.max_steps} -o RUN"
+    tune = ("or ask by experiment", f"splatseed tune {source} --minutes 30")
+    if advice.method == AS_IT_IS:
+        return [("train", f"splatseed train {source} --seeds scene {training}"), tune]
+    if advice.method == "auto":
+        return [
+            ("seeds", f"splatseed upsample {source} --budget {planned.most_seeds} -o OUT"),
+            ("train", f"splatseed train OUT {training}"),
+            tune,
+        ]
+    seeds = f"splatseed upsample {source} --method {advice.method} --ratio 4 -o OUT"
+    return [("seeds", seeds), ("train", f"splatseed train OUT {training}")]
+
+
+@dataclass(frozen=True)
+class _Options:
+    """Say what to do with a scene's points before training, and why; write nothing.
+
+    With --output or --method, points are added: see splatseed upsample --help.
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """The scene."""
+    budget: Budget = None
+    """Gaussians that training may end with: a number, or per pixel of a photograph."""
+    max_steps: int = FULL_RUN
+    """Steps that you plan to train."""
+
+
+def run_advice(arguments: list[str]) -> None:
+    """``splatseed upsample SCENE`` without a method and without an output.
+
+    Args:
+        arguments: The words after the verb.
+    """
+    options = parse_options(_Options, "upsample", arguments)
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = load_scene(options.scene, require_points=False)
+        planned = Planned.of(scene, options.budget, options.max_steps)
+        regions = empty_regions(scene, clock)
+        empty = None if regions is None else regions.mean
+        advice, found = advice_for(scene, planned, empty, clock)
+    print_pairs(str(options.scene), advice_rows(advice, found, planned))
+    OUT.print(
+        "\nThe rules rest on runs of a few scenes (docs/methods.md); splatseed tune asks this "
+        "very scene.",
+        soft_wrap=True,
+    )
+    print_commands("next", advice_commands(options.scene, advice, planned))

@@ -1,0 +1,330 @@
+"""``splatseed tune``: which seeds and which strategy are best for this scene, by experiment."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import sys
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from splatseed.bench.planning.estimate import Estimator
+from splatseed.bench.planning.plan import Plan, PlannedScene, plan_runs
+from splatseed.bench.planning.records import SFM, Arm, RunResult, RunSpec
+from splatseed.bench.planning.scenes import SceneFacts, survey
+from splatseed.bench.running.environment import describe_environment, package_version
+from splatseed.bench.running.folder import check_bench_folder, make_bench_folder
+from splatseed.bench.running.job import JobOptions
+from splatseed.bench.running.ledger import LEDGER, Ledger
+from splatseed.bench.tuning.halving import Rung, Verdict, best_arms, plan_rungs, verdict
+from splatseed.bench.tuning.validation import make_validation_scene
+from splatseed.commands.bench.display import run_display, spoken_time
+from splatseed.commands.bench.machine import Machine, open_machine
+from splatseed.commands.bench.options import Options as BenchOptions
+from splatseed.commands.options import parse_options
+from splatseed.console import OUT, print_commands, print_note, print_table, stage_display
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io.output.staging import atomic_file
+from splatseed.literal import quoted, visible
+from splatseed.process.interruption import exit_code
+from splatseed.train.settings import Backend, StrategyName, TrainSettings
+
+__all__ = ["Options", "run"]
+
+TUNING = "tune.json"
+SCENE = "scene"
+MINUTE = 60.0
+METHODS = (SFM, "mls", "stereo", "cover", "auto")
+STRATEGIES: tuple[StrategyName, ...] = ("default", "grow", "mcmc")
+TEST_EVERY = 8
+
+
+def _number(kind: type, default: str) -> Any:
+    return tyro.conf.arg(
+        constructor=kind,
+        metavar=kind.__name__.upper(),
+        help_behavior_hint=f"(default: {default})",
+    )
+
+
+@dataclass(frozen=True)
+class Options:
+    """Find the best seeds and strategy for a scene by short runs on it, at one number of Gaussians.
+
+    Test views are never looked at: every 8th of the other views is held out to choose by. Many
+    arms are trained a little, the best of them longer. Stop it when you like: the same command goes
+    on.
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """The scene, with photographs."""
+    minutes: float = 30.0
+    """How long to take, about."""
+    output: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            aliases=["-o"],
+            constructor=Path,
+            metavar="DIR",
+            help_behavior_hint="(default: tune_ and the scene's name, here)",
+        ),
+    ] = None
+    """The folder of its runs."""
+    budget: str = "0.25rho"
+    """Gaussians at the end: a number, or per pixel of a photograph at the size that is trained."""
+    max_steps: int = 7000
+    """Steps that you plan to train; the last runs have no more than that."""
+    long_side: int = 400
+    """Make photographs smaller by a whole factor until their longer side has at most so many
+    pixels."""
+    methods: tuple[str, ...] = METHODS
+    """Seeds to try."""
+    strategies: tuple[StrategyName, ...] = STRATEGIES
+    """Strategies to try."""
+    jobs: Annotated[int | None, _number(int, "one per GPU, else 1")] = None
+    """Runs at a time."""
+    threads: Annotated[int | None, _number(int, "the cores shared out")] = None
+    """Threads of each run on the CPU."""
+    backend: Backend = "auto"
+    """Where to train; auto takes a GPU if PyTorch sees one."""
+
+
+@dataclass(frozen=True)
+class _Study:
+    """A scene that is tuned: what all its rungs have in common."""
+
+    options: Options
+    folder: Path
+    facts: SceneFacts
+    machine: Machine
+    ledger: Ledger
+
+    def specs(self, rung: Rung, arms: Collection[Arm] | None = None) -> list[RunSpec]:
+        """The runs of a rung: of these arms, or of all."""
+        options = self.options
+        plan = Plan(
+            scenes=(PlannedScene(self.facts.path, self.facts.name),),
+            methods=options.methods,
+            ratios=(),
+            budgets=(options.budget,),
+            strategies=options.strategies,
+            repeats=rung.repeats,
+            training=TrainSettings(max_steps=rung.steps, test_every=TEST_EVERY),
+            long_side=options.long_side,
+        )
+        backend = self.machine.backend
+        runs = plan_runs(plan, [self.facts], backend, package_version("splatseed"))
+        return [spec for spec in runs if arms is None or spec.arm in arms]
+
+    def results(self, specs: Sequence[RunSpec]) -> dict[Arm, dict[int, RunResult]]:
+        """What is done of some runs, by arm and repeat."""
+        keys = {spec.key for spec in specs}
+        found: dict[Arm, dict[int, RunResult]] = defaultdict(dict)
+        for row in self.ledger.rows():
+            if row.spec.key in keys and row.result and math.isfinite(row.result.psnr):
+                found[row.spec.arm][row.spec.repeat] = row.result
+        return dict(found)
+
+
+def run(arguments: list[str]) -> None:
+    """Do what the command line asks for."""
+    options = parse_options(Options, "tune", arguments)
+    _check(options)
+    folder = options.output or Path(f"tune_{options.scene.resolve().name}")
+    check_bench_folder(folder, [options.scene])
+    asked = BenchOptions(jobs=options.jobs, threads=options.threads)
+    with open_machine(asked, options.backend) as machine:
+        study = _open(options, folder, machine, arguments)
+        rungs = _rungs(study)
+        _announce(study, rungs)
+        ended = _climb(study, rungs)
+    _report(study, rungs)
+    if not ended:
+        sys.exit(exit_code())
+
+
+def _check(options: Options) -> None:
+    if not options.minutes > 0:
+        raise ParameterError("--minutes above 0", found=f"{options.minutes}", fix="Give some.")
+    for name, needed in (("methods", SFM), ("strategies", "default")):
+        if needed not in getattr(options, name):
+            raise ParameterError(
+                f"{needed} among --{name}, with which all else is compared",
+                found=" ".join(getattr(options, name)),
+                fix="Add it.",
+            )
+
+
+def _open(options: Options, folder: Path, machine: Machine, arguments: Sequence[str]) -> _Study:
+    with stage_display() as clock:
+        clock("read", 0.0)
+        make_bench_folder(folder)
+        path = make_validation_scene(options.scene, folder / SCENE, TEST_EVERY)
+        facts = survey(path, options.scene.resolve().name, progress=clock)
+    ledger = Ledger.open(folder / LEDGER)
+    ledger.note_session(describe_environment(["tune", *arguments]))
+    return _Study(options, folder, facts, machine, ledger)
+
+
+def _rungs(study: _Study) -> tuple[Rung, ...]:
+    """The rungs that were planned when the folder was begun, or new ones."""
+    path, asked = study.folder / TUNING, _asked(study.options)
+    if path.is_file():
+        try:
+            kept = json.loads(path.read_text("utf-8"))
+            rungs = tuple(Rung(**each) for each in kept["rungs"])
+        except (OSError, ValueError, KeyError, TypeError):
+            raise SceneFormatError(
+                f"{path} as splatseed tune writes it", found="something else", fix="Remove it."
+            ) from None
+        if kept["asked"] != asked:
+            raise ParameterError(
+                f"the options that {study.folder} was begun with",
+                found="others",
+                fix="Repeat those, or name another folder with -o.",
+            )
+        return rungs
+    estimator = _estimator(study)
+
+    def cost(rungs: Sequence[Rung]) -> float:
+        return sum(_seconds(study, rung, estimator) for rung in rungs)
+
+    num_arms = len({spec.arm for spec in study.specs(Rung(100, 0, 1))})
+    seconds = study.options.minutes * MINUTE
+    rungs = plan_rungs(num_arms, seconds, study.options.max_steps, cost)
+    content = {"asked": asked, "rungs": [asdict(each) for each in rungs]}
+    with atomic_file(path) as partial:
+        partial.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+    return rungs
+
+
+def _asked(options: Options) -> dict[str, Any]:
+    """The options that decide on the rungs."""
+    told = ("minutes", "budget", "max_steps", "long_side", "methods", "strategies")
+    values = {name: getattr(options, name) for name in told}
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
+
+
+def _estimator(study: _Study) -> Estimator:
+    return Estimator([study.facts], study.ledger.rows(), study.machine.threads)
+
+
+def _seconds(study: _Study, rung: Rung, estimator: Estimator) -> float:
+    """What a rung takes, if its arms are like the mean of all."""
+    specs = study.specs(rung)
+    share = rung.arms / len({spec.arm for spec in specs})
+    return share * sum(estimator.of_all(specs).values()) / study.machine.jobs
+
+
+def _announce(study: _Study, rungs: Sequence[Rung]) -> None:
+    estimator = _estimator(study)
+    seconds = sum(_seconds(study, rung, estimator) for rung in rungs)
+    steps = ", then ".join(f"{rung.arms} arms for {rung.steps:,} steps" for rung in rungs)
+    facts = study.facts
+    OUT.print(
+        f"{visible(facts.name)}: {facts.num_images} views that are not for the test, every "
+        f"{TEST_EVERY}th held out; {facts.num_points:,} points\n  -> {steps}, the last twice\n  -> "
+        f"about {spoken_time(seconds)}; {study.machine.words}\n  -> {visible(study.folder)}",
+        soft_wrap=True,
+    )
+    if seconds > 1.5 * study.options.minutes * MINUTE:
+        print_note(
+            "The shortest runs that say anything take longer than that: name fewer --methods or "
+            "--strategies."
+        )
+
+
+def _climb(study: _Study, rungs: Sequence[Rung]) -> bool:
+    """Do the rungs one after the other; whether it went to the end."""
+    arms: Collection[Arm] | None = None
+    for i, rung in enumerate(rungs):
+        specs = study.specs(rung, arms)
+        OUT.print(f"\n{rung.steps:,} steps, {len({spec.arm for spec in specs})} arms")
+        if not _do(study, specs):
+            return False
+        if i + 1 < len(rungs):
+            arms = best_arms(study.results(specs), rungs[i + 1].arms)
+    return True
+
+
+def _do(study: _Study, specs: Sequence[RunSpec]) -> bool:
+    """Do what is not done yet of some runs."""
+    study.ledger.add(specs)
+    keys = frozenset(spec.key for spec in specs)
+    done = {row.spec.key for row in study.ledger.rows() if row.status in {"done", "failed"}}
+    left = [spec for spec in specs if spec.key not in done]
+    if not left:
+        return True
+    estimator = _estimator(study)
+    expected = estimator.of_all(left)
+    with run_display(expected, len(specs) - len(left), study.machine.jobs) as display:
+        return study.machine.run(study.ledger, study.folder, keys, JobOptions(), display)
+
+
+def _report(study: _Study, rungs: Sequence[Rung]) -> None:
+    """What the longest runs that are done say, and the command that follows from it."""
+    said = _verdict(study, rungs)
+    if said is None:
+        print_note("Nothing can be said yet: the same command goes on.")
+        return
+    rows = [(arm.label, arm.strategy, f"{psnr:.2f}") for arm, psnr in said.ranking]
+    views = f"{said.views} validation views, {said.steps:,} steps"
+    print_table(f"\n{views}", ("seeds", "strategy", "PSNR, dB"), rows)
+    OUT.print(_sentence(said), soft_wrap=True)
+    print_commands("next", _commands(study, said))
+
+
+def _verdict(study: _Study, rungs: Sequence[Rung]) -> Verdict | None:
+    """What the highest rung with two arms and more says."""
+    for rung in reversed(rungs):
+        found = study.results(study.specs(rung))
+        said = verdict(found, rung.steps)
+        if said is not None:
+            return said
+    return None
+
+
+def _sentence(said: Verdict) -> str:
+    arm, gain = said.winner, said.gain
+    name = f"{arm.label} + {arm.strategy}"
+    if (arm.method, arm.strategy) == (SFM, "default"):
+        return "The scene's own points with strategy default are best: leave them as they are."
+    spread = f" ± {gain.se:.2f} (standard error over the views)" if not math.isnan(gain.se) else ""
+    sure = not math.isnan(gain.se) and abs(gain.mean) > 2 * gain.se
+    doubt = "" if sure else " That is within noise: sfm + default may do as well."
+    return f"Best is {name}: {gain.mean:+.2f} dB{spread} over sfm + default.{doubt}"
+
+
+def _commands(study: _Study, said: Verdict) -> list[tuple[str, str]]:
+    """The winner's commands, for the whole scene and the steps that are planned."""
+    options, arm = study.options, said.winner
+    spec = next(each for each in study.specs(Rung(said.steps, 0, 1)) if each.arm == arm)
+    spec = dataclasses.replace(
+        spec, training=dataclasses.replace(spec.training, max_steps=options.max_steps)
+    )
+    scene, name = options.scene, options.scene.resolve().name
+    seeded = f"{name}_{arm.method}"
+    commands = []
+    if arm.method != SFM:
+        hold = f" --{arm.method}.hold-out {TEST_EVERY}" if "hold_out" in spec.parameters else ""
+        number = (
+            "" if hold else f" --num-points {max(spec.most_seeds or 0, study.facts.num_points)}"
+        )
+        seeding = (
+            f"splatseed upsample {quoted(scene)} --method {arm.method}{hold}{number} "
+            f"--budget {spec.most_seeds} -o {quoted(seeded)}"
+        )
+        commands.append(("seeds", seeding))
+    source = quoted(scene) if arm.method == SFM else quoted(seeded)
+    training = (
+        f"splatseed train {source} --seeds scene --strategy {arm.strategy} --cap-max "
+        f"{spec.training.cap_max} --max-steps {options.max_steps} --data-factor "
+        f"{spec.training.data_factor} -o {quoted(f'run_{seeded}_{arm.strategy}')}"
+    )
+    return [*commands, ("training", training)]

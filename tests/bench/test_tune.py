@@ -1,0 +1,156 @@
+"""``splatseed tune``: test views are never read, halving keeps the best, and it can be stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="training needs PyTorch")
+pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
+
+from splatseed.bench.planning.records import Arm
+from splatseed.bench.running.executor import Executor
+from splatseed.bench.running.job import run_job
+from splatseed.bench.running.kept import kept_folder, work_folder
+from splatseed.bench.tuning import halving
+from splatseed.bench.tuning.halving import Rung, best_arms, plan_rungs, verdict
+from splatseed.bench.tuning.validation import make_validation_scene
+from splatseed.cli import main
+from splatseed.commands import tune
+from splatseed.commands.bench.machine import Machine
+from splatseed.errors import SceneNotFoundError
+from splatseed.io import load_scene
+from splatseed.scores import EvalResult, ViewScore
+from splatseed.synthetic import make_capture, write_capture
+
+from .planted import result
+
+SFM, GROW, AUTO, MLS = (
+    Arm(*words, budget="99")
+    for words in (
+        ("sfm", "default", 1, "default"), ("sfm", "default", 1, "grow"),
+        ("auto", "default", 0, "grow"), ("mls", "default", 0, "default"),
+    )
+)  # fmt: skip
+
+
+def _runs(*psnr, repeat=0):
+    views = tuple(ViewScore(f"{i}.png", value, 0.8, None, 0.01) for i, value in enumerate(psnr))
+    return {repeat: dataclasses.replace(result(0.0), scores=EvalResult(views, num_gaussians=9))}
+
+
+def test_the_baseline_stays_whatever_it_scores():
+    found = {SFM: _runs(20.0), GROW: _runs(23.0), AUTO: _runs(22.0), MLS: _runs(21.0)}
+    assert best_arms(found, 2) == (GROW, SFM)
+    assert best_arms(found, 4) == (GROW, AUTO, MLS, SFM)
+
+
+def test_a_verdict_is_paired_by_view():
+    """Views differ by decibels, the gain on each by hundredths."""
+    base, own = (20.0, 30.0, 25.0), (20.5, 30.6, 25.4)
+    said = verdict({SFM: _runs(*base), AUTO: _runs(*own)}, 400)
+    assert said.winner == AUTO
+    assert said.gain.mean == pytest.approx(0.5)
+    assert said.gain.se == pytest.approx(np.std([0.5, 0.6, 0.4], ddof=1) / np.sqrt(3))
+    assert (said.views, said.repeats, said.steps) == (3, 1, 400)
+    assert verdict({AUTO: _runs(*own)}, 400) is None
+    assert verdict({SFM: _runs(*base)}, 400) is None
+
+
+def test_rungs_fit_the_time_as_long_as_they_can():
+    cost = lambda rungs: sum(r.steps * r.arms * r.repeats * 0.01 for r in rungs)
+    rungs = plan_rungs(15, 600.0, 30_000, cost)
+    assert [rung.arms for rung in rungs] == [15, 5, 2]
+    assert [rung.repeats for rung in rungs] == [1, 1, 2]
+    assert rungs[2].steps == 2 * rungs[1].steps == 4 * rungs[0].steps
+    assert 540 < cost(rungs) <= 600
+    assert plan_rungs(15, 600.0, 1000, cost)[2].steps <= 1000
+    assert plan_rungs(15, 0.1, 1000, cost)[0].steps == halving.LEAST_STEPS  # the least there is
+
+
+@pytest.fixture(scope="module")
+def scene_path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("made") / "my room"
+    return write_capture(make_capture(0, num_views=18, width=64, height=48), path)
+
+
+def test_the_validation_scene_has_no_test_view(scene_path, tmp_path):
+    made = load_scene(make_validation_scene(scene_path, tmp_path / "scene"))
+    train, test = load_scene(scene_path).split(8)
+    assert {image.name for image in made.images} == {image.name for image in train}
+    assert not {image.name for image in made.images} & {image.name for image in test}
+    assert len(made.split(8)[1]) == 2
+    assert set(made.tracks.image_ids) <= {image.image_id for image in made.images}
+
+
+def test_too_few_views_are_refused(tmp_path):
+    path = write_capture(make_capture(0, num_views=3, width=64, height=48), tmp_path / "room")
+    with pytest.raises(SceneNotFoundError, match="hold some of them out"):
+        make_validation_scene(path, tmp_path / "scene")
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """Runs that are done in this process, until so many are; and how many were."""
+    state = {"done": 0, "most": 99}
+
+    def run(ledger, bench, keys, options, watcher):
+        executor = Executor(ledger, watcher)
+        while state["done"] < state["most"]:
+            spec = executor.claim(keys)
+            if spec is None:
+                return True
+            folders = work_folder(bench, spec.key), kept_folder(bench, spec.key)
+            executor.settle(spec, run_job(spec, *folders, options))
+            state["done"] += 1
+        return False
+
+    @contextmanager
+    def machine(options, backend):
+        yield Machine("this process", "cpu", 1, 1, run, is_local=True)
+
+    monkeypatch.setattr(tune, "open_machine", machine)
+    monkeypatch.setattr(halving, "LEAST_STEPS", 4)
+    return state
+
+
+def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
+    scene_path, tmp_path, here, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    test = load_scene(scene_path).split(8)[1]
+    for image in test:  # whoever opens one fails
+        (scene_path / "images" / image.name).write_bytes(b"not a photograph")
+    words = ["tune", str(scene_path), "--minutes", "0.001", "--methods", "sfm", "cover",
+             "--strategies", "default", "--budget", "70", "--max-steps", "32",
+             "--long-side", "64"]  # fmt: skip
+    here["most"] = 1
+    with pytest.raises(SystemExit):
+        main(words)
+    assert "the same command goes on" in capsys.readouterr().out
+    here["most"] = 99
+    main(words)
+    out = capsys.readouterr().out
+    folder = tmp_path / "tune_my room"
+    rungs = [Rung(**each) for each in json.loads((folder / "tune.json").read_text())["rungs"]]
+    assert [rung.arms for rung in rungs] == [2, 2, 2]
+    assert here["done"] == 2 + 2 + 4
+    assert "2 validation views" in out
+    assert "splatseed train" in out
+    assert "--cap-max 70 --max-steps 32" in out
+    main(words)
+    assert here["done"] == 8  # nothing is done twice
+    with pytest.raises(SystemExit):
+        main([*words, "--budget", "80"])
+    assert "was begun with" in capsys.readouterr().err
+
+
+def test_the_baseline_must_be_there(scene_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["tune", str(scene_path), "--methods", "auto"])
+    assert stop.value.code == 2
+    assert "sfm among --methods" in capsys.readouterr().err
