@@ -98,7 +98,7 @@ def _pixels(grid: Bool[np.ndarray, "rows cols"], view: View) -> Bool[np.ndarray,
     return grid[np.ix_(i.astype(np.int64), j.astype(np.int64))]
 
 
-def _frames(images: Sequence, maps: DepthMaps | None) -> list[View]:  # type: ignore[type-arg]
+def _frames(images: Sequence, maps: DepthMaps | None) -> list[View]:  # type: ignore[type-arg]  # two kinds of image
     """The images' frames at the size that defines cells; with depth maps, only those with one."""
     known = [image for image in images if maps is None or image.name in maps]
     return list(poses_of(known, data_factor(known, MAX_SIZE))) if known else []

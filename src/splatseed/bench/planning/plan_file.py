@@ -53,16 +53,16 @@ BUDGETS = _Kind(
     _all(lambda value: isinstance(value, str) or _is_number(value)),
 )
 WHOLE = _Kind("a whole number", lambda value: type(value) is int)
+NUMBER = _Kind("a number", _is_number)
 TRUTH = _Kind("true or false", lambda value: isinstance(value, bool))
 TABLE = _Kind("a table", lambda value: isinstance(value, dict))
 TABLES = _Kind("tables, each headed [[scenes]]", _all(dict))
 
 
 def _kind_of(default: object) -> _Kind:
-    """The kind of a training setting; the one without a default is a number."""
-    if isinstance(default, bool):
-        return TRUTH
-    return TEXT if isinstance(default, str) else WHOLE
+    """The kind of a training setting; the one without a default is a whole number."""
+    kinds = {bool: TRUTH, str: TEXT, float: NUMBER}
+    return kinds.get(type(default), WHOLE)
 
 
 KINDS: Mapping[str, _Kind] = {
