@@ -141,7 +141,7 @@ def _make_runner(main: Any, config: Any, seed: int) -> Any:
     """Its Runner on the CPU; the rank within a machine shifts its seed and nothing else."""
     runner: Any = main.__globals__["Runner"]
 
-    class OnCpu(runner):  # type: ignore[misc]
+    class OnCpu(runner):  # type: ignore[misc]  # known at run time only
         device = property(lambda _: "cpu", lambda *_: None)
 
     return OnCpu(seed, 0, 1, config)

@@ -65,7 +65,7 @@ class Settings:
 
     sizes: tuple[int, ...] = (115_000, LARGE)
     """Originals of the made room: 16x below a million, 4x from there on."""
-    methods: tuple[Method, ...] = tuple(OPTIONS)  # type: ignore[assignment]
+    methods: tuple[Method, ...] = tuple(OPTIONS)  # type: ignore[assignment]  # its keys are the literals
     """Which methods."""
     cloud: str = "room"
     """The made room at every size, or one real capture as it is, 16x (bonsai, fox, ...)."""

@@ -1,4 +1,4 @@
-"""What ``info`` and ``upsample SCENE`` say is to be done: nothing written, and commands that run."""
+"""``info`` and ``upsample SCENE`` say is to be done: nothing written, and commands that run."""
 
 from __future__ import annotations
 

@@ -132,7 +132,7 @@ def _check(options: Options) -> None:
 
 
 def _open(options: Options, path: Path) -> Shown:
-    from splatseed.view.shown import open_shown  # noqa: PLC0415
+    from splatseed.view.shown import open_shown  # noqa: PLC0415  (loads with its use)
 
     shown = open_shown(path, options.scene)
     if shown.gaussians is None:
@@ -146,7 +146,7 @@ def _open(options: Options, path: Path) -> Shown:
 
 def _size(options: Options, shown: Shown) -> tuple[int, int]:
     """Width and height of the video."""
-    from splatseed.views.view import poses_of  # noqa: PLC0415
+    from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     if options.size is not None:
         words = options.size.lower().split("x")
@@ -165,8 +165,8 @@ def _size(options: Options, shown: Shown) -> tuple[int, int]:
 
 def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Sequence[View], float]:
     """The cameras, one per frame, and the frame rate."""
-    from splatseed.view.paths import orbit, smooth_path  # noqa: PLC0415
-    from splatseed.views.view import poses_of  # noqa: PLC0415
+    from splatseed.view.paths import orbit, smooth_path  # noqa: PLC0415  (loads with its use)
+    from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     if options.path is not None:
         return _views_of_file(options.path, options.transform, shown, size, options.fps)
@@ -184,10 +184,10 @@ def _views_of_file(
 ) -> tuple[Sequence[View], float]:
     """The cameras of a path's file in the model's world, and the frame rate."""
     from splatseed.evaluate.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415
-    from splatseed.scene import Scene  # noqa: PLC0415
-    from splatseed.view.paths import check_path, path_of_file, views_from  # noqa: PLC0415
-    from splatseed.views.view import poses_of  # noqa: PLC0415
+    from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415  (loads with its use)
+    from splatseed.scene import Scene  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.paths import check_path, path_of_file, views_from  # noqa: PLC0415  (loads with its use)
+    from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     views, named = path_of_file(path, size)
     if transform is not None:
@@ -203,7 +203,7 @@ def _views_of_file(
 def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> list[ModelRenderer]:
     """The renderers of the models, cropped and cleaned, all in the first one's frame."""
     from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.view.renderer import ModelRenderer, model_frame  # noqa: PLC0415
+    from splatseed.view.renderer import ModelRenderer, model_frame  # noqa: PLC0415  (loads with its use)
 
     clock("prepare", 0.0)
     crop = None if options.crop is None else parse_crop(options.crop)

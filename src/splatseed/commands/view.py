@@ -85,9 +85,9 @@ def run(arguments: list[str]) -> None:
 
 def _opened(options: Options) -> list[Shown]:
     """What to show, under names that tell them apart."""
-    from dataclasses import replace  # noqa: PLC0415
+    from dataclasses import replace  # noqa: PLC0415  (loads with its use)
 
-    from splatseed.view.shown import open_shown  # noqa: PLC0415
+    from splatseed.view.shown import open_shown  # noqa: PLC0415  (loads with its use)
 
     paths = _within(options.what)
     if options.compare is not None:
@@ -102,7 +102,7 @@ def _opened(options: Options) -> list[Shown]:
 
 def _within(path: Path) -> list[Path]:
     """The path itself, or the runs and scenes in a folder that is neither."""
-    from splatseed.io import load_scene  # noqa: PLC0415
+    from splatseed.io import load_scene  # noqa: PLC0415  (loads with its use)
 
     if not path.is_dir() or RunFolder(path).is_run:
         return [path]
@@ -120,8 +120,8 @@ def _within(path: Path) -> list[Path]:
 
 def _is_shown(path: Path) -> bool:
     """Whether something in a folder is a finished run, a scene or a model."""
-    from splatseed.export import SUFFIXES  # noqa: PLC0415
-    from splatseed.io import load_scene  # noqa: PLC0415
+    from splatseed.export import SUFFIXES  # noqa: PLC0415  (loads with its use)
+    from splatseed.io import load_scene  # noqa: PLC0415  (loads with its use)
 
     if path.is_file():
         return any(path.name.lower().endswith(suffix) for suffix in SUFFIXES)
@@ -137,7 +137,7 @@ def _is_shown(path: Path) -> bool:
 
 def _announce(options: Options, port: int, opened: list[Shown]) -> None:
     """Say where to look; flushed, because whoever started us may be waiting for it."""
-    host = "localhost" if options.host in LOCAL | {"0.0.0.0"} else options.host  # noqa: S104
+    host = "localhost" if options.host in LOCAL | {"0.0.0.0"} else options.host  # noqa: S104  (compared, not bound)
     url = f"http://{host}:{port}"
     rows = [(shown.name, _contents(shown)) for shown in opened]
     print_pairs("splatseed view", rows)

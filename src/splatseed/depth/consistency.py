@@ -81,7 +81,7 @@ def find_support(
 
 
 @inline
-def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[no-untyped-def]
+def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Colours of a view's own reduced photograph at its candidates, as smooth as the others'."""
     for k in range(len(xyz)):
         column, row, _ = place(xyz[k], grid_from_world)
@@ -91,7 +91,7 @@ def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[
 
 
 @inline
-def _ask(  # type: ignore[no-untyped-def]
+def _ask(  # type: ignore[no-untyped-def]  # Numba's types
     xyz,
     own,
     z,
@@ -122,7 +122,7 @@ def _ask(  # type: ignore[no-untyped-def]
 
 
 @inline
-def _compare(z, column, row, depth, tolerance):  # type: ignore[no-untyped-def]
+def _compare(z, column, row, depth, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
     """What the map of a view says about a depth at a grid position; NaN says nothing."""
     x0 = min(max(int(np.floor(column)), 0), max(z.shape[1] - 2, 0))
     y0 = min(max(int(np.floor(row)), 0), max(z.shape[0] - 2, 0))
@@ -143,7 +143,7 @@ def _compare(z, column, row, depth, tolerance):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _block(column, row, rgb_from_grid, shape):  # type: ignore[no-untyped-def]
+def _block(column, row, rgb_from_grid, shape):  # type: ignore[no-untyped-def]  # Numba's types
     """Row and column of the reduced photograph at a grid position."""
     p = int(np.floor(row * rgb_from_grid[1, 0] + rgb_from_grid[1, 1]))
     q = int(np.floor(column * rgb_from_grid[0, 0] + rgb_from_grid[0, 1]))
@@ -151,7 +151,7 @@ def _block(column, row, rgb_from_grid, shape):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _color_error(first, second):  # type: ignore[no-untyped-def]
+def _color_error(first, second):  # type: ignore[no-untyped-def]  # Numba's types
     """Sum of the channels' differences."""
     total = np.int64(0)
     for channel in range(3):

@@ -34,7 +34,7 @@ Values = Float64[np.ndarray, " M"]
 
 
 @inline
-def median(values):  # type: ignore[no-untyped-def]
+def median(values):  # type: ignore[no-untyped-def]  # Numba's types
     """NumPy's median for float64 without NaN, without its overhead on a thousand values."""
     return np.median(values)
 

@@ -89,7 +89,7 @@ def _cover(covers: Float64[np.ndarray, "J S"], num: int) -> Int64[np.ndarray, " 
 
 
 @kernel
-def _shortlist(samples, matrices, sizes, centers, out):  # type: ignore[no-untyped-def]
+def _shortlist(samples, matrices, sizes, centers, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Views whose frames cover the samples of each view."""
     num, per_view = samples.shape[0], samples.shape[1]
     for i in parallel_range(num):
@@ -101,7 +101,7 @@ def _shortlist(samples, matrices, sizes, centers, out):  # type: ignore[no-untyp
 
 
 @inline
-def _choose(covers, out):  # type: ignore[no-untyped-def]
+def _choose(covers, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Rows one after another by the sum of w / (1 + covered)^2, until none adds anything."""
     covered, worth = np.zeros(covers.shape[1]), np.ones(covers.shape[1])
     free = np.ones(len(covers), np.bool_)
@@ -123,7 +123,7 @@ def _choose(covers, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _weigh(samples, m, size, center, other, out):  # type: ignore[no-untyped-def]
+def _weigh(samples, m, size, center, other, out):  # type: ignore[no-untyped-def]  # Numba's types
     """How well a view covers each sample, by frame and angle."""
     for s in range(len(samples)):
         depth, column, row = _nearest(samples[s], m)
@@ -132,7 +132,7 @@ def _weigh(samples, m, size, center, other, out):  # type: ignore[no-untyped-def
 
 
 @inline
-def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]
+def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Remove samples that are hidden from the view or unknown to it."""
     for s in range(len(samples)):
         if out[s] > 0.0:
@@ -142,7 +142,7 @@ def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _nearest(point, m):  # type: ignore[no-untyped-def]
+def _nearest(point, m):  # type: ignore[no-untyped-def]  # Numba's types
     """Depth of a point in a view, and the nearest grid point; column -1 if there is none."""
     column, row, depth = place(point, m)
     column, row = column + 0.5, row + 0.5
@@ -152,7 +152,7 @@ def _nearest(point, m):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _angle_weight(point, first, second):  # type: ignore[no-untyped-def]
+def _angle_weight(point, first, second):  # type: ignore[no-untyped-def]  # Numba's types
     """Small where the rays coincide, rising to 1, and 0 where they are 90 degrees apart."""
     cosine = cosine_between(point, first, second)
     return min(max((1.0 - cosine) / FULL, LEAST), 1.0) * min(max(2.0 * cosine, 0.0), 1.0)

@@ -145,7 +145,7 @@ def _with_rest(
 
 
 @inline
-def _spread_distance(distance):  # type: ignore[no-untyped-def]
+def _spread_distance(distance):  # type: ignore[no-untyped-def]  # Numba's types
     """Chamfer distances from a grid's zeros, in place, at most 8% too long (Borgefors, 1986)."""
     rows, columns = distance.shape
     for sweep in range(2):
@@ -168,7 +168,7 @@ def _spread_distance(distance):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _draw(values, cumulative, columns, step, box, picks, jitter, radius, tolerance, out):  # type: ignore[no-untyped-def]
+def _draw(values, cumulative, columns, step, box, picks, jitter, radius, tolerance, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Pixels in the cells that ascending ``picks`` fall into; returns the number of usable ones."""
     top, left, bottom, right = box
     cell, count, first = 0, 0, 0  # out[first:count] belong to this cell
@@ -190,7 +190,7 @@ def _draw(values, cumulative, columns, step, box, picks, jitter, radius, toleran
 
 
 @inline
-def _contains(numbers, number):  # type: ignore[no-untyped-def]
+def _contains(numbers, number):  # type: ignore[no-untyped-def]  # Numba's types
     """Whether a short list contains a number."""
     for each in numbers:  # noqa: SIM110  (Numba has no any() of a generator)
         if each == number:
@@ -199,7 +199,7 @@ def _contains(numbers, number):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyped-def]
+def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Which of the pixels lie near a depth discontinuity."""
     width = values.shape[1]
     for k in range(len(pixel)):
@@ -208,7 +208,7 @@ def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyp
 
 
 @inline
-def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyped-def]
+def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
     """Whether 1 / depth bends within ``radius``, across, down or diagonally, or is mostly unknown.
 
     All distances are tested along the row, where memory is near, and only the largest one

@@ -129,7 +129,7 @@ def lift_pixels(
 
 
 @inline
-def _lift(pixel, depth, width, m, center, factor, xyz):  # type: ignore[no-untyped-def]
+def _lift(pixel, depth, width, m, center, factor, xyz):  # type: ignore[no-untyped-def]  # Numba's types
     """P = c + z M (u, v, 1), in float64."""
     for k in range(len(pixel)):
         u, v = pixel[k] % width + 0.5, pixel[k] // width + 0.5

@@ -123,7 +123,7 @@ def _solve(
 
 
 @inline
-def _compare_pair(samples, z, factor, m, out):  # type: ignore[no-untyped-def]
+def _compare_pair(samples, z, factor, m, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Median a of a pair and its standard error; leaves NaN where too little overlaps."""
     logs = np.empty(len(samples))
     count = 0

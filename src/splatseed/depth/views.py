@@ -198,7 +198,7 @@ def _colors_at(
 
 
 @inline
-def _take_colors(photograph, pixel, width, height, out):  # type: ignore[no-untyped-def]
+def _take_colors(photograph, pixel, width, height, out):  # type: ignore[no-untyped-def]  # Numba's types
     """The photograph's pixels at the centres of the map's pixels."""
     rows, columns = photograph.shape[0], photograph.shape[1]
     for k in range(len(pixel)):

@@ -131,7 +131,7 @@ class _Cubes:
 
 
 @kernel
-def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]
+def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]  # Numba's types
     """The key of each point's cube.
 
     Points outside the candidates' box get keys that no other cube has.
@@ -146,7 +146,7 @@ def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _take_best(keys, eligible, blocked, footprint, buckets, taken):  # type: ignore[no-untyped-def]
+def _take_best(keys, eligible, blocked, footprint, buckets, taken):  # type: ignore[no-untyped-def]  # Numba's types
     """Mark the finest candidate of every cube in some buckets; returns their number."""
     counts = np.zeros(buckets, np.int64)
     for b in parallel_range(buckets):
@@ -155,7 +155,7 @@ def _take_best(keys, eligible, blocked, footprint, buckets, taken):  # type: ign
 
 
 @inline
-def _take_bucket(bucket, keys, eligible, blocked, footprint, taken):  # type: ignore[no-untyped-def]
+def _take_bucket(bucket, keys, eligible, blocked, footprint, taken):  # type: ignore[no-untyped-def]  # Numba's types
     """One bucket, by a hash table with open addressing; the earlier of equals wins."""
     shift = np.uint64(59)  # the top 5 bits: BUCKETS is 32
     size = 0
@@ -188,7 +188,7 @@ def _take_bucket(bucket, keys, eligible, blocked, footprint, taken):  # type: ig
 
 
 @inline
-def _find(key, table, owner):  # type: ignore[no-untyped-def]
+def _find(key, table, owner):  # type: ignore[no-untyped-def]  # Numba's types
     """The slot of a key, or the free one where it belongs."""
     last = np.uint64(len(table) - 1)
     slot = key & last

@@ -1,4 +1,4 @@
-"""PSNR and SSIM of one image beside another, in PyTorch.
+"""PSNR and SSIM between two images, in PyTorch.
 
 Notation: images are [H, W, 3], values about 0..1.
 """
@@ -16,7 +16,7 @@ __all__ = ["psnr", "psnr_within", "ssim", "ssim_of_all"]
 
 
 def ssim(render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> Float[Tensor, ""]:
-    """Mean SSIM over the places where the 11 x 11 window fits whole, by convolutions."""
+    """Mean SSIM over the positions where the 11 x 11 window fits entirely, by convolutions."""
     x, y = (image.permute(2, 0, 1).unsqueeze(1) for image in (render, photograph))
     weights = torch.from_numpy(window_weights()).to(render)
     mean_x, mean_y, e_xy, e_2 = (
@@ -32,7 +32,7 @@ def ssim(render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> 
 
 @torch.no_grad()
 def ssim_of_all(render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> float:
-    """SSIM averaged over all pixels; the mirrored margin lets the window fit at each of them."""
+    """SSIM averaged over all pixels; a mirrored margin lets the window fit everywhere."""
     margin = [WINDOW // 2] * 4
     x, y = (
         pad(image.clamp(0, 1).permute(2, 0, 1), margin, mode="reflect").permute(1, 2, 0)
@@ -47,7 +47,7 @@ def ssim_of_all(render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3
 def psnr_within(
     render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W"]
 ) -> float | None:
-    """PSNR in dB over the pixels of a mask; None where it has none."""
+    """PSNR in dB over the pixels of a mask; None if it is empty."""
     if not bool(mask.any()):
         return None
     error = (render.clamp(0, 1) - photograph).square()[mask].mean(dtype=torch.float64)

@@ -35,11 +35,11 @@ class _Teller(event.Listener):
     def on_start(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
         tell(begins=True)
 
-    def on_end(self, event: object) -> None:  # noqa: ARG002
+    def on_end(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
         tell(begins=False)
 
 
-event.register("numba:compile", _Teller())  # type: ignore[no-untyped-call]
+event.register("numba:compile", _Teller())  # type: ignore[no-untyped-call]  # Numba is untyped
 
 parallel_range = numba.prange
 

@@ -105,7 +105,7 @@ def list_tiles(records: Float32[np.ndarray, " 16*G"], width: int, height: int) -
 
 
 @inline
-def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]
+def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]  # Numba's types
     """Radix sort of the visible by depth, from the lowest digit; stable.
 
     On one thread: two gain as much as they lose by waiting for each other eight times.
@@ -141,7 +141,7 @@ def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]
 
 
 @always_inline
-def _ellipse(records, r):  # type: ignore[no-untyped-def]
+def _ellipse(records, r):  # type: ignore[no-untyped-def]  # Numba's types
     """A, B, C and R of the ellipse A dx^2 + 2 B dx dy + C dy^2 <= R, d being pixel minus mean."""
     a, b, c = np.float64(records[r + 2]), np.float64(records[r + 3]), np.float64(records[r + 4])
     reach = max(np.float64(records[r + 5]) - np.float64(LOWEST), 0.0)
@@ -149,7 +149,7 @@ def _ellipse(records, r):  # type: ignore[no-untyped-def]
 
 
 @always_inline
-def _tiles(low, high, tiles):  # type: ignore[no-untyped-def]
+def _tiles(low, high, tiles):  # type: ignore[no-untyped-def]  # Numba's types
     """First and one-past-last of the tiles with a pixel centre between two coordinates.
 
     Clipped before conversion to integers, which the pixels of a huge Gaussian would overflow.
@@ -161,7 +161,7 @@ def _tiles(low, high, tiles):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-def]
+def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-def]  # Numba's types
     """First and one-past-last row of tiles that each ellipse touches.
 
     All rows if float32 rounding has made the conic something other than an ellipse (a needle or a
@@ -186,7 +186,7 @@ def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-de
 
 
 @kernel
-def _find_columns(  # type: ignore[no-untyped-def]
+def _find_columns(  # type: ignore[no-untyped-def]  # Numba's types
     records, columns, row_range, span_start, cursor, spans, pairs
 ):
     """Write the span of every Gaussian in each of its rows to the row's part of ``spans``.
@@ -225,7 +225,7 @@ def _find_columns(  # type: ignore[no-untyped-def]
 
 
 @always_inline
-def _profile(a, b, c, reach):  # type: ignore[no-untyped-def]
+def _profile(a, b, c, reach):  # type: ignore[no-untyped-def]  # Numba's types
     """An ellipse's left and right edges at height dy: dx = lean dy +- sqrt(width - falloff dy^2).
 
     Also ``extreme``, the dy of the right extreme point; the left one's is its negative. Anything
@@ -240,7 +240,7 @@ def _profile(a, b, c, reach):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fill(  # type: ignore[no-untyped-def]
+def _fill(  # type: ignore[no-untyped-def]  # Numba's types
     row_order, columns, row_spans, spans, row_start, tile_start, ranks, listed
 ):
     """List each row's spans by tile.

@@ -224,7 +224,7 @@ def _places_in_views(xyz: Float32[np.ndarray, "N 3"], views: Sequence[View]) -> 
 
 
 @kernel
-def _find_closest(xyz, matrices, focals, sizes, group, place):  # type: ignore[no-untyped-def]
+def _find_closest(xyz, matrices, focals, sizes, group, place):  # type: ignore[no-untyped-def]  # Numba's types
     for c in parallel_range(CHUNKS):
         at = np.empty((3, BLOCK))
         stop = len(xyz) * (c + 1) // CHUNKS
@@ -245,7 +245,7 @@ def _find_closest(xyz, matrices, focals, sizes, group, place):  # type: ignore[n
 
 
 @inline
-def _insert(close, v, at, closeness, group, place):  # type: ignore[no-untyped-def]
+def _insert(close, v, at, closeness, group, place):  # type: ignore[no-untyped-def]  # Numba's types
     """Insert a view among the closest; among equals the earlier stays first."""
     k = len(closeness) - 1
     while k > 0 and closeness[k - 1] < close:
@@ -257,7 +257,7 @@ def _insert(close, v, at, closeness, group, place):  # type: ignore[no-untyped-d
 
 
 @inline
-def _keep(order, group, place, spacing, limit, slots, kept):  # type: ignore[no-untyped-def]
+def _keep(order, group, place, spacing, limit, slots, kept):  # type: ignore[no-untyped-def]  # Numba's types
     """Mark the points that are needed, in order, besides those already marked."""
     table = np.full(slots, FREE)
     count = 0
@@ -278,7 +278,7 @@ def _keep(order, group, place, spacing, limit, slots, kept):  # type: ignore[no-
 
 
 @inline
-def _mark_cells(group, place, spacing, table):  # type: ignore[no-untyped-def]
+def _mark_cells(group, place, spacing, table):  # type: ignore[no-untyped-def]  # Numba's types
     for k in range(len(group)):
         if group[k] >= 0:
             key = _key(group[k], place[k], spacing)
@@ -286,7 +286,7 @@ def _mark_cells(group, place, spacing, table):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _key(group, place, spacing):  # type: ignore[no-untyped-def]
+def _key(group, place, spacing):  # type: ignore[no-untyped-def]  # Numba's types
     """A 64-bit key for a cell of a view; collisions are not to be expected."""
     key = scramble(np.uint64(group))
     for axis in range(3):
@@ -295,7 +295,7 @@ def _key(group, place, spacing):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _slot(key, table):  # type: ignore[no-untyped-def]
+def _slot(key, table):  # type: ignore[no-untyped-def]  # Numba's types
     """The slot of a key in a hash table with open addressing, or the free slot where it belongs."""
     last = np.uint64(len(table) - 1)
     slot = key & last

@@ -215,7 +215,7 @@ def _side_at_one(view: View, shape: tuple[int, ...]) -> float:
 
 
 @inline
-def _mean_colors(image, used, shape, empty, rgb, usable):  # type: ignore[no-untyped-def]
+def _mean_colors(image, used, shape, empty, rgb, usable):  # type: ignore[no-untyped-def]  # Numba's types
     """The mean of each cell's pixels that count, and whether they make up half of it."""
     rows, cols = shape
     height, width = image.shape[:2]
@@ -236,7 +236,7 @@ def _mean_colors(image, used, shape, empty, rgb, usable):  # type: ignore[no-unt
 
 
 @inline
-def _lift_all(m, cols, empty, depths, xyz):  # type: ignore[no-untyped-def]
+def _lift_all(m, cols, empty, depths, xyz):  # type: ignore[no-untyped-def]  # Numba's types
     """The points at these depths on the rays through the cells' centres."""
     point = np.empty(3)
     for k in range(len(empty)):

@@ -140,7 +140,7 @@ def cell_depths(
 
 
 @inline
-def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-untyped-def]
+def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-untyped-def]  # Numba's types
     """The cell and the depth of each point; -1 outside of the view and behind it."""
     at = np.empty((3, BLOCK))
     for start in range(0, len(xyz), BLOCK):
@@ -154,14 +154,14 @@ def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-unty
 
 
 @inline
-def project_block(xyz, m, at):  # type: ignore[no-untyped-def]
+def project_block(xyz, m, at):  # type: ignore[no-untyped-def]  # Numba's types
     """Column, row and depth of points [N, 3] into ``at`` [3, >= N]; NaN or infinite at depth 0."""
     for k in range(len(xyz)):
         at[0, k], at[1, k], at[2, k] = place(xyz[k], m)
 
 
 @inline
-def _sort_by_cell(cells, depths, num_cells):  # type: ignore[no-untyped-def]
+def _sort_by_cell(cells, depths, num_cells):  # type: ignore[no-untyped-def]  # Numba's types
     """Where each cell's depths begin, and the depths cell by cell: a counting sort."""
     starts = np.zeros(num_cells + 1, np.int64)
     for cell in cells:
@@ -179,7 +179,7 @@ def _sort_by_cell(cells, depths, num_cells):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _lower_quartiles(starts, by_cell, quartiles):  # type: ignore[no-untyped-def]
+def _lower_quartiles(starts, by_cell, quartiles):  # type: ignore[no-untyped-def]  # Numba's types
     """The n // 4-th of n depths in order, counted from 0."""
     rows, cols = quartiles.shape
     for i in range(rows):
@@ -189,7 +189,7 @@ def _lower_quartiles(starts, by_cell, quartiles):  # type: ignore[no-untyped-def
 
 
 @inline
-def _select(values, k):  # type: ignore[no-untyped-def]
+def _select(values, k):  # type: ignore[no-untyped-def]  # Numba's types
     """The k-th smallest, by Hoare's quickselect, which reorders the values."""
     low, high = 0, len(values) - 1
     while low < high:
@@ -213,7 +213,7 @@ def _select(values, k):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _drop_hidden(depths, visible):  # type: ignore[no-untyped-def]
+def _drop_hidden(depths, visible):  # type: ignore[no-untyped-def]  # Numba's types
     rows, cols = depths.shape
     for i in range(rows):
         for j in range(cols):

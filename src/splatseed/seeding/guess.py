@@ -98,7 +98,7 @@ def guess_depths(
 
 
 @inline
-def _guess(depths, empty, back, matrices, shapes, starts, seen, guesses, reach):  # type: ignore[no-untyped-def]
+def _guess(depths, empty, back, matrices, shapes, starts, seen, guesses, reach):  # type: ignore[no-untyped-def]  # Numba's types
     nearest, depth_of = np.empty(SECTORS), np.empty(SECTORS, np.float32)
     weights, point = np.empty(SECTORS), np.empty(3)
     for k in range(len(empty)):
@@ -116,7 +116,7 @@ def _guess(depths, empty, back, matrices, shapes, starts, seen, guesses, reach):
 
 
 @inline
-def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]
+def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]  # Numba's types
     """The point at a depth on the ray through the centre of cell (i, j)."""
     z = np.float64(depth)
     x, y = (j + 0.5) * z, (i + 0.5) * z
@@ -126,7 +126,7 @@ def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-untyped-def]
+def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-untyped-def]  # Numba's types
     """How many views look through a point."""
     count = 0
     for v in range(len(matrices)):
@@ -140,7 +140,7 @@ def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-u
 
 
 @inline
-def _look_around(depths, i, j, nearest, depth_of):  # type: ignore[no-untyped-def]
+def _look_around(depths, i, j, nearest, depth_of):  # type: ignore[no-untyped-def]  # Numba's types
     """The nearest covered cell of each sector, by squared distance; of equals, ring by ring."""
     rows, cols = depths.shape
     last = max(i, rows - 1 - i, j, cols - 1 - j)
@@ -159,7 +159,7 @@ def _look_around(depths, i, j, nearest, depth_of):  # type: ignore[no-untyped-de
 
 
 @inline
-def _sector(dy, dx):  # type: ignore[no-untyped-def]
+def _sector(dy, dx):  # type: ignore[no-untyped-def]  # Numba's types
     """The sector of 45 degrees, each including one of its borders; dy and dx are not both 0."""
     if dx > 0 and dy >= 0:
         quarter, u, v = 0, dx, dy
@@ -173,7 +173,7 @@ def _sector(dy, dx):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _weighted_median(values, weights):  # type: ignore[no-untyped-def]
+def _weighted_median(values, weights):  # type: ignore[no-untyped-def]  # Numba's types
     """The smallest value such that it and the values below it hold half of the weight."""
     order = np.argsort(values)
     half = 0.0

@@ -66,7 +66,7 @@ def choose_judges(
 
 
 @kernel
-def _choose(  # type: ignore[no-untyped-def]
+def _choose(  # type: ignore[no-untyped-def]  # Numba's types
     xyz, base, normals, order, offsets, matrices, sizes, centers, focals, sources, judges
 ):
     """The best views of each point."""
@@ -88,7 +88,7 @@ def _choose(  # type: ignore[no-untyped-def]
 
 
 @inline
-def _has_witnesses(point, sources, matrices, sizes):  # type: ignore[no-untyped-def]
+def _has_witnesses(point, sources, matrices, sizes):  # type: ignore[no-untyped-def]  # Numba's types
     """Whether enough of a view's sources contain a point."""
     asked, holding = 0, 0
     for other in sources:
@@ -99,7 +99,7 @@ def _has_witnesses(point, sources, matrices, sizes):  # type: ignore[no-untyped-
 
 
 @inline
-def _holds(matrix, size, point):  # type: ignore[no-untyped-def]
+def _holds(matrix, size, point):  # type: ignore[no-untyped-def]  # Numba's types
     """Whether a point lies in front of a camera and well within its frame."""
     u, v, z = place(point, matrix)
     inside = MARGIN <= u <= size[0] - MARGIN and MARGIN <= v <= size[1] - MARGIN
@@ -107,7 +107,7 @@ def _holds(matrix, size, point):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _sight(point, normal, center):  # type: ignore[no-untyped-def]
+def _sight(point, normal, center):  # type: ignore[no-untyped-def]  # Numba's types
     """How well a surface is seen: (cos of the angle to its normal + OBLIQUE) / distance."""
     dot, squared = 0.0, 0.0
     for axis in range(3):

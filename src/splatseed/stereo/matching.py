@@ -27,7 +27,7 @@ __all__ = ["check_stereo_memory", "make_pictures", "match_views", "other_from_vi
 BYTES_A_DEPTH = 3 * 4 + 4 + 1
 """A view's planes, costs, and agreement bits."""
 
-Found = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
+Matched = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
 Grey = UInt8[np.ndarray, "H W"]
 
 
@@ -73,16 +73,16 @@ def match_views(
     """
     check_stereo_memory(views, settings)
     greys = [grey_image(view.photograph) for view in views]
-    found: list[Found] = [None] * len(views)  # type: ignore[list-item]  # filled in below
+    matched: list[Matched] = [None] * len(views)  # type: ignore[list-item]  # filled in below
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):
             others = sources[i][sources[i] >= 0][: settings.num_sources].tolist()
             rng = np.random.default_rng([seed, i])
-            found[i] = _match(i, others, views, greys, hints[i], settings, rng)
+            matched[i] = _match(i, others, views, greys, hints[i], settings, rng)
 
     in_threads(work, len(views), 1, "compare photographs", progress)
-    planes, costs = [each[0] for each in found], [each[1] for each in found]
+    planes, costs = [each[0] for each in matched], [each[1] for each in matched]
     agreeing = _confirm_all(views, planes, costs, sources, settings, progress)
     return Stereo(tuple(views), planes, costs, agreeing, sources, settings)
 
@@ -95,7 +95,7 @@ def _match(
     hints: Hints | None,
     settings: StereoSettings,
     rng: np.random.Generator,
-) -> Found:
+) -> Matched:
     """The planes of one view."""
     view, grid = views[i], settings.grid
     shape = (view.height // grid, view.width // grid)

@@ -54,12 +54,12 @@ def seeded(
     from splatseed.seeding.photographs import Auto  # noqa: PLC0415  (loads with its use)
     from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
 
-    found: list[Stereo] = []
+    results: list[Stereo] = []
 
     class Remembering(Auto):
         def find(self, *given: Any) -> Stereo:
-            found.append(super().find(*given))
-            return found[-1]
+            results.append(super().find(*given))
+            return results[-1]
 
     start = time.perf_counter()
     part = SEEDS_SHARE.get(settings.densification, 1.0)
@@ -76,7 +76,7 @@ def seeded(
         f"in {time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as "
         "they are."
     )
-    return scene.replace(points=cloud), found[-1] if found else None
+    return scene.replace(points=cloud), results[-1] if results else None
 
 
 def _was_seeded(scene: Scene) -> bool:

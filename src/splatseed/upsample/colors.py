@@ -34,7 +34,7 @@ def interpolate_colors(
 
 
 @kernel
-def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # type: ignore[no-untyped-def]
+def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(len(xyz)):
         if count[i] > 0:
             around, color = _gather(xyz, rgb, i, idx[i])
@@ -49,7 +49,7 @@ def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # t
 
 
 @inline
-def _gather(xyz, rgb, i, rows):  # type: ignore[no-untyped-def]
+def _gather(xyz, rgb, i, rows):  # type: ignore[no-untyped-def]  # Numba's types
     """Positions relative to the base [3, k + 1] and colours [k + 1, 3], for all its new points."""
     k = rows.size
     around, color = np.zeros((3, k + 1), np.float32), np.empty((k + 1, 3), np.float32)
@@ -62,7 +62,7 @@ def _gather(xyz, rgb, i, rows):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _weights(around, x, y, z, nearest, weight):  # type: ignore[no-untyped-def]
+def _weights(around, x, y, z, nearest, weight):  # type: ignore[no-untyped-def]  # Numba's types
     """Inverse distances; separate from the sums, so that the square roots are vectorised."""
     for j in range(weight.size):
         dx, dy, dz = x - around[0, j], y - around[1, j], z - around[2, j]
@@ -71,7 +71,7 @@ def _weights(around, x, y, z, nearest, weight):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _mix(weight, color, out):  # type: ignore[no-untyped-def]
+def _mix(weight, color, out):  # type: ignore[no-untyped-def]  # Numba's types
     total = red = green = blue = np.float32(0.0)
     for j in range(weight.size):
         total += weight[j]

@@ -96,7 +96,7 @@ def views_of_points(
 
 
 @kernel
-def _add_up(rows, starts, xyz, centers, order, offsets, worth):  # type: ignore[no-untyped-def]
+def _add_up(rows, starts, xyz, centers, order, offsets, worth):  # type: ignore[no-untyped-def]  # Numba's types
     """The worth of all pairs."""
     for i in parallel_range(len(centers)):
         for k in range(starts[i], starts[i + 1]):
@@ -108,7 +108,7 @@ def _add_up(rows, starts, xyz, centers, order, offsets, worth):  # type: ignore[
 
 
 @inline
-def _weight(point, first, second):  # type: ignore[no-untyped-def]
+def _weight(point, first, second):  # type: ignore[no-untyped-def]  # Numba's types
     """The weight of a point by the angle between its rays to two cameras."""
     cosine = cosine_between(point, first, second)
     angle = np.degrees(np.arccos(min(max(cosine, -1.0), 1.0)))

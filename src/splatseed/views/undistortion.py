@@ -57,7 +57,7 @@ def _rays(
 
 
 @inline
-def _resample(photograph, uv, out, known):  # type: ignore[no-untyped-def]
+def _resample(photograph, uv, out, known):  # type: ignore[no-untyped-def]  # Numba's types
     """Bilinear colours at positions, NaN = outside; edge pixels extend to the border."""
     height, width = photograph.shape[:2]
     for i in range(out.shape[0]):

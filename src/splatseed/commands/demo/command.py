@@ -149,7 +149,7 @@ def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None
 
 
 def _row(each: TrainedArm, least: float) -> tuple[str, ...]:
-    from splatseed.commands.demo.training import psnr_after, total_seconds  # noqa: PLC0415
+    from splatseed.commands.demo.training import psnr_after, total_seconds  # noqa: PLC0415  (loads with its use)
 
     scores, then = each.result.scores, psnr_after(least, each)
     return (

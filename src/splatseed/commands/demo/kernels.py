@@ -129,8 +129,8 @@ def compile_parts(folder: str, *parts: str) -> None:
 
 
 def _compile(part: str, path: Path) -> None:
-    from splatseed.io import find_depths, load_scene, write_scene  # noqa: PLC0415
-    from splatseed.preview import preview_pair  # noqa: PLC0415
+    from splatseed.io import find_depths, load_scene, write_scene  # noqa: PLC0415  (loads with its use)
+    from splatseed.preview import preview_pair  # noqa: PLC0415  (loads with its use)
 
     if part == TRAINING:
         _train(path)
@@ -144,8 +144,8 @@ def _compile(part: str, path: Path) -> None:
 
 
 def _train(scene: Path) -> None:
-    from splatseed.commands.demo.training import Arm, train_arm  # noqa: PLC0415
-    from splatseed.train.settings import TrainSettings  # noqa: PLC0415
+    from splatseed.commands.demo.training import Arm, train_arm  # noqa: PLC0415  (loads with its use)
+    from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
 
     arm = Arm("", scene, scene.with_name("run"))
     train_arm(arm, TrainSettings(strategy="grow", cap_max=2000, max_steps=4), StageClock())

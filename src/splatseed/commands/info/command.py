@@ -133,7 +133,7 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
 
     alignments = align(scene, progress=clock)
     if options.picture is not None:
-        from splatseed.commands.info.depth_picture import write_depth_picture  # noqa: PLC0415
+        from splatseed.commands.info.depth_picture import write_depth_picture  # noqa: PLC0415  (loads with its use)
 
         clock("draw picture", 0.0)
         write_depth_picture(scene, alignments, options.picture)

@@ -59,7 +59,7 @@ class Linear(NearestMethod):
 
 
 @kernel
-def _blend(xyz, rgb, center, idx, start, count, alpha, out_xyz, out_rgb):  # type: ignore[no-untyped-def]
+def _blend(xyz, rgb, center, idx, start, count, alpha, out_xyz, out_rgb):  # type: ignore[no-untyped-def]  # Numba's types
     """P = a P1 + (1 - a) P2 and the same for colours, for all new points of all rows."""
     for i in parallel_range(len(xyz)):
         j = idx[i, 0]

@@ -62,7 +62,7 @@ class Mls(PatchMethod):
 
 
 @kernel
-def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  # type: ignore[no-untyped-def]
+def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Heights of all new points of rows ``first:last``."""
     for i in parallel_range(first, last):
         if count[i] > 0:
@@ -75,7 +75,7 @@ def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  #
 
 
 @inline
-def _fit(xyz, i, rows, distance, frame):  # type: ignore[no-untyped-def]
+def _fit(xyz, i, rows, distance, frame):  # type: ignore[no-untyped-def]  # Numba's types
     """Coefficients of 1, u, v, u^2, uv, v^2, with lengths in units of the k-th distance."""
     normal, rhs = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
     term = np.empty(TERMS)
@@ -102,7 +102,7 @@ def _fit(xyz, i, rows, distance, frame):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _solve(normal, rhs):  # type: ignore[no-untyped-def]
+def _solve(normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
     """Solve the ridge-regularised normal equations in place, by Cholesky on the lower triangle."""
     trace = 0.0
     for a in range(TERMS):

@@ -109,7 +109,7 @@ def fit(
 
 
 @kernel
-def _fit(weight, cell, z, count, smoothing, roughness, coefficients):  # type: ignore[no-untyped-def]
+def _fit(weight, cell, z, count, smoothing, roughness, coefficients):  # type: ignore[no-untyped-def]  # Numba's types
     for row in parallel_range(len(z)):
         if count[row] > 0:
             normal = np.empty((COEFFICIENTS, COEFFICIENTS))
@@ -122,7 +122,7 @@ def _fit(weight, cell, z, count, smoothing, roughness, coefficients):  # type: i
 
 
 @inline
-def _accumulate(weight, cell, z, normal, rhs):  # type: ignore[no-untyped-def]
+def _accumulate(weight, cell, z, normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
     """Add B'B (upper triangle) and B'z; every data point touches 4 x 4 control values."""
     product = np.empty((4, 4))
     for j in range(z.size):
@@ -143,7 +143,7 @@ def _accumulate(weight, cell, z, normal, rhs):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _solve(normal, rhs):  # type: ignore[no-untyped-def]
+def _solve(normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
     """Solve in place by a banded Cholesky factor U'U; whole rows are updated, to vectorise."""
     n = rhs.size
     for a in range(n):

@@ -123,7 +123,7 @@ def _relative(
 
 
 @kernel
-def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]
+def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(len(volume)):
         around = np.sort(volume[idx[i]])
         median = 0.5 * (around[(around.size - 1) // 2] + around[around.size // 2])
@@ -131,7 +131,7 @@ def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _place(xyz, site_center, center, radius, frames, start, count, out):  # type: ignore[no-untyped-def]
+def _place(xyz, site_center, center, radius, frames, start, count, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Uniform in each cell's ball, replacing the draws in ``out``; directions turn with frames."""
     for i in parallel_range(len(xyz)):
         for m in range(start[i], start[i] + count[i]):

@@ -45,7 +45,7 @@ def local_frames(
 
 
 @kernel
-def _frames(xyz, idx, frames, collinear, tolerance):  # type: ignore[no-untyped-def]
+def _frames(xyz, idx, frames, collinear, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(len(xyz)):
         covariance = _covariance(xyz, i, idx[i])
         collinear[i] = _principal_axes(covariance, frames[i]) < tolerance
@@ -53,7 +53,7 @@ def _frames(xyz, idx, frames, collinear, tolerance):  # type: ignore[no-untyped-
 
 
 @inline
-def coordinate(xyz, i, j, axis_vector):  # type: ignore[no-untyped-def]
+def coordinate(xyz, i, j, axis_vector):  # type: ignore[no-untyped-def]  # Numba's types
     """Coordinate of row j along a unit vector, relative to row i."""
     return (
         (xyz[j, 0] - xyz[i, 0]) * axis_vector[0]
@@ -63,7 +63,7 @@ def coordinate(xyz, i, j, axis_vector):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _covariance(xyz, i, rows):  # type: ignore[no-untyped-def]
+def _covariance(xyz, i, rows):  # type: ignore[no-untyped-def]  # Numba's types
     """Covariance of row i and its neighbours, scaled to a trace of 1: (xx, xy, xz, yy, yz, zz)."""
     mx = my = mz = 0.0
     for j in rows:
@@ -86,7 +86,7 @@ def _covariance(xyz, i, rows):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]
+def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]  # Numba's types
     """Fill ``frame`` with e_u, e_v, e_n; return the middle variance over the largest.
 
     The eigenvalue that lies farthest from the others gives a well-conditioned first axis; the
@@ -116,14 +116,14 @@ def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _set_rows(frame, first, second, third):  # type: ignore[no-untyped-def]
+def _set_rows(frame, first, second, third):  # type: ignore[no-untyped-def]  # Numba's types
     # One by one: assigning a tuple to a row makes Numba compile 5 s of its own checks and messages.
     for axis in range(3):
         frame[0, axis], frame[1, axis], frame[2, axis] = first[axis], second[axis], third[axis]
 
 
 @inline
-def _null_vector(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
+def _null_vector(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]  # Numba's types
     """Unit null vector of a symmetric matrix of rank 2: the longest cross product of its rows."""
     x0, y0, z0 = xy * yz - xz * yy, xz * xy - xx * yz, xx * yy - xy * xy
     x1, y1, z1 = xy * zz - xz * yz, xz * xz - xx * zz, xx * yz - xy * xz
@@ -144,7 +144,7 @@ def _null_vector(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _plane_axes(covariance, wx, wy, wz):  # type: ignore[no-untyped-def]
+def _plane_axes(covariance, wx, wy, wz):  # type: ignore[no-untyped-def]  # Numba's types
     """Principal axes in the plane orthogonal to w: (major, minor, variance along major)."""
     xx, xy, xz, yy, yz, zz = covariance
     if abs(wx) > abs(wy):
@@ -177,7 +177,7 @@ def _plane_axes(covariance, wx, wy, wz):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _fix_signs(xyz, i, rows, frame):  # type: ignore[no-untyped-def]
+def _fix_signs(xyz, i, rows, frame):  # type: ignore[no-untyped-def]  # Numba's types
     """Point e_u and e_v to the neighbour farthest along each; e_n makes the frame right-handed."""
     far_u = far_v = 0.0
     for j in rows:

@@ -62,7 +62,7 @@ def lift(
 
 
 @kernel
-def _lift(xyz, center, idx, frames, start, count, uv, height, margin, out):  # type: ignore[no-untyped-def]
+def _lift(xyz, center, idx, frames, start, count, uv, height, margin, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Compute p + u e_u + v e_v + clamp(z) e_n for all new points of all rows."""
     for i in parallel_range(len(xyz)):
         if count[i] > 0:
@@ -78,7 +78,7 @@ def _lift(xyz, center, idx, frames, start, count, uv, height, margin, out):  # t
 
 
 @inline
-def _height_range(xyz, i, rows, e_n):  # type: ignore[no-untyped-def]
+def _height_range(xyz, i, rows, e_n):  # type: ignore[no-untyped-def]  # Numba's types
     """Lowest and highest of the neighbours and the base (at 0) along the normal."""
     low = high = 0.0
     for j in rows:

@@ -62,7 +62,7 @@ def place_in_box(
 
 
 @kernel
-def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def]
+def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def]  # Numba's types
     """Polar coordinates with a square-root radius, in place of the draws in ``uv``."""
     turn = np.float32(2.0 * math.pi)  # float32 sine and cosine are twice as fast
     for i in parallel_range(len(radius)):
@@ -75,7 +75,7 @@ def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-untyped-def]
+def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-untyped-def]  # Numba's types
     """The square-root map on the triangle of the base and a random pair of its neighbours."""
     pairs = idx.shape[1] * (idx.shape[1] - 1) // 2
     for i in parallel_range(len(xyz)):
@@ -92,7 +92,7 @@ def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-unt
 
 
 @kernel
-def _box(xyz, idx, frames, start, count, uv):  # type: ignore[no-untyped-def]
+def _box(xyz, idx, frames, start, count, uv):  # type: ignore[no-untyped-def]  # Numba's types
     """Stretch the draws in ``uv`` over the neighbourhood's bounding box."""
     for i in parallel_range(len(xyz)):
         for axis in range(2):

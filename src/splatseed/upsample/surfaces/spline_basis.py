@@ -83,7 +83,7 @@ def evaluate(
 
 
 @kernel
-def _patch_basis(xyz, idx, distance, frames, count, first, last, weight, cell, z, scale):  # type: ignore[no-untyped-def]
+def _patch_basis(xyz, idx, distance, frames, count, first, last, weight, cell, z, scale):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(first, last):
         if count[i] > 0:
             row = i - first
@@ -98,7 +98,7 @@ def _patch_basis(xyz, idx, distance, frames, count, first, last, weight, cell, z
 
 
 @inline
-def _local_points(xyz, i, rows, frame, reach, scale):  # type: ignore[no-untyped-def]
+def _local_points(xyz, i, rows, frame, reach, scale):  # type: ignore[no-untyped-def]  # Numba's types
     """Scaled (u, v, z) of the neighbours and, last, the base [k + 1, 3]; fills the scales."""
     k = rows.size
     points = np.zeros((k + 1, 3))
@@ -116,7 +116,7 @@ def _local_points(xyz, i, rows, frame, reach, scale):  # type: ignore[no-untyped
 
 
 @inline
-def _weights(t):  # type: ignore[no-untyped-def]
+def _weights(t):  # type: ignore[no-untyped-def]  # Numba's types
     """First control index and the four uniform cubic B-splines at t in [-1, 1]."""
     x = (t + 1.0) * 0.5 * (CONTROL - 3)
     cell = min(max(int(x), 0), CONTROL - 4)
@@ -132,7 +132,7 @@ def _weights(t):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _evaluate(start, count, uv, coefficients, scale, first, last, out):  # type: ignore[no-untyped-def]
+def _evaluate(start, count, uv, coefficients, scale, first, last, out):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(first, last):
         c, unit = coefficients[i - first], scale[i - first]
         for m in range(start[i], start[i] + count[i]):
