@@ -4,7 +4,7 @@ too."""
 from __future__ import annotations
 
 import dataclasses
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -217,18 +217,17 @@ def short(bench, room, examples):
     return _train(bench, room, examples, 1)
 
 
-def test_the_peers_file_trains_on_our_views_and_is_scored(bench, room, examples, short):
-    long = _train(bench, room, examples, 60, cap_max=short["gaussians"])
-    assert long["psnr"] > short["psnr"] + 2
-    assert long["ssim"] > short["ssim"]
-    assert long["seconds"] > short["seconds"] > 0
-
-
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_both_strategies_of_the_peer_are_held_to_the_cap(bench, room, examples, short, strategy):
+def test_the_peers_file_trains_on_our_views_to_the_cap_and_is_scored(
+    bench, room, examples, short, strategy
+):
     cap = short["gaussians"] + 20
-    found = _train(bench, room, examples, 40, strategy=strategy, cap_max=cap)
-    assert short["gaussians"] < found["gaussians"] <= cap
+    long = _train(bench, room, examples, 60, strategy=strategy, cap_max=cap)
+    assert short["gaussians"] < long["gaussians"] <= cap
+    assert long["seconds"] > short["seconds"] > 0
+    if strategy == "default":  # mcmc's noise takes longer than this to be worth anything
+        assert long["psnr"] > short["psnr"] + 2
+        assert long["ssim"] > short["ssim"]
 
 
 def test_validation_views_are_of_the_training_views(bench, room):
@@ -334,14 +333,11 @@ def test_options_that_make_no_sense_are_refused(bench, wrong, says):
         bench.peer_trainer.Settings(Path(), **wrong)
 
 
-def test_the_script_says_what_is_missing_without_a_traceback(room):
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "benchmarks.training.peer_trainer"),
-            *("--scene", room, "--gsplat-examples", "none"),
-        ],
-        cwd=ROOT, capture_output=True, check=False, text=True,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert done.stderr.startswith("expected the folder examples of gsplat v1.5.3")
-    assert "Traceback" not in done.stderr
+def test_the_script_says_what_is_missing_without_a_traceback(bench, room, monkeypatch):
+    """Run in this process: one of its own would wait for PyTorch again."""
+    words = ["--scene", str(room), "--gsplat-examples", "none"]
+    monkeypatch.setattr(sys, "argv", ["peer_trainer", *words])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_path(bench.peer_trainer.__file__, run_name="__main__")
+    # A text is printed on stderr, and the exit code is 1.
+    assert stop.value.code.startswith("expected the folder examples of gsplat v1.5.3")
