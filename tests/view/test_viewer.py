@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import socket
+from functools import partial
 
 import numpy as np
 import pytest
@@ -150,7 +151,18 @@ def test_a_browser_gets_as_many_points_as_it_draws_quickly(room, tmp_path, monke
         session._fill_stage()  # as when another entry is chosen
         assert waits_for(lambda: f"original: {total:,} (" in text(page))
         assert len(session._clouds["original"].xyz) <= 100
+        # One that does not answer is left with the points that it has, shown.
+        session._seconds_of_a_picture = partial(_unanswered, session)
+        with pytest.raises(TimeoutError):
+            session._affordable_points()
+        assert all(node.visible for node in session._nodes.values())
     served.stop()
+
+
+def _unanswered(session, points):
+    for node in session._nodes.values():
+        node.visible = points
+    raise TimeoutError
 
 
 @needs_browser

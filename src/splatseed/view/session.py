@@ -192,8 +192,10 @@ class Session:
 
     def _affordable_points(self) -> int:
         """How many points the browser draws in reasonable time, by how long those it has take."""
-        without, with_points = (self._seconds_of_a_picture(points=on) for on in (False, True))
-        self._restyle()
+        try:
+            without, with_points = (self._seconds_of_a_picture(points=on) for on in (False, True))
+        finally:  # it may not have answered
+            self._restyle()
         return round(FIRST_POINTS * PATIENCE / max(with_points - without, 1e-3))
 
     def _seconds_of_a_picture(self, *, points: bool) -> float:
