@@ -1,4 +1,4 @@
-"""``info`` and ``upsample SCENE`` say is to be done: nothing written, and commands that run."""
+"""What ``info`` and ``upsample SCENE`` say is to be done; they write nothing."""
 
 from __future__ import annotations
 

@@ -212,11 +212,9 @@ def test_costs_are_means_over_scenes_and_the_papers_stand_beside():
 
 def test_quality_is_told_as_far_as_it_was_measured():
     table = quality_table(one(rows(scenes=("fox", "room0"))), "none")
-    assert table.header == ("method", "PSNR, dB", "SSIM", "scenes")
+    assert table.header == ("method", "PSNR, dB", "co-visible PSNR, dB", "SSIM", "scenes")
     assert column(table, "SSIM")["mls 8x"].value == pytest.approx(0.8)
-    some = [
-        dataclasses.replace(r, result=dataclasses.replace(r.result, lpips=0.25)) for r in rows()
-    ]
+    some = [dataclasses.replace(r, result=result(20.0, lpips=0.25)) for r in rows()]
     assert column(quality_table(one(some), "none"), "LPIPS")["sfm"].value == pytest.approx(0.25)
 
 

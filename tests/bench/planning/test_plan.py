@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from splatseed.bench.planning.estimate import Estimator
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene, plan_runs
 from splatseed.bench.planning.plan_file import KINDS, _kind_of, plan_text, read_plan
+from splatseed.bench.planning.presets import preset_plan
 from splatseed.bench.planning.records import SFM, SHARED, Arm
 from splatseed.bench.planning.scenes import SceneFacts, survey
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
@@ -276,3 +278,16 @@ def test_a_setting_of_any_type_has_its_kind(default, words):
     assert kind.words == words
     assert kind.fits(default)
     assert not kind.fits([])
+
+
+def test_a_laptop_has_four_scenes_at_one_number_of_gaussians(tmp_path):
+    for name in ("fern", "fox", "bonsai"):
+        (tmp_path / name).mkdir()
+    plan, missing = preset_plan("laptop", tmp_path)
+    assert [scene.label for scene in plan.scenes] == ["fern", "fox", "bonsai"]
+    assert missing == ("treehill",)
+    assert plan.budgets == ("0.25rho",)
+    assert (plan.training.max_steps, plan.long_side) == (1500, 400)
+    runs = plan_runs(plan, [FERN, BONSAI], "cpu", "1")
+    hours = sum(Estimator([FERN, BONSAI], []).of_all(runs).values()) / 3600
+    assert 0.05 < 2 * hours < 0.9  # of all four, by the rough model

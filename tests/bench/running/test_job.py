@@ -218,21 +218,26 @@ def budgeted(small_plan, room_path):
 def test_seeds_are_thinned_to_the_budget_and_equal_seeds_are_trained_once(
     budgeted, do, tmp_path, monkeypatch
 ):
-    first = do(budgeted["sfm"], "sfm")
+    first = _as_kept(do, budgeted["sfm"])
     assert (first.status, first.error) == ("done", "")
     assert first.result.num_seeds == first.result.num_gaussians == 60
     assert first.result.upsample_seconds > 0
     monkeypatch.setattr(job, "_prepare", lambda *_: pytest.fail("trained again"))
     for method in ("linear", "auto"):
-        twin = do(budgeted[method], method).result
-        assert (twin.twin, twin.scores, twin.curve) == ("sfm", first.result.scores,
-                                                        first.result.curve)  # fmt: skip
-        kept = tmp_path / "runs" / method
+        twin = _as_kept(do, budgeted[method]).result
+        assert twin.twin == budgeted["sfm"].key
+        assert (twin.scores, twin.curve) == (first.result.scores, first.result.curve)
+        kept = tmp_path / "runs" / budgeted[method].key
         assert read_result(kept, budgeted[method].key) == twin
         assert len(list((kept / "renders").iterdir())) == 3
     monkeypatch.undo()
-    other = do(dataclasses.replace(budgeted["linear"], repeat=1), "other").result
+    other = _as_kept(do, dataclasses.replace(budgeted["linear"], repeat=1)).result
     assert other.twin == ""  # another seed of training
+
+
+def _as_kept(do, spec):
+    """A run in the folder of its key, as executors have it."""
+    return do(spec, spec.key)
 
 
 def test_a_method_fills_the_budget(budgeted, room_path):

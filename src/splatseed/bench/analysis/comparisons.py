@@ -40,7 +40,7 @@ def ratio_table(study: Study) -> Table:
     return Table(
         "gain_by_ratio",
         "Gain over sfm in PSNR by ratio, mean over these scenes",
-        ("strategy", "method", *(f"{ratio:g}x" for ratio in ratios)),
+        ("strategy", "method", *(f"{ratio:g}x" if ratio else "no ratio" for ratio in ratios)),
         tuple(rows),
         (NOTE, f"{study.description}."),
     )

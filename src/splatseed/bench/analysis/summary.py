@@ -129,8 +129,8 @@ def _when_as_good(steps: Difference, seconds: Difference) -> str:
         for each, unit in ((steps, "steps"), (seconds, "seconds"))
     ]
     return (
-        f"It is as good as {base} becomes in the end after {parts[0]} and {parts[1]} that {base} "
-        "itself takes to it."
+        f"To become as good as {base} is in the end it takes {parts[0]} and {parts[1]} that "
+        f"{base} takes."
     )
 
 

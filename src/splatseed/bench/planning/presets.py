@@ -86,7 +86,7 @@ def _laptop(data: Path) -> Plan:
         ratios=(),
         budgets=("0.25rho",),
         strategies=("default", "grow"),
-        repeats=3,
+        repeats=2,
         training=TrainSettings(max_steps=1500),
         long_side=400,
     )

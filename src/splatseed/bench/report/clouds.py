@@ -62,7 +62,10 @@ def open_unchanged(specs: Sequence[RunSpec]) -> Scene:
 
 
 def cloud_picture(
-    scene: Scene, specs: Mapping[Variant, RunSpec], progress: Progress = silent
+    scene: Scene,
+    specs: Mapping[Variant, RunSpec],
+    progress: Progress = silent,
+    bench: Path | None = None,
 ) -> bytes:
     """A PNG of the photograph, the originals and each variant's seeds.
 
@@ -70,6 +73,7 @@ def cloud_picture(
         scene: As ``open_unchanged`` gives it.
         specs: As ``seed_specs`` gives them.
         progress: Told the stages of upsampling.
+        bench: The benchmark's folder, where points may be kept that took long to make.
 
     Raises:
         SplatseedError: As ``splatseed.upsample``.
@@ -77,7 +81,8 @@ def cloud_picture(
     from splatseed.preview import preview_methods  # noqa: PLC0415  (Numba and Pillow)
 
     clouds = {
-        variant.label: make_seeds(scene, spec, progress)[0] for variant, spec in specs.items()
+        variant.label: make_seeds(scene, spec, progress, bench)[0]
+        for variant, spec in specs.items()
     }
     progress("draw points", 0.0)
     with tempfile.TemporaryDirectory() as folder:

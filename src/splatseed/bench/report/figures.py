@@ -203,17 +203,18 @@ def ratio_figure(study: Study) -> Plot | None:
     Args:
         study: The study.
     """
-    if len({variant.ratio for variant in study.variants}) < 2:
+    with_ratio = [variant for variant in study.variants if variant.ratio]
+    if len({variant.ratio for variant in with_ratio}) < 2:
         return None
     figure, parts = panels(len(study.strategies))
     for strategy, axes in zip(study.strategies, parts, strict=True):
         found = gains(study, strategy)
-        for line in _lines(found.variants):
+        for line in _lines(variant for variant in found.variants if variant.ratio):
             means = [found.on_these[variant].mean for variant in line]
             axes.plot([variant.ratio for variant in line], means, **_line(line[0]), linewidth=1.3)
             for variant in line:
                 _dot(axes, found.on_these[variant], variant.ratio, variant)
-        ratios = sorted({variant.ratio for variant in found.variants})
+        ratios = sorted({variant.ratio for variant in found.variants} - {0.0})
         axes.set_xscale("log", base=2)
         axes.set_xticks(ratios, [f"{ratio:g}x" for ratio in ratios])
         axes.set_xticks([], minor=True)
@@ -222,7 +223,7 @@ def ratio_figure(study: Study) -> Plot | None:
         axes.set_xlabel("points, per original")
         axes.set_ylabel("gain over sfm, dB")
         axes.grid(visible=True, alpha=0.25)
-    lines = [replace(line[0], ratio=0.0) for line in _lines(study.variants)]
+    lines = [replace(line[0], ratio=0.0) for line in _lines(with_ratio)]
     legend_of(figure, [(each.label, _line(each)) for each in lines])
     return Plot(
         "gain_by_ratio",

@@ -79,7 +79,7 @@ def scene_pictures(
         if key in drawn:
             found.clouds[scene] = drawn[key]
         if from_scenes and (scene not in found.described or (specs and scene not in found.clouds)):
-            _look(found, scene, anyone, specs, progress)
+            _look(found, scene, anyone, specs, bench, progress)
         if scene in found.clouds:
             found.files[scene] = f"clouds_{safe_name(scene)}_{key[:6]}"
             found.keys[found.files[scene]] = key
@@ -95,6 +95,7 @@ def _look(
     scene: str,
     anyone: RunSpec,
     specs: Mapping[Variant, RunSpec],
+    bench: Path,
     progress: Progress,
 ) -> None:
     """Open a scene for what is not known of it."""
@@ -103,7 +104,7 @@ def _look(
         if scene not in found.described:
             found.described[scene] = describe(opened, progress)
         if specs and scene not in found.clouds:
-            found.clouds[scene] = cloud_picture(opened, specs, progress)
+            found.clouds[scene] = cloud_picture(opened, specs, progress, bench)
     except SplatseedError as error:
         found.notes.append(f"{scene}: its points are not shown or described: {error}")
 

@@ -126,7 +126,7 @@ def _add_gains(report: StudyReport, study: Study) -> None:
         "By ratio, strategy and count",
         [
             ratio_figure(study),
-            ratio_table(study),
+            ratio_table(study) if any(each.ratio for each in study.variants) else None,
             strategy_figure(study),
             strategy_table(study),
             equal_count_table(study),

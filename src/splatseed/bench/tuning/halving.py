@@ -96,7 +96,7 @@ def plan_rungs(
         )
 
     low, high = LEAST_STEPS, max(most_steps >> (len(KEPT) - 1), LEAST_STEPS)
-    while high - low > LEAST_STEPS // 10:
+    while high - low > max(LEAST_STEPS // 10, 1):
         middle = (low + high) // 2
         low, high = (middle, high) if cost(rungs(middle)) <= seconds else (low, middle)
     return rungs(low)

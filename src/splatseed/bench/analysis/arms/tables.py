@@ -208,10 +208,8 @@ def _in_time(best: Compared, base: Arm) -> tuple[str, ...]:
         )
     if best.sooner is not None:
         share = math.exp(best.sooner.mean)
-        told.append(
-            f"It is as good as {base.label} will be in the end after {share:.0%} of the time that "
-            f"{base.label} takes."
-        )
+        sooner = f"{share:.0%} of the time" if share < 1 else f"{share:.2f} times as long"
+        told.append(f"To become as good as {base.label} is in the end it takes {sooner}.")
     elif best.reached < best.runs:
         told.append(
             f"{best.reached} of its {best.runs} runs become as good as {base.label} in the end."
