@@ -21,7 +21,7 @@ def view_from(x, pixels):
     pose[:3, 3] = [-x, 0.0, 3.0]
     matrix = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1.0]])
     return View(
-        name=f"{x}.png", image=pixels, K=matrix, width=SIDE, height=SIDE, cam_from_world=pose
+        name=f"{x}.png", photograph=pixels, K=matrix, width=SIDE, height=SIDE, cam_from_world=pose
     )
 
 
