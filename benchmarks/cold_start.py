@@ -119,7 +119,7 @@ def inside(num: int, output: str) -> None:
     """Run the demo here, and print the CPU seconds of compiling each kernel with its helpers."""
     from numba.core import event  # noqa: PLC0415  (only there is it installed)
 
-    from splatseed.commands import demo  # noqa: PLC0415  (loads with its use)
+    from splatseed.commands.demo import command as demo  # noqa: PLC0415  (loads with its use)
 
     running: list[tuple[str, float]] = []
     spent: Counter[str] = Counter()
