@@ -140,7 +140,9 @@ def _camera_in_sight(session):
 @needs_browser
 def test_a_browser_gets_as_many_points_as_it_draws_quickly(room, tmp_path, monkeypatch):
     monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
-    monkeypatch.setattr(session_module.Session, "_seconds_of_a_picture", lambda _, points: points / 1e6)  # fmt: skip
+    monkeypatch.setattr(
+        session_module.Session, "_seconds_of_a_picture", lambda _, points: points / 1e6
+    )
     port = free_port("127.0.0.1", 0)
     served = Viewer([open_shown(room)], "127.0.0.1", port)
     total = len(served.entries[0].shown.scene.points)
