@@ -119,7 +119,7 @@ def inside(num: int, output: str) -> None:
     """Run the demo here, and print the CPU seconds of compiling each kernel with its helpers."""
     from numba.core import event  # noqa: PLC0415  (only there is it installed)
 
-    from splatseed.commands import demo  # noqa: PLC0415
+    from splatseed.commands import demo  # noqa: PLC0415  (loads with its use)
 
     running: list[tuple[str, float]] = []
     spent: Counter[str] = Counter()
@@ -129,12 +129,12 @@ def inside(num: int, output: str) -> None:
             function = event.data["dispatcher"].py_func
             running.append((f"{function.__module__}.{function.__name__}", time.process_time()))
 
-        def on_end(self, event: event.Event) -> None:  # noqa: ARG002
+        def on_end(self, event: event.Event) -> None:  # noqa: ARG002  (the interface's name)
             name, begun = running.pop()
             if not running:
                 spent[name] += time.process_time() - begun
 
-    demo.kernels_ahead = _nobody_ahead  # type: ignore[attr-defined]
+    demo.kernels_ahead = _nobody_ahead  # type: ignore[attr-defined]  # replaced for the measurement
     with redirect_stdout(sys.stderr), event.install_listener("numba:compile", _Clock()):
         demo.run(["--output", output, "--train-steps", "20"])
     rows = [[name, f"{seconds:.1f}"] for name, seconds in spent.most_common(num)]

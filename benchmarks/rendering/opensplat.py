@@ -72,7 +72,7 @@ def _write_scene(workload: Workload, folder: Path) -> None:
     for view in workload.views:
         path = folder / "images" / view.name
         path.parent.mkdir(parents=True, exist_ok=True)
-        PillowImage.fromarray(view.image).save(path)
+        PillowImage.fromarray(view.photograph).save(path)
 
 
 def _image(index: int, view: View) -> Image:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import statistics
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from benchmarks.common.clocks import Clock
 from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
 from benchmarks.common.memory import status_bytes
+from benchmarks.common.skipping import or_skip
 from benchmarks.rendering.opensplat import seconds_per_step
 from benchmarks.rendering.splats import Workload, make_workload, useful_pairs
 from benchmarks.rendering.stopwatch import RENDER_STAGES, Place, Stopwatch, timed
@@ -331,15 +332,7 @@ def main(settings: Settings) -> None:
         print_start_up(settings.clock)
     if settings.opensplat is not None:
         program, made = settings.opensplat, [(name, work) for name, work, _ in workloads]
-        _or_skip("OpenSplat", lambda: print_opensplat(program, made, runs, settings.clock))
-
-
-def _or_skip(what: str, measure_it: Callable[[], None]) -> None:
-    """Measure, or say why not."""
-    try:
-        measure_it()
-    except SplatseedError as error:
-        print(f"SKIPPED {what}: {error}\n")
+        or_skip("OpenSplat", lambda: print_opensplat(program, made, runs, settings.clock))
 
 
 if __name__ == "__main__":

@@ -201,7 +201,7 @@ def _turned(
     # Pixel centres are at half pixels in ours, at whole ones in OpenCV.
     half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
     homography = half @ turn @ np.linalg.inv(half @ view.K)
-    grey = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(view.photograph, cv2.COLOR_RGB2GRAY)
     image: UInt8[np.ndarray, "h w"] = cv2.warpPerspective(grey, homography, size)
     return image
 

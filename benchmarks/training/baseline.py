@@ -11,7 +11,7 @@ import json
 import os
 import statistics
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -28,7 +28,7 @@ from benchmarks.training.baseline_arms import ARMS, CAPS, fingerprint
 
 from splatseed.errors import ParameterError, SplatseedError
 
-__all__ = ["read_ledger", "say", "write_line"]
+__all__ = ["read_ledger", "run_missing", "say", "write_line"]
 
 WRITING = Lock()
 
@@ -139,13 +139,17 @@ def say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def run_missing(wanted: Iterable[Any], run: Callable[..., None], ledger: Path, jobs: int) -> None:
+    """Call ``run`` for the wanted keys that a ledger lacks, ``jobs`` at a time."""
+    scenes, done = find_scenes(), read_ledger(ledger)
+    missing = [key for key in wanted if key not in done]
+    with ThreadPoolExecutor(jobs) as pool:
+        list(pool.map(partial(run, scenes=scenes, ledger=ledger), missing))
+
+
 def main(settings: Settings) -> None:
     """Run what is not there yet, and print the table."""
-    scenes = find_scenes()
-    done = read_ledger(settings.ledger)
-    missing = [key for key in wanted(settings) if key not in done]
-    with ThreadPoolExecutor(settings.jobs) as pool:
-        list(pool.map(partial(run, scenes=scenes, ledger=settings.ledger), missing))
+    run_missing(wanted(settings), run, settings.ledger, settings.jobs)
     header = ["arm", *settings.scenes, "mean"]
     print(f"{describe()}\n\n### {settings.max_steps:,} steps, seeds: {settings.seeds}\n")
     print(table(header, rows(read_ledger(settings.ledger), settings)))

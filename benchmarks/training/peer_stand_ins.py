@@ -141,7 +141,7 @@ def _make_runner(main: Any, config: Any, seed: int) -> Any:
     """Its Runner on the CPU; the rank within a machine shifts its seed and nothing else."""
     runner: Any = main.__globals__["Runner"]
 
-    class OnCpu(runner):  # type: ignore[misc]
+    class OnCpu(runner):  # type: ignore[misc]  # known at run time only
         device = property(lambda _: "cpu", lambda *_: None)
 
     return OnCpu(seed, 0, 1, config)
@@ -271,7 +271,7 @@ class Photographs:
     """Reads the views' pixels by the paths that were laid out for them."""
 
     def __init__(self, capture: Capture, folder: Path) -> None:
-        self._pixels = {folder / "images" / view.name: view.image for view in capture.views}
+        self._pixels = {folder / "images" / view.name: view.photograph for view in capture.views}
 
     def __call__(self, path: str) -> np.ndarray:
         """The pixels, uint8 [H, W, 3]."""

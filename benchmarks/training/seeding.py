@@ -10,18 +10,15 @@ from __future__ import annotations
 import os
 import statistics
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import tyro
 from benchmarks.common.children import call
-from benchmarks.common.clouds import find_scenes
 from benchmarks.common.machine import describe
 from benchmarks.common.markdown import table
-from benchmarks.training.baseline import read_ledger, say, write_line
+from benchmarks.training.baseline import read_ledger, run_missing, say, write_line
 from benchmarks.training.baseline_arms import CAPS
 from benchmarks.training.seeding_arms import ARMS
 
@@ -123,11 +120,7 @@ def _scores(means: list[float]) -> str:
 
 def main(settings: Settings) -> None:
     """Run what is not there yet, and print the table."""
-    scenes = find_scenes()
-    done = read_ledger(settings.ledger)
-    missing = [key for key in wanted(settings) if key not in done]
-    with ThreadPoolExecutor(settings.jobs) as pool:
-        list(pool.map(partial(run, scenes=scenes, ledger=settings.ledger), missing))
+    run_missing(wanted(settings), run, settings.ledger, settings.jobs)
     header = ["strategy", "rho", "seeds", *settings.scenes, "mean"]
     print(f"{describe()}\n\n### {settings.max_steps:,} steps, {settings.seeds} run(s) of each\n")
     print(table(header, rows(read_ledger(settings.ledger), settings)))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -21,6 +21,7 @@ from benchmarks.common.clouds import REAL_SCENES, find_scenes, load_cloud, room
 from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
 from benchmarks.common.memory import peak_bytes_per_output
+from benchmarks.common.skipping import or_skip
 from benchmarks.upsampling.end_to_end import cli_seconds, interpreter_seconds
 from benchmarks.upsampling.naive import seconds_per_point
 from benchmarks.upsampling.peer_pcl import MODES, build, run as run_peer
@@ -64,7 +65,7 @@ class Settings:
 
     sizes: tuple[int, ...] = (115_000, LARGE)
     """Originals of the made room: 16x below a million, 4x from there on."""
-    methods: tuple[Method, ...] = tuple(OPTIONS)  # type: ignore[assignment]
+    methods: tuple[Method, ...] = tuple(OPTIONS)  # type: ignore[assignment]  # its keys are the literals
     """Which methods."""
     cloud: str = "room"
     """The made room at every size, or one real capture as it is, 16x (bonsai, fox, ...)."""
@@ -186,17 +187,9 @@ def main(settings: Settings) -> None:
     for work in workloads(settings):
         print_methods(work, settings)
         if settings.pcl:
-            _or_skip("peer", lambda work=work: print_peer(work, settings))
+            or_skip("peer", lambda work=work: print_peer(work, settings))
     if settings.cli:
-        _or_skip("command line", lambda: print_cli(settings.repeats))
-
-
-def _or_skip(what: str, measure: Callable[[], None]) -> None:
-    """Measure, or say why not: a scene, a program or a library may be absent here."""
-    try:
-        measure()
-    except SplatseedError as error:
-        print(f"SKIPPED {what}: {error}\n")
+        or_skip("command line", lambda: print_cli(settings.repeats))
 
 
 if __name__ == "__main__":

@@ -100,7 +100,7 @@ class Intrinsics:
 
     @property
     def has_distortion(self) -> bool:
-        """Whether straight lines are bent: not where all coefficients are 0, but by any fisheye."""
+        """Whether straight lines look bent: not if all coefficients are 0, always by a fisheye."""
         num_focal = CAMERA_MODELS[self.model].num_focal
         return self.model.endswith("FISHEYE") or any(self.params[num_focal + 2 :])
 

@@ -1,4 +1,4 @@
-"""The command line: finds the verb, runs it, and turns our errors into one line and exit code 2."""
+"""The command line: picks the verb, runs it, and turns our errors into one line and exit code 2."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ VERBS = {
     "evaluate": "Score a trained model: PSNR, SSIM, LPIPS.",
     "export": "Write a trained model as .ply, .spz, .sog or .splat; crop it.",
     "view": "Look at scenes and models in the browser.",
-    "flight": "Fly through a trained model: a video.",
+    "flight": "Make a video of a flight through a trained model.",
     "bench": "Compare methods by training: many runs, resumable, then a report.",
     "tune": "Find the best seeds and strategy for a scene by short runs on it.",
     "depth": "Make depth maps of the photographs, by a network or by stereo.",
@@ -39,11 +39,11 @@ VERBS = {
     "demo": "Make a small scene, upsample it by every method, measure, train.",
 }
 TERMINATED = 143
-"""As shells have it: 128 and the number of SIGTERM."""
+"""A shell's code for a process ended by SIGTERM: 128 plus the signal's number."""
 
 
 class _Termination(KeyboardInterrupt):
-    """SIGTERM, as schedulers send it: cleaned up after like Ctrl-C."""
+    """SIGTERM, as schedulers send it: cleanup runs as after Ctrl-C."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -80,7 +80,7 @@ def _print_completion(words: list[str]) -> None:
 
 def _run(verb: str, words: list[str]) -> None:
     try:
-        # One verb's imports are enough: --help must not wait for Numba.
+        # Import only this verb: --help must not wait for Numba.
         with _termination_raised():
             import_module(f"splatseed.commands.{verb}").run(words)
             sys.stdout.flush()
@@ -94,8 +94,8 @@ def _run(verb: str, words: list[str]) -> None:
     except OSError as error:
         where = f" at {error.filename}" if error.filename else ""
         _fail(
-            "expected to read and write what the command needs, its output among it; found"
-            f" {error.strerror or type(error).__name__}{where}. Check the disk and the place."
+            "expected to read the input and write the output; found"
+            f" {error.strerror or type(error).__name__}{where}. Check the disk and the path."
         )
     except KeyboardInterrupt as stop:
         ERR.print("\ninterrupted; nothing was left half-written")
@@ -106,9 +106,9 @@ def _run(verb: str, words: list[str]) -> None:
 
 @contextmanager
 def _termination_raised() -> Iterator[None]:
-    """Have SIGTERM raise, so that what is half-written is removed.
+    """Have SIGTERM raise an exception, so that half-written files are removed.
 
-    The handler of before comes back.
+    The previous handler is restored afterwards.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -125,7 +125,7 @@ def _terminate(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  (
 
 
 def _print_any_name() -> None:
-    """Let file names that are no valid text be printed, escaped, as Python does on stderr."""
+    """Print file names that are not valid Unicode escaped, as Python does on stderr."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
 
@@ -134,7 +134,7 @@ class _Notes(logging.Handler):
     """Shows what splatseed logs as notes on stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Show one."""
+        """Show one record."""
         ERR.print(f"note: {visible(record.getMessage())}", soft_wrap=True)
 
 
@@ -145,9 +145,9 @@ def _show_log() -> None:
 
 
 def _let_threads_sleep() -> None:
-    """Have idle threads sleep rather than spin; OpenMP reads this as PyTorch and Numba load it.
+    """Have idle threads sleep rather than spin; PyTorch's and Numba's OpenMP read this on loading.
 
-    The two have a pool of threads each: spinning, one takes the cores from the other, and on a busy
+    Each has its own pool of threads. If they spin, they take the cores from each other: on a busy
     machine a training step took 5 to 20 times as long.
     """
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -162,7 +162,7 @@ def _fail(message: str) -> NoReturn:
 
 
 def _forget_output() -> None:
-    """Write no more to a full or closed output, of which Python would complain at exit."""
+    """Stop writing to a full or closed output, or Python would complain at exit."""
     try:
         sys.stdout.flush()
     except (OSError, ValueError):

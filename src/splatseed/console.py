@@ -39,7 +39,7 @@ class LiteralConsole(Console):
         super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Text as it is, but for characters that would act; Rich calls this for every string."""
+        """Text unchanged but for control characters; Rich calls this for every string."""
         return super().render_str(visible(text, keep="\n"), **options)
 
 
@@ -47,11 +47,11 @@ OUT = LiteralConsole()
 ERR = LiteralConsole(stderr=True)
 COMPILE = "compiling kernels"
 TOLD_AFTER = 3.0
-"""Seconds of compilation that a log is told of: who reads one wonders only at longer ones."""
+"""Compilations shorter than this many seconds are not logged."""
 
 
 class StageClock:
-    """A ``Progress`` that times the stages, and shows them while within ``stage_display``."""
+    """A ``Progress`` that times the stages and, within ``stage_display``, shows them."""
 
     def __init__(self) -> None:
         self._bar: Bar | None = None
@@ -82,7 +82,7 @@ class StageClock:
         return total
 
     def begin_compilation(self) -> None:
-        """Count time as compilation, and show it; compilations can nest."""
+        """Count time as compilation and show it; compilations can nest."""
         self._compiling += 1
         if self._compiling == 1:
             self._before = self._started[-1][0] if self._started else COMPILE
@@ -92,7 +92,7 @@ class StageClock:
                 self._tasks[COMPILE] = self._bar.add_task(note, total=None)
 
     def end_compilation(self) -> None:
-        """Go on with the stage that compilation came into."""
+        """Return to the stage that compilation interrupted."""
         self._compiling -= 1
         if self._compiling == 0:
             self._started.append((self._before, time.perf_counter()))
@@ -100,14 +100,14 @@ class StageClock:
                 self._bar.remove_task(self._tasks.pop(COMPILE))
             if self._bar is None and not self._announced and self._compiled() > TOLD_AFTER:
                 self._announced = True
-                ERR.print(f"{COMPILE}, as the first use of each needs ...")
+                ERR.print(f"{COMPILE}, needed on first use ...")
 
     def tell_compilation(self) -> None:
-        """Say on stderr how long compilation took since this was last said, if it was long."""
+        """Report on stderr how long compilation took since the last report, if it was long."""
         since = self._compiled() - self._told
         if since > TOLD_AFTER:
             self._told += since
-            ERR.print(f"{COMPILE} took {since:.0f} s; they are kept for the next time")
+            ERR.print(f"{COMPILE} took {since:.0f} s; cached for the next run")
 
     def _compiled(self) -> float:
         return self.seconds().get(COMPILE, 0.0)
@@ -124,10 +124,10 @@ class StageClock:
 
 @contextmanager
 def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
-    """Bars on stderr while the block runs; print to stdout outside of it, or the two get mixed.
+    """Show progress bars on stderr while the block runs; print to stdout only outside the block.
 
     Args:
-        clock: One that has been shown before, to go on with; a new one when left out.
+        clock: A clock that was shown before, to resume; a new one when left out.
     """
     clock = StageClock() if clock is None else clock
     if not ERR.is_terminal:
@@ -146,12 +146,12 @@ def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
 
 
 def _compilation_shown(clock: StageClock) -> AbstractContextManager[None]:
-    """Tell the clock of compilations, which make a first run slow."""
+    """Tell the clock about compilations, which make a first run slow."""
     return watched(lambda begins: clock.begin_compilation() if begins else clock.end_compilation())
 
 
 def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print a two-column table, what and how much, unwrapped so that paths can be copied."""
+    """Print a two-column table of names and values, unwrapped so that paths can be copied."""
     _print_title(title)
     _print_columns(rows)
 

@@ -1,9 +1,9 @@
-"""DepthMap: how far away each pixel of an image is, and where such maps come from.
+"""DepthMap: the distance of each pixel of an image, and the source of such maps.
 
-Notation: a map is H x W pixels and belongs to one image, of the same size or another of the same
-shape: its pixel (column u, row v) has its centre at ((u + 0.5) / W, (v + 0.5) / H) of the image's
-width and height. Promise: values are float32 with NaN wherever nothing is known; a ``DepthMaps``
-reads a map when it is asked for, so that a scene's maps need not fit the memory.
+Notation: a map is H x W pixels and belongs to one image, of the same size or at least the same
+aspect ratio: its pixel (column u, row v) has its centre at ((u + 0.5) / W, (v + 0.5) / H) of the
+image's width and height. Promise: values are float32, NaN where unknown; a ``DepthMaps`` reads each
+map on demand, so a scene's maps need not fit in memory.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from splatseed.errors import SceneFormatError
 __all__ = ["ASPECT_SLACK", "DepthKind", "DepthMap", "DepthMaps"]
 
 DepthKind = Literal["z", "ray", "inverse"]
-"""What a value is: planar depth along the camera's axis, distance along the pixel's ray, or
-something that falls with z as a / z + b does (what most monocular networks predict)."""
+"""What a value is: planar depth z along the camera's axis, distance along the pixel's ray, or an
+inverse depth of the form a / z + b (what most monocular networks predict)."""
 
 ASPECT_SLACK = 0.02
-"""By how much a map's shape may differ from its image's: the rounding of a resized copy."""
+"""By how much a map's aspect ratio may differ from its image's: the rounding of a resized copy."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """What one image sees, in depth.
+    """The depth that one image sees.
 
     Args:
-        values: float32 [H, W]; NaN where nothing is known. For the kinds "z" and "ray" positive, in
-            units that are the scene's or (to be found by alignment) a multiple of them.
+        values: float32 [H, W]; NaN where unknown. For the kinds "z" and "ray", positive and in
+            scene units, or in a multiple of them that alignment determines.
         kind: What a value is.
     """
 
@@ -52,15 +52,15 @@ class DepthMap:
         return int(self.values.shape[0])
 
     def camera(self, camera: Camera) -> Camera:
-        """The camera of the image with its pixels those of the map: same pose, K scaled.
+        """The image's camera scaled to the map's pixels: same pose, K scaled.
 
         Raises:
-            SceneFormatError: The map has not the shape of the image.
+            SceneFormatError: The map and the image differ in aspect ratio.
         """
         scale = np.array([self.width / camera.width, self.height / camera.height])
         if abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
             raise SceneFormatError(
-                f"a depth map of the shape of its image, {camera.width} x {camera.height}",
+                f"a depth map with the aspect ratio of its image, {camera.width} x {camera.height}",
                 found=f"{self.width} x {self.height}",
                 fix="Make depth from the images of this scene, or resize both alike.",
             )
@@ -69,10 +69,10 @@ class DepthMap:
 
 
 class DepthMaps(Protocol):
-    """The depth maps of a scene, by the names of its images."""
+    """The depth maps of a scene, by image name."""
 
     def __contains__(self, name: object) -> bool:
-        """Whether there is a map for the image of that name."""
+        """Whether the image of that name has a map."""
         ...
 
     def __iter__(self) -> Iterator[str]:

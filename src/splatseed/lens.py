@@ -21,13 +21,13 @@ from splatseed.literal import quoted
 __all__ = ["distort", "fold_radius", "image_points", "rays_through", "undistort_first"]
 
 DIRECTIONS, STEPS = 8, 1024
-"""Rays along which a fold is looked for, and places on each."""
+"""Number of rays along which a fold is searched for, and of samples on each."""
 TRIES, DIFFERENCE, ARRIVED = 30, 1e-6, 1e-9
-"""Newton's method: its steps, the differences that slopes are from, and how near is there."""
+"""Newton's method: its steps, the step of finite differences, and the tolerance."""
 
 
 def undistort_first(scene: Path | None) -> str:
-    """What to tell the user of a scene that must have no distortion.
+    """Advice for the user whose scene must not have distortion.
 
     Args:
         scene: Its folder; None if that is not known.
@@ -54,12 +54,12 @@ def image_points(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[n
 
 
 def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
-    """Where the lens moves places on the plane at depth 1, float64 [*B, 2].
+    """Where the lens moves points on the plane at depth 1, float64 [*B, 2].
 
     Args:
-        lens: The camera, of which focal length and centre are left out.
-        xy: Places on the plane; far out, where a polynomial has lost its meaning, so has the
-            result.
+        lens: The camera; its focal length and centre are not used.
+        xy: Points on the plane; far out, where the polynomial has lost its meaning, the result is
+            meaningless too.
     """
     x, y = xy[..., 0], xy[..., 1]
     k = lens.params[CAMERA_MODELS[lens.model].num_focal + 2 :]
@@ -67,27 +67,27 @@ def distort(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.nda
         x, y = _equidistant(x, y)
     if lens.model == "FOV":
         return np.stack(_field_of_view(x, y, k[0]), axis=-1)
-    if lens.model == "RAD_TAN_THIN_PRISM_FISHEYE":  # tangential terms of what the radial ones give
+    if lens.model == "RAD_TAN_THIN_PRISM_FISHEYE":  # tangential terms apply to the radial result
         x, y = _moved(x, y, _Terms(radial=k[:6]))
         return np.stack(_moved(x, y, _Terms(tangential=k[7:5:-1], prism=k[8:])), axis=-1)
     return np.stack(_moved(x, y, _terms(lens.model, k)), axis=-1)
 
 
 def rays_through(lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:
-    """The rays (x, y, 1) that a lens brings to pixels: ``image_points`` undone, by Newton's method.
+    """The rays (x, y, 1) that a lens maps to pixels: ``image_points`` inverted by Newton's method.
 
     Args:
         lens: The camera.
         uv: Pixel coordinates; the first pixel's centre is (0.5, 0.5).
 
     Returns:
-        Places on the plane at depth 1, float64 [*B, 2]; NaN where no ray within the lens's fold
+        Points on the plane at depth 1, float64 [*B, 2]; NaN where no ray within the lens's fold
         leads there.
     """
     K = lens.K
     goal = (np.asarray(uv, np.float64) - K[:2, 2]) / K[[0, 1], [0, 1]]
     xy, ahead = goal.copy(), DIFFERENCE * np.eye(2)
-    with np.errstate(all="ignore"):  # far out nothing needs to be finite
+    with np.errstate(all="ignore"):  # values far out need not be finite
         for _ in range(TRIES):
             columns = [distort(lens, xy + move) - distort(lens, xy - move) for move in ahead]
             (a, c), (b, d) = (np.moveaxis(each / (2 * DIFFERENCE), -1, 0) for each in columns)
@@ -101,15 +101,14 @@ def rays_through(lens: Intrinsics, uv: Float64[np.ndarray, "*B 2"]) -> Float64[n
 
 
 def fold_radius(lens: Intrinsics, most: float) -> float:
-    """The distance from (0, 0) at which the lens folds: farther rays would come nearer.
+    """The distance from (0, 0) at which the lens folds: rays farther out would land nearer again.
 
-    Polynomials are fitted to the image; beyond it they turn back sooner or later, and would show
-    the image a second time.
+    Polynomials are fitted within the image; beyond it they turn back sooner or later, and would
+    show the image a second time.
 
     Args:
         lens: The camera.
-        most: How far to look, on the plane at depth 1; the result where there is no fold up to
-            there.
+        most: How far to search on the plane at depth 1; returned if there is no fold up to there.
     """
     radius = np.linspace(0.0, most, STEPS + 1)
     angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
@@ -121,9 +120,9 @@ def fold_radius(lens: Intrinsics, most: float) -> float:
 
 
 class _Terms(NamedTuple):
-    """Coefficients of a lens: of r^2, r^4, ... above and below, p1 and p2, and a prism's.
+    """A lens's coefficients: of r^2, r^4, ... in numerator and denominator, p1 and p2, a prism's.
 
-    The prism's are of r^2 and r^4, first for u, then for v.
+    The prism's multiply r^2 and r^4, first for u, then for v.
     """
 
     radial: tuple[float, ...] = ()
@@ -133,7 +132,7 @@ class _Terms(NamedTuple):
 
 
 def _terms(model: str, k: tuple[float, ...]) -> _Terms:
-    """A model's own order of parameters, sorted out."""
+    """A model's parameters, sorted into terms."""
     match model:
         case "OPENCV":
             return _Terms(k[:2], tangential=k[2:])
@@ -142,11 +141,11 @@ def _terms(model: str, k: tuple[float, ...]) -> _Terms:
         case "THIN_PRISM_FISHEYE":
             return _Terms((*k[:2], *k[4:6]), tangential=k[2:4], prism=(k[6], 0.0, k[7], 0.0))
         case _:
-            return _Terms(k)  # radial alone, or nothing
+            return _Terms(k)  # radial only, or none
 
 
 Plane = tuple[np.ndarray, np.ndarray]
-"""First and second coordinate of places on the plane."""
+"""First and second coordinates of points on the plane."""
 
 
 def _moved(x: np.ndarray, y: np.ndarray, terms: _Terms) -> Plane:
@@ -171,14 +170,14 @@ def _polynomial(t: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
 
 
 def _equidistant(x: np.ndarray, y: np.ndarray) -> Plane:
-    """A fisheye's plane: as far from the centre as the angle from the axis, theta = atan r."""
+    """A fisheye: the image radius is the angle from the axis, theta = atan r."""
     r = np.hypot(x, y)
     scale = np.divide(np.arctan(r), r, out=np.ones_like(r), where=r > 0)
     return x * scale, y * scale
 
 
 def _field_of_view(x: np.ndarray, y: np.ndarray, omega: float) -> Plane:
-    """Devernay and Faugeras: the image's radius is atan(2 r tan(omega / 2)) / omega."""
+    """Devernay and Faugeras: the image radius is atan(2 r tan(omega / 2)) / omega."""
     if not omega:
         return x, y
     r = np.hypot(x, y)

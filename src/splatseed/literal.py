@@ -1,7 +1,7 @@
 """Names of files as text that a terminal and a shell take literally.
 
 Promise: whatever characters a name has, it can neither move the cursor, colour the terminal, begin
-a new line nor change the command that it is printed in.
+a new line, nor change the command it is printed in.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["did_you_mean", "quoted", "visible"]
 
 
 def visible(text: object, keep: str = "") -> str:
-    r"""Text with every character that acts rather than shows written as an escape.
+    r"""Text with every control character written as an escape.
 
     Args:
         text: A name, or a sentence that holds some.
@@ -31,7 +31,7 @@ def visible(text: object, keep: str = "") -> str:
 
 
 def quoted(path: Path | str) -> str:
-    r"""A path as a word of a command line, for a POSIX shell.
+    r"""A path as one word of a command line, for a POSIX shell.
 
     Example:
         >>> print(quoted("my scene"), quoted("-o"), quoted("a\nb"))
@@ -45,7 +45,7 @@ def quoted(path: Path | str) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """A question with the known word that is most like another, and a space; nothing if none is.
+    """A question with the known word most similar to another, and a space; empty if none is.
 
     Example:
         >>> did_you_mean("--ratoi", ["--ratio", "--seed"])

@@ -1,10 +1,10 @@
-"""PointCloud: coloured points, which of them are the originals, and what is known of them.
+"""PointCloud: coloured points, where each came from, and what is known about them.
 
 Notation: N points; ``xyz`` in scene units and the scene's world frame; ``rgb`` 8-bit sRGB as stored
-by COLMAP; ``source`` 0 for an original point, otherwise the code of the method that made the point.
-The *attributes* normals, sizes and confidence are there or not, and NaN where they are not known of
-a point. Promise: arrays have the shapes and dtypes below and are read-only; methods return new
-clouds, in which every point keeps all that is known of it.
+by COLMAP; ``source`` is 0 for an original point, otherwise the code of the method that made it.
+The *attributes* normals, sizes and confidence are optional, and NaN where unknown for a point.
+Promise: arrays have the shapes and dtypes below and are read-only; methods return new clouds, in
+which every point keeps all its attributes.
 """
 
 from __future__ import annotations
@@ -24,16 +24,15 @@ ORIGINAL = 0
 """The ``source`` code of points that were in the input."""
 
 GENERATED = 255
-"""The ``source`` code of points made by a method that has no code of its own, or that is not
-known."""
+"""The ``source`` code of points whose method is unknown or has no code of its own."""
 
 ATTRIBUTES: Mapping[str, tuple[int, ...]] = MappingProxyType(
     {"normals": (3,), "sizes": (), "confidence": ()}
 )
-"""What may be known of a point beyond place, colour and origin: the shape of one point's value."""
+"""Optional attributes of a point besides position, colour and origin: the shape of one value."""
 
 FARTHEST = np.float32(1e15)
-"""Coordinates beyond are no places: the squares of such distances leave single precision."""
+"""Limit of valid coordinates: the squares of larger distances overflow single precision."""
 UNIT_TOLERANCE = 1e-2
 """By how much a normal's length may differ from 1: half precision keeps it within 1e-3."""
 
@@ -49,10 +48,10 @@ class PointCloud:
         xyz: Positions, float32 [N, 3], scene units, world frame.
         rgb: Colours, uint8 [N, 3].
         source: Origin of each point, uint8 [N]; 0 = original. All originals when left out.
-        normals: Unit normals of the surface there, float32 [N, 3], world axes; NaN where unknown.
-        sizes: Radius that a Gaussian there should begin with, float32 [N], scene units, above 0;
+        normals: Unit normals of the surface, float32 [N, 3], world axes; NaN where unknown.
+        sizes: Initial radius of a Gaussian there, float32 [N], scene units, above 0;
             NaN where unknown.
-        confidence: How sure it is that a surface is there, float32 [N], 0 to 1; NaN where unknown.
+        confidence: Confidence that a surface is there, float32 [N], 0 to 1; NaN where unknown.
 
     Raises:
         PointCloudError: The shapes or the colour type do not fit, or an attribute is out of range.
@@ -96,7 +95,7 @@ class PointCloud:
 
     @property
     def attributes(self) -> dict[str, Float32[np.ndarray, "N ..."]]:
-        """Those of ``ATTRIBUTES`` that the cloud has, by name."""
+        """The ``ATTRIBUTES`` that the cloud has, by name."""
         values = {name: getattr(self, name) for name in ATTRIBUTES}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -107,13 +106,13 @@ class PointCloud:
 
     @property
     def originals(self) -> PointCloud:
-        """The points of the input alone, in their order."""
+        """The original points only, in order."""
         return self.select(self.source == ORIGINAL)
 
     @property
     def finite(self) -> Bool[np.ndarray, " N"]:
-        """Which points have three finite coordinates, of which distances can be computed."""
-        return np.asarray((np.abs(self.xyz) < FARTHEST).all(axis=1))  # nor is NaN
+        """Which points have three finite coordinates, so that distances can be computed."""
+        return np.asarray((np.abs(self.xyz) < FARTHEST).all(axis=1))  # NaN compares false
 
     @property
     def distinct(self) -> Bool[np.ndarray, " N"]:
@@ -128,12 +127,12 @@ class PointCloud:
         return PointCloud(self.xyz[which], self.rgb[which], self.source[which], **chosen)
 
     def replace(self, **changes: np.ndarray | None) -> PointCloud:
-        """A copy with some of its arrays replaced; None takes an attribute out."""
+        """A copy with some of its arrays replaced; None removes an attribute."""
         return dataclass_replace(self, **changes)  # type: ignore[arg-type]  # None for attributes
 
     @staticmethod
     def concatenate(*clouds: PointCloud) -> PointCloud:
-        """The clouds one after another; what one has not of an attribute of another's is NaN."""
+        """The clouds one after another; attributes that one lacks and another has become NaN."""
         known = [name for name in ATTRIBUTES if any(name in c.attributes for c in clouds)]
         return PointCloud(
             np.concatenate([c.xyz for c in clouds]),
@@ -159,7 +158,7 @@ def _joined(clouds: Sequence[PointCloud], name: str) -> Float32[np.ndarray, "N .
 
 
 def _first_of_equals(xyz: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-    """Which of the finite rows equal no earlier one: exact, a hash only narrows the search."""
+    """Which of the finite rows equal no earlier row; exact, as a hash only narrows the search."""
     xyz = np.ascontiguousarray(xyz + np.float32(0.0))  # adding turns -0.0 into 0.0
     suspects = np.flatnonzero(_hash_collides(xyz))
     rows = xyz[suspects].view(np.dtype((np.void, 3 * xyz.itemsize))).ravel()
@@ -202,7 +201,7 @@ def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:
 
 
 def _check_attribute(name: str, values: np.ndarray, num_points: int) -> None:
-    """Hold an attribute to its shape and its range; NaN is always in range."""
+    """Check an attribute's shape and range; NaN is always in range."""
     shape = (num_points, *ATTRIBUTES[name])
     if values.shape != shape or values.dtype.kind not in "fiu":
         raise PointCloudError(
@@ -216,7 +215,7 @@ def _check_attribute(name: str, values: np.ndarray, num_points: int) -> None:
         raise PointCloudError(
             f"{name} {_RANGES[name]}, or NaN where not known",
             found=f"{values[wrong[0]].tolist()} at point {wrong[0]} and {wrong.size - 1:,} more",
-            fix="Pass NaN for points of which they are not known.",
+            fix="Pass NaN for points where they are unknown.",
         )
 
 
@@ -226,6 +225,6 @@ def _in_range(name: str, values: Float[np.ndarray, "N ..."]) -> Bool[np.ndarray,
         return np.asarray(np.abs(squares - 1.0) <= 2 * UNIT_TOLERANCE)[:, None]
     if name == "sizes":
         with np.errstate(over="ignore", under="ignore"):
-            sizes = values.astype(np.float32)  # in which they are kept
+            sizes = values.astype(np.float32)  # the type they are stored in
         return np.asarray((sizes > 0) & np.isfinite(sizes))
     return np.asarray((values >= 0) & (values <= 1))

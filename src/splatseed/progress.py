@@ -32,10 +32,10 @@ def blocks(total: int, size: int, stage: str, progress: Progress) -> Iterator[tu
 def in_threads(
     work: Callable[[int, int], None], total: int, size: int, stage: str, progress: Progress
 ) -> None:
-    """Call ``work(start, stop)`` for pieces of ``range(total)`` on all cores; report after each.
+    """Call ``work(start, stop)`` on pieces of ``range(total)`` on all cores; report after each.
 
-    For work that releases the GIL. An interrupt is raised only when the pieces in hand are done:
-    SciPy's own ``workers`` leave theirs running on arrays that are then freed, which crashes.
+    For work that releases the GIL. An interrupt is raised only once the running pieces are done:
+    SciPy's own ``workers`` keep running on arrays that are then freed, which crashes.
     """
     progress(stage, 0.0)
     starts = range(0, total, size)

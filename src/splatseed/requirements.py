@@ -1,4 +1,4 @@
-"""What parts of splatseed need beyond the package's own requirements."""
+"""Optional packages: checking that they are installed, and how to install them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ INSTALL = {
     "viser": "viser>=1.1",
     "zstandard": "zstandard>=0.22",
 }
-"""What to ask pip for, as in pyproject.toml: extras of splatseed itself can only be had from its
+"""What to ask pip for, as in pyproject.toml: splatseed's extras can only be installed from its
 folder."""
 
 

@@ -60,7 +60,7 @@ class Image:
     Args:
         name: Path relative to the images folder, with forward slashes.
         image_id: The id that tracks refer to.
-        intrinsics: The camera record that took it.
+        intrinsics: The camera record of the image.
         quat: wxyz rotation of ``cam_from_world``, float64 [4], as in the file.
         translation: Translation of ``cam_from_world``, float64 [3].
         observations: Its features; None where the format has none.
@@ -86,7 +86,7 @@ class Image:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """What Structure-from-Motion knows of its points beyond position and colour.
+    """What Structure-from-Motion knows about its points besides position and colour.
 
     The observations of point i are ``image_ids[offsets[i]:offsets[i + 1]]`` and the features
     ``point2d_idx`` of those images.
@@ -141,11 +141,11 @@ class SceneSource:
 
 @dataclass(frozen=True)
 class Split:
-    """Which images train and which test, by a list that came with the scene.
+    """Which images train and which test, from a list that came with the scene.
 
     Args:
         train: Names of the images to train on.
-        test: Names of the others that are to be tested; an image may be in neither.
+        test: Names of the images to test; an image may be in neither.
         origin: The list, in words.
     """
 
@@ -157,11 +157,11 @@ class Split:
     def sentence(self) -> str:
         """What the user should know before training."""
         count = f"{len(self.train):,} training and {len(self.test):,} test images"
-        return f"The scene's {self.origin} is followed: {count}, whatever --test-every says."
+        return f"The scene's {self.origin} sets the split: {count}; --test-every is ignored."
 
 
 class LeftOut(NamedTuple):
-    """How many points of its files a scene does without.
+    """How many points of its files a scene leaves out.
 
     Args:
         non_finite: Points without three finite coordinates, or beyond 1e15.
@@ -179,14 +179,13 @@ class Scene:
     Args:
         points: The cloud.
         images: The posed images, in file order; empty for a bare cloud.
-        intrinsics: All camera records of the file, also unused ones.
+        intrinsics: All camera records of the file, including unused ones.
         tracks: Tracks of the first ``len(tracks)`` points, which are the originals.
         source: Where it was read from; None for a scene made in memory.
         warnings: What the reader repaired or found odd, one sentence each.
-        depths: Depth maps of some of the images; None where there are none. They are read when
-            asked for.
-        listed: The split that lists beside the scene give; None where there are none.
-        left_out: How many points of its files it does without.
+        depths: Depth maps of some images, read on demand; None if there are none.
+        listed: The split given by lists beside the scene; None without such lists.
+        left_out: How many points of its files were left out.
     """
 
     points: PointCloud
@@ -214,7 +213,7 @@ class Scene:
 
     @property
     def has_photographs(self) -> bool:
-        """Whether the file of at least one image is there."""
+        """Whether the file of at least one image exists."""
         folder = self.source.image_dir if self.source else None
         return folder is not None and any((folder / each.name).is_file() for each in self.images)
 

@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 __all__ = ["Similarity", "fit_similarity", "similarity_of"]
 
 _TOLERANCE = 1e-3
-"""Of rotation @ rotation.T against the identity."""
+"""Largest deviation of rotation @ rotation.T from the identity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +52,12 @@ class Similarity:
 
     @property
     def matrix(self) -> Float64[np.ndarray, "3 4"]:
-        """As an affine map."""
+        """The similarity as an affine map."""
         return np.column_stack([self.scale * self.rotation, self.translation])
 
 
 def similarity_of(matrix: np.ndarray) -> Similarity | None:
-    """The similarity that an affine map [3, 4] or [4, 4] is; None if it is none."""
+    """The similarity that an affine map [3, 4] or [4, 4] is, or None if it is not one."""
     if matrix.shape not in {(3, 4), (4, 4)} or not np.isfinite(matrix).all():
         return None
     linear = np.asarray(matrix[:3, :3], np.float64)
@@ -74,11 +74,11 @@ def similarity_of(matrix: np.ndarray) -> Similarity | None:
 def fit_similarity(
     source: Float64[np.ndarray, "N 3"], target: Float64[np.ndarray, "N 3"]
 ) -> Similarity | None:
-    """The similarity that takes points closest to their partners; None where none is determined.
+    """The least-squares similarity that maps points to their partners; None if undetermined.
 
     Args:
-        source: At least three points, not on a line.
-        target: Where each belongs.
+        source: At least three points, not collinear.
+        target: The partner of each point.
     """
     if len(source) < 3:
         return None
@@ -86,7 +86,9 @@ def fit_similarity(
     around, wanted = source - center, target - goal
     left, stretch, right = np.linalg.svd(wanted.T @ around)
     spread = float((around**2).sum())
-    if spread == 0 or stretch[1] <= 1e-9 * stretch[0]:  # on a line, it could turn around that
+    if (
+        spread == 0 or stretch[1] <= 1e-9 * stretch[0]
+    ):  # collinear: the rotation about the line is free
         return None
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
     rotation = (left * signs) @ right

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from importlib import import_module
-from pathlib import Path
-from types import SimpleNamespace
-
 import pytest
 
 pytest.importorskip("torch", reason="training needs PyTorch")
@@ -17,16 +12,7 @@ from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import TrainSettings
 from splatseed.train.schedule import make_schedule
 
-ROOT = Path(__file__).parents[2]
-
-
-@pytest.fixture(scope="module")
-def bench():
-    sys.path.insert(0, str(ROOT))
-    yield SimpleNamespace(
-        **{n: import_module(f"benchmarks.training.{n}") for n in ("baseline", "baseline_arms")}
-    )
-    sys.path.remove(str(ROOT))
+MODULES = ("training.baseline", "training.baseline_arms")
 
 
 @pytest.fixture(scope="module")

@@ -4,11 +4,9 @@ too."""
 from __future__ import annotations
 
 import dataclasses
-import subprocess
+import runpy
 import sys
-from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -189,16 +187,6 @@ def distances(points):
 
 
 @pytest.fixture(scope="module")
-def bench():
-    """The modules by name; they import each other from the checkout."""
-    sys.path.insert(0, str(ROOT))
-    yield SimpleNamespace(
-        **{name.split(".")[1]: import_module(f"benchmarks.{name}") for name in MODULES}
-    )
-    sys.path.remove(str(ROOT))
-
-
-@pytest.fixture(scope="module")
 def room(tmp_path_factory):
     path = tmp_path_factory.mktemp("room") / "room"
     return write_capture(make_capture(0, num_views=12, width=96, height=72), path)
@@ -229,18 +217,17 @@ def short(bench, room, examples):
     return _train(bench, room, examples, 1)
 
 
-def test_the_peers_file_trains_on_our_views_and_is_scored(bench, room, examples, short):
-    long = _train(bench, room, examples, 60, cap_max=short["gaussians"])
-    assert long["psnr"] > short["psnr"] + 2
-    assert long["ssim"] > short["ssim"]
-    assert long["seconds"] > short["seconds"] > 0
-
-
 @pytest.mark.parametrize("strategy", ["default", "mcmc"])
-def test_both_strategies_of_the_peer_are_held_to_the_cap(bench, room, examples, short, strategy):
+def test_the_peers_file_trains_on_our_views_to_the_cap_and_is_scored(
+    bench, room, examples, short, strategy
+):
     cap = short["gaussians"] + 20
-    found = _train(bench, room, examples, 40, strategy=strategy, cap_max=cap)
-    assert short["gaussians"] < found["gaussians"] <= cap
+    long = _train(bench, room, examples, 60, strategy=strategy, cap_max=cap)
+    assert short["gaussians"] < long["gaussians"] <= cap
+    assert long["seconds"] > short["seconds"] > 0
+    if strategy == "default":  # mcmc's noise takes longer than this to be worth anything
+        assert long["psnr"] > short["psnr"] + 2
+        assert long["ssim"] > short["ssim"]
 
 
 def test_validation_views_are_of_the_training_views(bench, room):
@@ -346,14 +333,11 @@ def test_options_that_make_no_sense_are_refused(bench, wrong, says):
         bench.peer_trainer.Settings(Path(), **wrong)
 
 
-def test_the_script_says_what_is_missing_without_a_traceback(room):
-    done = subprocess.run(
-        [
-            *(sys.executable, "-m", "benchmarks.training.peer_trainer"),
-            *("--scene", room, "--gsplat-examples", "none"),
-        ],
-        cwd=ROOT, capture_output=True, check=False, text=True,
-    )  # fmt: skip
-    assert done.returncode == 1
-    assert done.stderr.startswith("expected the folder examples of gsplat v1.5.3")
-    assert "Traceback" not in done.stderr
+def test_the_script_says_what_is_missing_without_a_traceback(bench, room, monkeypatch):
+    """Run in this process: one of its own would wait for PyTorch again."""
+    words = ["--scene", str(room), "--gsplat-examples", "none"]
+    monkeypatch.setattr(sys, "argv", ["peer_trainer", *words])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_path(bench.peer_trainer.__file__, run_name="__main__")
+    # A text is printed on stderr, and the exit code is 1.
+    assert stop.value.code.startswith("expected the folder examples of gsplat v1.5.3")

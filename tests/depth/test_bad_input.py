@@ -79,7 +79,7 @@ def test_a_lens_with_distortion_is_refused(exact):
 def test_maps_that_know_nothing_are_an_error(exact, make_maps):
     empty = exact.replace(depths=make_maps("z", lambda z, _: z * np.nan))
     for options in ({}, {"align": False}, {"profile": "paper"}):
-        with pytest.raises(SceneFormatError, match=r"none among 12; view_000.*knows no depth"):
+        with pytest.raises(SceneFormatError, match=r"none among 12; view_000.*has no depth"):
             upsample(empty, **options)
 
 

@@ -296,7 +296,7 @@ def test_pictures_show_the_photograph_the_render_and_the_error(room, model_path,
             pixels = np.asarray(file)
         assert pixels.shape[0] == view.height
         assert pixels.shape[1] > 3 * view.width
-        np.testing.assert_array_equal(pixels[:, : view.width], view.image)
+        np.testing.assert_array_equal(pixels[:, : view.width], view.photograph)
 
 
 def test_a_bare_cloud_is_no_scene_to_score_on(room, model_path):

@@ -1,4 +1,4 @@
-"""Models survive each format, agree with the formats' own tools, and damaged files are told from whole ones."""
+"""Models survive each format and agree with the formats' own tools; damaged files are refused."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from splatseed.splat.gaussians import Gaussians
 
 SUFFIXES = [each.suffix for each in FORMATS.values()]
 PACKED = [suffix for suffix in SUFFIXES if suffix != ".ply"]
-LIMITS = {  # of positions, log-scales, degrees of rotation, opacities, first and further coefficients
+# Of positions, log-scales, degrees of rotation, opacities, first and further coefficients.
+LIMITS = {
     ".compressed.ply": (0.02, 0.01, 0.3, 0.003, 0.02, 0.02),
     ".splat": (0, 1e-5, 0.8, 0.003, 0.01, None),
     ".spz": (1e-4, 0.04, 0.3, 0.003, 0.02, 0.02),
@@ -182,7 +183,9 @@ def test_damage_is_told_or_harmless(files, tmp_path_factory, suffix, data):
     for _ in range(data.draw(st.integers(1, 4))):
         if content:
             # Headers are where it hurts.
-            at = data.draw(st.integers(0, min(len(content) - 1, data.draw(st.sampled_from([60, 2000, 10**9])))))  # fmt: skip
+            at = data.draw(
+                st.integers(0, min(len(content) - 1, data.draw(st.sampled_from([60, 2000, 10**9]))))
+            )
             content[at] = data.draw(st.integers(0, 255))
     path = tmp_path_factory.mktemp("damaged") / f"m{suffix}"
     path.write_bytes(content)
@@ -224,7 +227,11 @@ def test_what_is_no_model_is_named(tmp_path):
 def test_names_choose_the_format_and_others_have_a_tool(tmp_path):
     assert format_of_name(tmp_path / "A.COMPRESSED.PLY") == "compressed-ply"
     assert format_of_name(tmp_path / "a.ply") == "ply"
-    for name, word in (("a.glb", "splat-transform"), ("a.sogg", r"Did you mean \.sog"), ("a", "none")):  # fmt: skip
+    for name, word in (
+        ("a.glb", "splat-transform"),
+        ("a.sogg", r"Did you mean \.sog"),
+        ("a", "none"),
+    ):
         with pytest.raises(ParameterError, match=word):
             format_of_name(tmp_path / name)
 

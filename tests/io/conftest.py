@@ -193,3 +193,9 @@ def little_memory() -> Callable[[], AbstractContextManager[None]]:
             tracemalloc.stop()
 
     return guard
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory) -> Path:
+    """A file for fuzzed bytes."""
+    return tmp_path_factory.mktemp("fuzz") / "file"

@@ -14,6 +14,8 @@ from splatseed.errors import SplatseedError
 from splatseed.io.colmap import binary as colmap_binary, text as colmap_text
 from splatseed.io.ply.points import read_ply, write_ply
 
+from .fuzzing import assert_only_our_errors
+
 CAMERAS = (Intrinsics(7, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0)),)
 READERS: dict[str, Callable[[Path], object]] = {
     "cameras.bin": colmap_binary.read_cameras,
@@ -88,20 +90,6 @@ def valid(tmp_path_factory) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in READERS}
 
 
-@pytest.fixture(scope="module")
-def target(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("fuzz") / "file"
-
-
-def _assert_only_our_errors(name, target, data, little_memory):
-    target.write_bytes(data)
-    with little_memory():
-        try:
-            READERS[name](target)
-        except SplatseedError as error:
-            assert str(target) in str(error)  # noqa: PT017  (no error is as good as ours)
-
-
 @st.composite
 def _damage(draw, data: bytes) -> bytes:
     """The bytes with a few overwritten, cut out, put in or repeated."""
@@ -129,15 +117,15 @@ def _damage(draw, data: bytes) -> bytes:
 @fuzz
 @given(data=st.binary(max_size=300))
 def test_random_bytes(name, target, little_memory, data, valid):
-    _assert_only_our_errors(name, target, data, little_memory)
-    _assert_only_our_errors(name, target, valid[name][: len(data)] + data, little_memory)
+    assert_only_our_errors(READERS[name], target, data, little_memory)
+    assert_only_our_errors(READERS[name], target, valid[name][: len(data)] + data, little_memory)
 
 
 @pytest.mark.parametrize("name", READERS)
 @fuzz
 @given(data=st.data())
 def test_damaged_files(name, target, little_memory, data, valid):
-    _assert_only_our_errors(name, target, data.draw(_damage(valid[name])), little_memory)
+    assert_only_our_errors(READERS[name], target, data.draw(_damage(valid[name])), little_memory)
 
 
 WORDS = st.sampled_from(
@@ -152,10 +140,10 @@ WORDS = st.sampled_from(
 @given(words=st.lists(WORDS | st.text(max_size=5), max_size=60))
 def test_random_words(name, target, little_memory, words, valid):
     text = " ".join(words).encode("utf-8", errors="replace")
-    _assert_only_our_errors(name, target, text, little_memory)
-    _assert_only_our_errors(name, target, valid[name] + text, little_memory)
+    assert_only_our_errors(READERS[name], target, text, little_memory)
+    assert_only_our_errors(READERS[name], target, valid[name] + text, little_memory)
     start = valid[name].find(b"end_header\n") + len(b"end_header\n")
-    _assert_only_our_errors(name, target, valid[name][:start] + text, little_memory)
+    assert_only_our_errors(READERS[name], target, valid[name][:start] + text, little_memory)
 
 
 @pytest.mark.parametrize("name", [name for name in READERS if name.endswith(".bin")])

@@ -101,7 +101,7 @@ def test_a_list_that_fits_no_image_is_left_aside(text, scene_dir, names):
     scene = load_scene(scene_dir)
     assert scene.listed is None
     assert _names(scene.split(8)[1]) == set(sorted(names)[::8])
-    assert bool(text) == any("train.txt was left aside" in each for each in scene.warnings)
+    assert bool(text) == any("train.txt was ignored" in each for each in scene.warnings)
 
 
 def test_what_looks_at_photographs_holds_out_the_same(scene_dir, names):

@@ -142,7 +142,7 @@ def test_a_step_of_training_makes_no_lists(made: list[None]) -> None:
     assert "isect_ids" in info
     assert "isect" not in info
     assert len(info) == len(list(info)) == len(info.keys())
-    assert "made when it is read" in repr(info)
+    assert "made when first read" in repr(info)
     assert info.get("isect") is None
     with pytest.raises(KeyError):
         info["isect"]

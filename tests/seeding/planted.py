@@ -40,7 +40,7 @@ def photographs() -> list[View]:
 
 def constant(view: View, level: int = 128) -> View:
     """The same view of nothing but one grey."""
-    return dataclasses.replace(view, image=np.full_like(view.image, level))
+    return dataclasses.replace(view, photograph=np.full_like(view.photograph, level))
 
 
 def on_plane(places: np.ndarray) -> np.ndarray:

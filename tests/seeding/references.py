@@ -110,7 +110,7 @@ def cover(views, xyz, cell, rng):
         rows, cols = depths.shape
         for i, j in np.argwhere(np.isinf(depths)):
             depth, reach = guess(view, cell, depths, i, j, others)
-            box = view.image[
+            box = view.photograph[
                 i * view.height // rows : (i + 1) * view.height // rows,
                 j * view.width // cols : (j + 1) * view.width // cols,
             ]

@@ -114,7 +114,7 @@ def test_the_room_is_covered_near_its_surfaces(room_capture, room_views, rng):
         matrix = slow.matrix_of(view, 1)[0]
         at = np.array([slow.project(point, matrix) for point in seeds.xyz[mine]]).reshape(-1, 3)
         column, row = at[:, 0].astype(int), at[:, 1].astype(int)
-        gap = np.abs(seeds.rgb[mine].astype(float) - view.image[row, column]).mean()
+        gap = np.abs(seeds.rgb[mine].astype(float) - view.photograph[row, column]).mean()
         assert gap < 25
 
 
@@ -150,7 +150,7 @@ def test_masked_cells_get_no_seed(rng):
     assert (column[:, 0] / column[:, 2]).min() == pytest.approx(2.5)
     third = np.abs(column[:, 0] / column[:, 2] - 2.5) < 1e-3
     row = (column[third, 1] / column[third, 2]).astype(int)
-    expected = [view.image[8 * i : 8 * i + 8, 20:24].reshape(-1, 3).mean(axis=0) for i in row]
+    expected = [view.photograph[8 * i : 8 * i + 8, 20:24].reshape(-1, 3).mean(axis=0) for i in row]
     assert np.abs(seeds.rgb[third] - expected).max() <= 0.5
     assert not len(cover([view], xyz, rng=rng, masks=[np.zeros_like(mask)]))
 
@@ -164,7 +164,7 @@ def test_full_coverage_needs_no_seed(rng):
 
 def test_bad_input_is_refused(rng):
     view, xyz = slow.make_view(rng), np.zeros((1, 3), np.float32)
-    unseen = dataclasses.replace(view, image=np.empty((0, 0, 3), np.uint8))
+    unseen = dataclasses.replace(view, photograph=np.empty((0, 0, 3), np.uint8))
     with pytest.raises(ParameterError, match="pixels of 40 x 32"):
         cover([unseen], xyz, rng=rng)
     with pytest.raises(ParameterError, match="mask of 40 x 32"):

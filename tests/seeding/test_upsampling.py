@@ -137,7 +137,7 @@ def test_a_budget_that_originals_fill_is_theirs_alone(room):
     count, notes = room.points.num_original, []
     thinned = ss.upsample(room, budget=count // 2, note=notes.append)
     assert len(thinned) == thinned.num_original == count // 2
-    assert "are thinned, and none is added" in notes[-1]
+    assert "are thinned, and none are added" in notes[-1]
     made = ss.upsample(room, cover=8, budget=count // 2)  # the long way
     np.testing.assert_array_equal(made.xyz, thinned.xyz)
 

@@ -113,7 +113,7 @@ def test_the_notes_count_every_point(views, places):
     kept = hold(views, KNOWN, new)
     dropped = len(new) - len(kept.xyz)
     assert f"of {len(new):,} new points agree" in kept.notes[0]
-    assert any(f"{dropped:,} do so nowhere and were dropped" in note for note in kept.notes)
+    assert any(f"{dropped:,} agree nowhere and were dropped" in note for note in kept.notes)
 
 
 def test_without_texture_flat_places_stay_and_others_go(views, places, rng):
@@ -150,7 +150,9 @@ def test_of_a_photograph_only_what_it_shows_judges(views, places):
     cut = []
     for view in views:
         mask = np.arange(view.width) < np.full((view.height, 1), view.width // 2)
-        cut.append(dataclasses.replace(view, mask=mask, image=view.image * mask[..., None]))
+        cut.append(
+            dataclasses.replace(view, mask=mask, photograph=view.photograph * mask[..., None])
+        )
     far = np.concatenate([shifted(places, np.full(len(places), off)) for off in (-5.0, 5.0)])
     columns = np.array([project(v, far)[:, 0] for v in views])
     black, lit = (columns > WIDTH // 2).all(axis=0), (columns < WIDTH // 2 - 5).all(axis=0)

@@ -36,8 +36,13 @@ def served_page(folder, url, width=800, height=600):
 def go(page, url, width=800, height=600):
     page.requests.clear()
     page._events.clear()
-    page.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
-              deviceScaleFactor=1, mobile=False)  # fmt: skip
+    page.call(
+        "Emulation.setDeviceMetricsOverride",
+        width=width,
+        height=height,
+        deviceScaleFactor=1,
+        mobile=False,
+    )
     page.call("Page.navigate", url=url)
     while not page._events:
         page._next()
@@ -66,14 +71,16 @@ def text(page):
 def click_text(page, words, tag):
     """Click the last element that has just these words."""
     page.run(
-        f"[...document.querySelectorAll({tag!r})].filter(e => e.innerText === {words!r}).at(-1).click()"
+        f"[...document.querySelectorAll({tag!r})]"
+        f".filter(e => e.innerText === {words!r}).at(-1).click()"
     )
 
 
 def toggle(page, label):
     """Click the checkbox that stands beside a label."""
     page.run(
-        f"(() => {{ let e = [...document.querySelectorAll('*')].filter(e => e.innerText === {label!r}).at(-1);"
+        "(() => { let e = [...document.querySelectorAll('*')]"
+        f".filter(e => e.innerText === {label!r}).at(-1);"
         " while (!e.querySelector('input[type=checkbox]')) e = e.parentElement;"
         " e.querySelector('input[type=checkbox]').click(); })()"
     )

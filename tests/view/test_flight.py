@@ -1,4 +1,4 @@
-"""``splatseed flight`` as a user runs it: videos that can be read, and one line for what cannot be."""
+"""``splatseed flight`` as a user runs it: readable videos, and one line for what is refused."""
 
 from __future__ import annotations
 
@@ -62,7 +62,18 @@ def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, capsys
     frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 60}
     (tmp_path / "p.json").write_text(json.dumps({"camera_path": 4 * [frame], "fps": 8}))
     out = tmp_path / "flight.mkv"
-    code, said = _run(capsys, "flight", run_folder, "-o", out, "--path", tmp_path / "p.json", "--transform", "none", "--depth")  # fmt: skip
+    code, said = _run(
+        capsys,
+        "flight",
+        run_folder,
+        "-o",
+        out,
+        "--path",
+        tmp_path / "p.json",
+        "--transform",
+        "none",
+        "--depth",
+    )
     assert code == 0, said.err
     frames, fps = _frames(out)
     assert (len(frames), fps) == (4, 8)
@@ -73,7 +84,10 @@ def test_a_path_through_nerfstudios_world_needs_its_transform(room, run_folder, 
     not."""
     turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
     world = Similarity(0.01, turn, np.array([0.2, 40.0, 0.1]))
-    content = {"transform": np.column_stack([turn, world.translation / 0.01]).tolist(), "scale": 0.01}  # fmt: skip
+    content = {
+        "transform": np.column_stack([turn, world.translation / 0.01]).tolist(),
+        "scale": 0.01,
+    }
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(content))
     camera = load_scene(room).images[3].camera
     pose = np.linalg.inv(world.camera(camera.cam_from_world)) @ np.diag([1.0, -1, -1, 1])
@@ -88,7 +102,9 @@ def test_a_path_through_nerfstudios_world_needs_its_transform(room, run_folder, 
     code, said = _run(capsys, *words, "--transform", tmp_path / "dataparser_transforms.json")
     assert code == 0, said.err
     gaussians = read_gaussians(run_folder / "point_cloud.ply")
-    wanted = ModelRenderer(gaussians, model_frame(gaussians, None)).color(poses_of([load_scene(room).images[3]])[0])  # fmt: skip
+    wanted = ModelRenderer(gaussians, model_frame(gaussians, None)).color(
+        poses_of([load_scene(room).images[3]])[0]
+    )
     shown = _frames(tmp_path / "flight.mp4")[0][0] / 255
     assert np.abs(shown - wanted).mean() < 0.03
 

@@ -54,7 +54,10 @@ def test_a_path_follows_the_cameras_evenly(rng):
     assert (path[0].width, path[0].height) == (160, 90)
     np.testing.assert_allclose(path[0].K[:2, 2], [80, 45])
     # Names in no order: it goes from neighbour to neighbour.
-    shuffled = [v.__class__(**{**v.__dict__, "name": f"{i}"}) for i, v in zip(rng.permutation(24), cameras, strict=True)]  # fmt: skip
+    shuffled = [
+        v.__class__(**{**v.__dict__, "name": f"{i}"})
+        for i, v in zip(rng.permutation(24), cameras, strict=True)
+    ]
     again = _centers(smooth_path(shuffled, 90, (160, 90)))
     assert np.linalg.norm(np.diff(again, axis=0), axis=1).max() < 2 * steps.max()
 
@@ -90,10 +93,16 @@ def test_nerfstudios_paths_are_opengl_cameras(tmp_path):
 
 @pytest.mark.parametrize(
     "content",
-    ["", "[]", "{}", '{"camera_path": []}', '{"camera_path": [{"camera_to_world": [1, 2]}]}',
-     '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,5,0,0,0,0,1]}]}',
-     '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1], "fov": 200}]}'],
-)  # fmt: skip
+    [
+        "",
+        "[]",
+        "{}",
+        '{"camera_path": []}',
+        '{"camera_path": [{"camera_to_world": [1, 2]}]}',
+        '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,5,0,0,0,0,1]}]}',
+        '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1], "fov": 200}]}',
+    ],
+)
 def test_what_is_no_path_is_refused(content, tmp_path):
     (tmp_path / "path.json").write_text(content)
     with pytest.raises(SceneFormatError, match="camera path"):
@@ -114,7 +123,14 @@ def test_depth_is_that_of_a_wall():
     )
     pose = np.eye(4)
     pose[:3, 3] = -100
-    view = View("", np.empty((0, 0, 3), np.uint8), np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]), 64, 48, pose)  # fmt: skip
+    view = View(
+        "",
+        np.empty((0, 0, 3), np.uint8),
+        np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]),
+        64,
+        48,
+        pose,
+    )
     renderer = ModelRenderer(wall, model_frame(wall, None))
     np.testing.assert_allclose(renderer.depth(view), 4, atol=0.02)
     np.testing.assert_allclose(renderer.color(view), 0.5, atol=0.03)

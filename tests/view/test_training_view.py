@@ -1,4 +1,4 @@
-"""``train --view``: renders between steps, pause, stop and keep; the steps are what they would have been."""
+"""``train --view``: renders between steps, pause, stop and keep; the steps do not change."""
 
 from __future__ import annotations
 

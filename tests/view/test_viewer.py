@@ -88,8 +88,15 @@ def test_a_run_is_seen_offline_and_a_click_flies(viewer, run_folder, tmp_path):
         assert session._note.content == ""
         # A drag leaves the camera's place, and with it the photograph.
         for kind, x in (("mousePressed", 100), ("mouseMoved", 200), ("mouseReleased", 200)):
-            page.call("Input.dispatchMouseEvent", type=kind, x=x, y=400, button="left",
-                      buttons=1, clickCount=1)  # fmt: skip
+            page.call(
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=x,
+                y=400,
+                button="left",
+                buttons=1,
+                clickCount=1,
+            )
         assert waits_for(lambda: session.at is None)
         assert waits_for(lambda: "Click a camera" in session._note.content)
 

@@ -114,14 +114,14 @@ def distorted(room_path, tmp_path):
 
 def test_views_are_undistorted_where_that_is_asked_for(distorted):
     lens, straight = load_views(distorted, distorted.images[:2], undistort=True)
-    assert lens.mask.shape == lens.image.shape[:2] == (HEIGHT // 2, WIDTH // 2)
+    assert lens.mask.shape == lens.photograph.shape[:2] == (HEIGHT // 2, WIDTH // 2)
     assert np.allclose(lens.K[:2], distorted.images[0].intrinsics.K[:2] / 2)
     column, row = np.meshgrid(np.arange(WIDTH // 2) + 0.5, np.arange(HEIGHT // 2) + 0.5)
-    error = np.abs(lens.image - painting(rays_of(lens.K, column, row))).max(axis=-1)
+    error = np.abs(lens.photograph - painting(rays_of(lens.K, column, row))).max(axis=-1)
     assert np.mean(error[lens.mask] < 5) > 0.95
     assert straight.mask is None
     (alone,) = load_views(distorted, distorted.images[1:2])
-    assert np.array_equal(alone.image, straight.image)
+    assert np.array_equal(alone.photograph, straight.photograph)
 
 
 def test_distortion_is_refused_where_it_is_not(distorted):

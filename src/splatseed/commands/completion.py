@@ -1,7 +1,6 @@
 """``splatseed --completion``: a script by which a shell completes verbs and options.
 
-Promise: the options are those that the verbs have; where none begins as what was typed, files are
-offered.
+Promise: the options are those of the verbs; if none matches what was typed, files are offered.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ __all__ = ["completion_script"]
 SHELLS = ("bash", "zsh")
 FILES = "complete -o default -F _splatseed splatseed"
 ZSH = "autoload -U +X bashcompinit && bashcompinit\n"
-"""By which zsh reads a script for bash."""
+"""Lets zsh read a script for bash."""
 
 
 def completion_script(words: Sequence[str], verbs: Sequence[str]) -> str:
@@ -28,7 +27,7 @@ def completion_script(words: Sequence[str], verbs: Sequence[str]) -> str:
         verbs: All verbs.
 
     Raises:
-        ParameterError: It is another shell, or none is named.
+        ParameterError: It is an unknown shell, or none is named.
     """
     if len(words) != 1 or words[0] not in SHELLS:
         raise ParameterError(

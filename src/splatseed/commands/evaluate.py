@@ -45,12 +45,12 @@ class Options:
     """
 
     model: Annotated[Path, tyro.conf.Positional]
-    """The folder of a run of splatseed train, or a file of Gaussians from any trainer: .ply, .spz,
-    .sog, .splat."""
+    """A run folder of splatseed train, or a file of Gaussians from any trainer: .ply, .spz, .sog,
+    .splat."""
     scene: PathOrNone = None
-    """The scene that the model is of, in the same world; a run knows its own."""
+    """The scene the model belongs to, in the same world; a run knows its own."""
     data_factor: CountOrNone = None
-    """By how much photographs are made smaller; a run's own, else 1."""
+    """Factor by which photographs are downsampled; a run's own, else 1."""
     test_every: CountOrNone = None
     """Score every n-th image, sorted by name; by default as the run was trained, else 8."""
     transform: Annotated[
@@ -61,11 +61,11 @@ class Options:
             help_behavior_hint="(default: the same world)",
         ),
     ] = None
-    """From the scene's world to the model's, where its trainer normalised that: a JSON file with a
-    matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for what
-    its examples do; none: score the model where it is, whatever it looks like."""
+    """From the scene's world to the model's, if its trainer normalised the scene: a JSON file with
+    a matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for its
+    examples' normalisation; none: score the model where it is, however it looks."""
     lpips_net: Literal["vgg", "alex"] = "vgg"
-    """The network that LPIPS compares features of."""
+    """The network whose features LPIPS compares."""
     lpips_weights: PathOrNone = None
     """The file of that network's weights, or its folder; PyTorch's cache if left out."""
     backend: Backend = "auto"
@@ -76,14 +76,14 @@ class Options:
     ] = None
     """A JSON file to write the scores to."""
     renders: PathOrNone = None
-    """A folder to write pictures to: photograph, render, and error map of each test view."""
+    """A folder for pictures: photograph, render, and error map of each test view."""
     overwrite: bool = False
-    """Replace files and folders that are there."""
+    """Replace existing files and folders."""
 
 
 @dataclass(frozen=True)
 class _Task:
-    """What is scored against what."""
+    """What to score, and against what."""
 
     gaussians: Path
     scene: Path
@@ -92,7 +92,7 @@ class _Task:
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "evaluate", arguments)
     require("torch")
     task = _task(options)
@@ -104,12 +104,12 @@ def run(arguments: list[str]) -> None:
 
 
 def _task(options: Options) -> _Task:
-    """The files and settings, from a run's config where the options do not say."""
+    """The files and settings; a run's config fills in what the options leave open."""
     path, gaussians, config = options.model, model_file(options.model), config_of(options.model)
     scene = options.scene or config.get("scene")
     if not isinstance(scene, str | Path):
         raise ParameterError(
-            f"--scene, as {path} does not say what it is of",
+            f"--scene, as {path} does not name its scene",
             found="none",
             fix="Pass --scene SCENE: the scene that it was trained on.",
         )
@@ -150,7 +150,7 @@ def _check_outputs(options: Options, task: _Task) -> None:
 
 
 def _lpips(options: Options) -> tuple[Lpips | None, str]:
-    """The metric, or why there is none: weights that the user names must be there."""
+    """The metric, or why there is none; weights that the user names must exist."""
     from splatseed.evaluate import load_lpips  # noqa: PLC0415  (imports PyTorch)
 
     try:
@@ -164,7 +164,7 @@ def _lpips(options: Options) -> tuple[Lpips | None, str]:
 def _evaluate(
     options: Options, task: _Task, lpips: Lpips | None, reason: str, clock: StageClock
 ) -> EvalResult:
-    """Read the model and its scene, score the test views, and write what is asked for."""
+    """Read the model and its scene, score the test views, and write what was asked for."""
     from splatseed.evaluate import (  # noqa: PLC0415  (imports PyTorch)
         evaluate_model,
         load_model,
@@ -244,7 +244,7 @@ def _summarise(options: Options, task: _Task, result: EvalResult) -> None:
         ],
     )
     if result.lpips is None:
-        print_note(f"LPIPS was not measured: {result.lpips_reason}")
+        print_note(f"LPIPS was not computed: {result.lpips_reason}")
 
 
 def _numbers(

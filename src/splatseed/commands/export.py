@@ -1,4 +1,4 @@
-"""``splatseed export``: trained Gaussians to the files that viewers and engines read."""
+"""``splatseed export``: trained Gaussians in the file formats of viewers and engines."""
 
 from __future__ import annotations
 
@@ -31,28 +31,28 @@ __all__ = ["run"]
 
 @dataclass(frozen=True)
 class Options:
-    """Write a trained model in another format, cropped and cleaned if so asked."""
+    """Write a trained model in another format, optionally cropped and cleaned."""
 
     model: Annotated[Path, tyro.conf.Positional]
-    """The folder of a run of splatseed train, or a file of Gaussians: .ply, .compressed.ply,
-    .splat, .spz, .sog."""
+    """A run folder of splatseed train, or a file of Gaussians: .ply, .compressed.ply, .splat, .spz,
+    .sog."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The file to write; its name's end chooses the format: .ply, .compressed.ply, .splat, .spz,
+    """The file to write; its suffix chooses the format: .ply, .compressed.ply, .splat, .spz,
     .sog."""
     crop: Annotated[
         str | None,
         tyro.conf.arg(constructor=str, metavar="x0,y0,z0,x1,y1,z1", help_behavior_hint=""),
     ] = None
     """Keep the Gaussians whose centres lie in this box of the model's world; write --crop=-1,...
-    where the first number is negative."""
+    if the first number is negative."""
     min_opacity: float = 0.0
-    """Leave out Gaussians that are less opaque, 0 to 1."""
+    """Leave out Gaussians whose opacity is lower, 0 to 1."""
     overwrite: bool = False
-    """Replace a file that is there."""
+    """Replace an existing file."""
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "export", arguments)
     name = format_of_name(options.output)
     crop = None if options.crop is None else parse_crop(options.crop)
@@ -76,7 +76,7 @@ def _check_output(options: Options, source: Path) -> None:
         raise OutputError(f"no file at {target}", found="one", fix=fix)
     if RunFolder(target.resolve().parent).is_run:
         raise OutputError(
-            f"a file outside of training runs, not {target}",
+            f"a file outside training runs, not {target}",
             found="the folder of a run",
             fix="Choose a place beside the run.",
         )
@@ -94,6 +94,6 @@ def _summarise(
     ]
     print_pairs("splatseed export", rows)
     if name == "splat" and gaussians.shN.size:
-        print_note("A .splat has no view-dependent colour: what there was is left out.")
+        print_note("A .splat has no view-dependent colour: the model's is left out.")
     scene = " --scene SCENE"
     print_commands("next", [("score it", f"splatseed evaluate {quoted(options.output)}{scene}")])

@@ -1,4 +1,4 @@
-"""``splatseed flight``: a camera's way through a trained model, as a video."""
+"""``splatseed flight``: a video of a camera path through a trained model."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ WITHOUT_CAMERAS = (960, 720)
 PathOrNone = Annotated[
     Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
 ]
-TextOrNone = Annotated[str | None, tyro.conf.arg(constructor=str, metavar="TEXT", help_behavior_hint="")]  # fmt: skip
+TextOrNone = Annotated[
+    str | None, tyro.conf.arg(constructor=str, metavar="TEXT", help_behavior_hint="")
+]
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,11 @@ class Options:
     """Fly through a trained model: a video of a smooth path past its training cameras."""
 
     model: Annotated[Path, tyro.conf.Positional]
-    """The folder of a run of splatseed train, or a file of Gaussians."""
+    """A run folder of splatseed train, or a file of Gaussians."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The video to write: .mp4, .mkv or .mov."""
     scene: PathOrNone = None
-    """The scene that a file of Gaussians is of, for its cameras; a run knows its own."""
+    """The scene a file of Gaussians belongs to, for its cameras; a run knows its own."""
     path: PathOrNone = None
     """A camera path in nerfstudio's JSON to follow instead, in the model's world or that of
     --transform."""
@@ -58,29 +60,35 @@ class Options:
     orbit: bool = False
     """Circle around what the cameras look at instead."""
     compare: PathOrNone = None
-    """Another run or file of the same scene: the left half shows the model, the right half this
-    one."""
+    """Another run or file of the same scene, shown in the right half; the model is in the left."""
     depth: bool = False
     """Show depth, near bright and far dark, instead of colour."""
     seconds: float = 10.0
-    """How long the video is; a path's file says itself."""
+    """Length of the video in seconds; a path file states its own."""
     fps: float = 30.0
-    """Frames per second; a path's file says itself."""
-    size: Annotated[TextOrNone, tyro.conf.arg(metavar="WxH", help_behavior_hint="(default: the photographs', at most 1280 a side)")] = None  # fmt: skip
-    """Pixels of the video; odd numbers become even, as H.264 needs them."""
-    crop: Annotated[TextOrNone, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1", help_behavior_hint="")] = None  # fmt: skip
-    """Show only the Gaussians whose centres lie in this box; write --crop=-1,... where the first is
-    negative."""
+    """Frames per second; a path file states its own."""
+    size: Annotated[
+        TextOrNone,
+        tyro.conf.arg(
+            metavar="WxH", help_behavior_hint="(default: the photographs', at most 1280 a side)"
+        ),
+    ] = None
+    """Size of the video in pixels; odd numbers become even, as H.264 requires."""
+    crop: Annotated[
+        TextOrNone, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1", help_behavior_hint="")
+    ] = None
+    """Show only the Gaussians whose centres lie in this box; write --crop=-1,... if the first
+    number is negative."""
     min_opacity: float = 0.0
-    """Leave out Gaussians that are less opaque, 0 to 1."""
+    """Leave out Gaussians whose opacity is lower, 0 to 1."""
     backend: Backend = "auto"
     """Where to render; auto takes a GPU if PyTorch sees one."""
     overwrite: bool = False
-    """Replace a file that is there."""
+    """Replace an existing file."""
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "flight", arguments)
     _check(options)
     require("torch", "imageio_ffmpeg")
@@ -102,7 +110,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _check(options: Options) -> None:
-    """Refuse what cannot be done before any work is."""
+    """Check what can be checked before any work starts."""
     check_video_name(options.output)
     if options.output.exists() and not options.overwrite:
         fix = "Pass --overwrite to replace it, or choose another name."
@@ -124,7 +132,7 @@ def _check(options: Options) -> None:
 
 
 def _open(options: Options, path: Path) -> Shown:
-    from splatseed.view.shown import open_shown  # noqa: PLC0415
+    from splatseed.view.shown import open_shown  # noqa: PLC0415  (loads with its use)
 
     shown = open_shown(path, options.scene)
     if shown.gaussians is None:
@@ -138,7 +146,7 @@ def _open(options: Options, path: Path) -> Shown:
 
 def _size(options: Options, shown: Shown) -> tuple[int, int]:
     """Width and height of the video."""
-    from splatseed.views.view import poses_of  # noqa: PLC0415
+    from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     if options.size is not None:
         words = options.size.lower().split("x")
@@ -156,9 +164,9 @@ def _size(options: Options, shown: Shown) -> tuple[int, int]:
 
 
 def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Sequence[View], float]:
-    """The cameras, one a frame, and how many a second."""
-    from splatseed.view.paths import orbit, smooth_path  # noqa: PLC0415
-    from splatseed.views.view import poses_of  # noqa: PLC0415
+    """The cameras, one per frame, and the frame rate."""
+    from splatseed.view.paths import orbit, smooth_path  # noqa: PLC0415  (loads with its use)
+    from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     if options.path is not None:
         return _views_of_file(options.path, options.transform, shown, size, options.fps)
@@ -174,12 +182,12 @@ def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Seque
 def _views_of_file(
     path: Path, transform: str | None, shown: Shown, size: tuple[int, int], fps: float
 ) -> tuple[Sequence[View], float]:
-    """The cameras of a path's file in the model's world, and how many a second."""
+    """The cameras of a path's file in the model's world, and the frame rate."""
     from splatseed.evaluate.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415
-    from splatseed.scene import Scene  # noqa: PLC0415
-    from splatseed.view.paths import check_path, path_of_file, views_from  # noqa: PLC0415
-    from splatseed.views.view import poses_of  # noqa: PLC0415
+    from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415  (loads with its use)
+    from splatseed.scene import Scene  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.paths import check_path, path_of_file, views_from  # noqa: PLC0415  (loads with its use)
+    from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     views, named = path_of_file(path, size)
     if transform is not None:
@@ -193,9 +201,9 @@ def _views_of_file(
 
 
 def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> list[ModelRenderer]:
-    """Of each model, cropped and cleaned; all in the first one's frame."""
+    """The renderers of the models, cropped and cleaned, all in the first one's frame."""
     from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.view.renderer import ModelRenderer, model_frame  # noqa: PLC0415
+    from splatseed.view.renderer import ModelRenderer, model_frame  # noqa: PLC0415  (loads with its use)
 
     clock("prepare", 0.0)
     crop = None if options.crop is None else parse_crop(options.crop)

@@ -1,4 +1,4 @@
-"""A trained model as a user names it: a run's folder, or a file."""
+"""A trained model as a user names it: a run folder, or a file."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["config_of", "model_file"]
 
 
 def model_file(path: Path) -> Path:
-    """The file of a model's Gaussians: of a run the one it ended with.
+    """The file of a model's Gaussians; for a run, its result.
 
     Raises:
         SceneNotFoundError: There is none.
@@ -23,18 +23,18 @@ def model_file(path: Path) -> Path:
     folder = RunFolder(path)
     if path.is_dir() and folder.gaussians.is_file():
         return folder.gaussians
-    found = "nothing there"
+    there = "nothing there"
     if path.is_dir():
-        found = "a run that has not finished" if folder.is_run else "a folder that is no run"
+        there = "a run that has not finished" if folder.is_run else "a folder that is no run"
     raise SceneNotFoundError(
         f"{path} to be a finished run of splatseed train, or a file of Gaussians (.ply, .spz, ...)",
-        found=found,
-        fix="Name a file, or go on with the run: splatseed train SCENE -o RUN --resume.",
+        found=there,
+        fix="Name a file, or finish the run: splatseed train SCENE -o RUN --resume.",
     )
 
 
 def config_of(path: Path) -> Mapping[str, Any]:
-    """The config of a run; nothing for a file, or a folder that is no run.
+    """The config of a run; empty for a file, or a folder that is not a run.
 
     Raises:
         SceneFormatError: It cannot be read.

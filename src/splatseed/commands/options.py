@@ -1,7 +1,7 @@
-"""The words of a command line, made into a verb's options.
+"""Parsing a command line into a verb's options.
 
-Promise: what tyro finds wrong with them is raised as one of our errors, so that it ends in one line
-like any other; ``--help`` still prints and exits.
+Promise: tyro's complaints are raised as our errors, so that they end in one line like any other;
+``--help`` still prints and exits.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ RULE = re.compile("[─-]{5,}")
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
 CHOICE = re.compile(r"invalid choice '([^']*)'.*?one of \(([^)]*)\)")
 TRIED = "Got errors:"
-"""What follows lists tyro's attempts to read a value, for its own developers."""
+"""Marks the start of tyro's attempts to read a value, meant for its own developers."""
 
 
 def parse_options(
@@ -37,12 +37,12 @@ def parse_options(
 
     Args:
         kind: The dataclass that holds them.
-        verb: Whose they are.
+        verb: The verb they belong to.
         arguments: The words after the verb.
-        default: What holds where an option is not given; the dataclass's own defaults if left out.
+        default: Values of options that are not given; the dataclass's own defaults if left out.
 
     Raises:
-        ParameterError: An option is unknown, missing, or has a value that is none.
+        ParameterError: An option is unknown, missing, or has an invalid value.
     """
     said = io.StringIO()
     given: dict[str, Any] = {} if default is None else {"default": default}
@@ -62,7 +62,7 @@ def parse_options(
 
 
 def known_options(kind: type[Any]) -> list[str]:
-    """All options, such as ``--ratio``, that a command line for a dataclass may have."""
+    """All options of a dataclass's command line, such as ``--ratio``."""
     shown = io.StringIO()
     with redirect_stdout(shown), suppress(SystemExit):
         tyro.cli(kind, args=["--help"])
@@ -70,7 +70,7 @@ def known_options(kind: type[Any]) -> list[str]:
 
 
 def _suggestion(kind: type[Any], said: str, arguments: Sequence[str]) -> str:
-    """What the user may have meant by an option or a choice that is unknown; nothing if unclear."""
+    """What the user may have meant by an unknown option or choice; empty if unclear."""
     box = " ".join(COLOR.sub("", said).replace("│", " ").split())
     if choice := CHOICE.search(box):
         return did_you_mean(choice[1], re.findall(r"'([^']+)'", choice[2]))
@@ -80,7 +80,7 @@ def _suggestion(kind: type[Any], said: str, arguments: Sequence[str]) -> str:
 
 
 def _sentence(box: str) -> str:
-    """What a box of tyro's, drawn in Unicode or ASCII, says between its title and next rule."""
+    """The text of one of tyro's boxes, in Unicode or ASCII, from its title to the next rule."""
     lines = [line.strip("│ ") for line in COLOR.sub("", box).splitlines()]
     below_title = dropwhile(RULE.fullmatch, [line for line in lines if line][1:])
     said = takewhile(lambda line: not RULE.fullmatch(line) and line != TRIED, below_title)

@@ -1,4 +1,4 @@
-"""``splatseed sfm``: photographs to a scene, by pycolmap."""
+"""``splatseed sfm``: a scene from photographs, by pycolmap."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Options:
     """Make a scene from photographs: poses and points, undistorted, ready to upsample."""
 
     images: Annotated[Path, tyro.conf.Positional]
-    """The folder of photographs, or a video, of which sharp and spread frames are taken."""
+    """The folder of photographs, or a video, from which sharp, evenly spread frames are taken."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     poses_from: Annotated[
@@ -42,15 +42,15 @@ class Options:
     ] = None
     """Compare every pair of images, or (for a video) each with its successors."""
     frames: int = 150
-    """Most frames that are taken of a video."""
+    """Most frames to take from a video."""
     camera_model: str = "OPENCV"
     """COLMAP's model of the lens; not used with --poses-from."""
     shared_camera: bool = True
     """One lens for all photographs of a size; not used with --poses-from."""
     device: DeviceName = "auto"
-    """Where features are found and matched; auto takes a GPU when pycolmap can."""
+    """Where features are detected and matched; auto takes a GPU if pycolmap can use one."""
     max_image_size: int = 3200
-    """Longer sides are reduced to this many pixels to find features."""
+    """Longer sides are reduced to this many pixels for feature detection."""
     seed: int = 0
     """Seed of every random choice."""
     threads: int = -1
@@ -62,7 +62,7 @@ class Options:
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "sfm", arguments)
     with stage_display() as clock:
         clock("prepare", 0.0)
@@ -74,7 +74,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _of_video(options: Options, clock: StageClock) -> SfmReport:
-    """Take frames, and go on with them as with photographs; the scene keeps those with a pose."""
+    """Pick frames, then treat them like photographs; the scene keeps those with a pose."""
     if options.poses_from is not None:
         fix = "Leave one out, or name the folder of the photographs that have the poses."
         raise ParameterError("a video or --poses-from", found="both", fix=fix)
@@ -84,7 +84,7 @@ def _of_video(options: Options, clock: StageClock) -> SfmReport:
         picked = pick_frames(options.images, folder, options.frames, clock)
         report = _reconstruct(options, folder, clock)
     print_note(
-        f"{len(picked.numbers)} of the video's {picked.total:,} frames were taken, in which the "
+        f"{len(picked.numbers)} of the video's {picked.total:,} frames were picked; the "
         f"picture moves by {picked.way:.1f} times its width."
     )
     return report

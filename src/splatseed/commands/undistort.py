@@ -1,4 +1,4 @@
-"""``splatseed undistort``: a scene of distorted photographs to one that every trainer takes."""
+"""``splatseed undistort``: a scene without lens distortion, for trainers that need PINHOLE."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["run"]
 
 @dataclass(frozen=True)
 class Options:
-    """Take lens distortion out of a scene's photographs; its cameras become PINHOLE (pycolmap)."""
+    """Remove lens distortion from a scene's photographs; its cameras become PINHOLE (pycolmap)."""
 
     scene: Annotated[Path, tyro.conf.Positional]
     """A scene with photographs, in any layout."""
@@ -35,7 +35,7 @@ class Options:
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "undistort", arguments)
     check_output(
         options.output, kind="undistort", overwrite=options.overwrite, protect=[options.scene]
@@ -43,7 +43,7 @@ def run(arguments: list[str]) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         scene = load_scene(options.scene)
-        found = undistort(
+        undistorted = undistort(
             scene,
             options.output,
             threads=options.threads,
@@ -52,8 +52,8 @@ def run(arguments: list[str]) -> None:
             on_progress=clock,
         )
     rows = [
-        ("images", f"{len(found.registered):,}"),
-        ("points", f"{found.num_points:,}"),
+        ("images", f"{len(undistorted.registered):,}"),
+        ("points", f"{undistorted.num_points:,}"),
         ("output", str(options.output)),
     ]
     print_pairs("splatseed undistort", rows)

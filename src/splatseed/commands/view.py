@@ -29,21 +29,25 @@ LOCAL = {"127.0.0.1", "localhost", "::1"}
 
 @dataclass(frozen=True)
 class Options:
-    """Look at a scene, its seeds or a trained model in the browser; at two side by side."""
+    """Look at a scene, its seeds or a trained model in the browser, or at two side by side."""
 
     what: Annotated[Path, tyro.conf.Positional]
-    """A scene, the folder of a run, a file of Gaussians or of points, or a folder that holds
-    several of these."""
-    compare: Annotated[Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")] = None  # fmt: skip
+    """A scene, a run folder, a file of Gaussians or points, or a folder that holds several of
+    these."""
+    compare: Annotated[
+        Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
+    ] = None
     """Another to show beside it, from the same camera."""
-    scene: Annotated[Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")] = None  # fmt: skip
-    """The scene that a file of Gaussians is of; a run knows its own."""
+    scene: Annotated[
+        Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
+    ] = None
+    """The scene a file of Gaussians belongs to; a run knows its own."""
     host: str = "127.0.0.1"
-    """The address to listen at: this machine alone, or 0.0.0.0 for all that can reach it."""
+    """The address to listen on: this machine alone, or 0.0.0.0 for all that can reach it."""
     port: int = 8080
-    """The port to listen at; 0 for any that is free."""
+    """The port to listen on; 0 for any free one."""
     max_points: int = 5_000_000
-    """Most points that the browser gets to draw; fewer for one without a GPU."""
+    """The most points that the browser draws; choose fewer for one without a GPU."""
     browser: bool = False
     """Open this machine's browser."""
     backend: Backend = "auto"
@@ -51,7 +55,7 @@ class Options:
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "view", arguments)
     require("torch", "viser")
     from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
@@ -80,10 +84,10 @@ def run(arguments: list[str]) -> None:
 
 
 def _opened(options: Options) -> list[Shown]:
-    """What to show, under names that tell one from the other."""
-    from dataclasses import replace  # noqa: PLC0415
+    """What to show, under names that tell them apart."""
+    from dataclasses import replace  # noqa: PLC0415  (loads with its use)
 
-    from splatseed.view.shown import open_shown  # noqa: PLC0415
+    from splatseed.view.shown import open_shown  # noqa: PLC0415  (loads with its use)
 
     paths = _within(options.what)
     if options.compare is not None:
@@ -98,16 +102,16 @@ def _opened(options: Options) -> list[Shown]:
 
 def _within(path: Path) -> list[Path]:
     """The path itself, or the runs and scenes in a folder that is neither."""
-    from splatseed.io import load_scene  # noqa: PLC0415
+    from splatseed.io import load_scene  # noqa: PLC0415  (loads with its use)
 
     if not path.is_dir() or RunFolder(path).is_run:
         return [path]
     try:
         load_scene(path, require_points=False)
     except SceneNotFoundError as error:
-        found = [each for each in sorted(path.iterdir()) if _is_shown(each)][:MOST_OPENED]
-        if found:
-            return found
+        shown = [each for each in sorted(path.iterdir()) if _is_shown(each)][:MOST_OPENED]
+        if shown:
+            return shown
         raise SceneNotFoundError(
             f"{path} to be a scene, a run or a folder of these", found=error.found, fix=error.fix
         ) from None
@@ -116,8 +120,8 @@ def _within(path: Path) -> list[Path]:
 
 def _is_shown(path: Path) -> bool:
     """Whether something in a folder is a finished run, a scene or a model."""
-    from splatseed.export import SUFFIXES  # noqa: PLC0415
-    from splatseed.io import load_scene  # noqa: PLC0415
+    from splatseed.export import SUFFIXES  # noqa: PLC0415  (loads with its use)
+    from splatseed.io import load_scene  # noqa: PLC0415  (loads with its use)
 
     if path.is_file():
         return any(path.name.lower().endswith(suffix) for suffix in SUFFIXES)
@@ -132,14 +136,16 @@ def _is_shown(path: Path) -> bool:
 
 
 def _announce(options: Options, port: int, opened: list[Shown]) -> None:
-    """Say where to look; flushed, as whoever started us may be waiting for it."""
-    host = "localhost" if options.host in LOCAL | {"0.0.0.0"} else options.host  # noqa: S104
+    """Say where to look; flushed, because whoever started us may be waiting for it."""
+    host = "localhost" if options.host in LOCAL | {"0.0.0.0"} else options.host  # noqa: S104  (compared, not bound)
     url = f"http://{host}:{port}"
     rows = [(shown.name, _contents(shown)) for shown in opened]
     print_pairs("splatseed view", rows)
     commands = [("open in a browser", url)]
     if options.host in LOCAL:
-        commands.append(("from elsewhere, first", f"ssh -L {port}:localhost:{port} {socket.gethostname()}"))  # fmt: skip
+        commands.append(
+            ("from elsewhere, first", f"ssh -L {port}:localhost:{port} {socket.gethostname()}")
+        )
     print_commands("next", [*commands, ("stop", "Ctrl-C")])
     OUT.file.flush()
     if options.browser and not webbrowser.open(url):

@@ -1,10 +1,10 @@
-"""The scale (and shift) that takes an image's depth map to the scene's units, by its SfM points.
+"""The scale (and shift) that takes an image's depth map to scene units, from its SfM points.
 
 Notation: at an SfM point that falls into a pixel, ``value`` is the map's and ``z`` the point's
 planar depth. For maps of the kinds "z" and "ray" z = scale value (value divided by the length of
 the pixel's ray for "ray"; the shift is 0), for "inverse" 1 / z = scale value + shift. Promise: an
-image is left out rather than believed when too few points see depth, or when it fits much worse
-than the others; each such image is reported with the reason.
+image is left out when too few of its points see depth, or when it fits much worse than the others;
+each such image is reported with the reason.
 """
 
 from __future__ import annotations
@@ -39,22 +39,23 @@ GOOD_RESIDUAL = 0.01
 """An image that fits this well is never an outlier, however well the others fit."""
 
 MAX_RESIDUAL = 0.25
-"""An image that is off by more at half of its points is not aligned at all."""
+"""An image whose median error exceeds this is not aligned at all."""
 
 
 UNIT_POINTS = 20
 UNIT_SLACK = 1.25
-"""A map that is not aligned is refused where this many SfM points say that it is off by this
+"""A map in scene units is refused if at least this many SfM points say that it is off by this
 factor."""
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How an image's depth map is taken to the scene's units.
+    """How an image's depth map is taken to scene units.
 
     Args:
-        scale: Scene units per unit of the map; for inverse depth, its inverse units likewise.
-        shift: Added after scaling; 0 but for inverse depth.
+        scale: Scene units per unit of the map; for inverse depth, its inverse units in inverse
+            units likewise.
+        shift: Added after scaling; 0 except for inverse depth.
         num_points: SfM points that see depth.
         residual: Median of the points' |aligned depth / depth of the point - 1|; NaN without
             points.
@@ -88,11 +89,12 @@ def align(
         progress: Told how many maps are read.
 
     Returns:
-        By name, in the order of ``scene.images``, all images that have a map; rejected ones too.
+        The alignments of all images that have a map, by name, in the order of ``scene.images``;
+        rejected images are included.
 
     Raises:
         SceneNotFoundError: The scene has no maps, or a map's file is gone.
-        SceneFormatError: A map cannot be read or has not the shape of its image.
+        SceneFormatError: A map cannot be read, or differs from its image in aspect ratio.
     """
     if scene.depths is None:
         raise SceneNotFoundError(
@@ -100,19 +102,19 @@ def align(
         )
     depths, visibility = scene.depths, find_visibility(scene)
     images = [image for image in scene.images if image.name in depths]
-    found: list[Alignment | None] = [None] * len(images)
+    alignments: list[Alignment | None] = [None] * len(images)
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):
             depth = depths.read(images[i].name)
             camera = map_camera(depth, images[i])
             points = camera_points(camera, visibility.of(images[i]))
-            found[i] = align_map(depth, camera, points, fit, min_points)
+            alignments[i] = align_map(depth, camera, points, fit, min_points)
 
     in_threads(work, len(images), 1, "align depth", progress)
     aligned = {
         image.name: alignment
-        for image, alignment in zip(images, found, strict=True)
+        for image, alignment in zip(images, alignments, strict=True)
         if alignment is not None
     }
     return reject_outliers(aligned, max_residual_ratio)
@@ -121,12 +123,12 @@ def align(
 def align_map(
     depth: DepthMap, camera: Camera, points: SeenPoints, fit: Fit, min_points: int
 ) -> Alignment:
-    """Align one map by the SfM points that its image sees.
+    """Align one map with the SfM points that its image sees.
 
     Args:
         depth: The map.
         camera: The image's camera in pixels of the map (``DepthMap.camera``).
-        points: Those that the image sees, in pixels of the map.
+        points: The points that the image sees, in pixels of the map.
         fit: As in ``align``.
         min_points: As in ``align``.
     """
@@ -134,7 +136,7 @@ def align_map(
     if len(value) < max(min_points, 1):
         return Alignment(np.nan, 0.0, len(value), np.nan, _too_few(depth, len(value), min_points))
     if np.ptp(depth.values[np.isfinite(depth.values)]) == 0:
-        told = "the map has one value everywhere: whatever made it failed on this image"
+        told = "the map has one value everywhere: its estimation failed on this image"
         return Alignment(np.nan, 0.0, len(value), np.nan, told)
     scale, shift = _fit(depth.kind, value, z, fit)
     residual = _residual(depth.kind, value, z, scale, shift)
@@ -142,12 +144,12 @@ def align_map(
 
 
 def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignment:
-    """Take a map as it is, in scene units, and hold it against the SfM points if there are some.
+    """Take a map as being in scene units, and check it against the SfM points if there are any.
 
     Args:
         depth: The map.
         camera: The image's camera in pixels of the map.
-        points: Those that the image sees, in pixels of the map.
+        points: The points that the image sees, in pixels of the map.
     """
     value, z = values_at(depth, camera, points)
     plain = Alignment(1.0, 0.0, len(value), np.nan)
@@ -166,7 +168,7 @@ def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignmen
 def values_at(
     depth: DepthMap, camera: Camera, points: SeenPoints
 ) -> tuple[Float64[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
-    """What the map holds where points fall, and their planar depth: [K] each, K <= M see depth.
+    """The map's values at the points, and the points' planar depths: [K] each, K <= M see depth.
 
     A point takes the value of the pixel it falls into. Distances along the ray are turned into
     planar depth by the ray through that pixel's centre.
@@ -199,7 +201,7 @@ def reject_outliers(
 def _fit(
     kind: DepthKind, value: Float64[np.ndarray, " M"], z: Float64[np.ndarray, " M"], fit: Fit
 ) -> tuple[float, float]:
-    """Scale and shift by the kind of map."""
+    """Scale and shift for the kind of map."""
     if kind == "inverse":
         return (robust_line if fit == "robust" else least_squares_line)(value, z)
     return (median_scale if fit == "robust" else least_squares_scale)(value, z), 0.0
@@ -214,7 +216,7 @@ def _residual(
 ) -> float:
     """Median relative error of depth.
 
-    A point that would lie behind the camera counts as infinite.
+    A point that would lie behind the camera has an infinite error.
     """
     aligned = scale * value + shift
     if kind == "inverse":
@@ -225,12 +227,12 @@ def _residual(
 
 def _too_few(depth: DepthMap, num: int, min_points: int) -> str:
     if not np.isfinite(depth.values).any():
-        return "the map knows no depth at any pixel"
-    return f"{num} SfM points see depth, and {max(min_points, 1)} are needed"
+        return "the map has no depth at any pixel"
+    return f"{num} SfM points see depth; {max(min_points, 1)} are needed"
 
 
 def _misfit(kind: DepthKind, scale: float, residual: float) -> str | None:
-    """Why a fit is none: the wrong kind of map, or one of another scene."""
+    """Why a fit is not valid: the wrong kind of map, or a map of another scene."""
     if kind == "inverse" and not scale > 0:
         return "values rise with depth, so they are not its inverse"
     if not residual <= MAX_RESIDUAL:

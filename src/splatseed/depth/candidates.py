@@ -2,8 +2,8 @@
 
 Notation: C candidates; ``tier`` 0 is sound, then come ``UNCONFIRMED``, ``NEAR_EDGE`` and
 ``DISTRUSTED``.
-Promise: a candidate of a higher tier is taken only if all of the lower tiers are; among those of
-one tier, points are spread evenly in space, or every image gives the same number as far as it can.
+Promise: a candidate of a higher tier is taken only after all of the lower tiers; within one tier,
+points are spread evenly in space, or every image gives the same number as far as it can.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = ["DISTRUSTED", "NEAR_EDGE", "UNCONFIRMED", "Candidates", "choose", "ga
 
 SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
 PIECE = 4
-"""Views that a thread takes at a time."""
+"""Views per task of a thread."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Candidates:
         rgb: Colours, uint8 [C, 3].
         footprint: Size of a pixel at their depth, scene units, float32 [C].
         tier: How far each can be trusted, uint8 [C].
-        counts: How many are of each view, int64 [V].
+        counts: Number of candidates of each view, int64 [V].
     """
 
     xyz: Float32[np.ndarray, "C 3"]
@@ -52,12 +52,12 @@ class Candidates:
 
     @cached_property
     def num_sound(self) -> int:
-        """How many are of the lowest tier."""
+        """Number of candidates of the lowest tier."""
         return int(np.count_nonzero(self.tier == SOUND))
 
 
 def gather(views: Sequence[View], settings: Settings, progress: Progress) -> Candidates:
-    """Lift the views' candidates, and hold them against other views if the settings say so."""
+    """Lift the views' candidates, and compare them with other views if the settings say so."""
     counts = np.array([len(view) for view in views])
     neighbors = choose_neighbors(views, settings.num_neighbors, progress)
     factors = np.ones(len(views))
@@ -65,7 +65,7 @@ def gather(views: Sequence[View], settings: Settings, progress: Progress) -> Can
         factors = harmonize(views, neighbors, progress)
     copies = _rescaled(views, factors)
     total, start_of = int(counts.sum()), np.cumsum(counts) - counts
-    found = Candidates(
+    candidates = Candidates(
         np.empty((total, 3), np.float32),
         np.concatenate([view.rgb for view in views]),
         np.empty(total, np.float32),
@@ -76,22 +76,22 @@ def gather(views: Sequence[View], settings: Settings, progress: Progress) -> Can
     def work(first: int, last: int) -> None:
         for i in range(first, last):
             mine = slice(start_of[i], start_of[i] + counts[i])
-            _fill(found, mine, views[i], float(factors[i]))
+            _fill(candidates, mine, views[i], float(factors[i]))
             asked = [copy for j in neighbors[i] if j >= 0 and (copy := copies[j]) is not None]
             own = copies[i]
             if settings.compares_views and own is not None:
-                support = find_support(found.xyz[mine], own, asked, settings)
-                found.tier[mine] = _tier(views[i], support, settings)
+                support = find_support(candidates.xyz[mine], own, asked, settings)
+                candidates.tier[mine] = _tier(views[i], support, settings)
 
     in_threads(work, len(views), PIECE, "compare views", progress)
-    return found
+    return candidates
 
 
-def _fill(found: Candidates, mine: slice, view: View, factor: float) -> None:
-    """Write a view's candidates where they belong."""
-    lift_pixels(view.pixel, view.z, view.camera, found.xyz[mine], factor)
-    np.multiply(view.z, factor / view.camera.K[0, 0], out=found.footprint[mine])
-    found.tier[mine][view.edge] = NEAR_EDGE
+def _fill(candidates: Candidates, mine: slice, view: View, factor: float) -> None:
+    """Write a view's candidates into their slice."""
+    lift_pixels(view.pixel, view.z, view.camera, candidates.xyz[mine], factor)
+    np.multiply(view.z, factor / view.camera.K[0, 0], out=candidates.footprint[mine])
+    candidates.tier[mine][view.edge] = NEAR_EDGE
 
 
 def _rescaled(views: Sequence[View], factors: Float64[np.ndarray, " V"]) -> list[Reduced | None]:
@@ -121,11 +121,11 @@ def choose(
     """Choose exactly ``num`` candidates, ascending indices.
 
     Args:
-        candidates: Of which to choose.
-        originals: Points that are there already.
+        candidates: The candidates to choose from.
+        originals: Points that exist already.
         num: How many.
-        settings: Whether they are spread in space, or each image gives as many.
-        rng: Draws where there is nothing to tell candidates apart.
+        settings: Whether they are spread in space, or each image gives the same number.
+        rng: Draws where nothing else distinguishes candidates.
         progress: Told when it is done.
 
     Raises:
@@ -162,7 +162,7 @@ def _pick(
     settings: Settings,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, " C"]:
-    """Which ``num`` of the members of a tier to take, beside the points that are there."""
+    """Which ``num`` of the members of a tier to take, given the points chosen before."""
     if settings.spread:
         xyz, footprint = candidates.xyz, candidates.footprint
         return thin_by_voxels(xyz, footprint, members, there, num, rng)
@@ -176,7 +176,7 @@ def _pick(
 def _even_shares(
     view_idx: Int64[np.ndarray, " C"], num: int, rng: np.random.Generator
 ) -> Int64[np.ndarray, " num"]:
-    """``num`` of C indices, as many of every view as it and the others have."""
+    """``num`` of C indices, as many from every view as it and the others have."""
     order = rng.permutation(len(view_idx))
     order = order[np.argsort(view_idx[order], kind="stable")]
     counts = np.bincount(view_idx)

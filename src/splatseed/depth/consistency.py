@@ -27,18 +27,18 @@ THROUGH = 2.0
 """Clearly farther: by this many tolerances, as both depths have errors."""
 
 ALWAYS = 8
-"""Views that are asked about every point; more are asked about those that lack confirmation."""
+"""Views asked about every point; more are asked about points that lack confirmation."""
 
 SAYS_NOTHING, CONFIRMS, LOOKS_THROUGH = range(3)
 
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """What other views say of a view's candidates.
+    """The verdict of other views on a view's candidates.
 
     Args:
-        agreeing: How many confirm each, counted up to the number that is asked for, uint8 [C].
-        seen_through: Which some view looks through, bool [C].
+        agreeing: How many confirm each, counted up to the number required, uint8 [C].
+        seen_through: Whether some view looks through each, bool [C].
     """
 
     agreeing: UInt8[np.ndarray, " C"]
@@ -48,12 +48,12 @@ class Support:
 def find_support(
     xyz: Float32[np.ndarray, "C 3"], own: Reduced, others: Sequence[Reduced], settings: Settings
 ) -> Support:
-    """Ask other views about candidates.
+    """Compare candidates with other views.
 
     Args:
         xyz: The candidates of one view, in the world.
-        own: Its reduced copy.
-        others: Those to ask.
+        own: That view's reduced copy.
+        others: The reduced copies of the views to ask.
         settings: How many must confirm, and the tolerances.
     """
     agreeing = np.zeros(len(xyz), np.uint8)
@@ -81,7 +81,7 @@ def find_support(
 
 
 @inline
-def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[no-untyped-def]
+def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Colours of a view's own reduced photograph at its candidates, as smooth as the others'."""
     for k in range(len(xyz)):
         column, row, _ = place(xyz[k], grid_from_world)
@@ -91,7 +91,7 @@ def _own_colors(xyz, grid_from_world, rgb, rgb_from_grid, out):  # type: ignore[
 
 
 @inline
-def _ask(  # type: ignore[no-untyped-def]
+def _ask(  # type: ignore[no-untyped-def]  # Numba's types
     xyz,
     own,
     z,
@@ -106,7 +106,7 @@ def _ask(  # type: ignore[no-untyped-def]
     agreeing,
     seen_through,
 ):
-    """One neighbour's word on all candidates, added to what is known of them."""
+    """Add one neighbour's verdict on all candidates."""
     height, width = z.shape
     for k in range(len(xyz)):
         if only_unconfirmed and agreeing[k] >= enough:
@@ -122,8 +122,8 @@ def _ask(  # type: ignore[no-untyped-def]
 
 
 @inline
-def _compare(z, column, row, depth, tolerance):  # type: ignore[no-untyped-def]
-    """What the map of a view says of a depth at a place of its grid; NaN says nothing."""
+def _compare(z, column, row, depth, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
+    """What the map of a view says about a depth at a grid position; NaN says nothing."""
     x0 = min(max(int(np.floor(column)), 0), max(z.shape[1] - 2, 0))
     y0 = min(max(int(np.floor(row)), 0), max(z.shape[0] - 2, 0))
     x1, y1 = min(x0 + 1, z.shape[1] - 1), min(y0 + 1, z.shape[0] - 1)
@@ -143,15 +143,15 @@ def _compare(z, column, row, depth, tolerance):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _block(column, row, rgb_from_grid, shape):  # type: ignore[no-untyped-def]
-    """Row and column of the reduced photograph at a place of the grid."""
+def _block(column, row, rgb_from_grid, shape):  # type: ignore[no-untyped-def]  # Numba's types
+    """Row and column of the reduced photograph at a grid position."""
     p = int(np.floor(row * rgb_from_grid[1, 0] + rgb_from_grid[1, 1]))
     q = int(np.floor(column * rgb_from_grid[0, 0] + rgb_from_grid[0, 1]))
     return min(max(p, 0), shape[0] - 1), min(max(q, 0), shape[1] - 1)
 
 
 @inline
-def _color_error(first, second):  # type: ignore[no-untyped-def]
+def _color_error(first, second):  # type: ignore[no-untyped-def]  # Numba's types
     """Sum of the channels' differences."""
     total = np.int64(0)
     for channel in range(3):

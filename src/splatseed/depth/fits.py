@@ -1,4 +1,4 @@
-"""Fits that take depth values to the scene's units, with and without regard to outliers.
+"""Robust and least-squares fits that take depth values to scene units.
 
 Notation: at M SfM points, ``value`` is what the map holds and ``z`` the planar depth of the point,
 both positive, float64 [M]. A scale s means z = s value. A line (a, b) means 1 / z = a value + b:
@@ -34,8 +34,8 @@ Values = Float64[np.ndarray, " M"]
 
 
 @inline
-def median(values):  # type: ignore[no-untyped-def]
-    """As NumPy's, of float64 without NaN, without what that costs for a thousand values."""
+def median(values):  # type: ignore[no-untyped-def]  # Numba's types
+    """NumPy's median for float64 without NaN, without its overhead on a thousand values."""
     return np.median(values)
 
 
@@ -55,7 +55,7 @@ def least_squares_line(value: Values, z: Values) -> tuple[float, float]:
 
 
 def robust_line(value: Values, z: Values) -> tuple[float, float]:
-    """(a, b) that most points agree with, by relative error r = z (a value + b) - 1.
+    """The (a, b) that most points agree with, by relative error r = z (a value + b) - 1.
 
     Of the lines through 256 pairs of points, the one whose errors have the least median is refined
     by iteratively reweighted least squares with Tukey's biweight, as LO-RANSAC refines its best
@@ -75,7 +75,7 @@ def robust_line(value: Values, z: Values) -> tuple[float, float]:
 
 
 def _best_of_pairs(value: Values, inverse: Values) -> tuple[float, float]:
-    """The line through two points that leaves the least median of relative errors."""
+    """The line through two points with the smallest median of relative errors."""
     order = np.argsort(value, kind="stable")
     steps = (np.arange(1, PAIRS + 1)[:, None] * GOLDEN) % 1.0
     first, second = order[(steps * len(value)).astype(np.int64)].T

@@ -1,10 +1,10 @@
 """Depth-guided lifting, from the images of a scene to new points.
 
 Notation: every image gives *candidates*; a candidate is *sound* if enough views confirm it, none
-looks through it, and no jump of depth is near. Promise: exactly the number asked for, or one error
-that says how many there can be; sound candidates first, then those that too few views confirm, then
-those near jumps, and none that a view looks through (unless that is allowed). A note says when it
-came to that.
+looks through it, and no depth discontinuity is near. Promise: exactly the number asked for, or one
+error that says how many are possible; sound candidates first, then those that too few views
+confirm, then those near discontinuities, and none that a view looks through (unless that is
+allowed). A note reports any use of the later ones.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from splatseed.views.visibility import find_visibility
 __all__ = ["Lifted", "lift"]
 
 OVERSAMPLING = 1.4
-"""Candidates per new point, where views are compared or points spread."""
+"""Candidates per new point, when views are compared or points spread."""
 MAX_OVERSAMPLING = 16.0
-"""Candidates per new point, at most; a round of reading multiplies them by up to ``MAX_GROWTH``."""
+"""Most candidates per new point; a round of reading multiplies them by up to ``MAX_GROWTH``."""
 MAX_GROWTH = 8.0
 SURPLUS = 1.25
-"""How many times as many candidates are drawn as seem to be needed, to save another round."""
+"""Candidates are overdrawn by this factor, to save another round."""
 NAMED = 3
-"""Images that a note names."""
+"""Most images that a note names."""
 
 
 class Lifted(NamedTuple):
-    """New points, and what is to be said of them."""
+    """New points, and notes for the user."""
 
     xyz: Float32[np.ndarray, "M 3"]
     """World positions, float32 [M, 3], image after image."""
@@ -60,7 +60,7 @@ def lift(
 ) -> Lifted:
     """Lift ``num`` pixels of a scene's images into its world.
 
-    Each image and its map are read once; again only if too few of the candidates are sound.
+    Each image and its map are read once, and again only if too few of the candidates are sound.
 
     Args:
         scene: A scene with images in a folder, and depth maps.
@@ -95,7 +95,7 @@ def lift(
 
 
 def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
-    """The scene with the mean of its cameras at the origin, and where that was.
+    """The scene with the mean of its cameras moved to the origin, and that mean.
 
     Candidates are float32, which far from the origin (UTM coordinates) would be too coarse to
     compare.
@@ -167,10 +167,10 @@ def _read_all(
 def _leave_out(
     images: Sequence[Image], views: Sequence[View], max_ratio: float | None
 ) -> tuple[list[Image], list[View], tuple[str, ...]]:
-    """The images and views whose maps are aligned, and what to say of the others.
+    """The images and views whose maps are aligned, and notes on the others.
 
     Raises:
-        SceneFormatError: No map is.
+        SceneFormatError: No map is aligned.
     """
     alignments = reject_outliers(
         {image.name: view.alignment for image, view in zip(images, views, strict=True)}, max_ratio
@@ -221,14 +221,14 @@ def _originals(scene: Scene) -> Float32[np.ndarray, "N 3"]:
 
 
 def _relaxed_notes(tier: UInt8[np.ndarray, " M"], settings: Settings) -> tuple[str, ...]:
-    """One sentence on each shortage that was worked around."""
+    """One sentence on each requirement that was relaxed."""
     unconfirmed, edge = (int(np.count_nonzero(tier == t)) for t in (UNCONFIRMED, NEAR_EDGE))
     notes = []
     if unconfirmed:
         notes.append(
             f"{unconfirmed:,} of {len(tier):,} new points are confirmed by fewer than "
-            f"{settings.min_agreeing} other views: there are no more that are."
+            f"{settings.min_agreeing} other views: no others were left."
         )
     if edge:
-        notes.append(f"{edge:,} of {len(tier):,} new points lie near jumps of depth.")
+        notes.append(f"{edge:,} of {len(tier):,} new points lie near depth discontinuities.")
     return tuple(notes)

@@ -1,11 +1,11 @@
 """Which other views to ask about a view's points.
 
 Notation: V views, S sample points of each. A view *covers* a sample of another, with a weight by
-the angle that the two cameras' rays to it enclose: little where the rays nearly coincide, since a
+the angle between the two cameras' rays to it: little where the rays nearly coincide, because a
 sensor errs alike from one place, and none from 90 degrees on, where the other side of a surface is
-seen. Promise: neighbours are chosen one after another, each for the samples that those before it
-cover least, first by frames alone (few of all views), then by what each sees there according to its
-map (``num`` of these few).
+seen. Promise: neighbours are chosen one after another, each for the samples that the ones before
+cover least; first a shortlist by frames alone, then ``num`` of it by what each sees there according
+to its map.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ __all__ = ["choose_neighbors"]
 SAMPLES = 40
 MIN_SAMPLES = 4
 WORK = 1 << 28
-"""Projections at most: the more views, the fewer samples of each."""
+"""Limit on projections: the more views, the fewer samples of each."""
 SHORTLIST = 2
-"""Views that are looked at closer, for each that is chosen."""
+"""Views on the shortlist, per neighbour chosen."""
 FULL = 0.03
 """1 - cos of the angle from which on (14 degrees) a view covers fully; up to 60 degrees."""
 LEAST = 0.05
-"""How much rays that coincide cover."""
+"""Weight of rays that coincide."""
 SEEN = 0.25
-"""A view sees a sample if its own depth there differs by less than this share."""
+"""A view sees a sample if its own depth there differs by less than this fraction."""
 MOST_COLUMNS = 1e6
-"""No grid has so many columns."""
+"""Larger than the number of columns of any grid."""
 PIECE = 8
-"""Views that a thread takes at a time."""
+"""Views per task of a thread."""
 
 
 def choose_neighbors(
@@ -47,7 +47,7 @@ def choose_neighbors(
     """The ``num`` views to ask about each view's points, best first, int64 [V, num]; -1 = no more.
 
     Args:
-        views: All of them; those without a reduced copy neither ask nor answer.
+        views: All views; those without a reduced copy neither ask nor answer.
         num: How many.
         progress: Told how many have been chosen.
     """
@@ -82,14 +82,14 @@ def choose_neighbors(
 
 
 def _cover(covers: Float64[np.ndarray, "J S"], num: int) -> Int64[np.ndarray, " K"]:
-    """Up to ``num`` of the rows, each chosen for what those before it cover least."""
+    """Up to ``num`` of the rows, each chosen for what the rows before it cover least."""
     out = np.full(num, -1)
     _choose(covers, out)
     return out[out >= 0]
 
 
 @kernel
-def _shortlist(samples, matrices, sizes, centers, out):  # type: ignore[no-untyped-def]
+def _shortlist(samples, matrices, sizes, centers, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Views whose frames cover the samples of each view."""
     num, per_view = samples.shape[0], samples.shape[1]
     for i in parallel_range(num):
@@ -101,7 +101,7 @@ def _shortlist(samples, matrices, sizes, centers, out):  # type: ignore[no-untyp
 
 
 @inline
-def _choose(covers, out):  # type: ignore[no-untyped-def]
+def _choose(covers, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Rows one after another by the sum of w / (1 + covered)^2, until none adds anything."""
     covered, worth = np.zeros(covers.shape[1]), np.ones(covers.shape[1])
     free = np.ones(len(covers), np.bool_)
@@ -123,8 +123,8 @@ def _choose(covers, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _weigh(samples, m, size, center, other, out):  # type: ignore[no-untyped-def]
-    """How much a view covers each sample, by frame and angle."""
+def _weigh(samples, m, size, center, other, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """How well a view covers each sample, by frame and angle."""
     for s in range(len(samples)):
         depth, column, row = _nearest(samples[s], m)
         if 0.0 < depth < np.inf and 0 <= column < size[1] and 0 <= row < size[0]:
@@ -132,8 +132,8 @@ def _weigh(samples, m, size, center, other, out):  # type: ignore[no-untyped-def
 
 
 @inline
-def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]
-    """Take back what is hidden from the view, or unknown to it."""
+def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Remove samples that are hidden from the view or unknown to it."""
     for s in range(len(samples)):
         if out[s] > 0.0:
             depth, column, row = _nearest(samples[s], m)
@@ -142,11 +142,8 @@ def _keep_seen(samples, m, z, factor, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _nearest(point, m):  # type: ignore[no-untyped-def]
-    """Depth of a point in a view, and the nearest point of its grid.
-
-    Column -1 where there is none.
-    """
+def _nearest(point, m):  # type: ignore[no-untyped-def]  # Numba's types
+    """Depth of a point in a view, and the nearest grid point; column -1 if there is none."""
     column, row, depth = place(point, m)
     column, row = column + 0.5, row + 0.5
     if not (0.0 <= column < MOST_COLUMNS and 0.0 <= row < MOST_COLUMNS):
@@ -155,7 +152,7 @@ def _nearest(point, m):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _angle_weight(point, first, second):  # type: ignore[no-untyped-def]
-    """From little where the rays coincide to 1, and to 0 where they are 90 degrees apart."""
+def _angle_weight(point, first, second):  # type: ignore[no-untyped-def]  # Numba's types
+    """Small where the rays coincide, rising to 1, and 0 where they are 90 degrees apart."""
     cosine = cosine_between(point, first, second)
     return min(max((1.0 - cosine) / FULL, LEAST), 1.0) * min(max(2.0 * cosine, 0.0), 1.0)

@@ -1,8 +1,8 @@
-"""Which pixels of a map to lift: known ones, away from jumps in depth, where SfM found little.
+"""Which pixels of a map to lift: known ones, away from discontinuities, where SfM has few points.
 
 Notation: a map is H x W; ``cells`` are squares of ``step`` pixels with a weight each; a pixel's
-number is row * W + column. w = 1 / depth, which is linear in the image on a plane at any slant, so
-that w(-k) + w(+k) = 2 w(0) there and a jump shows as what is left of it. Promise: no pixel is drawn
+number is row * W + column. w = 1 / depth is linear in the image on a plane at any slant, so
+w(-k) + w(+k) = 2 w(0) there, and a discontinuity shows as a residual. Promise: no pixel is drawn
 twice; at least as many are drawn as are asked for, or all there are.
 """
 
@@ -19,26 +19,26 @@ from splatseed.kernels.jit import inline
 __all__ = ["Drawn", "sample_pixels"]
 
 CELLS = 64
-"""Cells along the longer side of a map, at most."""
+"""Most cells along the longer side of a map."""
 
 ROUNDS = 4
 DIAGONAL = 2.0**0.5
 LEAST_DISTANCE = 0.5
-"""Of a cell that has points, in cells: it is not closed to new ones."""
+"""Distance, in cells, given to a cell that has points itself: it stays open to new ones."""
 
 SURPLUS = 1.15
-"""More is drawn than is missing, for some will be unknown or near a jump."""
+"""Overdraw factor: some pixels will be unknown or near a discontinuity."""
 LEAST_SHARE = 0.05
-"""Of what is drawn, that is taken to do."""
+"""Fraction of the drawn pixels that is assumed usable."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Pixels of one map.
+    """Pixels drawn from one map.
 
     Args:
         pixel: Their numbers, int64 [C].
-        edge: Which lie near a jump of depth, bool [C]: taken only when nothing else is left.
+        edge: Which lie near a depth discontinuity, bool [C]: taken only when nothing else is left.
     """
 
     pixel: Int64[np.ndarray, " C"]
@@ -52,7 +52,7 @@ def sample_pixels(
     settings: Settings,
     rng: np.random.Generator,
 ) -> Drawn:
-    """Draw ``num`` distinct pixels with depth, or a few more; fewer if there are not so many.
+    """Draw ``num`` distinct pixels with depth, or a few more; fewer if the map has fewer.
 
     Args:
         values: The map: positive where known, else NaN.
@@ -76,8 +76,8 @@ def sample_pixels(
         picks *= cumulative[-1]
         jitter = rng.random((len(picks), 2), dtype=np.float32)
         part = np.empty(len(picks), np.int64)
-        found = _draw(values, cumulative, weight.shape[1], step, box, picks, jitter, *edges, part)
-        pixel = part[:found] if not tried else np.unique(np.concatenate([pixel, part[:found]]))
+        drawn = _draw(values, cumulative, weight.shape[1], step, box, picks, jitter, *edges, part)
+        pixel = part[:drawn] if not tried else np.unique(np.concatenate([pixel, part[:drawn]]))
         tried += len(picks)
     if len(pixel) < num:
         return _with_rest(values, pixel, num, box, edges, rng)
@@ -91,7 +91,7 @@ def _region(shape: tuple[int, int], share: float) -> tuple[int, int, int, int]:
 
 
 def _edges(settings: Settings) -> tuple[int, float]:
-    """Radius and tolerance of the test for jumps; radius 0 passes all."""
+    """Radius and tolerance of the discontinuity test; radius 0 passes all."""
     if settings.edge_tolerance is None:
         return 0, np.inf
     return settings.edge_radius, settings.edge_tolerance
@@ -100,10 +100,10 @@ def _edges(settings: Settings) -> tuple[int, float]:
 def _cell_weights(
     shape: tuple[int, int], step: int, points: Float64[np.ndarray, "M 2"], settings: Settings
 ) -> Float64[np.ndarray, "R C"]:
-    """Weight of every cell: the root of its distance to the nearest that has an SfM point, or 1.
+    """Weight of every cell: the root of its distance to the nearest one with an SfM point, or 1.
 
-    The distance itself would leave too little for the surroundings of points: held against held-out
-    frames of two captures, the root leaves the smallest gaps.
+    The distance itself would leave too little for the surroundings of points: compared with
+    held-out frames of two captures, the root leaves the smallest gaps.
     """
     rows, columns = -(-shape[0] // step), -(-shape[1] // step)
     if settings.placement == "uniform" or not len(points):
@@ -116,7 +116,7 @@ def _cell_weights(
 
 
 def _picks(num: int, placement: str, rng: np.random.Generator) -> Float64[np.ndarray, " num"]:
-    """Ascending numbers of [0, 1): independent ones, or one in each of ``num`` equal parts."""
+    """Ascending numbers in [0, 1): independent, or stratified with one in each ``num``-th."""
     if placement == "uniform":
         return np.sort(rng.random(num))
     return (np.arange(num) + rng.random(num)) / num
@@ -145,7 +145,7 @@ def _with_rest(
 
 
 @inline
-def _spread_distance(distance):  # type: ignore[no-untyped-def]
+def _spread_distance(distance):  # type: ignore[no-untyped-def]  # Numba's types
     """Chamfer distances from a grid's zeros, in place, at most 8% too long (Borgefors, 1986)."""
     rows, columns = distance.shape
     for sweep in range(2):
@@ -168,30 +168,30 @@ def _spread_distance(distance):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _draw(values, cumulative, columns, step, box, picks, jitter, radius, tolerance, out):  # type: ignore[no-untyped-def]
-    """Pixels in the cells that ascending ``picks`` fall into; returns how many will do."""
+def _draw(values, cumulative, columns, step, box, picks, jitter, radius, tolerance, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Pixels in the cells that ascending ``picks`` fall into; returns the number of usable ones."""
     top, left, bottom, right = box
-    cell, found, first = 0, 0, 0  # out[first:found] are of this cell
+    cell, count, first = 0, 0, 0  # out[first:count] belong to this cell
     for k in range(len(picks)):
         while cell < len(cumulative) - 1 and cumulative[cell] <= picks[k]:
             cell += 1
-            first = found
+            first = count
         row = cell // columns * step + int(jitter[k, 0] * step)
         column = cell % columns * step + int(jitter[k, 1] * step)
         if row < top or row >= bottom or column < left or column >= right:
             continue
         pixel = row * values.shape[1] + column
-        if not 0 < values[row, column] < np.inf or _contains(out[first:found], pixel):
+        if not 0 < values[row, column] < np.inf or _contains(out[first:count], pixel):
             continue
         if radius == 0 or not _near_edge(values, row, column, radius, tolerance):
-            out[found] = pixel
-            found += 1
-    return found
+            out[count] = pixel
+            count += 1
+    return count
 
 
 @inline
-def _contains(numbers, number):  # type: ignore[no-untyped-def]
-    """Whether a few numbers have one among them."""
+def _contains(numbers, number):  # type: ignore[no-untyped-def]  # Numba's types
+    """Whether a short list contains a number."""
     for each in numbers:  # noqa: SIM110  (Numba has no any() of a generator)
         if each == number:
             return True
@@ -199,8 +199,8 @@ def _contains(numbers, number):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyped-def]
-    """Which of the pixels lie near a jump of depth."""
+def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Which of the pixels lie near a depth discontinuity."""
     width = values.shape[1]
     for k in range(len(pixel)):
         row, column = pixel[k] // width, pixel[k] % width
@@ -208,11 +208,11 @@ def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyp
 
 
 @inline
-def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyped-def]
+def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
     """Whether 1 / depth bends within ``radius``, across, down or diagonally, or is mostly unknown.
 
-    All distances are looked at along the row, where memory is near, and the largest alone
-    elsewhere: there, a jump that is passed twice can be missed.
+    All distances are tested along the row, where memory is near, and only the largest one
+    elsewhere: there, a discontinuity that is crossed twice can be missed.
     """
     here = 2.0 / values[row, column]
     known, pairs = 0, 0

@@ -1,4 +1,4 @@
-"""Depth maps in the pixels and the measure of a camera.
+"""Planar depth of a map, in the pixels and units of a camera.
 
 Notation: a ray has unit z in camera axes, so that its length is distance over planar depth.
 Promise: a pixel's ray passes through its centre, at +0.5.
@@ -24,7 +24,7 @@ def map_camera(depth: DepthMap, image: Image) -> Camera:
     """The camera of an image in the pixels of its map.
 
     Raises:
-        SceneFormatError: The map has not the shape of the image.
+        SceneFormatError: The map and the image differ in aspect ratio.
     """
     try:
         return depth.camera(image.camera)
@@ -37,7 +37,7 @@ def map_camera(depth: DepthMap, image: Image) -> Camera:
 def ray_length(
     camera: Camera, column: Int[np.ndarray, " ..."], row: Int[np.ndarray, " ..."]
 ) -> Float64[np.ndarray, " ..."]:
-    """Distance over planar depth along the rays through pixels' centres; the two broadcast."""
+    """Distance over planar depth along the rays through pixel centres; the arguments broadcast."""
     x = (column + (0.5 - camera.K[0, 2])) / camera.K[0, 0]
     y = (row + (0.5 - camera.K[1, 2])) / camera.K[1, 1]
     return np.asarray(np.sqrt(x * x + y * y + 1.0))
@@ -45,15 +45,15 @@ def ray_length(
 
 @dataclass(frozen=True, eq=False)
 class PlanarDepth:
-    """A map whose depth is worked out only where it is asked for.
+    """A map whose planar depth is computed only where needed.
 
-    Most maps need no more than one factor, and multiplying a whole map takes longer than all that
-    is done with the few pixels that are lifted.
+    Most maps need only one factor, and multiplying a whole map takes longer than everything done
+    with the few pixels that are lifted.
 
     Args:
         values: float32 [H, W]; NaN, or not above 0, where depth is unknown.
-        scale: Scene units a unit of ``values``.
-        along_ray: Whether they are distances along the ray.
+        scale: Scene units per unit of ``values``.
+        along_ray: Whether values are distances along the ray.
         camera: The image's camera in pixels of the map.
     """
 
@@ -73,7 +73,7 @@ class PlanarDepth:
             camera: The image's camera in pixels of the map.
             scale: As in ``Alignment``.
             shift: Likewise.
-            unit_ray: Whether to take planar depth for distance along the ray: equation 9's letter.
+            unit_ray: Whether to take planar depth as distance along the ray: equation 9's letter.
         """
         if depth.kind != "inverse":
             return cls(depth.values, scale, depth.kind == "ray" or unit_ray, camera)
@@ -83,7 +83,7 @@ class PlanarDepth:
         return cls(values, 1.0, unit_ray, camera)
 
     def every(self, first: int, step: int) -> Float32[np.ndarray, "h w"]:
-        """Planar depth, yet to be multiplied by the scale, at every ``step``-th row and column."""
+        """Planar depth, before multiplication by the scale, at every ``step``-th row and column."""
         z = self.values[first::step, first::step].copy()
         if self.along_ray:
             row, column = (np.arange(first, size, step) for size in self.values.shape)
@@ -96,7 +96,7 @@ class PlanarDepth:
         return self.every(0, 1) * np.float64(self.scale)
 
     def at(self, pixel: Int64[np.ndarray, " C"]) -> Float32[np.ndarray, " C"]:
-        """Planar depth in scene units of pixels, numbered row * W + column, [C]."""
+        """Planar depth in scene units of pixels numbered row * W + column, [C]."""
         z = self.values.ravel()[pixel] * self.scale
         if self.along_ray:
             row, column = np.divmod(pixel, self.camera.width)
@@ -119,8 +119,8 @@ def lift_pixels(
     Args:
         pixel: Numbers row * W + column, [C].
         z: Their planar depth, scene units, [C].
-        camera: Whose pixels they are.
-        out: Where to write.
+        camera: The camera whose pixels they are.
+        out: The output array.
         factor: Multiplies depth.
     """
     world_from_pixel = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K)
@@ -129,7 +129,7 @@ def lift_pixels(
 
 
 @inline
-def _lift(pixel, depth, width, m, center, factor, xyz):  # type: ignore[no-untyped-def]
+def _lift(pixel, depth, width, m, center, factor, xyz):  # type: ignore[no-untyped-def]  # Numba's types
     """P = c + z M (u, v, 1), in float64."""
     for k in range(len(pixel)):
         u, v = pixel[k] % width + 0.5, pixel[k] // width + 0.5

@@ -2,14 +2,14 @@
 
 Notation: V views; depth of view i is multiplied by exp(g_i). A pair (i, j) that sees the same
 places has a = median log(d_j / z_ij), where z_ij is the depth in view j of candidates of view i,
-and d_j what view j knows there. Then to first order
+and d_j the depth of view j itself there. Then to first order
 
     g_j - g_i = -a, to within the spread of the samples, and
     g_i = 0, to within the image's residual,
 
-the latter by its SfM points. Promise: the most probable g under these, with Huber's weights, found
-twice, the second time from where the first left the maps. Pairs move maps only against each other:
-the scale of all that overlap remains that of the SfM points. Nothing is random.
+the latter by its SfM points. Promise: the most probable g under these, with Huber's weights, solved
+twice, the second time from where the first left the maps. Pairs move maps only relative to each
+other: the common scale remains that of the SfM points. Nothing is random.
 
 SfM points of one image err together: on 7-Scenes red kitchen, where one sensor's scale is the same
 for all frames, scales fitted to one image at a time are off by 4% (standard deviation), and by up
@@ -34,28 +34,28 @@ from splatseed.views.projection import place
 __all__ = ["harmonize"]
 
 SAMPLES = 96
-"""Candidates of a view that are looked up in each neighbour."""
+"""Candidates of a view that are compared with each neighbour."""
 PAIRS = 6
-"""Neighbours of a view that it is compared with: more do not change the result."""
+"""Neighbours that each view is compared with: more do not change the result."""
 LEAST_SAMPLES = 12
 OTHER_SURFACE = 0.25
-"""Logarithms of ratios beyond this are of other surfaces."""
+"""Larger log ratios come from different surfaces."""
 LEAST_SIGMA, LEAST_RESIDUAL = 0.005, 0.0005
-"""No pair, and no SfM cloud, is believed to more than this."""
+"""Standard errors of pairs and of SfM clouds are not trusted below this."""
 INDEPENDENT = 0.1
-"""Share of the samples that is taken to be independent: neighbouring ones err alike."""
+"""Fraction of the samples that counts as independent: neighbouring ones err alike."""
 HUBER = 1.345
 ROUNDS = 2
 STEPS = 12
 CONVERGED = 1e-4
 PIECE = 8
-"""Views that a thread takes at a time."""
+"""Views per task of a thread."""
 
 
 def harmonize(
     views: Sequence[View], neighbors: Int64[np.ndarray, "V num"], progress: Progress
 ) -> Float64[np.ndarray, " V"]:
-    """What to multiply the depth of each view by, [V].
+    """The factor by which to multiply the depth of each view, [V].
 
     Args:
         views: Views with reduced copies.
@@ -78,7 +78,7 @@ def _compare_all(
 ) -> Float64[np.ndarray, "P 4"]:
     """Rows i, j, a, sigma of every pair that overlaps, with the maps multiplied by exp(g)."""
     neighbors = neighbors[:, :PAIRS]
-    found = np.full((*neighbors.shape, 4), np.nan)
+    pairs = np.full((*neighbors.shape, 4), np.nan)
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):
@@ -86,12 +86,12 @@ def _compare_all(
             for k, j in enumerate(neighbors[i].tolist()):
                 other = views[j].reduced if j >= 0 else None
                 if other is not None:
-                    found[i, k, :2] = i, j
+                    pairs[i, k, :2] = i, j
                     factor = other.factor * np.exp(g[j])
-                    _compare_pair(samples, other.z, factor, other.grid_from_world, found[i, k, 2:])
+                    _compare_pair(samples, other.z, factor, other.grid_from_world, pairs[i, k, 2:])
 
     in_threads(work, len(views), PIECE, "harmonize depth", progress)
-    rows = found.reshape(-1, 4)
+    rows = pairs.reshape(-1, 4)
     return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 
 
@@ -123,7 +123,7 @@ def _solve(
 
 
 @inline
-def _compare_pair(samples, z, factor, m, out):  # type: ignore[no-untyped-def]
+def _compare_pair(samples, z, factor, m, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Median a of a pair and its standard error; leaves NaN where too little overlaps."""
     logs = np.empty(len(samples))
     count = 0

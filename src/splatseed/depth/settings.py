@@ -13,12 +13,12 @@ __all__ = ["Settings"]
 
 @dataclass(frozen=True)
 class Settings:
-    """The choices of depth-guided lifting; the defaults treat the traps of the paper's text."""
+    """The choices of depth-guided lifting; the defaults avoid the traps of the paper's text."""
 
     align: bool = True
     """Fit the scale (for inverse depth, and shift) of each map to the SfM points."""
     fit: Literal["robust", "least-squares"] = "robust"
-    """How: medians and reweighting, or the paper's equation 7 (paper: least-squares)."""
+    """How to fit: medians and reweighting, or the paper's equation 7 (paper: least-squares)."""
     min_points: int = 20
     """Fewest SfM points that an image must see, else it is left out (paper: 1)."""
     max_residual_ratio: float | None = 3.0
@@ -28,35 +28,35 @@ class Settings:
     unit_ray: bool = False
     """Take z for the distance along the ray, as equation 9 says; this bends walls (paper: yes)."""
     region: float = 1.0
-    """Central share of the width, and of the height, that pixels are drawn from (paper: 0.5)."""
+    """Central fraction of the width and of the height that pixels are drawn from (paper: 0.5)."""
     placement: Literal["empty", "uniform"] = "empty"
-    """Draw pixels by their distance to the nearest SfM point, or all alike (paper: uniform)."""
+    """Draw pixels by their distance to the nearest SfM point, or uniformly (paper: uniform)."""
     edge_tolerance: float | None = 0.03
-    """Avoid pixels near jumps of depth by more than this share of it (paper: none)."""
+    """Avoid pixels near discontinuities larger than this fraction of depth (paper: none)."""
     edge_radius: int = 3
-    """How near, in pixels of the map."""
+    """Radius of the discontinuity test, in pixels of the map."""
     min_agreeing: int = 2
     """Other views whose depth and colour must confirm a point; 0 = none (paper: 0)."""
     see_through: bool = False
     """Keep points that another view looks through (paper: yes)."""
     num_neighbors: int = 12
-    """Other views that are asked, at most."""
+    """Most other views that are compared with a point."""
     tolerance: float = 0.02
-    """Relative difference at which two depths agree."""
+    """Relative difference up to which two depths agree."""
     color_tolerance: float | None = 0.15
-    """Mean difference of a colour, 0 to 1, at which two views agree; none = not compared."""
+    """Mean colour difference, 0 to 1, up to which two views agree; none = not compared."""
     spread: bool = True
-    """Take points as evenly apart as their number allows, whatever image they are from (paper:
+    """Spread points as evenly as their number allows, whatever image they come from (paper:
     no)."""
     hold_out: int = 0
-    """Leave out every n-th image by name, as trainers do for the test (8); 0 = use all."""
+    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
 
     @property
     def harmonizes(self) -> bool:
-        """Whether maps are scaled to each other; those in scene units are left as they are."""
+        """Whether maps are scaled to agree with each other; maps in scene units are left alone."""
         return self.align and self.harmonize
 
     @property
     def compares_views(self) -> bool:
-        """Whether points are held against other views at all."""
+        """Whether points are compared with other views at all."""
         return self.min_agreeing > 0 or not self.see_through

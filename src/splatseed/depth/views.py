@@ -1,9 +1,9 @@
-"""One image at a time: align its map, draw pixels, lift them, colour them; keep a reduced copy.
+"""One image at a time: align its map, draw pixels, lift and colour them; keep a reduced copy.
 
-Notation: a *view* is what stays of an image once its files are closed: C candidates, and the map
-and the photograph reduced to ``GRID`` pixels at most along the longer side, with which other
+Notation: a *view* is what remains of an image once its files are closed: C candidates, and the map
+and the photograph reduced to at most ``GRID`` pixels along the longer side, with which other
 images' candidates are compared. Promise: each file is read once; the candidates depend on the
-image, the seed and the settings alone, not on threads or other images.
+image, the seed and the settings only, not on threads or other images.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.kernels.jit import inline
 from splatseed.scene import Image
+from splatseed.views.view import check_lens
 from splatseed.views.visibility import SeenPoints, Visibility, camera_points
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 __all__ = ["Reader", "Reduced", "View"]
 
 GRID = 256
-"""Pixels along the longer side of a reduced copy: at most 7 bytes x 256 x 256 an image are kept."""
+"""Longer side of a reduced copy: at most 7 bytes x 256 x 256 per image are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +43,7 @@ class Reduced:
 
     Args:
         z: Planar depth at the grid's points, float32 [h, w]; NaN where unknown.
-        factor: Scene units a unit of ``z``.
+        factor: Scene units per unit of ``z``.
         grid_from_world: World to (column z, row z, z) of the grid, whose points are at whole
             numbers, float64 [3, 4].
         rgb: The photograph, smoothed and smaller, uint8 [p, q, 3].
@@ -59,17 +60,17 @@ class Reduced:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What stays of an image; where its map is rejected, nothing but the alignment.
+    """What remains of an image; if its map is rejected, only the alignment.
 
     Args:
-        alignment: Of its map.
-        camera: In pixels of the map.
-        pixel: Candidates, by their numbers row * W + column, int64 [C], about row by row.
+        alignment: The map's alignment.
+        camera: The camera, in pixels of the map.
+        pixel: Candidates, by their numbers row * W + column, int64 [C], roughly row by row.
         z: Their planar depth in scene units, float32 [C].
         rgb: Their colours, uint8 [C, 3].
-        edge: Which lie near a jump of depth, bool [C].
+        edge: Which lie near a depth discontinuity, bool [C].
         exhausted: Whether the map has no more pixels to give.
-        reduced: The coarse copy; None where views are not compared.
+        reduced: The coarse copy; None if views are not compared.
     """
 
     alignment: Alignment
@@ -82,11 +83,11 @@ class View:
     reduced: Reduced | None
 
     def __len__(self) -> int:
-        """How many candidates there are."""
+        """The number of candidates."""
         return len(self.pixel)
 
     def samples(self, num: int, factor: float = 1.0) -> Float32[np.ndarray, "num 3"]:
-        """The positions of up to ``num`` candidates spread evenly over the image, which has one.
+        """The positions of up to ``num`` candidates (one at least) spread evenly over the image.
 
         Args:
             num: How many.
@@ -103,8 +104,8 @@ class Reader:
     """Turns images into views.
 
     Args:
-        folder: Where the photographs are.
-        depths: Their maps.
+        folder: The folder of the photographs.
+        depths: The depth maps.
         visibility: The SfM points that each image sees.
         settings: The method's choices.
     """
@@ -119,9 +120,9 @@ class Reader:
 
         Raises:
             SceneNotFoundError: A file is gone.
-            SceneFormatError: A file is damaged or of another shape, or the lens has distortion.
+            SceneFormatError: A file is damaged, has the wrong aspect ratio, or the lens distorts.
         """
-        check_lens(image)
+        check_lens(image, reason="along whose rays pixels are lifted")
         seen = self._read_map(image, num, rng)  # the map is let go before the photograph is read
         if seen.alignment.rejected is not None:
             return _nothing(seen.alignment, seen.camera)
@@ -141,7 +142,7 @@ class Reader:
         )
 
     def _read_map(self, image: Image, num: int, rng: np.random.Generator) -> _Seen:
-        """Everything that is asked of a map."""
+        """Everything that is needed from a map."""
         depth = self.depths.read(image.name)
         camera = map_camera(depth, image)
         points = camera_points(camera, self.visibility.of(image))
@@ -165,20 +166,6 @@ class Reader:
         return align_map(depth, camera, points, self.settings.fit, self.settings.min_points)
 
 
-def check_lens(image: Image) -> None:
-    """Refuse a lens with distortion: pixels would be lifted along wrong rays.
-
-    Raises:
-        SceneFormatError: It has some.
-    """
-    if image.intrinsics.has_distortion:
-        raise SceneFormatError(
-            "cameras without lens distortion (PINHOLE), along whose rays pixels are lifted",
-            found=f"{image.intrinsics.model} for {image.name}",
-            fix="Undistort the scene first: splatseed undistort SCENE -o OUT.",
-        )
-
-
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """What is taken from a map: the fields of ``View`` before scales are synchronised."""
@@ -195,7 +182,7 @@ def _check_shape(path: Path, photograph: PilImage.Image, camera: Camera) -> None
     stretch = photograph.width / camera.width / (photograph.height / camera.height)
     if abs(stretch - 1) > ASPECT_SLACK:
         raise SceneFormatError(
-            f"{path} to have the shape of its camera and map, {camera.width} x {camera.height}",
+            f"{path} to have the aspect ratio of camera and map, {camera.width} x {camera.height}",
             found=f"{photograph.width} x {photograph.height}",
             fix="Use the images that the model was made from, or a resized copy of them.",
         )
@@ -204,15 +191,15 @@ def _check_shape(path: Path, photograph: PilImage.Image, camera: Camera) -> None
 def _colors_at(
     photograph: PilImage.Image, pixel: Int64[np.ndarray, " C"], camera: Camera
 ) -> UInt8[np.ndarray, "C 3"]:
-    """The colours that a photograph of any size has at the centres of a map's pixels."""
+    """The colours of a photograph of any size at the centres of a map's pixels."""
     out = np.empty((len(pixel), 3), np.uint8)
     _take_colors(np.asarray(photograph), pixel, camera.width, camera.height, out)
     return out
 
 
 @inline
-def _take_colors(photograph, pixel, width, height, out):  # type: ignore[no-untyped-def]
-    """The pixels of a photograph at the centres of those of a map."""
+def _take_colors(photograph, pixel, width, height, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """The photograph's pixels at the centres of the map's pixels."""
     rows, columns = photograph.shape[0], photograph.shape[1]
     for k in range(len(pixel)):
         row = int((pixel[k] // width + 0.5) * rows / height)
@@ -222,14 +209,14 @@ def _take_colors(photograph, pixel, width, height, out):  # type: ignore[no-unty
 
 
 def _reduce(seen: _Seen, coarse: Float32[np.ndarray, "h w"], photograph: PilImage.Image) -> Reduced:
-    """Every f-th pixel of the map, for means would bridge edges, and means of the photograph."""
+    """Every f-th pixel of the map, as means would bridge edges; block means of the photograph."""
     camera = seen.camera
     factor = -(-max(camera.width, camera.height) // GRID)
     first = factor // 2 + 0.5
     grid_from_map = np.array([[1, 0, -first], [0, 1, -first], [0, 0, factor]]) / factor
     size = [-(-side // -(-max(photograph.size) // GRID)) for side in photograph.size]
     # The mean of 2 x 2 samples of each block is smooth enough, and several times as fast as the
-    # block's.
+    # mean of the block.
     samples = photograph.resize((2 * size[0], 2 * size[1]), resample=0)
     block_from_map = np.array(size) / [camera.width, camera.height]
     return Reduced(

@@ -1,8 +1,8 @@
-"""A given number of points out of many candidates, as far apart as that number allows.
+"""Thinning to a given number of points, as far apart as that number allows.
 
-Notation: space is cut into cubes of one *side*; the key of a cube is its place, three numbers of 21
-bits, scrambled so that any bits of it are as good as random ones. Promise: one candidate at most is
-taken of each cube, that of the finest footprint, and none where an original lies; the side is the
+Notation: space is cut into cubes of one *side*; the key of a cube is its position, three numbers of
+21 bits, scrambled so that all its bits are as good as random. Promise: each cube gives at most one
+candidate, the one with the finest footprint, and none if an original lies in it; the side is the
 largest that gives the number, to about a fiftieth; the result does not depend on threads.
 """
 
@@ -21,20 +21,20 @@ from splatseed.kernels.jit import inline, kernel, parallel_range
 __all__ = ["thin_by_voxels"]
 
 BUCKETS = 32
-"""Parts of the hash's range, worked on in parallel."""
+"""Parts of the hash range that are processed in parallel."""
 SAMPLED = 2
-"""Parts that are looked at to find the side; all of them if there are few candidates."""
+"""Parts used to find the side; all of them if there are few candidates."""
 FEW = 1 << 16
 STEPS = 24
 LEAST_POWER = 0.2
-"""Least exponent e that is assumed in: number of cubes ~ (1 / side)^e; bounds a step's length."""
+"""Least exponent e assumed in: number of cubes ~ (1 / side)^e; bounds the length of a step."""
 SLACK = 0.02
 EMPTY, BLOCKED = -1, -2
-"""What a slot holds in place of a candidate."""
+"""Marks an empty slot."""
 BITS = 21
 OUTSIDE = 2.0**20 + 2
 FINEST = 2.0**-20
-"""The smallest side, as a share of the candidates' extent: places fit into the bits."""
+"""The smallest side, as a fraction of the candidates' extent: positions fit into the bits."""
 
 
 def thin_by_voxels(
@@ -45,15 +45,15 @@ def thin_by_voxels(
     num: int,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, " C"]:
-    """Mark ``num`` of the candidates.
+    """Mark ``num`` of the candidates, one per cube.
 
     Args:
         xyz: The candidates, [C, 3].
-        footprint: Size of a pixel at each: the finer is the better of two.
-        eligible: Of which to choose: at least ``num``.
-        originals: Points that are there already.
+        footprint: Size of a pixel at each: the finer of two is better.
+        eligible: Which may be chosen: at least ``num``.
+        originals: Points that exist already.
         num: How many.
-        rng: Draws which of a few too many are dropped, and fills up where candidates coincide.
+        rng: Draws which of a small surplus are dropped, and fills up where candidates coincide.
     """
     cubes = _Cubes(xyz, footprint, eligible, originals)
     side = _largest_side(cubes, num)
@@ -92,7 +92,7 @@ def _largest_side(cubes: _Cubes, num: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Cubes:
-    """Candidates and originals, to be put into cubes of any side."""
+    """Candidates and originals, sorted into cubes of any side."""
 
     xyz: Float32[np.ndarray, "C 3"]
     footprint: Float32[np.ndarray, " C"]
@@ -106,15 +106,15 @@ class _Cubes:
 
     @cached_property
     def extent(self) -> float:
-        """Its longest edge."""
+        """The box's longest edge."""
         return float((np.array([column.max() for column in self.xyz.T]) - self.low).max()) or 1.0
 
     def count(self, side: float) -> float:
         """Estimate how many cubes hold a candidate and no original."""
         buckets = BUCKETS if len(self.xyz) < FEW else SAMPLED
         taken = np.zeros(len(self.xyz), np.bool_)
-        found = self._take(side, buckets, taken)
-        return found * (BUCKETS / buckets)
+        count = self._take(side, buckets, taken)
+        return count * (BUCKETS / buckets)
 
     def take(self, side: float) -> Bool[np.ndarray, " C"]:
         """Mark the candidate that each cube gives."""
@@ -131,10 +131,10 @@ class _Cubes:
 
 
 @kernel
-def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]
+def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]  # Numba's types
     """The key of each point's cube.
 
-    Those outside of the candidates' box share keys that no other has.
+    Points outside the candidates' box get keys that no other cube has.
     """
     for k in parallel_range(len(xyz)):
         key = np.uint64(0)
@@ -146,16 +146,16 @@ def _find_cubes(xyz, low, side, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _take_best(keys, eligible, blocked, footprint, buckets, taken):  # type: ignore[no-untyped-def]
-    """Mark the finest candidate of every cube in some buckets; returns how many there are."""
-    found = np.zeros(buckets, np.int64)
+def _take_best(keys, eligible, blocked, footprint, buckets, taken):  # type: ignore[no-untyped-def]  # Numba's types
+    """Mark the finest candidate of every cube in some buckets; returns their number."""
+    counts = np.zeros(buckets, np.int64)
     for b in parallel_range(buckets):
-        found[b] = _take_bucket(np.uint64(b), keys, eligible, blocked, footprint, taken)
-    return found.sum()
+        counts[b] = _take_bucket(np.uint64(b), keys, eligible, blocked, footprint, taken)
+    return counts.sum()
 
 
 @inline
-def _take_bucket(bucket, keys, eligible, blocked, footprint, taken):  # type: ignore[no-untyped-def]
+def _take_bucket(bucket, keys, eligible, blocked, footprint, taken):  # type: ignore[no-untyped-def]  # Numba's types
     """One bucket, by a hash table with open addressing; the earlier of equals wins."""
     shift = np.uint64(59)  # the top 5 bits: BUCKETS is 32
     size = 0
@@ -172,23 +172,23 @@ def _take_bucket(bucket, keys, eligible, blocked, footprint, taken):  # type: ig
         if key >> shift == bucket:
             slot = _find(key, table, owner)
             table[slot], owner[slot] = key, BLOCKED
-    found = 0
+    count = 0
     for k in range(len(keys)):
         if keys[k] >> shift == bucket and eligible[k]:
             slot = _find(keys[k], table, owner)
             if owner[slot] == EMPTY:
                 table[slot], owner[slot] = keys[k], k
-                found += 1
+                count += 1
             elif owner[slot] != BLOCKED and footprint[k] < footprint[owner[slot]]:
                 owner[slot] = k
     for slot in range(slots):
         if owner[slot] >= 0:
             taken[owner[slot]] = True
-    return found
+    return count
 
 
 @inline
-def _find(key, table, owner):  # type: ignore[no-untyped-def]
+def _find(key, table, owner):  # type: ignore[no-untyped-def]  # Numba's types
     """The slot of a key, or the free one where it belongs."""
     last = np.uint64(len(table) - 1)
     slot = key & last

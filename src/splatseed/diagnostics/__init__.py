@@ -1,1 +1,1 @@
-"""Numbers about scenes and clouds: what is wrong with one, how far points lie from surfaces."""
+"""Statistics of scenes and clouds: what is wrong with a scene, how far points are from surfaces."""

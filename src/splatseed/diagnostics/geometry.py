@@ -1,4 +1,4 @@
-"""How good a cloud is where the surfaces are known, and how far new points stray where not.
+"""The accuracy of a cloud where the surfaces are known, and how far new points stray otherwise.
 
 Notation: h is a cloud's spacing: the mean over its points of the mean distance to the 6 nearest
 others. All scores are in units of h of the *originals*, so that scenes of any size compare.
@@ -24,7 +24,7 @@ NEIGHBORS = 6
 """Neighbours whose mean distance is the spacing: those of a point in a hexagonal pattern."""
 
 FAR_SPACINGS = 3.0
-"""A new point is far when no original lies within this many of the nearest original's spacings."""
+"""A new point is far from the originals beyond this many spacings of the nearest one."""
 
 Distance = Callable[[np.ndarray], np.ndarray]
 
@@ -38,12 +38,12 @@ class GeometryScore:
     """Geometric quality of upsampled points, in units of the originals' spacing h.
 
     Args:
-        error: Mean distance from a new point to the surface; NaN without new points. Few mismatched
-            originals can make up most of it.
+        error: Mean distance from a new point to the surface; NaN without new points. A few
+            mismatched originals can make up most of it.
         median: Median of the same.
         p95: 95th percentile of the same.
         coverage: Mean distance from a surface sample to the nearest of all points.
-        share_far: Share of new points that are far from every original (see ``far_share``).
+        share_far: Share of new points far from every original (see ``far_share``).
     """
 
     error: float
@@ -62,12 +62,12 @@ def measure(
 ) -> GeometryScore:
     """Compare points with known surfaces.
 
-    To score the originals by themselves, pass them as both ``new_xyz`` and ``all_xyz``.
+    To score only the originals, pass them as both ``new_xyz`` and ``all_xyz``.
 
     Args:
         new_xyz: The new points, world, [M, 3].
         all_xyz: The whole cloud, [N, 3]: originals first, the new points last.
-        surfaces: The truth: anything with ``distance(xyz)``, or such a function itself.
+        surfaces: The ground truth: anything with ``distance(xyz)``, or such a function itself.
         surface_samples: Points spread evenly on the surfaces, [S, 3].
         h: The unit of the result, usually ``spacing(originals)``.
 
@@ -111,12 +111,12 @@ def local_spacing(
     at: Float[np.ndarray, "M 3"] | None = None,
     tree: cKDTree | None = None,
 ) -> Float64[np.ndarray, " M"]:
-    """Mean distance to the 6 nearest others, in scene units, [M]; 0 where there are no others.
+    """Mean distance to the 6 nearest others, in scene units, [M]; 0 if there are no others.
 
     Args:
         xyz: The cloud, finite, [N, 3].
-        at: Those of its points to ask for, [M, 3]; all when left out.
-        tree: A tree of the cloud, if there is one already.
+        at: The points of the cloud to evaluate, [M, 3]; all when left out.
+        tree: A tree of the cloud, if one exists already.
     """
     tree = cKDTree(xyz) if tree is None else tree
     distances, _ = tree.query(xyz if at is None else at, k=NEIGHBORS + 1)
@@ -137,8 +137,8 @@ def far_share(
     Args:
         originals_xyz: The originals, [N, 3].
         new_xyz: The new points, [M, 3]; a non-finite one counts as far.
-        max_sample: More new points than this are judged by a sample.
-        rng: Draws the sample; evenly spaced ones are taken when left out.
+        max_sample: If there are more new points, a sample of this size is judged.
+        rng: Draws the sample; evenly spaced points are taken when left out.
 
     Raises:
         PointCloudError: There are new points but no finite original.

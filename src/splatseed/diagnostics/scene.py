@@ -1,7 +1,8 @@
-"""What is in a scene, and what is wrong with it: the numbers behind ``splatseed info``.
+"""What a scene contains, and what is wrong with it: the numbers behind ``splatseed info``.
 
 Notation: the spacing of a point is its mean distance to its 6 nearest, in scene units; track
-lengths count images, reprojection errors are in px. Shares are of all points unless said otherwise.
+lengths count images, reprojection errors are in px. Shares refer to all points unless said
+otherwise.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ MANY_EMPTY = 0.5
 
 @dataclass(frozen=True)
 class CloudStatistics:
-    """Facts of the points alone.
+    """Statistics of the points alone.
 
     Args:
         num_points: All points.
         non_finite: Points with a coordinate that is NaN or infinite.
-        duplicates: Finite points at exactly the place of an earlier one.
-        isolated: Points whose spacing is over 3 times their surroundings'.
+        duplicates: Finite points at exactly the position of an earlier one.
+        isolated: Points whose spacing is over 3 times that of their surroundings.
         spacing: Percentiles 5, 25, 50, 75, 95 of the spacing, scene units; NaN for fewer than 2.
         low: Least coordinates of the bounding box, [3].
         high: Greatest coordinates, [3].
@@ -53,7 +54,7 @@ class CloudStatistics:
 
 @dataclass(frozen=True)
 class TrackStatistics:
-    """Facts of the tracks: mean, and percentiles 5, 25, 50, 75, 95."""
+    """Statistics of the tracks: mean, and percentiles 5, 25, 50, 75, 95."""
 
     mean_length: float
     length: tuple[float, ...]
@@ -63,7 +64,7 @@ class TrackStatistics:
 
 @dataclass(frozen=True)
 class EmptyRegions:
-    """How much of the images no point projects to.
+    """How much of the images no point projects into.
 
     Args:
         mean: Mean share of empty cells over the images.
@@ -129,7 +130,7 @@ def track_statistics(scene: Scene) -> TrackStatistics | None:
 
 
 def empty_regions(scene: Scene, progress: Progress = silent) -> EmptyRegions | None:
-    """Which share of the images' area has no point; None for a scene without images or points.
+    """The share of the images' area without points; None for a scene without images or points.
 
     Visibility is not tested: a wall with points behind it counts as covered.
     """
@@ -148,20 +149,20 @@ def find_problems(
     scene: Scene, cloud: CloudStatistics, regions: EmptyRegions | None
 ) -> tuple[str, ...]:
     """What a user should know before training, one sentence each; the reader's warnings first."""
-    found = list(scene.warnings)
+    problems = list(scene.warnings)
     if cloud.isolated > MANY_ISOLATED * max(cloud.num_points, 1):
-        found.append(
-            f"{cloud.isolated:,} points ({cloud.isolated / cloud.num_points:.1%}) stand alone: "
+        problems.append(
+            f"{cloud.isolated:,} points ({cloud.isolated / cloud.num_points:.1%}) are isolated: "
             "outliers or a sparse background; spline, mls and voronoi start nothing from them"
         )
     if cloud.num_points == 0:
-        found.append("there are no points to upsample")
+        problems.append("there are no points to upsample")
     elif regions is not None and regions.mean > MANY_EMPTY:
-        found.append(
+        problems.append(
             f"{regions.mean:.0%} of the images' area has no point: upsampling fills between "
-            "points, but only depth can fill a bare wall"
+            "points, but only photographs or depth maps can fill a bare wall"
         )
-    return tuple(found)
+    return tuple(problems)
 
 
 def _empty_share(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> float:

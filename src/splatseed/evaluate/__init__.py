@@ -1,4 +1,4 @@
-"""Evaluation: how close renders come to photographs that were not trained on.
+"""Evaluation: how close renders come to photographs that were not used for training.
 
 ``evaluate_views`` scores any function from a view to an image; ``load_model`` and
 ``evaluate_model`` a trained .ply in the world of its scene, whoever trained it. Needs PyTorch
@@ -7,7 +7,7 @@
 
 from splatseed.requirements import require
 
-require("torch")  # asked for first, so that its absence is said once and plainly
+require("torch")  # first, for one clear error if it is absent
 
 from splatseed.evaluate.lpips import LPIPS_NETS, Lpips, LpipsNet, load_lpips  # noqa: E402  (after the check that PyTorch is there)
 from splatseed.evaluate.metrics import Covisible, Render, evaluate_views  # noqa: E402  (after the check that PyTorch is there)

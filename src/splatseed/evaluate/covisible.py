@@ -1,12 +1,12 @@
-"""Which pixels of the test views at least two training views see: where a score measures skill.
+"""Which pixels of the test views at least two training views see: where scores measure skill.
 
-What no training view shows can only be guessed, and what one shows has no depth: errors there tell
-of luck. Notation: frames are cut into the cells of ``seeding.coverage``; the geometry is the depth
-of each cell: the scene's own depth map's where there is one, else the lower quartile of the points'
-that fall in it; a cell without any has the median of the cells nearest to it. A training view sees
-a point where it projects into the view and no more than ``NEARER`` behind what that view has there.
-Promise: the answer depends on the capture alone (cameras, points, depth maps), never on a render,
-so that it is one and the same for everything that is scored on a scene.
+What no training view shows can only be guessed, and what a single one shows has no depth: errors
+there are a matter of luck. Notation: frames are cut into the cells of ``seeding.coverage``; the
+geometry is the depth of each cell: from the scene's own depth map if there is one, else the lower
+quartile of its points' depths; an empty cell has the median of the nearest cells. A training view
+sees a point if it projects into the view and lies no more than ``NEARER`` behind the geometry
+there. Promise: the answer depends on the capture alone (cameras, points, depth maps), never on a
+render, so it is the same for everything that is scored on a scene.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CELLS = 100
 LEAST_CELL = 2.0
 MAX_SIZE = 800
 NEAREST = 4
-"""Covered cells of which an empty one has the median inverse depth."""
+"""Covered cells whose median inverse depth an empty cell gets."""
 STAGE = "find co-visible pixels"
 
 Grids = Mapping[str, Bool[np.ndarray, "rows cols"]]
@@ -49,12 +49,12 @@ def find_covisible(
     """The cells of each test view that at least two training views see, by the view's name.
 
     Args:
-        scene: Whose cameras, original points and depth maps are looked at.
-        test_every: Which views are kept for the test.
+        scene: Provides cameras, original points and depth maps.
+        test_every: Every ``test_every``-th image, sorted by name, is a test view.
         progress: Told how far it is.
 
     Returns:
-        Nothing where the scene has neither points nor depth maps.
+        Nothing if the scene has neither points nor depth maps.
 
     Raises:
         SceneFormatError: A depth map is damaged.
@@ -83,10 +83,10 @@ def find_covisible(
 
 
 def pixel_masks(grids: Grids, views: Sequence[View]) -> dict[str, Bool[np.ndarray, "H W"]]:
-    """The cells as masks of pixels, for the views that are in them, whatever their size.
+    """The cells as masks of pixels, for views of any size that have cells.
 
     Args:
-        grids: As ``find_covisible`` gives them.
+        grids: The result of ``find_covisible``.
         views: The test views.
     """
     return {v.name: _pixels(grids[v.name], v) for v in views if v.name in grids}
@@ -141,7 +141,7 @@ def _planar(found: DepthMap, view: View) -> Float32[np.ndarray, "H W"]:
 
 
 def _filled(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
-    """The depths, with those of the nearest cells where there was none."""
+    """The depths, with gaps filled from the nearest cells."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
 
     known = np.isfinite(depths)
@@ -156,7 +156,7 @@ def _filled(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "ro
 
 
 def _farthest(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
-    """The greatest depth of each cell and its neighbours: at an edge either side is seen."""
+    """The largest depth of each cell and its neighbours: at an edge both sides count as seen."""
     from scipy.ndimage import maximum_filter  # noqa: PLC0415  (slow to import)
 
     return np.asarray(maximum_filter(depths, size=3, mode="nearest"))
@@ -198,7 +198,7 @@ def _sees(
 
 
 def write_covisible(path: Path, grids: Grids) -> None:
-    """Keep cells for the next run.
+    """Store cells for the next run.
 
     Raises:
         OutputError: The file cannot be written.
@@ -211,7 +211,7 @@ def write_covisible(path: Path, grids: Grids) -> None:
 
 
 def read_covisible(path: Path) -> dict[str, Bool[np.ndarray, "rows cols"]] | None:
-    """What ``write_covisible`` kept; None where there is no such file, or it cannot be read."""
+    """The cells that ``write_covisible`` stored; None if the file is missing or unreadable."""
     try:
         with np.load(path, allow_pickle=False) as kept:
             return {str(name): kept[f"cells_{i}"] for i, name in enumerate(kept["names"])}

@@ -118,10 +118,10 @@ class Lpips:
         self._heads = heads
 
     @torch.no_grad()
-    def __call__(self, render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
+    def __call__(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> float:
         """The distance of two images of values 0..1; 0 where they are equal."""
         self._move(render.device)
-        pair = torch.stack([render, truth]).permute(0, 3, 1, 2)
+        pair = torch.stack([render, photograph]).permute(0, 3, 1, 2)
         shift, scale = (pair.new_tensor(values).view(1, 3, 1, 1) for values in (SHIFT, SCALE))
         total = 0.0
         for features, head in zip(

@@ -1,6 +1,6 @@
 """The loop that scores renders of views: PSNR, SSIM, LPIPS.
 
-Notation: a render and a photograph are [H, W, 3], sRGB values 0..1, not made linear. Promise:
+Notation: a render and a photograph are [H, W, 3], sRGB values 0..1, not linearised. Promise:
 renders are clamped to [0, 1] and not rounded to 8 bits; each view is scored at its own size; SSIM
 has an 11 x 11 Gaussian window (sigma 1.5) and images mirrored at their edges, which is what
 torchmetrics and so gsplat's trainer report.
@@ -22,7 +22,7 @@ from splatseed.evaluate.images import psnr, psnr_within, ssim_of_all
 from splatseed.evaluate.lpips import Lpips
 from splatseed.progress import Progress, silent
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
-from splatseed.splat.rendering import photograph
+from splatseed.splat.rendering import photograph_of
 from splatseed.views.view import View
 
 __all__ = ["Covisible", "Render", "evaluate_views"]
@@ -45,14 +45,14 @@ def evaluate_views(
 ) -> EvalResult:
     """Score renders of views against their photographs.
 
-    The first view is rendered once more before, outside of the time, as a first call may compile.
+    The first view is rendered once more beforehand, untimed, because a first call may compile.
 
     Args:
-        render: Makes an image of a view, float [H, W, 3] of values about 0..1, on any device.
-        views: Which; at least one.
-        lpips: The network to measure LPIPS with; left out, LPIPS is not measured.
+        render: Renders a view as float [H, W, 3], values about 0..1, on any device.
+        views: The views; at least one.
+        lpips: The LPIPS metric; LPIPS is not measured when left out.
         lpips_reason: Why it is left out, for the reader of the result.
-        covisible: The pixels over which PSNR is taken once more, for the views that are in it; see
+        covisible: The pixels over which PSNR is also computed, for the views it contains; see
             ``evaluate.covisible``.
         progress: Told how far scoring is.
 
@@ -69,7 +69,7 @@ def evaluate_views(
     """
     if not views:
         raise ParameterError(
-            "views to score", found="none", fix="Keep some images for the test (test_every)."
+            "views to score", found="none", fix="Hold out some images for testing (test_every)."
         )
     render(views[0])
     scores = []
@@ -90,25 +90,27 @@ def _score(
     image = render(view)
     seconds = _now() - start
     _check(image, view)
-    clamped, truth = image.clamp(0.0, 1.0), photograph(view, image.device)
+    clamped, photograph = image.clamp(0.0, 1.0), photograph_of(view, image.device)
     return ViewScore(
         view.name,
-        psnr=psnr(clamped, truth),
-        ssim=ssim_of_all(clamped, truth),
-        lpips=None if lpips is None else lpips(clamped, truth),
+        psnr=psnr(clamped, photograph),
+        ssim=ssim_of_all(clamped, photograph),
+        lpips=None if lpips is None else lpips(clamped, photograph),
         seconds=seconds,
-        covisible_psnr=None if seen is None else psnr_within(clamped, truth, _mask(seen, truth)),
+        covisible_psnr=None
+        if seen is None
+        else psnr_within(clamped, photograph, _mask(seen, photograph)),
         covisible_share=None if seen is None else float(seen.mean()),
     )
 
 
-def _mask(seen: Bool[np.ndarray, "H W"], truth: Tensor) -> Bool[Tensor, "H W"]:
-    """A mask beside the photograph."""
-    return torch.from_numpy(seen).to(truth.device)
+def _mask(seen: Bool[np.ndarray, "H W"], photograph: Tensor) -> Bool[Tensor, "H W"]:
+    """A mask on the photograph's device."""
+    return torch.from_numpy(seen).to(photograph.device)
 
 
 def _now() -> float:
-    """The time once the GPU, if there is one in use, has done what it was asked for."""
+    """The time, once the GPU, if one is in use, has finished its work."""
     if torch.cuda.is_available():
         torch.cuda.synchronize()
     return time.perf_counter()
@@ -126,5 +128,5 @@ def _check(image: Tensor, view: View) -> None:
         raise ParameterError(
             f"a render of {view.name} of finite values",
             found="NaN or infinity",
-            fix="The model holds values that are not finite: train it again.",
+            fix="The model has values that are not finite: train it again.",
         )

@@ -1,8 +1,8 @@
-"""A trained model beside the test views of its scene, in the world of that scene.
+"""A trained model and the test views of its scene, in the world of that scene.
 
 Notation: the training frame is that of the scene's training cameras (``splat.frame``). Promise: a
-model is rendered in that frame whoever trained it, so that the near plane lies at the same place as
-in training and single precision suffices for a far-off world; what is behind all is black.
+model is rendered in that frame whoever trained it, so that the near plane is the same as in
+training and single precision suffices for a distant world; the background is black.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from splatseed.scene import Scene
 from splatseed.scores import NOT_ASKED, EvalResult
 from splatseed.splat.frame import TrainingFrame, training_frame
 from splatseed.splat.gaussians import Gaussians
-from splatseed.splat.pictures import beside_truth, picture_name, write_picture
+from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
 from splatseed.splat.rendering import render_view
 from splatseed.views.view import View, load_views, poses_of
 
@@ -51,12 +51,12 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:
-    """Gaussians and what to hold them to.
+    """Gaussians and the views to score them on.
 
     Args:
-        gaussians: In the scene's world.
+        gaussians: The model, in the scene's world.
         views: The scene's test views, in its world.
-        render: Renders the Gaussians from a view of the world.
+        render: Renders the Gaussians from a view in the world.
         scene: The scene.
     """
 
@@ -77,17 +77,17 @@ def load_model(
     cache_dir: Path | None = None,
     progress: Progress = silent,
 ) -> TrainedModel:
-    """Read Gaussians that any trainer wrote, and the test views of the scene that they are of.
+    """Read Gaussians that any trainer wrote, and the test views of their scene.
 
     Args:
         path: A file of Gaussians in any format that ``export.read_model`` reads.
         scene_path: The scene.
-        data_factor: By how much photographs are made smaller.
+        data_factor: The factor by which photographs are downsampled.
         test_every: Every n-th image, sorted by name, is a test view.
         transform: From the scene's world to the model's, if they differ: a file, or a word, as for
             ``find_transform``. When left out, the model must be in the scene's own world.
         device: Where to render; the CPU when left out.
-        cache_dir: Where smaller photographs are kept for the next time; nowhere when left out.
+        cache_dir: Where smaller photographs are cached; nowhere when left out.
         progress: Told how far reading is.
 
     Raises:
@@ -150,12 +150,12 @@ def evaluate_model(
 def gaussian_renderer(
     gaussians: Gaussians, frame: TrainingFrame, device: torch.device | None = None
 ) -> Render:
-    """A function from a view of the world to its render, without gradients.
+    """A function that renders views in the world, without gradients.
 
     Args:
-        gaussians: In the world.
-        frame: What to render in.
-        device: Where; the CPU when left out.
+        gaussians: In world coordinates.
+        frame: The frame to render in.
+        device: Where to render; the CPU when left out.
     """
     in_frame = dataclasses.replace(
         gaussians,
@@ -176,8 +176,8 @@ def frame_of_scene(scene: Scene, test_every: int = 8) -> TrainingFrame:
     """The frame that a scene is trained in, from the poses alone.
 
     Args:
-        scene: At least two images.
-        test_every: As it was trained with.
+        scene: A scene with at least two images.
+        test_every: As used in training.
     """
     train, _ = scene.split(test_every)
     return training_frame(poses_of(train))
@@ -190,6 +190,6 @@ def write_renders(model: TrainedModel, folder: Path, progress: Progress = silent
         OutputError: A file cannot be written.
     """
     for done, view in enumerate(model.views):
-        picture = beside_truth(view.image, model.render(view).cpu().numpy())
+        picture = beside_photograph(view.photograph, model.render(view).cpu().numpy())
         write_picture(folder / picture_name(view.name), picture)
         progress("write", (done + 1) / len(model.views))

@@ -1,6 +1,6 @@
 """L1 and SSIM of two images with their gradient, on the CPU, in one pass over the rows.
 
-Notation: x the render, y the truth, [H, W, 3] with interleaved channels; G the 11 x 11 Gaussian
+Notation: x the render, y the photograph, [H, W, 3] channels interleaved; G the 11 x 11 Gaussian
 window of standard deviation 1.5, applied where it fits whole ("valid"); mu_x = G*x, e_xy = G*(xy),
 e_2 = G*(x^2 + y^2). With A1 = 2 mu_x mu_y + C1, A2 = 2 (e_xy - mu_x mu_y) + C2,
 B1 = mu_x^2 + mu_y^2 + C1, B2 = e_2 - mu_x^2 - mu_y^2 + C2,
@@ -15,8 +15,8 @@ needs four windowed means, as the two variances appear only as a sum. Its deriva
 and the gradient of the sum of S is G'*dS/dmu_x + y G'*dS/de_xy + 2 x G'*dS/de_2.
 
 Promise: sums have a fixed order, so the bytes do not depend on the number of threads. A row of
-interleaved channels is one contiguous vector whose taps lie 3 apart; ``simd`` takes 16 at a time.
-The derivative maps stand in a frame of zeros, so that blurring them knows no border.
+interleaved channels is one contiguous vector whose taps are 3 apart; ``simd`` takes 16 at a time.
+The derivative maps are framed by zeros, so that blurring them needs no border cases.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, call-arg, var-annotated"
@@ -50,16 +50,16 @@ HALF = WINDOW // 2
 MARGIN = WINDOW - 1
 CHANNELS = 3
 REACH = MARGIN * CHANNELS
-"""Values from a row's first tap to the last."""
+"""Values from the first tap of a row to the last."""
 STRIP = 16
-"""Rows that one task works on; fixed, so that sums do not depend on the threads."""
+"""Rows per task; fixed, so that sums do not depend on the threads."""
 TALL = STRIP + MARGIN
 BLOCK = 480
-"""Values of a row that are worked on at once, or up to twice as many at the end of it: what they
-need stays in the nearer caches."""
+"""Values of a row that are processed at once, up to twice as many at its end: their working set
+stays in the nearer caches."""
 WIDE = 2 * BLOCK + 3 * LANES
 """Values from row to row of a block, with room for its margin and for whole vectors: an odd number
-of cache lines, so that a column of it is spread over the cache."""
+of cache lines, so that a column is spread over the cache."""
 
 
 def window_weights() -> Float32[np.ndarray, " 11"]:
@@ -71,15 +71,15 @@ def window_weights() -> Float32[np.ndarray, " 11"]:
 
 def l1_and_ssim(
     render: Float32[np.ndarray, "H W 3"],
-    truth: Float32[np.ndarray, "H W 3"],
+    photograph: Float32[np.ndarray, "H W 3"],
     l1_weight: float,
     ssim_weight: float,
 ) -> tuple[float, float, Float32[np.ndarray, "H W 3"]]:
-    """Mean |x - y|, mean SSIM, and the gradient of a mixture of them.
+    """Mean |x - y|, mean SSIM, and the gradient of a mixture of the two.
 
     Args:
         render: x, values about 0..1, contiguous; at least 11 pixels a side.
-        truth: y, likewise.
+        photograph: y, likewise.
         l1_weight: Weight of the mean absolute difference.
         ssim_weight: Weight of 1 - SSIM.
 
@@ -87,7 +87,7 @@ def l1_and_ssim(
         The two means, and d(l1_weight L1 + ssim_weight (1 - SSIM)) / dx.
     """
     height, width = len(render), render.shape[1] * CHANNELS
-    x, y = render.reshape(-1), truth.reshape(-1)
+    x, y = render.reshape(-1), photograph.reshape(-1)
     places = (height - MARGIN) * (width - REACH)
     partials = _framed(height, width)
     ssim_sums = np.empty(-(-(height - MARGIN) // STRIP), np.float64)
@@ -102,11 +102,11 @@ def l1_and_ssim(
 
 
 def _framed(height: int, width: int) -> Float32[np.ndarray, "3 H+10 W*3+30"]:
-    """Room for the three derivative maps within zeros as wide as the window reaches."""
+    """Buffers for the three derivative maps, framed by zeros as wide as the window reaches."""
     partials = np.empty((3, height + MARGIN + 1, width + REACH), np.float32)  # a row to read into
     partials[:, :MARGIN] = 0.0
     partials[:, height:] = 0.0
-    partials[:, :, :REACH] = 0.0  # what is right of the maps, _forward clears as it goes
+    partials[:, :, :REACH] = 0.0  # _forward clears the right side as it goes
     return partials
 
 
@@ -141,7 +141,7 @@ def _blur_columns(source, start, step, rows, columns, weights, out):
 
 @inline
 def _take_block(x, y, start, width, rows, columns, planes):
-    """Copy a block of both images, and what else SSIM has windowed means of: x y and x^2 + y^2."""
+    """Copy a block of both images, and the products x y and x^2 + y^2."""
     plane_x, plane_y, plane_xy, plane_2 = planes[0], planes[1], planes[2], planes[3]
     for row in range(rows):
         for at in range(0, columns, LANES):
@@ -155,7 +155,7 @@ def _take_block(x, y, start, width, rows, columns, planes):
 
 @inline
 def _similarity(means, at, columns, weights, partials, to, scores):
-    """Horizontal means of a row of vertical ones; SSIM and its three derivatives there."""
+    """Horizontal means of a row of vertical means, and from them SSIM and its three derivatives."""
     w = _splats(weights)
     mean_x, mean_y, mean_xy, mean_2 = means[0], means[1], means[2], means[3]
     by_mean, by_xy, by_2 = partials[0], partials[1], partials[2]
@@ -181,7 +181,7 @@ def _similarity(means, at, columns, weights, partials, to, scores):
 
 @inline
 def _blocks(width):
-    """How many blocks a row of ``width`` values has; the last takes the remainder."""
+    """The number of blocks in a row of ``width`` values; the last takes the remainder."""
     return max(1, width // BLOCK)
 
 

@@ -1,12 +1,12 @@
-"""The world that a trained model lies in, which need not be its scene's.
+"""The world of a trained model, which need not be its scene's.
 
 Notation: ``model_from_scene`` takes the scene's world to that of the Gaussians. Some trainers
-normalise the world before they train, and write Gaussians of that world; rendered from the scene's
-cameras these give a wrong picture, and a wrong score without a warning. *Apart* is the median
+normalise the world before training, and write Gaussians in that world; rendered from the scene's
+cameras these give wrong pictures, and wrong scores without a warning. *Apart* is the median
 distance from the scene's points to the nearest Gaussian, in units of the median distance between
 neighbouring Gaussians: in the right world about 1 (0.1 to 1.3 for seeds and trained models of five
 scenes), in a wrong one 4 to 700. Promise: Gaussians that lie apart from the scene's points are
-refused, with a transform that mends it if one is found.
+refused, naming a transform that fits if there is one.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ __all__ = [
 ]
 
 GSPLAT, NO_TRANSFORM = "gsplat", "none"
-"""Words that stand for a transform: that of gsplat's examples, and none whatever it looks like."""
+"""Words that name a transform: that of gsplat's examples, and none, without any check."""
 APART = 8.0
-"""More than this is another world."""
+"""Beyond this distance it is another world."""
 DOUBTFUL, CLOSER = 1.5, 3.0
-"""More than the first is, if in another world they are closer by as many times as the second."""
+"""Beyond the first it is, if another world is closer by the second as a factor."""
 SAMPLES = 3000
-"""Points and Gaussians that distances are measured for."""
+"""Number of points and Gaussians used to measure distances."""
 LEAST = 20
 VISIBLE = -2.2
 """Logit of the least opacity that counts, a tenth."""
 NERFSTUDIO = "dataparser_transforms.json"
 FILES = (NERFSTUDIO, "cameras.json")
-"""Files of nerfstudio and graphdeco, in the model's folder or up to three above, that tell a
+"""Files of nerfstudio and graphdeco, in the model's folder or up to three above, that give a
 transform."""
 _FIX = "Name another file, or a word: gsplat, none."
 
@@ -79,16 +79,16 @@ def find_transform(word: str, scene: Scene) -> Similarity | None:
 def check_world(
     path: Path, scene: Scene, gaussians: Gaussians, given: Similarity | None = None
 ) -> None:
-    """Refuse a model that is not in the world that it is taken to be in.
+    """Refuse a model that is not in the assumed world.
 
     Args:
         path: The model's file.
-        scene: With its points; without, nothing can be found out.
+        scene: The scene with its points; without points nothing can be checked.
         gaussians: The model.
         given: The transform that the user named.
 
     Raises:
-        SceneFormatError: It is not.
+        SceneFormatError: It is in another world.
     """
     apart = _measure(scene, gaussians)
     if apart is None or (found := apart(given)) <= DOUBTFUL:
@@ -216,8 +216,8 @@ def _of_cameras(path: Path, cameras: Sequence[Any], scene: Scene) -> Similarity:
 def _of_gsplat(scene: Scene) -> Similarity:
     """How gsplat's examples (1.5, examples/datasets/normalize.py) normalise a COLMAP scene.
 
-    Cameras are turned upright, moved and scaled; then points are turned onto their principal axes,
-    and over if more of them are above than below.
+    Cameras are turned upright, moved and scaled; then points are rotated onto their principal axes,
+    and flipped if more of them are above than below.
     """
     xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
     if len(xyz) < 3 or not scene.images:
@@ -239,7 +239,7 @@ def _of_gsplat(scene: Scene) -> Similarity:
 
 
 def _upright(world_from_cam: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray, "3 4"]:
-    """Mean up to -y, what cameras look at to 0, median camera distance to 1."""
+    """Mean up direction to -y, the point that cameras look at to 0, median camera distance to 1."""
     up = -world_from_cam[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
     goal = np.array([0.0, -1.0, 0.0])
@@ -258,7 +258,7 @@ def _upright(world_from_cam: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray
 
 
 def _principal(xyz: Float64[np.ndarray, "3 N"]) -> Float64[np.ndarray, "3 4"]:
-    """The median to 0, the axis along which points spread least to z."""
+    """The median to 0, the axis of least spread to z."""
     center = np.median(xyz, axis=1)
     _, vectors = np.linalg.eigh(np.cov(xyz - center[:, None]))
     vectors = vectors[:, ::-1].copy()

@@ -1,4 +1,4 @@
-"""Trained Gaussians in the files that viewers and engines read: one module a format."""
+"""Trained Gaussians in the file formats of viewers and engines: one module per format."""
 
 from splatseed.export.formats import FORMATS, SUFFIXES, detect_format, format_of_name
 from splatseed.export.model import read_model, write_model

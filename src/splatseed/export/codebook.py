@@ -1,7 +1,7 @@
-"""Codes for values and for vectors, as SOG's palettes want them: nothing random, the same bytes every time.
+"""Scalar and vector quantisation for SOG's palettes: nothing random, the same bytes every time.
 
-Notation: a *codebook* holds the 256 numbers that stand for all values; a *palette* holds K vectors, and each of N
-vectors a *label*, the one that stands for it.
+Notation: a *codebook* holds the 256 numbers that stand for all values; a *palette* holds K vectors,
+and a *label* says which of them stands for each of N vectors.
 """
 
 from __future__ import annotations
@@ -19,14 +19,15 @@ POWER_STEPS = 3
 
 
 def codebook(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, " 256"]:
-    """256 numbers, ascending, that stand for values with little square error (Lloyd's algorithm in 1D).
+    """The 256 numbers, ascending, that quantise values with small square error (1D Lloyd).
 
     Args:
         values: At least one, finite.
     """
     ordered = np.sort(values.reshape(-1).astype(np.float64))
     sums = np.concatenate([[0.0], np.cumsum(ordered)])
-    # Half of the codes start at even values, half at even ranks: tails get some, and so does the middle.
+    # Half of the codes start evenly spaced, half at even ranks: both the tails and the middle get
+    # some.
     ranks = np.quantile(ordered, (np.arange(CODES // 2) + 0.5) / (CODES // 2))
     centers = np.sort(np.concatenate([ranks, np.linspace(ordered[0], ordered[-1], CODES // 2)]))
     for _ in range(LLOYD_STEPS):
@@ -41,23 +42,24 @@ def codebook(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, " 256"]:
 def codes(
     values: Float32[np.ndarray, "..."], centers: Float64[np.ndarray, " 256"]
 ) -> UInt8[np.ndarray, "..."]:
-    """Which number of a codebook is nearest to each value."""
+    """The index of the codebook number nearest to each value."""
     return np.searchsorted((centers[1:] + centers[:-1]) / 2, values).astype(np.uint8)
 
 
 def palette(
     vectors: Float32[np.ndarray, "N D"], levels: int, progress: Progress = silent
 ) -> tuple[Float32[np.ndarray, "K D"], Int64[np.ndarray, " N"]]:
-    """2^levels vectors that stand for N, at least as many: halved again and again where they differ most.
+    """2^levels vectors that stand for N: groups are halved repeatedly where they vary most.
 
     Args:
-        vectors: Finite.
+        vectors: Finite; N is at least 2^levels.
         levels: How often to halve.
         progress: Told how far it is.
     """
     count = 2**levels
     size = -(-len(vectors) // count)
-    # Groups stay of one size, so that a level is a few operations on arrays: the first come twice.
+    # Groups keep one size, so that a level is a few array operations; to fill up, the first are
+    # repeated.
     order = np.resize(np.arange(len(vectors)), size * count)[None]
     for level in range(levels):
         progress("encode", level / levels)

@@ -1,8 +1,9 @@
-"""PlayCanvas's compressed PLY: 16 bytes a Gaussian, and a byte a further coefficient of its colour.
+"""PlayCanvas's compressed PLY: 16 bytes per Gaussian, and one per further colour coefficient.
 
-Notation: a *chunk* is 256 Gaussians with the bounds of their positions, log-scales and colours; within
-them a vector takes 11, 10 and 11 bits; a rotation 2 bits for its largest component and 10 for each other;
-a colour 8 bits a channel beside the opacity's; a coefficient c of -4 to 4 the byte (c / 8 + 1/2) 256.
+Notation: a *chunk* is 256 Gaussians with the bounds of their positions, log-scales and colours;
+relative to them a vector takes 11, 10 and 11 bits; a rotation takes 2 bits for the index of its
+largest component and 10 for each other one; a colour 8 bits per channel, and the opacity 8; a
+coefficient c in [-4, 4] is the byte (c / 8 + 1/2) 256.
 Source: the format's description in PlayCanvas's splat-transform and engine.
 """
 
@@ -45,13 +46,15 @@ COLOR_BITS = ((24, 8), (16, 8), (8, 8))
 
 
 def encode(gaussians: Gaussians) -> bytes:
-    """The bytes of a file that holds the Gaussians, in the order of a Z curve."""
+    """The bytes of a file with the Gaussians, in Z-curve order."""
     order = morton_order(gaussians.means)
     count, rest = len(order), 3 * gaussians.shN.shape[1]
     chunk = np.arange(count) // CHUNK
     scales = np.clip(gaussians.scales[order], -MOST_LOG_SCALE, MOST_LOG_SCALE)
     colors = gaussians.sh0[order, 0] * np.float32(SH_C0) + np.float32(0.5)
-    tables, units = zip(*(_in_chunks(v, chunk) for v in (gaussians.means[order], scales, colors)), strict=True)  # fmt: skip
+    tables, units = zip(
+        *(_in_chunks(v, chunk) for v in (gaussians.means[order], scales, colors)), strict=True
+    )
     largest, three = smallest_three(gaussians.quats[order])
     packed = np.empty((count, 4), "<u4")
     packed[:, 0] = _pack(units[0], VECTOR_BITS)
@@ -68,7 +71,7 @@ def encode(gaussians: Gaussians) -> bytes:
 
 
 def decode(path: Path) -> Gaussians:
-    """The Gaussians of a file.
+    """The Gaussians in a file.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -86,7 +89,7 @@ def decode(path: Path) -> Gaussians:
     means = _from_chunks(_unpack(vertices[PACKED[0]], VECTOR_BITS), chunks, BOUNDS[0:6], chunk)
     scales = _from_chunks(_unpack(vertices[PACKED[2]], VECTOR_BITS), chunks, BOUNDS[6:12], chunk)
     colors = _unpack(vertices[PACKED[3]], COLOR_BITS)
-    if BOUNDS[-1] in (chunks.dtype.names or ()):  # files of before 2024 have no bounds of colours
+    if BOUNDS[-1] in (chunks.dtype.names or ()):  # files from before 2024 have no colour bounds
         colors = _from_chunks(colors, chunks, BOUNDS[12:18], chunk)
     turn = vertices[PACKED[1]]
     three = (_unpack(turn, THREE_BITS) - np.float32(0.5)) * np.float32(np.sqrt(2))
@@ -112,7 +115,7 @@ def _header(num_chunks: int, count: int, rest: int) -> bytes:
 def _in_chunks(
     values: Float32[np.ndarray, "N 3"], chunk: np.ndarray
 ) -> tuple[Float32[np.ndarray, "C 6"], Float32[np.ndarray, "N 3"]]:
-    """The bounds of each chunk, and where between them each value lies, 0 to 1."""
+    """The bounds of each chunk, and each value as a fraction between them."""
     starts = np.arange(0, len(values), CHUNK)
     low = np.minimum.reduceat(values, starts, axis=0)
     high = np.maximum.reduceat(values, starts, axis=0)
@@ -134,7 +137,7 @@ def _from_chunks(
 def _pack(
     units: Float32[np.ndarray, "N 3"], layout: tuple[tuple[int, int], ...]
 ) -> UInt32[np.ndarray, " N"]:
-    """Values of 0 to 1 in so many bits each, shifted to their places."""
+    """Values in [0, 1] quantised to the given numbers of bits, shifted into one integer."""
     packed = np.zeros(len(units), np.uint32)
     for i, (shift, bits) in enumerate(layout):
         most = 2**bits - 1
@@ -158,7 +161,7 @@ def _dtype(reader: ByteReader, element: Element) -> np.dtype[Any]:
 def _checked(
     reader: ByteReader, tables: dict[str, np.ndarray[Any, Any]]
 ) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """The tables of chunks and vertices, with all that is read of them."""
+    """The tables of chunks and vertices, checked for every property that is read."""
     empty = np.empty(0, [])
     chunks, vertices = tables.get("chunk", empty), tables.get("vertex", empty)
     missing = {*BOUNDS[:12]} - {*(chunks.dtype.names or ())}
@@ -166,8 +169,8 @@ def _checked(
     if missing:
         raise reader.error("the properties of a compressed PLY", f"no {', '.join(sorted(missing))}")
     if len(vertices) == 0 or len(chunks) != -(-len(vertices) // CHUNK):
-        found = f"{len(chunks)} chunks and {len(vertices)} Gaussians"
-        raise reader.error(f"a chunk for every {CHUNK} Gaussians", found)
+        counts = f"{len(chunks)} chunks and {len(vertices)} Gaussians"
+        raise reader.error(f"a chunk for every {CHUNK} Gaussians", counts)
     if any(vertices.dtype[name] != np.dtype("<u4") for name in PACKED):
         raise reader.error("packed properties of type uint", "another type")
     return chunks, vertices
@@ -176,7 +179,7 @@ def _checked(
 def _coefficients(
     reader: ByteReader, table: np.ndarray[Any, Any] | None, count: int
 ) -> Float32[np.ndarray, "N K 3"]:
-    """Of each colour beyond the first coefficient; the file has all of red, then green, then blue."""
+    """Colour coefficients beyond the first; the file stores all of red, then green, then blue."""
     names = [] if table is None else [n for n in table.dtype.names or () if n.startswith("f_rest_")]
     if table is None or not names:
         return np.zeros((count, 0, 3), np.float32)

@@ -1,4 +1,4 @@
-"""Which format a file of Gaussians has: by its content when it is read, by its name when it is written."""
+"""The format of a file of Gaussians: read from its content, written by its name."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from splatseed.literal import did_you_mean
 __all__ = ["ELSEWHERE", "FORMATS", "SUFFIXES", "Format", "detect_format", "format_of_name"]
 
 CONVERTER = "npx @playcanvas/splat-transform"
-"""The converter of SOG's and the compressed PLY's own authors."""
+"""The converter by the authors of SOG and compressed PLY."""
 _HEADER = 1 << 20
 _SPLAT_BYTES = 32
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format that is read and written.
+    """A format that can be read and written.
 
     Args:
-        name: What it is called here.
-        suffix: How names of its files end.
-        about: What it keeps, and who reads it.
+        name: Its name here.
+        suffix: The end of its file names.
+        about: What it preserves, and who reads it.
     """
 
     name: str
@@ -44,45 +44,45 @@ FORMATS = {
 }
 """The formats by name."""
 SUFFIXES = {each.suffix: each.name for each in FORMATS.values()}
-"""The formats by how a file's name ends."""
+"""The formats by file name suffix."""
 ELSEWHERE = {
-    ".ksplat": "GaussianSplats3D's own tool (util/create-ksplat.js) makes one of a .ply",
-    ".glb": f"{CONVERTER} MODEL.ply OUT.glb makes one of a .ply",
-    ".gltf": f"{CONVERTER} MODEL.ply OUT.glb makes a .glb of a .ply",
-    ".usdz": "NVIDIA's converter (PyPI: usd-convert-gsplat) makes one of a .ply",
+    ".ksplat": "GaussianSplats3D's own tool (util/create-ksplat.js) makes one from a .ply",
+    ".glb": f"{CONVERTER} MODEL.ply OUT.glb makes one from a .ply",
+    ".gltf": f"{CONVERTER} MODEL.ply OUT.glb makes a .glb from a .ply",
+    ".usdz": "NVIDIA's converter (PyPI: usd-convert-gsplat) makes one from a .ply",
 }
-"""Formats that are not written here, and who does."""
+"""Formats that are not written here, and the tools that write them."""
 
 
 def format_of_name(path: Path) -> str:
-    """The name of the format that a file's name asks for.
+    """The format that a file name asks for.
 
     Raises:
-        ParameterError: None that is written here.
+        ParameterError: The suffix belongs to no format written here.
     """
     lower = path.name.lower()
     for suffix in sorted(SUFFIXES, key=len, reverse=True):
         if lower.endswith(suffix):
             return SUFFIXES[suffix]
     known = ", ".join(SUFFIXES)
-    found = path.suffix or "none"
+    suffix = path.suffix or "none"
     other = ELSEWHERE.get(path.suffix.lower())
     raise ParameterError(
         f"a file name that ends in one of {known}",
-        found=found,
-        fix=f"Export a .ply: {other}." if other else f"{did_you_mean(found, SUFFIXES)}Choose one.",
+        found=suffix,
+        fix=f"Export a .ply: {other}." if other else f"{did_you_mean(suffix, SUFFIXES)}Choose one.",
     )
 
 
 def detect_format(path: Path, data: bytes) -> str:
-    """The name of the format of a file's content.
+    """The format of a file's content.
 
     Args:
-        path: The file, for errors and for a format without a mark of its own.
+        path: The file, for errors and for the format without a signature.
         data: Its bytes.
 
     Raises:
-        SceneFormatError: It is none that is read.
+        SceneFormatError: The format is none that can be read.
     """
     if data.startswith(b"ply") and data[3:4] in (b"\n", b"\r", b" ", b"\t"):
         return "compressed-ply" if b"packed_position" in data[:_HEADER] else "ply"
@@ -112,7 +112,7 @@ def _unknown(path: Path, data: bytes) -> SceneFormatError:
     elif path.suffix.lower() == ".ksplat":
         found, fix = "a .ksplat", f"Convert it: {CONVERTER} IN.ksplat OUT.ply."
     elif path.suffix.lower() == ".splat":
-        found = f"{len(data):,} bytes, where each Gaussian of a .splat takes {_SPLAT_BYTES}"
+        found = f"{len(data):,} bytes, not a multiple of the {_SPLAT_BYTES} of a .splat's Gaussian"
         fix = "Copy the file again."
     return SceneFormatError(
         f"{path} to hold trained Gaussians ({', '.join(SUFFIXES)})", found=found, fix=fix

@@ -1,7 +1,7 @@
 """Reading and writing trained Gaussians in any of the formats.
 
-Promise: what a file is, its content says; a file appears whole or not at all; what comes back has finite
-positions; Gaussians keep their values but, in packed formats, not their order.
+Promise: a file's content decides its format; a file appears whole or not at all; positions read are
+finite; Gaussians keep their values but, in packed formats, not their order.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def read_model(path: Path) -> Gaussians:
 
     Raises:
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It holds no Gaussians in a format that is read, or is damaged.
-        MissingDependencyError: It is an .spz of version 4, and zstandard is absent.
+        SceneFormatError: It holds no Gaussians in a known format, or is damaged.
+        MissingDependencyError: It is an .spz of version 4, which needs zstandard.
     """
     gaussians = _DECODERS[detect_format(path, read_bytes(path))](path)
     bad = ~np.isfinite(gaussians.means).all(axis=1)
@@ -51,15 +51,15 @@ def read_model(path: Path) -> Gaussians:
 
 
 def write_model(path: Path, gaussians: Gaussians, progress: Progress = silent) -> None:
-    """Write Gaussians in the format that the file's name asks for, replacing a file at ``path``.
+    """Write Gaussians in the format that the file name asks for, replacing a file at ``path``.
 
     Args:
         path: The file.
         gaussians: At least one, with finite positions.
-        progress: Told how far a slow format is.
+        progress: Told how far slow formats are.
 
     Raises:
-        ParameterError: The name ends in no format that is written.
+        ParameterError: The suffix belongs to no format written here.
         OutputError: The file cannot be written.
     """
     name = format_of_name(path)

@@ -1,7 +1,7 @@
-"""What the packed formats share: rotations as three numbers, opacities as bytes, an order in space.
+"""Shared by the packed formats: rotations as three numbers, opacities as bytes, spatial order.
 
-Notation: quaternions are wxyz; a rotation's *largest* component, made positive, is left out, as the other
-*three*, each within 1/sqrt(2) of 0, determine it; [N] Gaussians.
+Notation: quaternions are wxyz; a rotation's *largest* component, made positive, is dropped, because
+the other *three*, each within 1/sqrt(2) of 0, determine it; [N] Gaussians.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _MORTON_BITS = 16
 
 
 def unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
-    """Quaternions of length 1; those of no length become no rotation."""
+    """Quaternions of length 1; zeros become the identity."""
     norms = np.linalg.norm(quats, axis=1, keepdims=True)
     known = np.isfinite(norms) & (norms > 0)
     unit = np.divide(quats, norms, out=np.zeros_like(quats), where=known)
@@ -37,7 +37,7 @@ def unit_quats(quats: Float32[np.ndarray, "N 4"]) -> Float32[np.ndarray, "N 4"]:
 def smallest_three(
     quats: Float32[np.ndarray, "N 4"],
 ) -> tuple[Int64[np.ndarray, " N"], Float32[np.ndarray, "N 3"]]:
-    """Which component is the largest, and the other three in their order; see the module."""
+    """The index of the largest component, and the other three in order; see the module."""
     unit = unit_quats(quats)
     largest = np.argmax(np.abs(unit), axis=1)
     rows = np.arange(len(unit))
@@ -48,7 +48,7 @@ def smallest_three(
 def from_smallest_three(
     largest: Int64[np.ndarray, " N"], three: Float32[np.ndarray, "N 3"]
 ) -> Float32[np.ndarray, "N 4"]:
-    """The unit quaternions that ``smallest_three`` took apart."""
+    """The unit quaternions that ``smallest_three`` encoded."""
     rows = np.arange(len(three))
     quats = np.empty((len(three), 4), np.float32)
     quats[rows[:, None], _OTHERS[largest]] = three
@@ -57,19 +57,19 @@ def from_smallest_three(
 
 
 def opacity_bytes(logits: Float32[np.ndarray, " N"]) -> UInt8[np.ndarray, " N"]:
-    """Opacities 0 to 1 in steps of 1/255."""
+    """Opacities in [0, 1] in steps of 1/255."""
     with np.errstate(over="ignore"):
         return np.rint(255 / (1 + np.exp(-logits.astype(np.float64)))).astype(np.uint8)
 
 
 def opacity_logits(values: UInt8[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]:
-    """Logits of opacities in steps of 1/255; the ends, whose logits are infinite, a quarter step inward."""
+    """Logits of opacities in steps of 1/255; 0 and 1 move a quarter step inward to stay finite."""
     opacity = np.clip(values / 255, 0.25 / 255, 1 - 0.25 / 255)
     return np.log(opacity / (1 - opacity)).astype(np.float32)
 
 
 def morton_order(xyz: Float32[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
-    """The order of points along a Z curve through their bounding box: neighbours in it are near in space."""
+    """The order of points along a Z curve through their bounding box."""
     low, high = xyz.min(axis=0), xyz.max(axis=0)
     extent = np.where(high > low, high - low, 1).astype(np.float64)
     cells = ((xyz - low) / extent * (2**_MORTON_BITS - 1)).astype(np.uint64)

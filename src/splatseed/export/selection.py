@@ -1,4 +1,4 @@
-"""Which Gaussians of a model to keep: those within a box, those that are seen."""
+"""Which Gaussians of a model to keep: those within a box, those opaque enough."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Crop:
     """A box in the model's world.
 
     Args:
-        low: Its least corner, [3].
-        high: Its greatest corner, [3].
+        low: Minimum corner, [3].
+        high: Maximum corner, [3].
     """
 
     low: Float64[np.ndarray, " 3"]
@@ -27,10 +27,10 @@ class Crop:
 
 
 def parse_crop(text: str) -> Crop:
-    """The box that six numbers with commas between them name: x, y, z least, then x, y, z greatest.
+    """The box given by six comma-separated numbers: minimum x, y, z, then maximum x, y, z.
 
     Raises:
-        ParameterError: They are not six, or no box.
+        ParameterError: There are not six, or they make no box.
 
     Example:
         >>> parse_crop("-1,-1,-1,1,1,2").high.tolist()
@@ -42,9 +42,9 @@ def parse_crop(text: str) -> Crop:
         numbers = np.empty(0)
     if numbers.shape != (6,) or not (numbers[:3] < numbers[3:]).all():
         raise ParameterError(
-            "--crop x0,y0,z0,x1,y1,z1, the least corner of a box and its greatest",
+            "--crop x0,y0,z0,x1,y1,z1, the minimum and maximum corners of a box",
             found=repr(text),
-            fix="splatseed info SCENE prints the box of the points, to begin with.",
+            fix="splatseed info SCENE prints the bounding box of the points.",
         )
     return Crop(numbers[:3], numbers[3:])
 
@@ -55,12 +55,12 @@ def keep_gaussians(
     """The Gaussians whose centres lie in a box and that are opaque enough, in their order.
 
     Args:
-        gaussians: Some.
-        crop: The box; everywhere when left out.
-        min_opacity: Least opacity, 0 to 1.
+        gaussians: The model's.
+        crop: The box; no limit when left out.
+        min_opacity: Lowest opacity kept, 0 to 1.
 
     Raises:
-        ParameterError: The opacity is out of its range, or none is left.
+        ParameterError: The opacity is out of range, or no Gaussian is left.
     """
     if not 0 <= min_opacity < 1:
         raise ParameterError(

@@ -1,9 +1,10 @@
-"""PlayCanvas's SOG, version 2: a .zip of lossless WebP pictures, a pixel a Gaussian, and ``meta.json``.
+"""PlayCanvas's SOG, version 2: a .zip of lossless WebP pictures and ``meta.json``.
 
-Notation: a position p is stored as sign(p) log(1 + |p|) in 16 bits between its bounds, low and high bytes in
-two pictures; a rotation as its three smaller components in RGB and 252 + the largest's number in A; scales
-and first colour coefficients as bytes of a codebook each; further coefficients as a number of a palette, whose
-entries are bytes of a third codebook, 64 entries a row. Source: the format's specification by PlayCanvas.
+Notation: each picture has one pixel per Gaussian; a position p is stored as sign(p) log(1 + |p|) in
+16 bits between its bounds, with low and high bytes in two pictures; a rotation as its three smaller
+components in RGB and 252 + the index of the largest in A; scales and first colour coefficients as
+bytes of a codebook each; further coefficients as an index into a palette, whose entries are bytes
+of a third codebook, 64 entries per row. Source: the format's specification by PlayCanvas.
 """
 
 from __future__ import annotations
@@ -40,18 +41,18 @@ Pixels = UInt8[np.ndarray, "N 4"]
 VERSION = 2
 META = "meta.json"
 PER_ROW = 64
-"""Palette entries in a row of the centroids' picture."""
+"""Palette entries per row of the centroid picture."""
 MOST_LEVELS, LEAST_LEVELS = 16, 10
-"""The palette has 2^16 entries at most, for as many Gaussians, and 2^10 at least, if there are so many."""
+"""The palette grows with the number of Gaussians, from 2^10 to 2^16 entries at most."""
 MOST_BYTES = 2**31
 QUAT_MARK = 252
 FIX = "Copy the file again, or export it again."
 STAMP = (1980, 1, 1, 0, 0, 0)
-"""The zip's time of each picture: equal Gaussians give equal bytes."""
+"""The timestamp of each picture in the zip, fixed so that equal Gaussians give equal bytes."""
 
 
 def encode(gaussians: Gaussians, progress: Progress = silent) -> bytes:
-    """The bytes of a file that holds the Gaussians, in the order of a Z curve."""
+    """The bytes of a file with the Gaussians, in Z-curve order."""
     order = morton_order(gaussians.means)
     low, high, positions = _encoded_positions(gaussians.means[order])
     largest, three = smallest_three(gaussians.quats[order])
@@ -82,7 +83,7 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> bytes:
 
 
 def decode(path: Path) -> Gaussians:
-    """The Gaussians of a file, or of the ``meta.json`` of one that was unpacked.
+    """The Gaussians in a file, or in the unpacked folder that a ``meta.json`` lies in.
 
     Raises:
         SceneNotFoundError: There is no such file, or a picture beside its ``meta.json`` is missing.
@@ -115,10 +116,10 @@ def _decoded(path: Path, content: Callable[[str], bytes]) -> Gaussians:
 
     def pixels(part: str, which: int = 0, least: int = count) -> UInt8[np.ndarray, "P 4"]:
         name = meta[part]["files"][which]
-        found = _picture(content(name)).reshape(-1, 4)
-        if len(found) < least:
-            raise _damaged(path, f"{len(found):,} pixels in {name}, of {least:,}")
-        return found[:least]
+        rows = _picture(content(name)).reshape(-1, 4)
+        if len(rows) < least:
+            raise _damaged(path, f"{len(rows):,} pixels in {name}, of {least:,}")
+        return rows[:least]
 
     low, high = (pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
     quats, sh0 = pixels("quats"), pixels("sh0")
@@ -197,7 +198,7 @@ def _byte(values: Float64[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
 
 
 def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
-    """A pixel a row of 3 or 4 bytes, in a picture about as wide as high; its sides are multiples of 4."""
+    """One pixel per row of 3 or 4 bytes, in a near-square picture; sides are multiples of 4."""
     width = 4 * int(np.ceil(np.sqrt(len(values)) / 4))
     height = 4 * int(np.ceil(len(values) / width / 4))
     pixels = np.zeros((height * width, 4), np.uint8)
@@ -214,14 +215,14 @@ def _zipped(meta: dict[str, Any], pictures: dict[str, Pixels]) -> bytes:
         archive.writestr(zipfile.ZipInfo(META, STAMP), json.dumps(meta))
         for name, pixels in pictures.items():
             picture = io.BytesIO()
-            # exact: colours also where alpha is 0, as opacities and quaternions need.
+            # exact keeps colours where alpha is 0, which opacities and quaternions need.
             Image.fromarray(pixels).save(picture, "WEBP", lossless=True, exact=True, quality=75)
             archive.writestr(zipfile.ZipInfo(name, STAMP), picture.getvalue())
     return file.getvalue()
 
 
 def _opened(path: Path) -> Callable[[str], bytes]:
-    """A function that gives the content of a named part."""
+    """A function that returns the content of a named part."""
     if path.name.lower().endswith(".json"):
         return lambda name: read_bytes(path if name == META else path.parent / Path(name).name)
     archive = zipfile.ZipFile(io.BytesIO(read_bytes(path)))

@@ -1,8 +1,9 @@
-"""The .splat of web viewers: 32 bytes a Gaussian, without view-dependent colour.
+"""The .splat of web viewers: 32 bytes per Gaussian, without view-dependent colour.
 
-Notation: a record is float32 x, y, z and scales (standard deviations), then bytes: red, green, blue,
-opacity, and the rotation wxyz as 128 q + 128. The file has no header; Gaussians come in the order of
-what they cover, so that a viewer can begin with the first. Source: antimatter15/splat.
+Notation: a record is float32 x, y, z and scales (standard deviations), then bytes: red, green,
+blue, opacity, and the rotation wxyz as 128 q + 128. The file has no header; Gaussians are sorted by
+size times opacity, so that a viewer can draw the most important ones first. Source:
+antimatter15/splat.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), (
 
 
 def encode(gaussians: Gaussians) -> bytes:
-    """The bytes of a file that holds the Gaussians, the largest and most opaque first."""
+    """The bytes of a file with the Gaussians, the largest and most opaque first."""
     log_opacity = -np.logaddexp(0, -gaussians.opacities.astype(np.float64))
     size = gaussians.scales.astype(np.float64).sum(axis=1) + log_opacity
     order = np.argsort(-size, kind="stable")
@@ -37,11 +38,11 @@ def encode(gaussians: Gaussians) -> bytes:
 
 
 def decode(path: Path) -> Gaussians:
-    """The Gaussians of a file.
+    """The Gaussians in a file.
 
     Raises:
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no whole number of records, or a scale is not above 0.
+        SceneFormatError: It is not a whole number of records, or a scale is not above 0.
     """
     reader = ByteReader(path, "Copy the file again, or export it again.")
     reader.record = "Gaussians"
@@ -49,8 +50,8 @@ def decode(path: Path) -> Gaussians:
     reader.finish()
     good = np.isfinite(rows["scale"]).all(axis=1) & (rows["scale"] >= 0).all(axis=1)
     if not len(rows) or not good.all():
-        found = f"{rows['scale'][np.argmin(good)]} in Gaussian {np.argmin(good)}"
-        raise reader.error("scales of 0 or more", found if len(rows) else "no Gaussian")
+        worst = f"{rows['scale'][np.argmin(good)]} in Gaussian {np.argmin(good)}"
+        raise reader.error("scales of 0 or more", worst if len(rows) else "no Gaussian")
     least = np.finfo(np.float32).tiny
     return Gaussians(
         means=np.ascontiguousarray(rows["mean"], np.float32),

@@ -1,10 +1,11 @@
-"""Niantic's .spz: attribute after attribute in few bits, gzipped (versions 1 to 3) or in zstd streams (4).
+"""Niantic's .spz: quantised attributes one after another, gzipped (versions 1 to 3) or in zstd (4).
 
-Notation: the file's axes are right, up, back (RUB), ours right, down, front: y and z change sign. A position
-takes 24 bits a component in units of 2^-f, where f is *fractional_bits*; a log-scale s the byte 16 (s + 10); a
-colour's first coefficient c the byte 255 (0.15 c + 1/2), each further one 128 c + 128. A rotation is its xyz
-with w >= 0 in a byte each (version 2), or 2 bits for the largest component and a sign and 9 bits for each other
-(3 and 4). Source: nianticlabs/spz (load-spz.cc, splat-types.h).
+Notation: the file's axes are right, up, back (RUB), ours right, down, front: y and z change sign. A
+position takes 24 bits per component in units of 2^-f, where f is *fractional_bits*; a log-scale s
+is the byte 16 (s + 10); a first colour coefficient c is the byte 255 (0.15 c + 1/2), a further one
+128 c + 128. A rotation is its xyz with w >= 0, one byte each (version 2), or 2 bits for the index
+of the largest component and a sign and 9 bits for each other one (3 and 4). Source: nianticlabs/spz
+(load-spz.cc, splat-types.h).
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ __all__ = ["decode", "encode"]
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
 STREAMS = struct.Struct("<I12x")
-"""What follows the header in version 4: where the table of streams lies."""
+"""Follows the header in version 4: the offset of the stream table."""
 SIZES = struct.Struct("<QQ")
 WRITTEN = 3
-"""The version that is written: the last that every reader takes."""
+"""The version that is written: the latest that every reader accepts."""
 MOST_FRACTIONAL_BITS = 20
 MOST = 2**23 - 1
 NINE_BITS = 511
@@ -48,12 +49,12 @@ COLOR = 0.15 * 255
 FIX = "Copy the file again, or export it again."
 AXES = np.array([1, -1, -1], np.float32)
 SH_AXES = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""Signs of the spherical harmonics of degrees 1 to 3 where y and z are turned round."""
+"""Signs of the spherical harmonics of degrees 1 to 3 when y and z are flipped."""
 XYZW = [1, 2, 3, 0]
 STEP = 4
-"""Further coefficients are rounded to this many 128ths, that gzip finds more to save. Niantic's own writer takes
-8 for the first degree and 16 for the others: a quarter smaller, but coefficients of a short run vanish, and with
-them up to 2.8 dB (docs/formats.md)."""
+"""Further coefficients are rounded to this many 128ths, so that gzip saves more. Niantic's writer
+takes 8 for the first degree and 16 for the others: files are a quarter smaller, but coefficients of
+a short run vanish, and with them up to 2.8 dB (docs/formats.md)."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +66,14 @@ class _Header:
 
     @property
     def sizes(self) -> list[int]:
-        """Bytes a Gaussian takes for its position, opacity, colour, scale, rotation, harmonics."""
+        """Bytes per Gaussian for position, opacity, colour, scale, rotation, harmonics."""
         position = 6 if self.version == 1 else 9
         rotation = 3 if self.version < 3 else 4
         return [position, 1, 3, 3, rotation, 3 * SH_COUNTS[self.degree]]
 
 
 def encode(gaussians: Gaussians) -> bytes:
-    """The bytes of a file that holds the Gaussians, in the order of a Z curve, at most of degree 3."""
+    """The bytes of a file with the Gaussians, in Z-curve order, of degree 3 at most."""
     order = morton_order(gaussians.means)
     rest = gaussians.shN.shape[1]
     farthest = float(np.abs(gaussians.means).max())
@@ -94,11 +95,11 @@ def encode(gaussians: Gaussians) -> bytes:
 
 
 def decode(path: Path) -> Gaussians:
-    """The Gaussians of a file.
+    """The Gaussians in a file.
 
     Raises:
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It is damaged, or of a version that is not known.
+        SceneFormatError: It is damaged, or its version is unknown.
         MissingDependencyError: It is of version 4, and zstandard is absent.
     """
     data = read_bytes(path)
@@ -125,7 +126,7 @@ def _byte(values: np.ndarray) -> UInt8[np.ndarray, "..."]:
 
 
 def _packed_quats(quats: Float32[np.ndarray, "N 4"]) -> np.ndarray:
-    """From the highest bits down: which of x, y, z, w is the largest, then the others' signs and sizes."""
+    """From the highest bits: the index of the largest component, then signs and sizes of others."""
     largest, three = smallest_three(quats[:, XYZW])
     packed = largest.astype(np.uint32)
     for i in range(3):
@@ -168,7 +169,7 @@ def _header(path: Path, data: bytes) -> _Header:
         raise _damaged(path, f"{len(data)} bytes, not even a header")
     _, version, count, degree, fractional_bits, _, _ = HEADER.unpack_from(data)
     if not 1 <= version <= 4:
-        raise _damaged(path, f"version {version}, where 1 to 4 are known")
+        raise _damaged(path, f"version {version}; versions 1 to 4 are known")
     if degree >= len(SH_COUNTS) or count == 0 or fractional_bits > 24:
         raise _damaged(
             path, f"{count} Gaussians of degree {degree}, {fractional_bits} fractional bits"
@@ -179,7 +180,7 @@ def _header(path: Path, data: bytes) -> _Header:
 
 
 def _unzipped(path: Path, data: bytes) -> bytes:
-    """What the gzip stream holds, no more than its header asks for: a bomb is not unpacked."""
+    """The content of the gzip stream, up to the size in the header: no zip bomb is unpacked."""
     stream = zlib.decompressobj(wbits=31)
     try:
         head = stream.decompress(data, HEADER.size)
@@ -189,12 +190,12 @@ def _unzipped(path: Path, data: bytes) -> bytes:
     except zlib.error as error:
         raise _damaged(path, f"a gzip stream that cannot be unpacked ({error})") from None
     if not stream.eof and not more:
-        raise _damaged(path, f"the end after {len(body):,} bytes unpacked")
+        raise _damaged(path, f"a stream that ends after {len(body):,} bytes")
     return head + body
 
 
 def _slices(path: Path, content: bytes, header: _Header) -> list[UInt8[np.ndarray, "N B"]]:
-    """The parts of an unpacked file, one after the other."""
+    """The parts of an unpacked file, in order."""
     wanted = HEADER.size + header.count * sum(header.sizes)
     if len(content) < wanted:
         raise _damaged(path, f"{len(content):,} of {wanted:,} bytes")
@@ -205,7 +206,7 @@ def _slices(path: Path, content: bytes, header: _Header) -> list[UInt8[np.ndarra
 
 
 def _zstd_parts(path: Path, data: bytes, header: _Header) -> list[UInt8[np.ndarray, "N B"]]:
-    """The parts of a file of version 4; parts without bytes have no stream."""
+    """The parts of a file of version 4; empty parts have no stream."""
     require("zstandard")
     import zstandard  # noqa: PLC0415  (of the extra view)
 

@@ -1,6 +1,6 @@
-"""Reading scenes and writing them, one file per format.
+"""Reading and writing scenes, one folder per format.
 
-``load_scene`` finds out what a path holds; ``write_scene`` makes a folder that every 3D Gaussian
+``load_scene`` recognises what a path holds; ``write_scene`` makes a folder that every 3D Gaussian
 Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a scene's images.
 Promise: malformed input and failing output raise one error from ``splatseed.errors``; importing
 this package loads neither Numba nor SciPy.

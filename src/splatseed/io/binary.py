@@ -86,7 +86,7 @@ class ByteReader:
         return text
 
     def finish(self) -> None:
-        """Check that nothing is left."""
+        """Check that no bytes are left."""
         if self.remaining:
             self.record = "end"
             raise self.error("the end of the file", f"{self.remaining} more bytes")

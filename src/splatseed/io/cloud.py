@@ -1,7 +1,7 @@
-"""The points of a scene, clean: distinct and finite, and what a user should know of them.
+"""Cleaning the points of a scene: distinct and finite, with a report of what was left out.
 
 Notation: a duplicate has the float32 position of an earlier point. Promise: the counts are exact;
-what is clean is handed back as it is.
+a clean scene is returned unchanged.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ _RESOLUTION = 1e-4  # float32 steps coarser than this share of the cloud's exten
 
 
 def clean_scene(scene: Scene) -> Scene:
-    """The scene with its distinct finite points alone, and with their tracks and observations.
+    """The scene with its distinct finite points only, and with their tracks and observations.
 
-    ``left_out`` counts the others, and ``warnings`` tells of them.
+    ``left_out`` counts the others, and ``warnings`` report them.
     """
     points = scene.points
     keep = points.distinct
@@ -56,15 +56,15 @@ def _left_out_notes(points: PointCloud, left: LeftOut) -> list[str]:
 
 
 def cloud_warnings(points: PointCloud) -> tuple[str, ...]:
-    """A sentence on each thing that is wrong with the cloud as a whole."""
+    """A sentence on each problem of the cloud as a whole."""
     warnings = []
     far, distance = _far_points(points)
     if far.any():
         what = "point lies" if far.sum() == 1 else "points lie"
         warnings.append(
             f"{far.sum():,} {what} up to {distance:.3g} from the middle of the others, more than"
-            f" {_FAR_OUT:,.0f} times their extent: probably a mistake of the reconstruction; take"
-            f" {'it' if far.sum() == 1 else 'them'} out."
+            f" {_FAR_OUT:,.0f} times their extent: probably a reconstruction error; remove"
+            f" {'it' if far.sum() == 1 else 'them'}."
         )
     if _is_too_far_out(points.select(~far)):
         warnings.append(

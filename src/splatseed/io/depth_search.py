@@ -24,19 +24,18 @@ def find_depths(
     """The depth maps in a folder that belong to images of a scene.
 
     Args:
-        scene: Whose images.
-        path: The folder: maps named as the images are, with subfolders, or a COLMAP dense
-            workspace, an RGB-D capture in NICE-SLAM's or TUM's layout, or what ``splatseed depth``
-            wrote.
+        scene: The scene.
+        path: The folder: maps named like the images, with subfolders, or a COLMAP dense workspace,
+            an RGB-D capture in NICE-SLAM's or TUM's layout, or the output of ``splatseed depth``.
         kind: What the values are; None: what the folder or file itself says, else planar z.
         scale: Stored units per scene unit; None: what the folder itself says, else 1000 for
             integers and 1 for floats.
 
     Returns:
-        The maps, to be read one by one. An image without a map is not among them.
+        The maps, read one by one on demand. An image without a map is not among them.
 
     Raises:
-        ParameterError: The kind is none, or the scale not a positive number.
+        ParameterError: The kind is unknown, or the scale is not a positive number.
         SceneNotFoundError: There is no such folder, or no image has a map in it.
         SceneFormatError: Two images share a map, or the folder's description is damaged.
     """
@@ -48,15 +47,15 @@ def find_depths(
             found="a file" if root.exists() else "nothing",
             fix="Name the folder that the maps lie in.",
         )
-    found = search_depths(scene, root)
-    if found is None:
+    maps = search_depths(scene, root)
+    if maps is None:
         names = [image.name for image in scene.images[:3]]
         raise SceneNotFoundError(
             f"depth maps of the scene's images in {root}: {_looked_for(scene)}",
             found="none" if names else "a scene without images",
             fix="Name maps as their images are, with subfolders and another suffix.",
         )
-    return replace(found, kind=kind or found.kind, scale=scale or found.scale)
+    return replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
 
 
 def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
@@ -65,11 +64,11 @@ def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
     Raises:
         SceneFormatError: Two images share a map, or the folder's description is damaged.
     """
-    if is_tum(root) and (found := find_tum_depths(scene, root)) is not None:
-        return found
-    if (found := match_by_name(scene, root)) is not None:
-        return found
-    capture = root.resolve().parent  # the folder of depth images alone was named
+    if is_tum(root) and (maps := find_tum_depths(scene, root)) is not None:
+        return maps
+    if (maps := match_by_name(scene, root)) is not None:
+        return maps
+    capture = root.resolve().parent  # perhaps the folder of depth images was named
     return find_tum_depths(scene, capture) if is_tum(capture) else None
 
 

@@ -1,9 +1,8 @@
 """Opening files that a scene names, which may be anything.
 
-Promise: only regular files are opened, so that nothing is waited for or read without end (a pipe,
-``/dev/zero``), and none that is larger than the free memory. What is refused raises an ``OSError``
-whose ``strerror`` says why, as what the system refuses does; ``read_bytes`` makes one of our errors
-of it.
+Promise: only regular files are opened, so that nothing blocks or reads forever (a pipe,
+``/dev/zero``), and none larger than the free memory. What is refused raises an ``OSError`` whose
+``strerror`` says why, just as the system's refusals do; ``read_bytes`` turns these into our errors.
 """
 
 from __future__ import annotations
@@ -66,10 +65,10 @@ def read_file(path: Path) -> bytes:
         return file.read()
 
 
-def _check(path: Path, found: os.stat_result) -> None:
-    if stat.S_ISREG(found.st_mode):
+def _check(path: Path, status: os.stat_result) -> None:
+    if stat.S_ISREG(status.st_mode):
         return
-    number, kind = next((number, kind) for is_, number, kind in _KINDS if is_(found.st_mode))
+    number, kind = next((number, kind) for is_, number, kind in _KINDS if is_(status.st_mode))
     raise OSError(number, kind, str(path))
 
 

@@ -1,6 +1,6 @@
-"""What a user should know of a scene's images and lenses before training.
+"""Warnings about a scene's images and lenses before training.
 
-Promise: only the headers of a few image files are opened; nothing here raises for what it finds.
+Promise: only the headers of a few image files are opened; problems are returned, never raised.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ _MAX_OPENED = 32  # files whose size is compared
 
 
 def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
-    """What the image files have against their records; only headers of a few are opened.
+    """What is wrong with the image files against their records; only a few headers are opened.
 
     Args:
         images: The images.
-        image_dir: What their names are relative to, if there is such a folder.
+        image_dir: The folder their names are relative to, if it exists.
         root: The scene's folder.
     """
     if not images:
@@ -39,15 +39,15 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
         count, first = f"{len(outside)} of {len(images)} images lie", outside[0]
         warnings.append(f"{count} outside of {root}, the first is {first}.")
     present = [im for im in images if im.name not in missing]
-    sample = present[:: -(-len(present) // _MAX_OPENED) or 1]  # the first, and every so many
+    sample = present[:: -(-len(present) // _MAX_OPENED) or 1]  # evenly spaced, the first among them
     wrong = [text for im in sample if (text := _size_warning(im, image_dir))]
     return [*warnings, *wrong[:1]]
 
 
 def _leads_out(name: str, image_dir: Path, root: Path) -> bool:
-    """Whether an image's name leads out of its scene.
+    """Whether an image's name leads out of its scene's folder.
 
-    Links, which somebody made, may lead anywhere.
+    Links, which somebody made on purpose, may lead anywhere.
     """
     path, around = (os.path.abspath(each) for each in (image_dir / name, root))  # noqa: PTH100  (without following links)
     return os.path.commonpath([path, around]) != around
@@ -73,10 +73,10 @@ def _size_warning(image: Image, image_dir: Path) -> str | None:
 
 
 def lens_warnings(images: Sequence[Image]) -> list[str]:
-    """A sentence on lens distortion, which not every trainer takes."""
+    """A sentence on lens distortion, which not every trainer supports."""
     models = sorted({im.intrinsics.model for im in images if not im.intrinsics.is_pinhole})
     if not models:
         return []
     lenses = f"Cameras have lens distortion ({', '.join(models)})"
-    trainers = "graphdeco's trainer and OpenSplat need PINHOLE"
-    return [f"{lenses}; {trainers}: undistort it with splatseed undistort SCENE -o OUT."]
+    trainers = "graphdeco's trainer and OpenSplat need PINHOLE cameras"
+    return [f"{lenses}; {trainers}: undistort the scene with splatseed undistort SCENE -o OUT."]

@@ -1,8 +1,8 @@
-"""Reading a scene, whatever it is kept in.
+"""Reading a scene in any format.
 
 Notation: a *model* is a folder with COLMAP's cameras, images and points3D, each as ``.bin`` or
-``.txt``. Promise: one function finds out what a path holds and reads it; what is odd but usable
-becomes a sentence in ``Scene.warnings``, what is not raises one error.
+``.txt``. Promise: one function recognises what a path holds and reads it; what is odd but usable
+becomes a sentence in ``Scene.warnings``, anything else raises one error.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
             the model, or ``0`` in it), with ``transforms.json``, with ``transforms_train.json`` and
             ``transforms_test.json``, or with an RGB-D capture (``traj.txt``, or ``rgb.txt`` and
             ``groundtruth.txt``); or a ``.json`` or ``.ply`` file. Where there are several,
-            ``sparse`` goes before ``transforms.json``, and that before ``colmap/sparse/0``.
+            ``sparse`` precedes ``transforms.json``, which precedes ``colmap/sparse/0``.
         require_points: Whether a scene without points is an error; else its cloud is empty.
 
     Returns:
-        The scene in the world of its files, cameras in OpenCV axes. Points are finite
-        and no two coincide: ``left_out`` counts those of the files that are not, and ``warnings``
-        tells of them. Points that splatseed added before have no tracks, and the ``source`` and
-        attributes that ``seeds.npz`` says, or else ``source`` 255 (``GENERATED``).
+        The scene in the world frame of its files, cameras in OpenCV axes. Points are finite and
+        distinct: ``left_out`` counts the points of the files that are not, and ``warnings`` report
+        them. Points that splatseed added before have no tracks; their ``source`` and attributes
+        come from ``seeds.npz``, else ``source`` is 255 (``GENERATED``).
 
     Raises:
         SceneNotFoundError: There is no scene, or it has no points.
@@ -64,7 +64,7 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     if require_points and not len(scene.points):
         fix = _TRIANGULATE if scene.images else "Name a scene or a PLY that has points."
         raise SceneNotFoundError(f"points in {path}", found="none", fix=fix)
-    # What seeds.npz and the manifest say goes by the points as the files have them.
+    # seeds.npz and the manifest count the points as the files have them, so this comes first.
     scene = clean_scene(follow_lists(recall_seeds(scene)))
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
 
@@ -133,16 +133,16 @@ def _no_scene(path: Path) -> SceneNotFoundError:
     files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
     near = sorted(files - {MANIFEST})
     if scenes:
-        found, fix = f"scenes in it: {_some(scenes)}", f"Name one of them: {path / scenes[0]}"
+        inside, fix = f"scenes in it: {_some(scenes)}", f"Name one of them: {path / scenes[0]}"
     else:
-        found = f"only {_some(near)}" if near else "none of them"
+        inside = f"only {_some(near)}" if near else "none of them"
         fix = (
             "Name the scene's folder, or a .ply or .json file itself. For photographs alone, run:"
             " splatseed sfm IMAGES -o SCENE."
         )
     return SceneNotFoundError(
         f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt in {path}",
-        found=found,
+        found=inside,
         fix=fix,
     )
 

@@ -1,11 +1,11 @@
-"""Which images are for training and which for the test, where a scene has files that say so.
+"""Which images train and which test, for scenes with files that say so.
 
-Notation: a *list* is a text file with one image name a line. Promise: the first of these is
-followed, and told of: ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) of a
+Notation: a *list* is a text file with one image name per line. Promise: the first of these that
+fits is used, and reported: ``train_filenames`` and ``test_filenames`` (else ``val_filenames``) of a
 transforms.json, as nerfstudio writes them; ``train_list.txt``, ``test_list.txt`` (else
-``validation_list.txt``) in the scene's folder, as its COLMAP reader has them; ``test.txt`` in the
-model's folder (graphdeco); ``train.txt`` and ``test.txt`` in the scene's. A list whose names fit no
-image is left aside, and told of too.
+``validation_list.txt``) in the scene's folder, as nerfstudio's COLMAP reader has them; ``test.txt``
+in the model's folder (graphdeco); ``train.txt`` and ``test.txt`` in the scene's. A list whose names
+match no image is ignored, and reported too.
 """
 
 from __future__ import annotations
@@ -49,15 +49,12 @@ def follow_lists(scene: Scene) -> Scene:
         split = _split(scene, lists)
         if split is not None:
             return scene.replace(listed=split, warnings=tuple(warnings))
-        warnings.append(f"{lists.origin} was left aside: no split of the images comes of it.")
+        warnings.append(f"{lists.origin} was ignored: it does not split the images.")
     return scene.replace(warnings=tuple(warnings))
 
 
 def split_fields(scene: Scene) -> dict[str, list[str]]:
-    """The fields by which a new ``transforms.json`` tells nerfstudio of a split.
-
-    None without one.
-    """
+    """The fields of a new ``transforms.json`` that tell nerfstudio the split; none without one."""
     if scene.listed is None:
         return {}
     train, test = scene.split()
@@ -69,7 +66,7 @@ def split_fields(scene: Scene) -> dict[str, list[str]]:
 
 
 def _lists(scene: Scene) -> Iterator[_Lists]:
-    """All lists of a scene that are there, those first that go first."""
+    """All lists that a scene has, in order of precedence."""
     source = scene.source
     assert source is not None  # noqa: S101  (checked by the caller)
     if source.transforms_path is not None:
@@ -118,16 +115,16 @@ def _split(scene: Scene, lists: _Lists) -> Split | None:
 def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str]) -> frozenset[str]:
     """The names that are listed: as they are, within their folder, or by file name or stem."""
     whole = {_plain(each) for each in listed}
-    found = frozenset(n for n in names if any(f"{prefix}{n}" in whole for prefix in prefixes))
-    if found:
-        return found
+    exact = frozenset(n for n in names if any(f"{prefix}{n}" in whole for prefix in prefixes))
+    if exact:
+        return exact
     for field in ("name", "stem"):
         parts = [getattr(PurePosixPath(name), field) for name in names]
-        if len(set(parts)) == len(parts):  # else it would not say which image is meant
+        if len(set(parts)) == len(parts):  # else a name would be ambiguous
             wanted = {getattr(PurePosixPath(each), field) for each in whole}
-            found = frozenset(n for n, own in zip(names, parts, strict=True) if own in wanted)
-            if found:
-                return found
+            matching = frozenset(n for n, own in zip(names, parts, strict=True) if own in wanted)
+            if matching:
+                return matching
     return frozenset()
 
 

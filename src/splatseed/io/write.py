@@ -1,10 +1,10 @@
 """Writing a scene that every 3D Gaussian Splatting trainer loads unchanged.
 
 Notation: *originals* are the points that were read, with their tracks; a *layout* is the set of
-files a trainer looks for. Promise: the folder is there whole or not at all; its points are finite
-and no two coincide; all point files in it say the same; originals keep their float64 positions and
-tracks; point ids are 1..N in the cloud's order; what else is known of points is in ``seeds.npz``,
-which no trainer but ours looks for. Which trainer asks for what is in docs/formats.md.
+files a trainer looks for. Promise: the folder appears whole or not at all; its points are finite
+and distinct; all its point files agree; originals keep their float64 positions and tracks; point
+ids are 1..N in the cloud's order; other attributes of points are in ``seeds.npz``, which no trainer
+but ours looks for. docs/formats.md says which trainer needs which file.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ __all__ = ["Layout", "WriteReport", "write_scene"]
 Layout = Literal["colmap", "transforms"]
 
 _KIND = "write_scene"
-"""What writes an output, where the provenance names no verb."""
+"""The kind of an output whose provenance names no verb."""
 _PACKAGES = ("splatseed", "numpy", "scipy", "numba")
 
 
@@ -76,7 +76,7 @@ def write_scene(
             RGB-D capture or a scene made in memory.
         overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the image folders instead of linking them.
-        provenance: How the points came about, for ``splatseed.json``.
+        provenance: How the points were made, for ``splatseed.json``.
 
     Returns:
         What was written.
@@ -87,7 +87,7 @@ def write_scene(
         PointCloudError: No point is finite.
     """
     layout = _choose_layout(scene, format)
-    clean = clean_scene(scene)  # one that load_scene handed out is clean already
+    clean = clean_scene(scene)  # a scene from load_scene is clean already
     if not len(clean.points):
         raise PointCloudError(
             "at least one point with finite coordinates",
@@ -134,7 +134,7 @@ def _choose_layout(scene: Scene, wanted: str) -> Layout:
 
 
 def _inputs(scene: Scene) -> tuple[Path, ...]:
-    """What was read, which the output must stay apart from."""
+    """The files that were read, which the output must stay apart from."""
     source = scene.source
     if source is None:
         return ()
@@ -184,6 +184,6 @@ def _source_path(scene: Scene) -> str | None:
 def _versions() -> dict[str, str]:
     versions = {}
     for package in _PACKAGES:
-        with suppress(PackageNotFoundError):  # splatseed itself, where it is not installed
+        with suppress(PackageNotFoundError):  # splatseed itself may not be installed
             versions[package] = version(package)
     return versions

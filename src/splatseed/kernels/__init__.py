@@ -1,1 +1,1 @@
-"""What compiled code stands on: Numba's settings, its cache's key, vectors of 16 floats."""
+"""The base of compiled code: Numba's settings, the key of its cache, vectors of 16 floats."""

@@ -1,4 +1,4 @@
-"""Who is told when machine code is made: a first run is slow, and its user should know why.
+"""Watching compilation: a first run is slow, and its user should know why.
 
 Promise: watching does not import Numba; ``splatseed.kernels.jit`` tells the watchers once it is
 imported.

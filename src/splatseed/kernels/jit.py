@@ -4,8 +4,8 @@ Promise: a kernel compiled here divides by zero as NumPy does (Numba's Python se
 a SystemError inside ``prange``), releases the GIL, is cached on disk, and never reorders
 floating-point sums, so its bytes do not depend on the number of threads or on the cache.
 
-A cached kernel is keyed on what its own file says and on every file that this one reaches by its
-imports (``splatseed.kernels.sources``): kernels call functions and use constants of any file.
+A cached kernel is keyed on the contents of its own file and of every file reachable through its
+imports (``splatseed.kernels.sources``), since kernels use functions and constants of other files.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
 
 
 class _Teller(event.Listener):
-    """Hands Numba's events on."""
+    """Passes Numba's events on."""
 
     def on_start(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
         tell(begins=True)
 
-    def on_end(self, event: object) -> None:  # noqa: ARG002
+    def on_end(self, event: object) -> None:  # noqa: ARG002  (the interface's name)
         tell(begins=False)
 
 
-event.register("numba:compile", _Teller())  # type: ignore[no-untyped-call]
+event.register("numba:compile", _Teller())  # type: ignore[no-untyped-call]  # Numba is untyped
 
 parallel_range = numba.prange
 
@@ -57,28 +57,28 @@ def inline(function: F) -> F:
 
 
 def always_inline(function: F) -> F:
-    """Compile a helper into every kernel that calls it, for calls that are too many to be calls.
+    """Compile a helper into every kernel that calls it, for calls too frequent to be calls.
 
-    A call passes every array as seven numbers and counts references with locked additions; where
-    the compiler has its way (``inline``), it declines for large helpers, and kernels of many
-    helpers compile in half of the time.
+    A call passes every array as seven numbers and counts references with locked additions. Left to
+    choose (``inline``), the compiler declines for large helpers; kernels with many helpers then
+    compile in half the time.
     """
     return _compile(function, forceinline=True)
 
 
 def _compile(function: F, **options: bool) -> F:
-    njit: Any = numba.njit  # whose annotations want every option by its name
+    njit: Any = numba.njit  # its annotations list every option by name
     compiled = njit(cache=True, error_model="numpy", nogil=True, **options)(function)
     _key_on_sources(compiled, function)
     return cast("F", compiled)
 
 
 def _key_on_sources(compiled: Any, function: Callable[..., Any]) -> None:
-    """Make machine code in the cache stale when any file changes that the function may be made of.
+    """Make cached machine code stale when any file changes that the function may be built from.
 
-    Numba asks for the function's own file only, and has no setting for more, so its stamp of the
+    Numba checks only the function's own file and has no setting for more, so its stamp of the
     source is replaced. Where there is no such stamp, as without a compiler (``NUMBA_DISABLE_JIT``),
-    or no source to be read, as in an archive, Numba's own way stays.
+    or no source to read, as in an archive, Numba's own check stays.
     """
     file: Any = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
     if hasattr(file, "_source_stamp"):
@@ -86,5 +86,5 @@ def _key_on_sources(compiled: Any, function: Callable[..., Any]) -> None:
             path = Path(function.__code__.co_filename)
             digest = source_digest(path, function.__module__)
             file._source_stamp = digest  # noqa: SLF001  (there is no public way)
-            # Looked at before the rest is unpickled, which may name modules that are gone.
+            # Checked before the rest is unpickled, which may name modules that no longer exist.
             file._version = f"{numba.__version__} {digest}"  # noqa: SLF001  (there is no public way)

@@ -1,6 +1,6 @@
-"""Lanes of ``simd``'s vectors by their number, moved in fixed patterns and taken out.
+"""Lanes of ``simd``'s vectors: moved in fixed patterns, and extracted.
 
-Promise: as in ``simd``; nothing is rounded but by ``three_sums``, whose tree is fixed.
+Promise: as in ``simd``; only ``three_sums`` rounds, and its summation tree is fixed.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
@@ -40,7 +40,7 @@ def permutation(pattern: Sequence[int]):
 
 
 def lane(number: int):
-    """An intrinsic: one lane of its argument, float32."""
+    """An intrinsic: one lane of its argument, as float32."""
     index = ir.Constant(I32, number)
 
     @intrinsic
@@ -54,7 +54,7 @@ def lane(number: int):
 
 
 def _shuffle(builder, a, b, lanes):
-    """Lanes of two vectors, b's counted from ``LANES``."""
+    """Lanes of two vectors; b's are numbered from ``LANES``."""
     return builder.shuffle_vector(a, b, ir.Constant(INDEX, list(lanes)))
 
 

@@ -159,7 +159,7 @@ def _splat(builder, x):
 def broadcast(typing_context, array, index):
     """Element ``index`` of a contiguous float32 array in every lane.
 
-    Like ``element``'s, not below 0.
+    Like ``element``'s, the index must not be negative.
     """
 
     def generate(context, builder, signature, arguments):
@@ -172,8 +172,8 @@ def broadcast(typing_context, array, index):
 def element(typing_context, array, index):
     """Element ``index`` of a contiguous array.
 
-    It must not be below 0: counting from the end, as NumPy does there, takes several instructions
-    even where it never happens.
+    The index must not be negative: counting from the end, as NumPy does, takes several instructions
+    even if it never happens.
     """
 
     def generate(context, builder, signature, arguments):
@@ -218,7 +218,7 @@ def store(typing_context, array, index, v):
 
 @inline
 def aligned(size):
-    """A float32 array that begins where a vector register's worth of memory does."""
+    """A float32 array aligned to the size of a vector register."""
     array = np.empty(size + LANES, np.float32)
     first = -(array.ctypes.data // 4) % LANES
     return array[first : first + size]
@@ -273,7 +273,7 @@ def _row(builder, pointer, i):
 
 
 def _transposed(builder, rows):
-    """Lane i of row j becomes lane j of row i: bit by bit of both numbers."""
+    """Lane i of row j becomes lane j of row i, one bit of both indices at a time."""
     for width in (1, 2, 4, 8):
         rows = _exchange(builder, rows, width)
     return rows

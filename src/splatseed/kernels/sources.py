@@ -1,10 +1,10 @@
-"""Which source files a compiled function may be made of, and a digest of what they say.
+"""The source files that a compiled function may be built from, and a digest of their contents.
 
 Notation: a file *reaches* another file of its own package, or of splatseed, through the imports at
-its top, directly or by way of others. Imports that are indented, as those for annotations are, do
-not count.
-Promise: the digest depends on the contents of these files and on nothing else, neither on their
-dates nor on their place: two checkouts of one commit have the same.
+its top, directly or through other files. Indented imports, such as those for annotations, do not
+count.
+Promise: the digest depends on the contents of these files and on nothing else, neither their dates
+nor their location: two checkouts of one commit have the same.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ IMPORT = re.compile(
 
 
 def source_digest(path: Path, module: str) -> str:
-    """The SHA-256 of a file and of all that it reaches, in hexadecimal.
+    """The SHA-256 of a file and of everything it reaches, in hexadecimal.
 
     Args:
         path: A Python file.
@@ -46,7 +46,7 @@ def source_digest(path: Path, module: str) -> str:
 
 
 def reached_files(path: Path, module: str) -> frozenset[Path]:
-    """A file and all that it reaches.
+    """A file and everything it reaches.
 
     Args:
         path: A Python file.
@@ -59,7 +59,7 @@ def reached_files(path: Path, module: str) -> frozenset[Path]:
 
 
 class _Source(NamedTuple):
-    """What is taken from a file: the digest of its contents, and the files that it imports."""
+    """What is read from a file: the digest of its contents, and the files that it imports."""
 
     digest: bytes
     imports: tuple[Path, ...]
@@ -67,15 +67,15 @@ class _Source(NamedTuple):
 
 def _reach(path: Path, module: str) -> dict[Path, _Source]:
     packages: Packages = tuple({**dict(_own_package(path, module)), **dict([SPLATSEED])}.items())
-    found: dict[Path, _Source] = {}
+    sources: dict[Path, _Source] = {}
     waiting = [path]
     while waiting:
         each = waiting.pop()
-        if each not in found:
+        if each not in sources:
             status = each.stat()
-            found[each] = _read(each, packages, status.st_mtime_ns, status.st_size)
-            waiting.extend(found[each].imports)
-    return found
+            sources[each] = _read(each, packages, status.st_mtime_ns, status.st_size)
+            waiting.extend(sources[each].imports)
+    return sources
 
 
 def _own_package(path: Path, module: str) -> Packages:
@@ -86,7 +86,7 @@ def _own_package(path: Path, module: str) -> Packages:
 
 @cache
 def _read(path: Path, packages: Packages, mtime_ns: int, size: int) -> _Source:  # noqa: ARG001  (part of the cache's key)
-    """A file is read again if its date or its size says that it has changed."""
+    """Cached: a file is read again only if its date or size has changed."""
     text = path.read_bytes()
     return _Source(hashlib.sha256(text).digest(), tuple(_imports(path, text, packages)))
 
@@ -94,20 +94,20 @@ def _read(path: Path, packages: Packages, mtime_ns: int, size: int) -> _Source: 
 def _imports(path: Path, text: bytes, packages: Packages) -> Iterator[Path]:
     """The files that the imports at the top of a file name."""
     folders = dict(packages)
-    for found in IMPORT.finditer(text):
-        words = (found["module"] or found["whole"] or b"").decode().split(".")
-        if found["dots"]:
-            folder, parts = path.parents[len(found["dots"]) - 1], [word for word in words if word]
+    for match in IMPORT.finditer(text):
+        words = (match["module"] or match["whole"] or b"").decode().split(".")
+        if match["dots"]:
+            folder, parts = path.parents[len(match["dots"]) - 1], [word for word in words if word]
         elif words[0] in folders:
             folder, parts = folders[words[0]], words[1:]
         else:
             continue
-        names = re.findall(r"\w+", (found["names"] or b"").decode())
+        names = re.findall(r"\w+", (match["names"] or b"").decode())
         yield from _files(folder.joinpath(*parts), names)
 
 
 def _files(place: Path, names: list[str]) -> Iterator[Path]:
-    """The file of a module, or of a package and of those of ``names`` that are its modules."""
+    """The file of a module, or of a package and those of its modules in ``names``."""
     if (module := place.with_name(f"{place.name}.py")).is_file():
         yield module
     elif (package := place / "__init__.py").is_file():

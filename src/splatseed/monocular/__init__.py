@@ -1,4 +1,4 @@
-"""Depth from single photographs, by networks that others have trained.
+"""Depth from single photographs, by pretrained networks.
 
 ``load_network`` takes a network that is on this machine, in transformers' format or in ONNX, and
 ``estimate_depths`` runs it on a scene's photographs. Promise: nothing is downloaded; PyTorch and
@@ -39,14 +39,14 @@ def load_network(
     Args:
         model: An ``.onnx`` file; a folder in transformers' format; or the id of a model that
             Hugging Face's cache holds.
-        kind: What it predicts; None: what its configuration tells.
-        device: Where to run it; auto takes a GPU if there is one that can be used.
+        kind: What it predicts; None: what its configuration says.
+        device: Where to run it; auto takes a usable GPU if there is one.
         preparation: How the input of an ONNX network is made, where its file leaves that open.
 
     Raises:
-        MissingDependencyError: What runs it is not installed.
+        MissingDependencyError: A package that runs it is not installed.
         SceneNotFoundError: It is not on this machine; says which command fetches it.
-        SceneFormatError: It is no depth network, or is damaged.
+        SceneFormatError: It is not a depth network, or is damaged.
         ParameterError: There is no such device, nothing says what it predicts, or a preparation is
             given for a network that brings its own.
     """

@@ -1,4 +1,4 @@
-"""Predicting a depth map for every photograph of a scene, and keeping them.
+"""Predicting and storing a depth map for every photograph of a scene.
 
 Promise: every photograph is read to its last byte before the network runs on the first; one batch
 is in memory at a time; the folder of maps appears whole or not at all.
@@ -18,10 +18,15 @@ from jaxtyping import Float32, UInt8
 from PIL import Image as PilImage
 
 from splatseed.depthmap import ASPECT_SLACK
-from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.depth.folder import depth_folder
 from splatseed.io.output.staging import check_output
-from splatseed.io.photograph import check_photograph, decode_photograph, photograph_bytes
+from splatseed.io.photograph import (
+    check_photograph,
+    decode_photograph,
+    photograph_bytes,
+    photograph_folder,
+)
 from splatseed.monocular.network import DepthNetwork
 from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
@@ -30,20 +35,20 @@ from splatseed.scene import Image, Scene
 __all__ = ["DepthReport", "estimate_depths"]
 
 BYTES_A_PIXEL = 3 + 4 * 3 + 4
-"""Of a photograph that goes through a network: its colours, these as floats, and its depth."""
+"""Bytes per pixel of a photograph in a network: its colours, these as floats, and its depth."""
 Size = tuple[int, int]
 """Width and height in pixels."""
 
 
 @dataclass(frozen=True)
 class DepthReport:
-    """What was predicted.
+    """The result of prediction.
 
     Args:
         path: The folder of maps.
         num_images: How many there are.
         sizes: Width and height of the smallest and the largest map.
-        flat: Images whose map is of one value, or of none that is finite: the network failed there.
+        flat: Images whose map is constant or has no finite value: the network failed there.
         seconds: Wall time of the predictions.
     """
 
@@ -69,25 +74,26 @@ def estimate_depths(
 
     Args:
         scene: A scene with photographs.
-        network: What predicts.
-        output: The folder to write, with one float32 ``.npy`` an image.
-        batch: Photographs that the network sees at once.
-        max_size: A photograph whose longer side has more pixels is reduced to that before the
+        network: The network.
+        output: The folder to write, with one float32 ``.npy`` per image.
+        batch: Photographs per run of the network.
+        max_size: A photograph whose longer side has more pixels is reduced to this before the
             network sees it, and its map has that size.
         overwrite: Whether an earlier folder of maps may be replaced.
-        provenance: How the maps came about, for ``splatseed.json``.
+        provenance: How the maps were made, for ``splatseed.json``.
         progress: Told how many photographs are done.
 
     Raises:
         ParameterError: A number is out of its range.
         SceneNotFoundError: The scene has no images, or a photograph is missing.
-        SceneFormatError: A photograph cannot be decoded, or has not its camera's shape.
+        SceneFormatError: A photograph cannot be decoded, or differs from its camera in aspect
+            ratio.
         OutputError: The folder cannot be written.
     """
     for name, number in (("batch", batch), ("max-size", max_size)):
         if number < 1:
             raise ParameterError(f"--{name} of 1 or more", found=f"{number}", fix="Raise it.")
-    folder = _image_folder(scene)
+    folder = photograph_folder(scene)
     protect = (folder,) if scene.source is None else (folder, scene.source.root)
     check_output(output, kind="depth", overwrite=overwrite, protect=protect)
     sizes = _check_images(scene.images, folder, max_size, progress)
@@ -109,26 +115,15 @@ def estimate_depths(
     return DepthReport(output, done, (ordered[0], ordered[-1]), tuple(sorted(flat)), seconds)
 
 
-def _image_folder(scene: Scene) -> Path:
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None or not scene.images:
-        raise SceneNotFoundError(
-            "a scene with photographs",
-            found="no images" if folder else "no folder of images",
-            fix="Name a scene with cameras, and put its photographs into a folder named images.",
-        )
-    return folder
-
-
 def _check_images(
     images: Sequence[Image], folder: Path, max_size: int, progress: Progress
 ) -> dict[str, Size]:
-    """The size that each photograph will have for the network, by name, in order of names."""
+    """The size at which the network sees each photograph, by name, in order of names."""
     by_name = {image.name: image for image in images}
     sizes = {}
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
-        found = pool.map(lambda name: check_photograph(folder / name), sorted(by_name))
-        for name, size in zip(sorted(by_name), found, strict=True):
+        checked = pool.map(lambda name: check_photograph(folder / name), sorted(by_name))
+        for name, size in zip(sorted(by_name), checked, strict=True):
             _check_shape(folder / name, size, by_name[name])
             sizes[name] = _reduced(size, max_size)
             progress("check images", len(sizes) / len(by_name))
@@ -136,7 +131,7 @@ def _check_images(
 
 
 def _check_memory(sizes: Mapping[str, Size], batch: int) -> None:
-    """Refuse a batch that the memory cannot hold, whatever the network makes of it."""
+    """Refuse a batch that does not fit into memory, whatever the network itself needs."""
     largest = max(width * height for width, height in sizes.values())
     fix = "Pass --batch {most}, or a smaller --max-size."
     what = f"photographs of {largest / 1e6:.1f} megapixels at a time"
@@ -147,7 +142,7 @@ def _check_shape(path: Path, size: Size, image: Image) -> None:
     camera = (image.intrinsics.width, image.intrinsics.height)
     if abs(size[0] / size[1] / (camera[0] / camera[1]) - 1) > ASPECT_SLACK:
         raise SceneFormatError(
-            f"{path} to have the shape of its camera, {camera[0]} x {camera[1]}",
+            f"{path} to have the aspect ratio of its camera, {camera[0]} x {camera[1]}",
             found=f"{size[0]} x {size[1]}",
             fix="Use the images that the model was made from, or a resized copy of them.",
         )
@@ -159,7 +154,7 @@ def _reduced(size: Size, max_size: int) -> Size:
 
 
 def _batches(sizes: Mapping[str, Size], batch: int) -> Iterator[tuple[list[str], Size]]:
-    """Names that go through the network together, all of one size."""
+    """Names that go through the network together, all of the same size."""
     for size, group in groupby(sorted(sizes, key=lambda name: (sizes[name], name)), sizes.get):
         names = list(group)
         for start in range(0, len(names), batch):

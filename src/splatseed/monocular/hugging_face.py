@@ -1,9 +1,9 @@
 """Depth networks in Hugging Face's format, run by transformers and PyTorch.
 
 Notation: a network sees a photograph within a *frame*: pixels [height, width] of the frame's
-[full_height, full_width], from (top, left) on; all else is padding that the network asked for.
+[full_height, full_width], from (top, left) on; the rest is padding that the network asked for.
 Promise: nothing is downloaded and no code from a model's folder is run; a network whose weights are
-not all in its file is refused rather than run with random ones; logs of transformers stay silent.
+not all in its file is refused rather than run with random ones; transformers' logs stay silent.
 """
 
 from __future__ import annotations
@@ -31,15 +31,16 @@ from splatseed.errors import (
     SplatseedError,
 )
 from splatseed.monocular.network import DeviceName, Meaning, meaning_of, one_line
+from splatseed.process.torch_device import pick_torch_device
 
 __all__ = ["HuggingFaceNetwork", "load_hugging_face"]
 
 EXAMPLE = "depth-anything/Depth-Anything-V2-Small-hf"
 _ID = re.compile(r"\w[\w.-]*/\w[\w.-]*")
 _UNUSED = re.compile(r"fusion_stage\.layers\.0\.residual_layer1\.")
-"""Weights that DPT has and never uses; Intel's files leave them out."""
+"""Weights that DPT has but never uses; Intel's files omit them."""
 _ZOE_MARGIN = 3
-"""ZoeDepth mirrors this many times the square root of half a side's pixels around a photograph."""
+"""ZoeDepth pads a photograph by mirroring this times the square root of half a side's pixels."""
 _LOCAL = {"local_files_only": True, "trust_remote_code": False}
 
 
@@ -85,11 +86,11 @@ class HuggingFaceNetwork:
     ) -> list[Float32[np.ndarray, "H W"]]:
         """Predict for photographs of one size (sRGB), at their size.
 
-        Predictions are scaled to the photograph bilinearly, so that no value lies outside those
-        predicted, and free of the padding that some networks ask for.
+        Predictions are resized to the photograph bilinearly, so that no value lies outside those
+        predicted, and without the padding that some networks ask for.
 
         Raises:
-            ParameterError: The batch does not fit the GPU's memory.
+            ParameterError: The batch does not fit into the GPU's memory.
             SceneFormatError: The network does not run on such an image.
         """
         size = images[0].shape[:2]
@@ -110,7 +111,7 @@ class HuggingFaceNetwork:
         processor, height, width = self._processor, *images[0].shape[:2]
         divisor = getattr(processor, "size_divisor", None)
         pads = bool(getattr(processor, "do_pad", False))
-        if pads and divisor:  # done here: the processor would not say how much
+        if pads and divisor:  # done here: the processor does not report how much
             return _padded(self._process(images, do_pad=False), divisor)
         values = self._process(images)
         if pads and self._network.config.model_type == "zoedepth":
@@ -144,16 +145,16 @@ def load_hugging_face(
     Args:
         model: A folder with ``config.json``, ``preprocessor_config.json`` and weights, or the id of
             a model that Hugging Face's cache holds.
-        kind: What it predicts; None: what its configuration tells.
+        kind: What it predicts; None: what its configuration says.
         device: Where to run it; auto takes a GPU if PyTorch sees one.
 
     Raises:
         SceneNotFoundError: It is not on this machine; says which command fetches it.
-        SceneFormatError: It is no depth network, or is damaged.
+        SceneFormatError: It is not a depth network, or is damaged.
         ParameterError: There is no such device, or nothing says what it predicts.
         MissingDependencyError: Its image processor needs torchvision, which is absent.
     """
-    where = _pick_device(device)
+    where = pick_torch_device(device, "--device")
     _check_folder(model)
     with _silent():
         meaning = meaning_of(_read_config(model).to_dict(), model, kind)
@@ -162,9 +163,9 @@ def load_hugging_face(
 
 
 def _failed(error: Exception, values: Float[Tensor, "B 3 h w"]) -> SplatseedError:
-    """What to tell of a network that stopped.
+    """The error for a network that failed.
 
-    PyTorch's word for memory on the CPU is "allocate".
+    PyTorch's memory errors on the CPU contain "allocate".
     """
     batch, _, height, width = values.shape
     if isinstance(error, torch.cuda.OutOfMemoryError) or "allocate" in str(error):
@@ -180,19 +181,8 @@ def _failed(error: Exception, values: Float[Tensor, "B 3 h w"]) -> SplatseedErro
     )
 
 
-def _pick_device(device: DeviceName) -> torch.device:
-    seen = torch.cuda.is_available()
-    if device == "cuda" and not seen:
-        raise ParameterError(
-            "a GPU for --device cuda",
-            found="none that PyTorch sees",
-            fix="Pass --device cpu, or install PyTorch's CUDA build.",
-        )
-    return torch.device("cuda" if seen and device != "cpu" else "cpu")
-
-
 def _check_folder(model: str) -> None:
-    """Refuse what is on disk under that name and holds no network."""
+    """Refuse a path on disk that holds no network."""
     path = Path(model)
     if path.is_dir() and not (path / "config.json").is_file():
         raise _misfit(model, "no config.json in it")
@@ -206,7 +196,7 @@ def _read_config(model: str) -> Any:
 
     try:
         config = AutoConfig.from_pretrained(model, **_LOCAL)
-    except Exception as error:  # transformers raises what it and its parts like
+    except Exception as error:  # transformers raises errors of many libraries
         if Path(model).is_dir():
             raise _misfit(model, one_line(error)) from error
         raise _absent(model) from error
@@ -224,14 +214,14 @@ def _absent(model: str) -> SceneNotFoundError:
 
 
 def _fetch(model: str) -> str:
-    """How to get a network: this one if it has the name of a published one, else a small one."""
+    """How to get a network: this one if its name is that of a published one, else a small one."""
     name = model if _ID.fullmatch(model) else EXAMPLE
     folder = name.rpartition("/")[2]
     return f"Run: hf download {name} --local-dir {folder} and pass --model {folder}."
 
 
 def _load(model: str) -> tuple[Any, Any]:
-    """The image processor and the network, from local files alone."""
+    """The image processor and the network, from local files only."""
     from transformers import (  # noqa: PLC0415  (seconds to import)
         AutoImageProcessor,
         AutoModelForDepthEstimation,
@@ -240,14 +230,14 @@ def _load(model: str) -> tuple[Any, Any]:
     try:
         # Pillow's resizing, with or without torchvision: the same maps on every machine.
         processor = AutoImageProcessor.from_pretrained(model, backend="pil", **_LOCAL)
-        network, found = AutoModelForDepthEstimation.from_pretrained(
+        network, loading = AutoModelForDepthEstimation.from_pretrained(
             model, dtype=torch.float32, output_loading_info=True, **_LOCAL
         )
     except MemoryError:
         raise
-    except Exception as error:  # transformers raises what it and its parts like
+    except Exception as error:  # transformers raises errors of many libraries
         raise _unloadable(model, error) from error
-    _check_complete(model, network, found["missing_keys"])
+    _check_complete(model, network, loading["missing_keys"])
     return processor, network
 
 
@@ -262,7 +252,7 @@ def _unloadable(model: str, error: Exception) -> SplatseedError:
 
 
 def _check_complete(model: str, network: Any, missing: set[str]) -> None:
-    """Refuse a network some of whose weights would be random."""
+    """Refuse a network if some of its weights would be random."""
     parameters = {name for name, _ in network.named_parameters()}
     random = sorted(name for name in missing & parameters if not _UNUSED.search(name))
     if random:
@@ -297,7 +287,7 @@ def _silent() -> Iterator[None]:
 def _padded(
     values: Float[Tensor, "B 3 h w"], divisor: int
 ) -> tuple[Float[Tensor, "B 3 H W"], Frame]:
-    """With as many zeros on either side as make both sides multiples of ``divisor``."""
+    """Zero-padded on both sides to multiples of ``divisor``."""
     height, width = values.shape[2:]
     down, right = (-side % divisor for side in (height, width))
     top, left = down // 2, right // 2

@@ -1,8 +1,7 @@
-"""What a depth network is to the rest of splatseed, whoever made it and whatever runs it.
+"""The interface of depth networks, whatever runs them.
 
-Notation: a *prediction* is float32 [H, W], one value for each pixel of a photograph. Promise: what
-its values mean is stated with the reason for believing so, and where nothing says it the user is
-asked.
+Notation: a *prediction* is float32 [H, W], one value for each pixel of a photograph. Promise: the
+meaning of its values is stated with the evidence for it; if there is none, the user is asked.
 """
 
 from __future__ import annotations
@@ -27,16 +26,16 @@ _METRIC = {
     "tipsv2_dpt": "TIPSv2",
     "zoedepth": "ZoeDepth",
 }
-"""Model types that only predict depth in metres, and what people call them."""
+"""Model types that only predict depth in metres, and their common names."""
 
 
 @dataclass(frozen=True)
 class Meaning:
-    """What the values of a network are.
+    """What a network's values are.
 
     Args:
         kind: As in ``DepthMap``.
-        reason: Why it is taken for that, in a few words.
+        reason: The evidence, in a few words.
     """
 
     kind: DepthKind
@@ -44,7 +43,7 @@ class Meaning:
 
 
 class DepthNetwork(Protocol):
-    """A network with its weights, ready to look at photographs."""
+    """A network with its weights, ready to run."""
 
     @property
     def meaning(self) -> Meaning:
@@ -71,9 +70,9 @@ def meaning_of(config: Mapping[str, Any], name: str, given: DepthKind | None) ->
     """What a network predicts, by its ``config.json`` as transformers writes it.
 
     Args:
-        config: The file's content; empty where there is none.
-        name: The network's, for the error.
-        given: What the user says, which goes before all else.
+        config: The file's content; empty if there is none.
+        name: The network's name, for the error.
+        given: What the user says, which takes precedence.
 
     Raises:
         ParameterError: Neither the user nor the file says.
@@ -89,7 +88,7 @@ def meaning_of(config: Mapping[str, Any], name: str, given: DepthKind | None) ->
         return _dpt(config)
     raise ParameterError(
         f"--depth-kind, to say what {name} predicts",
-        found=f"a network of type {model_type!r}, which does not tell"
+        found=f"a network of type {model_type!r}, which does not say"
         if config
         else "no config.json",
         fix="Pass --depth-kind inverse for networks that predict disparity (MiDaS, Depth Anything"
@@ -112,6 +111,6 @@ def _dpt(config: Mapping[str, Any]) -> Meaning:
 
 
 def one_line(error: Exception) -> str:
-    """What another library's error says first."""
+    """The first line of another library's error."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0].rstrip('.')}" if lines else type(error).__name__

@@ -2,8 +2,8 @@
 
 Notation: a network takes [B, 3, h, w] and returns [B, h', w'] or [B, 1, h', w']; B, h and w are
 fixed by the file or left open. A photograph becomes (pixel / 255 - mean) / std for each channel.
-Promise: PyTorch is not needed; the input's name, type and size are the file's; a file that is of
-another form is refused before it is run.
+Promise: PyTorch is not needed; the input's name, type and size are the file's; a file of another
+form is refused before it is run.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ERRORS_ONLY = 3
 
 @dataclass(frozen=True)
 class _Fixed:
-    """What a file asks for: its input's name and type, and B, h, w; None where left open."""
+    """What a file fixes: its input's name and type, and B, h, w; None where left open."""
 
     name: str
     dtype: np.dtype[Any]
@@ -49,7 +49,7 @@ class OnnxNetwork:
 
     Args:
         path: The file, for errors.
-        session: onnxruntime's.
+        session: onnxruntime's session.
         meaning: What it predicts.
         form: How its input is made.
     """
@@ -73,7 +73,7 @@ class OnnxNetwork:
 
         Raises:
             ParameterError: The network does not run on such an input.
-            SceneFormatError: What it returns is no map an image.
+            SceneFormatError: Its output is not one map per image.
         """
         height, width = images[0].shape[:2]
         free = self._form.sides(height, width)
@@ -84,23 +84,23 @@ class OnnxNetwork:
         return [_scaled(each, (width, height)) for part in parts for each in part]
 
     def _run(self, values: Float32[np.ndarray, "b 3 h w"]) -> Float32[np.ndarray, "b h2 w2"]:
-        """The network's own maps; where its batch is fixed, the last image fills it up."""
+        """The network's own maps; a fixed batch is filled up with the last image."""
         count = len(values)
         short = (self._fixed.batch or count) - count
         full = np.concatenate([values, np.repeat(values[-1:], short, axis=0)])
         feed = {self._fixed.name: full.astype(self._fixed.dtype)}
         try:
-            (found,) = self._session.run([self._fixed.output], feed)
+            (output,) = self._session.run([self._fixed.output], feed)
         except Exception as error:  # onnxruntime's own errors have no common base
             raise ParameterError(
                 f"{self._path} to take an input of {list(full.shape)}",
                 found=one_line(error),
                 fix="Pass the --input-size and --input-multiple that the network was made for.",
             ) from error
-        maps = np.asarray(found, np.float32)
+        maps = np.asarray(output, np.float32)
         maps = maps[:, 0] if maps.ndim == 4 and maps.shape[1] == 1 else maps
         if maps.ndim != 3 or len(maps) != len(full) or not maps.size:
-            raise _misfit(self._path, f"an output of {list(np.shape(found))}")
+            raise _misfit(self._path, f"an output of {list(np.shape(output))}")
         return maps[:count]
 
 
@@ -113,18 +113,18 @@ def load_onnx(
 ) -> OnnxNetwork:
     """Load an ``.onnx`` file.
 
-    ``config.json`` and ``preprocessor_config.json`` beside it, or one folder up, as Hugging Face's
-    collections of such files have them, say what it predicts and how its input is made.
+    ``config.json`` and ``preprocessor_config.json`` beside it, or one folder up as in Hugging
+    Face's collections of such files, say what it predicts and how its input is made.
 
     Args:
         path: The file.
-        kind: What it predicts; None: what ``config.json`` tells.
-        device: Where to run it; auto takes a GPU if onnxruntime can.
-        preparation: How its input is made; what is None in it is looked up.
+        kind: What it predicts; None: what ``config.json`` says.
+        device: Where to run it; auto takes a GPU if onnxruntime can use one.
+        preparation: How its input is made; fields that are None are looked up.
 
     Raises:
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no depth network, or is damaged.
+        SceneFormatError: It is not a depth network, or is damaged.
         ParameterError: There is no such device, or nothing says what it predicts.
     """
     if not path.is_file():
@@ -177,7 +177,7 @@ def _read_fixed(path: Path, session: Any) -> _Fixed:
 
 
 def _scaled(depth: Float32[np.ndarray, "h w"], size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
-    """At the photograph's width and height, bilinearly, pixel centres at +0.5."""
+    """Resized to the photograph's width and height, bilinearly, pixel centres at +0.5."""
     picture = PilImage.fromarray(np.ascontiguousarray(depth))
     return np.asarray(picture.resize(size, PilImage.Resampling.BILINEAR))
 

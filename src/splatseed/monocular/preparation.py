@@ -1,9 +1,9 @@
-"""How photographs become the input of a network whose file does not say: its ONNX form.
+"""How photographs become the input of an ONNX network, whose file does not say.
 
 Notation: a photograph of H x W pixels becomes (pixel / 255 - mean) / std for each channel, at h x
 w.
-Promise: what the user says goes before what lies beside the network's file, and that before what
-most depth networks use: 518 pixels in multiples of 14, and the colours of ImageNet.
+Promise: the user's choice takes precedence over files beside the network, and those over what most
+depth networks use: 518 pixels in multiples of 14, and the colour statistics of ImageNet.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Channels = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Preparation:
-    """What the user says of a network's input; None: not said.
+    """The user's choices about a network's input; None: not given.
 
     Args:
-        input_size: What the sides are scaled to, in pixels, where the network leaves them open.
-        input_multiple: What the sides are then rounded to a multiple of.
-        mean: Taken away from the channels of an image in 0..1.
-        std: What the channels are divided by then.
+        input_size: Size in pixels to which the sides are scaled, if the network leaves them open.
+        input_multiple: The sides are then rounded to a multiple of this.
+        mean: Subtracted from the channels of an image in 0..1.
+        std: Divides the channels after that.
 
     Raises:
         ParameterError: A number is out of its range.
@@ -67,10 +67,10 @@ class InputForm:
     """How a network's input is made.
 
     Args:
-        size: What the sides are scaled to, in pixels.
-        multiple: What they are then rounded to a multiple of.
-        mean: Taken away from the channels of an image in 0..1.
-        std: What the channels are divided by then.
+        size: Size in pixels to which the sides are scaled.
+        multiple: The sides are then rounded to a multiple of this.
+        mean: Subtracted from the channels of an image in 0..1.
+        std: Divides the channels after that.
     """
 
     size: int = 518
@@ -81,8 +81,8 @@ class InputForm:
     def sides(self, height: int, width: int) -> tuple[int, int]:
         """The input's height and width for photographs of a size.
 
-        One factor scales both sides: the one nearer to 1 of those that bring either side to
-        ``size``. This is what DPT's own image processor does where it keeps the shape.
+        One factor scales both sides: of the two that bring a side to ``size``, the one nearer to 1.
+        This is what DPT's own image processor does when it keeps the aspect ratio.
         """
         factor = min((self.size / height, self.size / width), key=lambda each: abs(1 - each))
         rows, columns = (round(side * factor / self.multiple) for side in (height, width))
@@ -99,10 +99,10 @@ class InputForm:
 
 
 def complete(said: Preparation, path: Path) -> InputForm:
-    """What the user said, completed from the ``preprocessor_config.json`` beside a network's file.
+    """The user's choices, completed from ``preprocessor_config.json`` beside a network's file.
 
     Raises:
-        SceneFormatError: That file is there and is not one of an image processor.
+        SceneFormatError: That file exists but does not belong to an image processor.
     """
     try:
         beside = _described(json_beside(path, "preprocessor_config.json"))
@@ -125,7 +125,7 @@ def json_beside(path: Path, name: str) -> dict[str, Any]:
     """The JSON object of that name in a file's folder or the one above; empty if there is none.
 
     Raises:
-        SceneFormatError: There is such a file, and it holds something else.
+        SceneFormatError: Such a file exists but holds something else.
     """
     for folder in (path.parent, path.resolve().parent.parent):
         try:

@@ -1,4 +1,4 @@
-"""Pictures of point clouds, maps and cells, as seen by the scene's own cameras.
+"""Pictures of point clouds, maps and cells, seen by the scene's own cameras.
 
 Notation: a picture is uint8 [H, W, 3]; a tile is a picture with its label; a page is tiles in rows.
 Promise: the functions that make pictures and tiles touch no files; the same input gives the same

@@ -1,8 +1,8 @@
 """Which cells of a photograph hold a seed, and which hold none.
 
-Notation: cell (i, j) of a ``covered`` grid [rows, columns] has the pixels from ``cell i`` and
-``cell j`` on, ``cell`` px a side; the last row and column may reach beyond the picture. Promise: no
-pixel of another cell takes a cell's colour.
+Notation: cell (i, j) of a ``covered`` grid [rows, columns] starts at pixel (``cell i``, ``cell j``)
+and has ``cell`` px a side; the last row and column may reach beyond the photograph. Promise: cells
+are coloured exactly, without bleeding into each other.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from splatseed.preview.page import Tile, centered, fitted, write_grid
 __all__ = ["CoveredView", "cell_picture", "preview_cells"]
 
 EMPTY = np.array([214.0, 20.0, 190.0])
-"""Magenta, which photographs have least of."""
+"""Magenta, the rarest colour in photographs."""
 BLEND = 0.6
-"""How much of an empty cell's colour is that."""
+"""Opacity of that colour over an empty cell."""
 DIM = 0.75
-"""What is left of the photograph's brightness."""
+"""Factor on the photograph's brightness."""
 SIDE = 600
 
 
@@ -33,11 +33,11 @@ class CoveredView(NamedTuple):
     """Which cells of one view are covered.
 
     Args:
-        name: Of the image.
+        name: The image's name.
         photograph: Its pixels, uint8 [H, W, 3].
-        cell: Pixels a side.
+        cell: Side of a cell in pixels.
         before: Whether each cell holds an original, bool [rows, columns].
-        after: Whether it holds a seed; None where nothing was added.
+        after: Whether it holds a seed; None if nothing was added.
     """
 
     name: str
@@ -50,22 +50,22 @@ class CoveredView(NamedTuple):
 def cell_picture(
     photograph: UInt8[np.ndarray, "H W 3"], covered: Bool[np.ndarray, "rows columns"], cell: int
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The dimmed photograph, on which cells without a seed are magenta.
+    """The dimmed photograph, with cells without a seed in magenta.
 
     Args:
-        photograph: The picture, in the pixels that cells are counted in.
+        photograph: The photograph at the size at which cells were counted.
         covered: Whether each cell holds a seed.
-        cell: Pixels a side.
+        cell: Side of a cell in pixels.
 
     Raises:
-        ParameterError: The cells do not cover the picture.
+        ParameterError: The cells do not cover the photograph.
     """
     height, width = photograph.shape[:2]
     if covered.shape != (-(-height // cell), -(-width // cell)):
         raise ParameterError(
             f"{-(-height // cell)} x {-(-width // cell)} cells of {cell} px for {width} x {height}",
             found=" x ".join(map(str, covered.shape)),
-            fix="Pass the picture at the size that the cells were counted at.",
+            fix="Pass the photograph at the size at which cells were counted.",
         )
     empty = ~np.repeat(np.repeat(covered, cell, axis=0), cell, axis=1)[:height, :width, None]
     dimmed = DIM * photograph.astype(np.float64)
@@ -75,7 +75,7 @@ def cell_picture(
 
 
 def preview_cells(views: Sequence[CoveredView], path: Path | str) -> Path:
-    """Write a page: each view with the cells that the originals cover, and those that all seeds do.
+    """Write a page: for each view, the cells covered by the originals, and by all seeds.
 
     Args:
         views: At least one.

@@ -1,7 +1,7 @@
 """Pages of clouds: before and after, every method, distances from the true surface.
 
 Notation: a picture is uint8 [H, W, 3]. Promise: the clouds of a page are seen by one of the scene's
-own cameras, where it has any; files appear whole or not at all.
+own cameras, if it has any; files appear whole or not at all.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def preview_pair(
         scene: The scene as read.
         upsampled: The points made from it.
         path: The PNG to write.
-        title: What the upsampled points are, such as ``"mls, 8x"``.
+        title: Describes the upsampled points, such as ``"mls, 8x"``.
 
     Raises:
         OutputError: The file cannot be written.
@@ -48,7 +48,7 @@ def preview_pair(
 
 
 def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: Path | str) -> Path:
-    """Write a grid: the photograph where there is one, the scene's points, and each cloud.
+    """Write a grid: the photograph if there is one, the scene's points, and each cloud.
 
     Args:
         scene: The scene as read.
@@ -81,12 +81,12 @@ def preview_errors(
     """Write a grid of clouds whose points are coloured by their distance to the true surface.
 
     Args:
-        clouds: Points by label; usually the new ones alone.
+        clouds: Points by label; usually only the new ones.
         distances: For each label the distance of every point, in ``unit``.
-        camera: From where to look.
+        camera: The camera to look from.
         path: The PNG to write.
-        limit: Distances from here on have the colour bar's last colour.
-        unit: What the colour bar counts in.
+        limit: Distances from this on have the last colour of the colour bar.
+        unit: Unit of the colour bar.
 
     Raises:
         OutputError: The file cannot be written.

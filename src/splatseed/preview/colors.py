@@ -1,6 +1,7 @@
-"""Colours of numbers, and the bars that say what they mean.
+"""Colour maps for numbers, and colour bars that explain them.
 
-Promise: colours rise evenly to the eye and are told apart in grey print; what is not known is grey.
+Promise: colours are perceptually uniform and remain distinct in grey print; unknown values are
+grey.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ __all__ = ["UNKNOWN", "color_bar", "heat", "map_colors", "usual_range"]
 
 UNKNOWN = (150, 150, 150)
 RANGE = (2, 98)
-"""Percentiles of a map's values between which its colours change."""
+"""Percentiles of a map's values between which its colours vary."""
 
 
 def heat(values: Float64[np.ndarray, " N"]) -> UInt8[np.ndarray, "N 3"]:
-    """Colours of values 0..1: blue is good, yellow bad, and both are told apart in grey print."""
+    """Colours of values 0..1: blue is good, yellow bad, distinct in grey print."""
     from matplotlib import colormaps  # noqa: PLC0415  (slow to import, needed here alone)
 
     rgba = colormaps["plasma"](np.clip(values, 0.0, 1.0), bytes=True)
@@ -48,7 +49,7 @@ def usual_range(values: Float[np.ndarray, "H W"]) -> tuple[float, float]:
 
 
 def color_bar(low: str, high: str, colormap: str = "plasma") -> UInt8[np.ndarray, "H W 3"]:
-    """A strip of colours, by default of ``heat``, with the meaning of its ends beside it."""
+    """A strip of colours, by default of ``heat``, with labels at its ends."""
     strip = map_colors(np.tile(np.linspace(0.0, 1.0, 240), (20, 1)), 0.0, 1.0, colormap)
     bar = PillowImage.new("RGB", (GRID_SIDE, 44), PAPER)
     bar.paste(PillowImage.fromarray(strip), (70, 12))

@@ -25,12 +25,12 @@ _WIDE = (
     "Apple SD Gothic Neo",
     "Arial Unicode MS",
 )
-"""Families with these scripts, of which most systems have one."""
+"""Families with these scripts; most systems have one."""
 
 
 @lru_cache(maxsize=1)
 def font_families() -> tuple[str, ...]:
-    """Families for text in figures, in the order in which a character is looked for."""
+    """Families for text in figures, in order of preference."""
     from matplotlib.font_manager import fontManager  # noqa: PLC0415  (slow to import)
 
     there = {each.name for each in fontManager.ttflist}
@@ -40,7 +40,7 @@ def font_families() -> tuple[str, ...]:
 def plain(text: str) -> str:
     r"""A name as text for matplotlib: a dollar would begin a formula.
 
-    What no font has becomes \u....
+    Characters that no font has become \u....
 
     Example:
         >>> plain("a$b")
@@ -63,7 +63,7 @@ def _known_characters() -> frozenset[int]:
 
 
 def font_file(text: str) -> str | None:
-    """A font file that has all of a text's characters; None where no family has."""
+    """A font file that has all of a text's characters; None if no family has."""
     from matplotlib.font_manager import FontProperties, findfont, get_font  # noqa: PLC0415  (loads with its use)
 
     for name in font_families():

@@ -1,8 +1,8 @@
-"""Depth, normals and confidence beside the photograph that they belong to.
+"""Depth, normals and confidence beside their photograph.
 
 Notation: a map is H x W values in the pixels of its own camera; depth is planar z in scene units,
-normals are unit vectors in the camera's axes (x right, y down, z forward). Promise: what a map does
-not know is grey; every picture of a row is of one size, and shows the map's pixels as they are.
+normals are unit vectors in the camera's axes (x right, y down, z forward). Promise: unknown values
+are grey; all pictures in a row have one size, and show the map's pixels unchanged.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ __all__ = ["ViewMaps", "depth_picture", "map_tiles", "normal_picture", "preview_
 
 SIDE = 440
 LABEL = 40
-"""Letters of a label that a tile has room for."""
+"""Characters of a label that fit above a tile."""
 
 
 class ViewMaps(Protocol):
-    """What is known of a photograph's pixels; ``splatseed.stereo`` makes such maps."""
+    """Maps of a photograph's pixels; ``splatseed.stereo`` makes such maps."""
 
     @property
     def name(self) -> str:
-        """Of the image."""
+        """The image's name."""
 
     @property
     def camera(self) -> Camera:
-        """In pixels of the maps."""
+        """The camera, in pixels of the maps."""
 
     @property
     def depth(self) -> Float[np.ndarray, "H W"]:
@@ -58,13 +58,13 @@ Maps = TypeVar("Maps", bound=ViewMaps)
 def preview_maps(
     scene: Scene, maps: Sequence[ViewMaps], path: Path | str, *, most: int = 4
 ) -> Path:
-    """Write a page with a row of ``map_tiles`` for some of the maps, evenly chosen.
+    """Write a page with a row of ``map_tiles`` for a few maps, evenly chosen.
 
     Args:
-        scene: Whose photographs they belong to; grey stands in for one that cannot be read.
+        scene: The scene of the photographs; grey stands in for one that cannot be read.
         maps: At least one.
         path: The PNG to write.
-        most: Rows.
+        most: The most rows.
 
     Raises:
         OutputError: The file cannot be written.
@@ -83,7 +83,7 @@ def map_tiles(maps: ViewMaps, photograph: UInt8[np.ndarray, "H W 3"]) -> list[Ti
 
     Args:
         maps: The maps.
-        photograph: The picture that they belong to, of any size.
+        photograph: Their photograph, of any size.
     """
     known = np.isfinite(maps.depth)
     low, high = usual_range(maps.depth)
@@ -103,7 +103,7 @@ def map_tiles(maps: ViewMaps, photograph: UInt8[np.ndarray, "H W 3"]) -> list[Ti
 
 
 def depth_picture(depth: Float[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth in colours: near is yellow, far is violet; logarithmic, so that both are told apart."""
+    """Depth in colours: near is yellow, far is violet, on a logarithmic scale."""
     with np.errstate(divide="ignore", invalid="ignore"):
         nearness = -np.log(depth)
     return map_colors(nearness, *usual_range(nearness))
@@ -118,7 +118,7 @@ def normal_picture(normal: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W
 
 
 def _spread(maps: Sequence[Maps], most: int) -> list[Maps]:
-    """At most so many of them, evenly chosen."""
+    """At most ``most`` of them, evenly chosen."""
     places = np.linspace(0, len(maps) - 1, min(most, len(maps)))
     return [maps[i] for i in np.unique(places.round().astype(int))]
 
@@ -126,6 +126,6 @@ def _spread(maps: Sequence[Maps], most: int) -> list[Maps]:
 def _resized(
     picture: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Pixel for pixel: a blend of known and unknown would be a depth that nobody found."""
+    """Nearest neighbour: blending known and unknown pixels would invent depths."""
     resized = PillowImage.fromarray(picture).resize(size, PillowImage.Resampling.NEAREST)
     return np.asarray(resized)

@@ -1,8 +1,8 @@
 """Seeds by origin: each point in the colour of the method that made it.
 
 Notation: an origin is a ``PointCloud.source`` code. Promise: the same code has the same colour in
-every picture, told apart by the colour-blind for the methods that are mixed in one cloud (Okabe and
-Ito).
+every picture; the methods that are mixed in one cloud have colours that the colour-blind can tell
+apart (Okabe and Ito).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ COLORS: Mapping[int, tuple[int, int, int]] = MappingProxyType(
         GENERATED: (140, 86, 75),
     }
 )
-"""Of each origin; what is not here has that of ``GENERATED``."""
+"""The colour of each origin; others have that of ``GENERATED``."""
 PALE = 0.7
 """How far a photograph behind points is bleached."""
 
@@ -67,8 +67,8 @@ def origin_picture(
 
     Args:
         points: Seeds, world coordinates.
-        camera: From where.
-        photograph: What it saw, of any size; white when left out.
+        camera: The camera to look from.
+        photograph: Its photograph, of any size; white when left out.
         scale: Size of the picture relative to the camera's.
     """
     size = (max(round(camera.width * scale), 1), max(round(camera.height * scale), 1))
@@ -110,7 +110,7 @@ def preview_origins(scene: Scene, points: PointCloud, path: Path | str) -> Path:
     """Write a page: the seeds in their own colours, and by origin over the photograph.
 
     Args:
-        scene: The scene as read, one of whose cameras is chosen.
+        scene: The scene as read; one of its cameras is chosen.
         points: The seeds.
         path: The PNG to write.
 

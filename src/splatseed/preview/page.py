@@ -31,35 +31,35 @@ __all__ = [
 ]
 
 GRID_SIDE = 600
-"""The longer side of a picture in a grid, in pixels."""
+"""Longer side of a picture in a grid, in pixels."""
 
 LABEL_SIZES = (20, 11)
-"""Of letters, usually and at least."""
+"""Usual and smallest size of letters."""
 
 PAPER = (255, 255, 255)
 INK = (20, 20, 20)
 
 
 class Tile(NamedTuple):
-    """A picture and the words above it."""
+    """A picture and its label."""
 
     label: str
     picture: UInt8[np.ndarray, "H W 3"]
 
 
 def columns_for(num_tiles: int) -> int:
-    """Three or four, whichever leaves fewer places empty; fewer where that is enough."""
+    """Three or four columns, whichever leaves fewer gaps; fewer if that is enough."""
     return num_tiles if num_tiles < 3 else min((3, 4), key=lambda columns: -num_tiles % columns)
 
 
 def fitted(width: int, height: int, side: int = GRID_SIDE) -> tuple[int, int]:
-    """Width and height that keep their ratio and whose longer one is ``side``."""
+    """Width and height that keep the aspect ratio and whose longer side is ``side``."""
     factor = side / max(width, height)
     return max(round(width * factor), 1), max(round(height * factor), 1)
 
 
 def centered(tiles: Sequence[Tile]) -> list[Tile]:
-    """The tiles on white, all as large as the largest: a scene's images may differ in size."""
+    """The tiles padded with white to the size of the largest: images may differ in size."""
     height, width = np.max([tile.picture.shape[:2] for tile in tiles], axis=0)
     return [Tile(tile.label, _centered(tile.picture, height, width)) for tile in tiles]
 
@@ -82,7 +82,7 @@ def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _letters(label: str, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    """The font in which a label is no wider than its tile, if it is legible so."""
+    """The largest font, down to a legible size, in which a label is no wider than its tile."""
     size = LABEL_SIZES[0]
     # Pillow's own font has Latin letters only.
     file = font_file(label) if any(ord(each) > LATIN for each in label) else None
@@ -98,12 +98,12 @@ def write_grid(
     columns: int,
     footer: UInt8[np.ndarray, "H W 3"] | None = None,
 ) -> Path:
-    """Set pictures of one size in rows, each with its label above, and write the PNG.
+    """Arrange pictures of one size in rows, each with its label above, and write the PNG.
 
     Args:
-        tiles: At least one, set row by row.
+        tiles: At least one, placed row by row.
         path: The PNG to write.
-        columns: Tiles in a row.
+        columns: Tiles per row.
         footer: A strip below all, no wider than the page.
 
     Raises:

@@ -1,6 +1,6 @@
-"""A scene's photographs as pictures of a size.
+"""A scene's photographs at a given size.
 
-Promise: a photograph that cannot be had is no error: a scene without its pictures has much to show.
+Promise: an unreadable photograph is no error: a scene without photographs still has much to show.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ BLANK = (230, 230, 230)
 def photograph_at(
     scene: Scene, image: Image, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "H W 3"] | None:
-    """An image's photograph, scaled to width and height; None where it cannot be read."""
+    """An image's photograph, scaled to width and height; None if it cannot be read."""
     folder = scene.source.image_dir if scene.source else None
     if folder is None:
         return None
@@ -37,5 +37,5 @@ def photograph_or_blank(
     scene: Scene, image: Image | None, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The same, or plain light grey."""
-    found = None if image is None else photograph_at(scene, image, size)
-    return np.full((size[1], size[0], 3), BLANK, np.uint8) if found is None else found
+    photograph = None if image is None else photograph_at(scene, image, size)
+    return np.full((size[1], size[0], 3), BLANK, np.uint8) if photograph is None else photograph

@@ -1,7 +1,7 @@
-"""Points drawn as seen by a camera.
+"""Drawing points as a camera sees them.
 
 Notation: a picture is uint8 [H, W, 3], ``uv`` are pixels [N, 2]. Promise: points are drawn with a
-depth test, as small discs whose size belongs to the picture and not to the cloud, so that a denser
+depth test, as small discs sized relative to the picture and not to the cloud, so that a denser
 cloud looks denser; the same input gives the same bytes.
 """
 
@@ -39,7 +39,7 @@ def render_points(
 
     Args:
         points: The cloud, world coordinates.
-        camera: From where; its lens distortion is not drawn.
+        camera: The camera to look from; its lens distortion is ignored.
         point_size: Diameter of a disc at the median depth, in pixels of the picture; chosen from
             the picture's size when left out.
         background: Colour where there are no points, 0..255, or a picture of the same size to draw
@@ -107,7 +107,7 @@ def _draw_discs(uv, depth, radii, nearest, front):  # type: ignore[no-untyped-de
         for y in range(max(int(v - r), 0), min(int(v + r) + 1, height)):
             for x in range(max(int(u - r), 0), min(int(u + r) + 1, width)):
                 covered = (x + 0.5 - u) ** 2 + (y + 0.5 - v) ** 2 <= r * r
-                own = x == column and y == row  # however small, a point is seen
+                own = x == column and y == row  # however small, a point is visible
                 if (covered or own) and depth[i] < nearest[y, x]:
                     nearest[y, x] = depth[i]
                     front[y, x] = i

@@ -1,6 +1,6 @@
 """Child processes that run our own code in our own interpreter.
 
-Promise: the working directory, which may hold anybody's files, has no part in what a child imports:
+Promise: the working directory, which may hold anybody's files, plays no part in a child's imports:
 a ``numpy.py`` that lies there is never executed.
 """
 
@@ -18,14 +18,14 @@ def child_command(program: str, *words: str) -> list[str]:
 
     Args:
         program: Python code.
-        words: What it finds in ``sys.argv[1:]``.
+        words: The child's ``sys.argv[1:]``.
     """
     # Without -P, python -c puts the working directory before all else on sys.path.
     return [sys.executable, "-P", "-c", program, *words]
 
 
 def child_environment(more: Mapping[str, str] | None = None) -> dict[str, str]:
-    """The environment of a child: ours, and the places that we import from.
+    """The environment of a child: ours, plus the paths we import from.
 
     Args:
         more: Variables to set on top.

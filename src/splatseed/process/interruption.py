@@ -1,7 +1,7 @@
 """Ctrl-C that waits for the end of a step.
 
-Promise: while the block runs, the first SIGINT or SIGTERM only raises a flag, so that a run stops
-between two steps; a second one interrupts at once, as usual. The handlers of before come back.
+Promise: while the block runs, the first SIGINT or SIGTERM only sets a flag, so that a run stops
+between two steps; a second one interrupts at once, as usual. The previous handlers are restored.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Interruption:
     """Whether the user asked to stop.
 
     Attributes:
-        last: The signal that the process was last asked to stop by, whichever block heard it.
+        last: The last signal that asked the process to stop, whichever block received it.
     """
 
     last = signal.SIGINT
@@ -30,7 +30,7 @@ class Interruption:
         self.requested = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002  (signal's)
-        """Be told of a signal."""
+        """Handle a signal."""
         Interruption.last = signal.Signals(number)
         if self.requested:
             raise KeyboardInterrupt
@@ -38,13 +38,13 @@ class Interruption:
 
 
 def exit_code() -> int:
-    """What a process exits with that stopped as it was asked to, as shells have it."""
+    """The exit code, by shell convention, of a process that stopped because it was asked to."""
     return 128 + Interruption.last
 
 
 @contextmanager
 def interruption() -> Iterator[Interruption]:
-    """Watch for signals; other threads than the main one cannot, and are left as they are."""
+    """Watch for signals in the main thread; other threads cannot, and are left alone."""
     flag = Interruption()
     if threading.current_thread() is not threading.main_thread():
         yield flag

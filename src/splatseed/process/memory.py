@@ -1,8 +1,8 @@
-"""Memory that is free, and refusing what cannot fit it before any work is done.
+"""Free memory, and refusing early what cannot fit into it.
 
 Promise: where the system does not tell how much is free, nothing is refused. An estimate counts
-what is sure to be held at once, so what is refused would not have ended well; what is let pass
-still may not.
+only what is certainly held at once, so what is refused would have failed; what is admitted may
+still fail.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ CGROUP = Path("/sys/fs/cgroup")
 
 
 def check_memory(count: int, bytes_each: int, what: str, *, found: str = "", fix: str) -> None:
-    """Refuse what the free memory cannot hold.
+    """Refuse what does not fit into the free memory.
 
     Args:
         count: How many things are wanted.

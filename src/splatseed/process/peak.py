@@ -1,4 +1,4 @@
-"""The most memory that a process has held."""
+"""The peak memory of a process."""
 
 from __future__ import annotations
 
@@ -11,10 +11,9 @@ STATUS = Path("/proc/self/status")
 
 
 def peak_bytes() -> int | None:
-    """Most bytes of memory that this process has held so far; None where the system does not tell.
+    """The peak memory of this process so far, in bytes; None where the system does not tell.
 
-    On Linux, that since the program was loaded: what getrusage says also counts the process that
-    started it.
+    On Linux, since the program was loaded: getrusage also counts the process that started it.
     """
     try:
         lines = STATUS.read_text("ascii", "replace").splitlines()

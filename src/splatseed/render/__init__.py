@@ -3,8 +3,8 @@
 ``rasterization`` has the signature and the results of ``gsplat.rasterization`` (1.5.3). CUDA
 tensors go to gsplat itself; CPU tensors to this package's own rasteriser, so that code written for
 gsplat runs, trains and is tested without a GPU. ``MCMCStrategy`` is gsplat's on either device, and
-``mcmc_on_cpu`` a block within which gsplat's own runs on the CPU. It needs PyTorch; the strategy
-also needs gsplat (``pip install ".[train]"``).
+within ``mcmc_on_cpu`` gsplat's own class runs on the CPU. PyTorch is required; the strategy also
+needs gsplat (``pip install ".[train]"``).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from splatseed.errors import MissingDependencyError
 from splatseed.requirements import INSTALL, require
 
 try:
-    import torch  # noqa: F401  (asked for first, so that its absence is said once and plainly)
+    import torch  # noqa: F401  (imported first, for one clear error if it is absent)
 except ModuleNotFoundError as error:
     raise MissingDependencyError(
         "PyTorch for rendering and training",
@@ -33,7 +33,7 @@ __all__ = ["MCMCStrategy", "mcmc_on_cpu", "rasterization"]
 
 
 def __getattr__(name: str) -> Any:
-    """What needs gsplat.
+    """The names that need gsplat.
 
     Raises:
         MissingDependencyError: gsplat is absent.

@@ -23,7 +23,7 @@ from splatseed.render.binning import RECORD, TILE, TileLists, depth_order, list_
 __all__ = ["Blend", "Harmonics", "Lens", "Project", "is_seen"]
 
 GREATEST = np.float32(1e6)
-"""Opacities above it count as this much: beyond 1 they only make a Gaussian wider."""
+"""Opacities above this are clamped: beyond 1 they only make a Gaussian wider."""
 ALIGNMENT = 64
 
 
@@ -114,9 +114,9 @@ def _sparse(dense: Tensor, rows: Tensor) -> Tensor:
 
 
 class Harmonics(torch.autograd.Function):
-    """Harmonics to colours [N, 3]: 0.5 more, and at least 0.
+    """Spherical harmonics to colours [N, 3]: colour = max(0, 1/2 + sum_k y_k h_k).
 
-    Inputs: means [N, 3], the camera's place [3], coefficients, radii [N, 2], degree. Coefficients
+    Inputs: means [N, 3], the camera's centre [3], coefficients, radii [N, 2], degree. Coefficients
     come in one tensor [N, K, 3] and None, or in two, [N, 1, 3] and [N, K - 1, 3].
     """
 
@@ -172,7 +172,7 @@ def _coefficients(base: Tensor, rest: Tensor | None) -> tuple[np.ndarray, np.nda
 
 
 def _resized(array: np.ndarray, count: int) -> np.ndarray:
-    """Filled with zeros or cut along axis 1; as it is where nothing changes."""
+    """Padded with zeros or cut along axis 1; unchanged if it has that length already."""
     kept = array[:, :count]
     missing = count - kept.shape[1]
     return np.ascontiguousarray(np.pad(kept, ((0, 0), (0, missing), (0, 0))) if missing else kept)
@@ -184,19 +184,19 @@ class _Prepared(NamedTuple):
     order: np.ndarray
     log_opacities: np.ndarray
     records: np.ndarray
-    """Of the first pass of channels."""
+    """Records of the first pass of channels."""
     lists: TileLists
     width: int
     height: int
 
     @property
     def columns(self) -> int:
-        """Tiles in a row."""
+        """Tiles per row."""
         return -(-self.width // TILE)
 
     @property
     def row_order(self) -> np.ndarray:
-        """Rows of tiles as threads take them."""
+        """Rows of tiles in the order in which threads take them."""
         return row_order(-(-self.height // TILE))
 
     @property
@@ -304,7 +304,7 @@ def _prepare(
 
 
 def _aligned(size: int, *, zero: bool = False) -> np.ndarray:
-    """A float32 array that begins where a vector register's worth of memory does."""
+    """A float32 array aligned to the size of a vector register."""
     make = np.zeros if zero else np.empty
     array = make(size + ALIGNMENT // 4, np.float32)
     first = -(array.ctypes.data // 4) % (ALIGNMENT // 4)
@@ -314,7 +314,7 @@ def _aligned(size: int, *, zero: bool = False) -> np.ndarray:
 def _records(
     prepared: _Prepared, means2d: Tensor, conics: Tensor, colors: Tensor, first: int
 ) -> np.ndarray:
-    """Those of this pass of channels."""
+    """The records of this pass of channels."""
     if first == 0:
         return prepared.records
     return _gather(prepared.order, prepared.log_opacities, means2d, conics, colors, first)

@@ -1,18 +1,18 @@
 """Which Gaussians touch which tile, in depth order.
 
 Notation: tiles are 8 x 8 px, numbered row by row; a *pair* is a Gaussian with a tile that its
-ellipse touches, a *span* a Gaussian with the tiles of one row of tiles that it touches. Spans are
+ellipse touches, a *span* a Gaussian with the tiles that it touches in one row of tiles. Spans are
 numbered Gaussian by Gaussian in depth order, and each Gaussian's by row; pairs are listed tile by
-tile in depth order; ``listed_span`` and ``listed_rank`` lead from the list back to span and
-Gaussian. A Gaussian counts as touching a tile if within the rectangle of the tile's pixel centres
-its alpha reaches 1/255: exact, and opacity-aware, where a square of three sigmas would be far
-larger and still cut some off.
+tile in depth order; ``listed_span`` and ``listed_rank`` map list entries to spans and Gaussians. A
+Gaussian touches a tile if its alpha reaches 1/255 within the rectangle of the tile's pixel centres:
+exact and opacity-aware, whereas a square of three sigmas would be far larger and still cut some
+off.
 Promise: ties in depth go by index; nothing depends on the number of threads.
 
-Stages: spans are sorted by row while they are found, then each row sorts its own by column. Both
-are counting sorts, which keep the depth order; a row's tiles stay in the first cache, where those
-of the whole image would not. Indices are unsigned where it counts: Numba asks of every other one
-whether it is negative, which took a third of the time.
+Stages: spans are sorted by row as they are generated, then each row sorts its own by column. Both
+are counting sorts, which preserve the depth order; a row's tiles stay in the L1 cache, where those
+of the whole image would not. Indices are unsigned where it counts: Numba checks every signed index
+for being negative, which took a third of the time.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -31,18 +31,18 @@ __all__ = ["LOWEST", "RECORD", "TILE", "TileLists", "depth_order", "list_tiles",
 
 TILE = 8
 RECORD = 16
-"""Numbers in a record of a Gaussian, see ``blending``."""
+"""Numbers in the record of a Gaussian, laid out in ``blending``."""
 LOWEST = np.float32(-np.log(255.0) / 8)
-"""Where alpha is 1/255, in a record's units."""
+"""Exponent log(alpha) / 8 at alpha = 1/255, as in a record."""
 CHUNKS = 16
-"""Pieces of the depth order that are worked on in parallel, whatever the threads."""
+"""Pieces of the depth order that are processed in parallel, whatever the number of threads."""
 STRIDE = 7
 """Pieces are taken in this stride: near Gaussians are large, and threads take consecutive turns."""
 GOLDEN = 0.6180339887498949
 BITS, PASSES = 8, 4
-"""Of a depth's 32 bits, how many are sorted by at a time; an even number of times."""
+"""Radix sort of a depth's 32 bits: bits per pass, and passes, an even number."""
 SLACK = 0.01
-"""In pixels, in case rounding moved an ellipse's edge past a pixel centre."""
+"""Margin in pixels, in case rounding moved an ellipse's edge past a pixel centre."""
 
 
 class TileLists(NamedTuple):
@@ -59,9 +59,9 @@ class TileLists(NamedTuple):
 
 
 def row_order(rows: int) -> Int64[np.ndarray, " rows"]:
-    """Rows of tiles, such that every stretch of them has its share of all parts of the image.
+    """Rows of tiles in an order in which every stretch samples all parts of the image.
 
-    Threads take stretches of equal length, and images are seldom as busy above as below.
+    Threads take stretches of equal length, and images are rarely as busy at the top as below.
     """
     return np.argsort(np.arange(rows) * GOLDEN % 1.0)
 
@@ -86,7 +86,7 @@ def list_tiles(records: Float32[np.ndarray, " 16*G"], width: int, height: int) -
     row_range = np.empty((num, 2), np.int32)
     touched = np.zeros((CHUNKS, rows + 1), np.int64)
     _find_rows(records, rows, row_range, touched)
-    # In ``spans`` they lie row by row, and within a row chunk by chunk.
+    # ``spans`` is ordered by row, and within a row by chunk.
     per_row = touched[:, :-1].cumsum(axis=1).T
     row_end = per_row.cumsum().reshape(rows, CHUNKS)
     row_spans = np.concatenate([[0], row_end[:, -1]])
@@ -105,8 +105,8 @@ def list_tiles(records: Float32[np.ndarray, " 16*G"], width: int, height: int) -
 
 
 @inline
-def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]
-    """Sort the visible by depth, digit by digit from the last; equal ones stay in their order.
+def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]  # Numba's types
+    """Radix sort of the visible by depth, from the lowest digit; stable.
 
     On one thread: two gain as much as they lose by waiting for each other eight times.
 
@@ -114,14 +114,14 @@ def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]
         depths: Their bits, uint32 [N]: positive floats sort as these do.
         visible: bool [N].
         keys: Written: depths above indices, sorted, uint64 [N].
-        spare: Room, uint64 [N].
+        spare: Workspace, uint64 [N].
 
     Returns:
-        How many are visible.
+        The number of visible Gaussians.
     """
     total, one, mask = np.uint64(0), np.uint32(1), np.uint64((1 << BITS) - 1)
     for i in range(len(depths)):
-        # Written in any case, and written over by the next where this one is not visible.
+        # Written unconditionally, and overwritten by the next if this one is not visible.
         keys[total] = np.uint64(depths[i]) << np.uint64(32) | np.uint64(i)
         total += np.uint64(visible[i])
     for turn in range(PASSES):
@@ -141,18 +141,18 @@ def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]
 
 
 @always_inline
-def _ellipse(records, r):  # type: ignore[no-untyped-def]
-    """A, B, C and R of the ellipse A dx^2 + 2 B dx dy + C dy^2 <= R, d the pixel less the mean."""
+def _ellipse(records, r):  # type: ignore[no-untyped-def]  # Numba's types
+    """A, B, C and R of the ellipse A dx^2 + 2 B dx dy + C dy^2 <= R, d being pixel minus mean."""
     a, b, c = np.float64(records[r + 2]), np.float64(records[r + 3]), np.float64(records[r + 4])
     reach = max(np.float64(records[r + 5]) - np.float64(LOWEST), 0.0)
     return -a, -0.5 * b, -c, reach
 
 
 @always_inline
-def _tiles(low, high, tiles):  # type: ignore[no-untyped-def]
-    """First and one-past-last of the tiles that have a pixel between two coordinates.
+def _tiles(low, high, tiles):  # type: ignore[no-untyped-def]  # Numba's types
+    """First and one-past-last of the tiles with a pixel centre between two coordinates.
 
-    Clipped while still floats: the pixels of a giant overflow integers.
+    Clipped before conversion to integers, which the pixels of a huge Gaussian would overflow.
     """
     last_pixel = TILE - 0.5
     first = min(max((low - (SLACK + last_pixel)) / TILE, 0.0), np.float64(tiles))
@@ -161,17 +161,17 @@ def _tiles(low, high, tiles):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-def]
+def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-def]  # Numba's types
     """First and one-past-last row of tiles that each ellipse touches.
 
-    All of them where float32 has rounded the conic to one that is no ellipse (a needle or a sheet
-    of thousands of pixels).
+    All rows if float32 rounding has made the conic something other than an ellipse (a needle or a
+    sheet of thousands of pixels).
 
     Args:
         records: As in ``list_tiles``.
         rows: Rows of tiles.
         row_range: Written, int32 [G, 2].
-        touched: Changes from row to row of how many of a chunk touch it, int64 [CHUNKS, rows + 1].
+        touched: Change from row to row in how many of a chunk touch it, int64 [CHUNKS, rows + 1].
     """
     for k in parallel_range(CHUNKS):
         chunk = STRIDE * k % CHUNKS
@@ -186,7 +186,7 @@ def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-de
 
 
 @kernel
-def _find_columns(  # type: ignore[no-untyped-def]
+def _find_columns(  # type: ignore[no-untyped-def]  # Numba's types
     records, columns, row_range, span_start, cursor, spans, pairs
 ):
     """Write the span of every Gaussian in each of its rows to the row's part of ``spans``.
@@ -225,11 +225,11 @@ def _find_columns(  # type: ignore[no-untyped-def]
 
 
 @always_inline
-def _profile(a, b, c, reach):  # type: ignore[no-untyped-def]
-    """An ellipse's edges by height: dx = lean dy +- sqrt(width - falloff dy^2).
+def _profile(a, b, c, reach):  # type: ignore[no-untyped-def]  # Numba's types
+    """An ellipse's left and right edges at height dy: dx = lean dy +- sqrt(width - falloff dy^2).
 
-    Also ``extreme``, the dy of the right extreme point; the left one's is its negative. What is no
-    ellipse is endless.
+    Also ``extreme``, the dy of the right extreme point; the left one's is its negative. Anything
+    but an ellipse extends without end.
     """
     det = a * c - b * b
     if not det > 0.0:
@@ -240,7 +240,7 @@ def _profile(a, b, c, reach):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fill(  # type: ignore[no-untyped-def]
+def _fill(  # type: ignore[no-untyped-def]  # Numba's types
     row_order, columns, row_spans, spans, row_start, tile_start, ranks, listed
 ):
     """List each row's spans by tile.
@@ -251,7 +251,7 @@ def _fill(  # type: ignore[no-untyped-def]
         row_spans: Where in ``spans`` each row begins, int64 [rows + 1].
         spans: As in ``_find_columns``.
         row_start: First list entry of each row, int64 [rows + 1].
-        tile_start: Written but for its end, as in ``TileLists``.
+        tile_start: Written except for its end, as in ``TileLists``.
         ranks: ``listed_rank``, written.
         listed: ``listed_span``, written.
     """

@@ -3,22 +3,21 @@
 Specification (``reference.py`` is its readable form): over the Gaussians of a pixel, nearest first,
 sigma = (a dx^2 + c dy^2) / 2 + b dx dy, alpha = min(0.999, opacity exp(-sigma)); those with alpha <
 1/255 are skipped; blending ends before the Gaussian that would bring the transmittance T to 1e-4 or
-less; colour += alpha T c, T <- T (1 - alpha). (The reference skips sigma < 0 too; records hold
-ellipses, whose sigma is negative by rounding at most.)
+less; colour += alpha T c, T <- T (1 - alpha). (The reference also skips sigma < 0; records hold
+ellipses, whose sigma is negative only by rounding.)
 
 Notation: h = (log opacity - sigma) / 8, so that alpha = exp(8 h); ``top`` = log(opacity) / 8 is
-where sigma is 0; LOWEST is where alpha is 1/255. A pixel that is done keeps its transmittance with
-a minus sign. A tile's 64 pixels are four blocks of 4 x 4, one vector each; the *hits* of a Gaussian
-in a tile are the blocks that it adds to, as bits.
+its value at sigma = 0; LOWEST its value at alpha = 1/255. A finished pixel keeps its transmittance
+with a minus sign. A tile's 64 pixels are four blocks of 4 x 4, one vector each; the *hits* of a
+Gaussian in a tile are the blocks that it contributes to, as bits.
 
-Stages: a tile's list is taken in chunks. First h is formed for all four blocks and a whole chunk,
-without a branch, and which blocks are hit is noted down; then each block's hits are blended, with
-all state in registers. Deciding block by block instead costs half of the time: the processor
-guesses such branches wrong, and finds out late.
+Stages: a tile's list is processed in chunks. First h is computed for all four blocks and a whole
+chunk, without a branch, and the blocks that are hit are recorded; then each block's hits are
+blended, with all state in registers. Deciding block by block instead would double the time: the
+processor mispredicts such branches, and finds out late.
 
-Arrays: a *record* of a Gaussian is 16 float32: mean x, y; -a/16, -b/8, -c/16; top; 0; the channels;
-rest 0. A block image is [tiles, 4 blocks, channels, 16 lanes]. Arrays that begin at a multiple of
-64 bytes are read and written fastest.
+Arrays: a *record* of a Gaussian is 16 float32, see the table below. A block image is [tiles, 4
+blocks, channels, 16 lanes]. Arrays aligned to 64 bytes are read and written fastest.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -53,10 +52,14 @@ from splatseed.render.binning import LOWEST, RECORD, TILE
 __all__ = ["BLOCKS", "CHANNELS", "MAX_ALPHA", "STOP", "forward"]
 
 CHANNELS = 4
-"""The most of a pass; the last takes time only where it is used."""
+"""Channels per pass; the fourth takes time only where it is used."""
 BLOCKS = 4
 STOP = np.float32(1e-4)
 MAX_ALPHA = np.float32(0.999)
+# A record, RECORD float32:
+#    0 1    2      3     4      5              6   7 .. 10        11 .. 15
+#    x y    -a/16  -b/8  -c/16  log(opacity)/8 0   the channels   0
+#
 # Lane l of a block is its pixel in column l % 4 and row l // 4:
 #    0  1  2  3      Blocks of a tile: 0 1
 #    4  5  6  7                        2 3
@@ -69,9 +72,9 @@ STATE = (1 + CHANNELS) * LANES
 """Transmittance and channels of a block."""
 CHUNK = 32
 AHEAD = 32
-"""How many list entries ahead records are asked for: those of a tile lie all over memory."""
+"""How many list entries ahead records are prefetched: a tile's lie all over memory."""
 ALL = 15
-"""Every block."""
+"""The bits of all four blocks."""
 
 
 @kernel
@@ -90,7 +93,7 @@ def forward(
         fourth: Whether the last channel is used.
         image: Written: float32 [t * 4 * CHANNELS * 16].
         transmittance: Written: T in front of the background, float32 [t * 4 * 16].
-        hits: Written, uint8 [P]; blocks whose pixels were all done when a chunk began have none.
+        hits: Written, uint8 [P]; blocks that were finished when a chunk began have none.
     """
     columns = (len(tile_start) - 1) // len(row_order)
     for place in parallel_range(len(tile_start) - 1):
@@ -122,7 +125,7 @@ def _forward_tile(
             prefetch(records, RECORD * np.int64(element(listed_rank, ahead)))
             r = RECORD * np.int64(element(listed_rank, entry))
             h0, h1, h2, h3 = _exponents(records, r, px, right, py, below)
-            # Written in any case, and written over by the next where the block is not hit.
+            # Written unconditionally, and overwritten by the next if the block is not hit.
             hit[n0] = hit[chunk + n1] = hit[2 * chunk + n2] = hit[3 * chunk + n3] = r
             store(h, LANES * n0, h0)
             store(h, LANES * (chunk + n1), h1)
@@ -156,7 +159,7 @@ def _clear(state):
 def _write(state, tile, image, transmittance):
     for q in range(BLOCKS):
         block = BLOCKS * tile + q
-        signed = negative_magnitude(load(state, STATE * q))  # -T, done or not
+        signed = negative_magnitude(load(state, STATE * q))  # -T, finished or not
         store(transmittance, LANES * block, subtract(splat(ZERO), signed))
         for channel in range(CHANNELS):
             color = load(state, STATE * q + LANES * (1 + channel))
@@ -184,7 +187,7 @@ def _exponents(records, r, left, right, above, below):
 
 @always_inline
 def _blend_block(records, hit, h, q, count, fourth, state):
-    """Blend what hits block q; returns 1 if some pixel is not done, else 0."""
+    """Blend the hits of block q; returns 1 if some pixel is unfinished, else 0."""
     zero, stop = splat(ZERO), splat(STOP)
     base, first = STATE * q, CHUNK * q
     transmittance = load(state, base)
@@ -195,7 +198,7 @@ def _blend_block(records, hit, h, q, count, fourth, state):
         # alpha = min(0.999, exp(8 h)), and 0 below 1/255
         alpha = select_greater(exponent, splat(LOWEST), exp_of_eighth(exponent), zero)
         alpha = minimum(alpha, splat(MAX_ALPHA))
-        # T' = T (1 - alpha); where T' <= 1e-4 the pixel is done: no weight, and T keeps a minus
+        # T' = T (1 - alpha); where T' <= 1e-4 the pixel is finished: weight 0, and T gets a minus
         # sign
         after = fnma(transmittance, alpha, transmittance)
         weight = select_greater(after, stop, multiply(transmittance, alpha), zero)

@@ -1,17 +1,16 @@
 """Gradients of ``blending``, whose notation and arrays this file shares.
 
-It walks front to back again: with the image known, what lies behind a Gaussian is what the image
-has less what has been blended so far, so nothing need be stored but which blocks each Gaussian
-hits.
+It walks front to back again: the colour behind a Gaussian is the final image minus what has been
+blended so far, so only the blocks that each Gaussian hits need be stored.
 
-Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums are kept by *span*, a Gaussian in
-a row of tiles: p; p dx, p dy; p dx^2, p dx dy, p dy^2; d channels; |d mean x|, |d mean y|; rest 0,
-each summed over the row's pixels. With pixels at (x, y) from a block's centre and the mean at (mx,
-my), dx = mx - x, so that all of them follow from the moments of p about the centre.
+Notation: p = d loss / d sigma of one Gaussian at one pixel. Sums are kept per *span*, a Gaussian in
+a row of tiles, over the row's pixels; their table is below. With pixels at (x, y) from a block's
+centre and the mean at (mx, my), dx = mx - x, so all of them follow from the moments of p about the
+centre.
 
 Stages: per tile and block the hits are queued, then blended with all state in registers. p and the
-weights alpha T of sixteen hits at a time are turned, so that a vector holds one pixel of sixteen
-Gaussians: their sums over pixels are then plain additions, and pixels have the same few
+weights alpha T of sixteen hits at a time are transposed, so that a vector holds one pixel of
+sixteen Gaussians: their sums over pixels are then plain additions, and pixels have the same few
 coordinates. One thread takes a row of tiles from left to right, so that a span's sums are added up
 in a fixed order without atomics, while they are still in the cache: the same bytes every time.
 """
@@ -52,19 +51,23 @@ from splatseed.render.blending import BLOCKS, CHANNELS, MAX_ALPHA, STOP
 __all__ = ["SUMS", "backward", "sum_spans"]
 
 SUMS = 16
-"""Numbers of a span."""
+"""Numbers per span, each summed over its pixels:
+
+   0   1     2     3       4        5       6 .. 9       10          11          12 .. 15
+   p   p dx  p dy  p dx^2  p dx dy  p dy^2  d channels   |d mean x|  |d mean y|  0
+"""
 ABSOLUTE = 10
-"""Where among them the absolute gradients are."""
+"""Offset of the absolute gradients among them."""
 CHUNK = 512
 """Entries of a tile's list that are queued at a time."""
 AHEAD = 128
-"""How many list entries ahead records and sums are asked for."""
+"""How many list entries ahead records and sums are prefetched."""
 WEIGHTS, MEANS = LANES * LANES, 2 * LANES * LANES
-"""Where in a batch of sixteen hits the weights alpha T and the means are; p is at 0."""
+"""Offsets of the weights alpha T and the means in a batch of sixteen hits; p is at 0."""
 BATCH = MEANS + 2 * LANES
 ZERO, ONE, HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 OUTER = np.float32(1.5)
-"""A block's columns, and its rows, are at -OUTER, -HALF, HALF and OUTER from its centre."""
+"""A block's columns and rows are at -OUTER, -HALF, HALF and OUTER from its centre."""
 
 
 @kernel
@@ -86,7 +89,8 @@ def backward(
         lane_y: ``ROW``.
         fourth: Whether the last channel is used.
         gradient: d loss / d image, block image, float32 [t * 4 * CHANNELS * 16].
-        behind: gradient . final colour - (d loss / d alpha) T_final, float32 [t * 4 * 16]; used up.
+        behind: gradient . final colour - (d loss / d alpha) T_final, float32 [t * 4 * 16];
+            overwritten.
         absolute: Whether the absolute gradients of the means are wanted; else they are 0.
         sums: Written: float32 [16 S]; must hold 0.
     """
@@ -108,7 +112,7 @@ def backward(
                     x = np.float32(TILE * column + 4 * (q % 2))
                     y = np.float32(TILE * row + 4 * (q // 2))
                     block = LANES * (BLOCKS * tile + q)
-                    if fourth:  # compiled for its own constant
+                    if fourth:  # specialised by the compiler
                         _backward_block(
                             records, listed_rank, listed_span, queue, CHUNK * q, counts[q],
                             lane_x, lane_y, x, y, True, gradient, CHANNELS * block, behind, block,
@@ -124,7 +128,7 @@ def backward(
 
 @always_inline
 def _queue_hits(hits, start, stop, records, listed_rank, sums, listed_span, queue):
-    """Queue the list entries that hit each block, and ask for what they need; returns how many.
+    """Queue the list entries that hit each block, and prefetch their data; returns the counts.
 
     Waiting for memory is otherwise a third of the time.
     """
@@ -134,7 +138,7 @@ def _queue_hits(hits, start, stop, records, listed_rank, sums, listed_span, queu
         ahead = min(entry + AHEAD, len(hits) - 1)  # it may be the next tile's
         prefetch(records, RECORD * np.int64(listed_rank[ahead]))
         prefetch(sums, SUMS * np.int64(listed_span[ahead]))
-        # Written in any case, and written over by the next where the block is not hit.
+        # Written unconditionally, and overwritten by the next if the block is not hit.
         queue[n0] = queue[CHUNK + n1] = queue[2 * CHUNK + n2] = queue[3 * CHUNK + n3] = entry
         n0 += bits & 1
         n1 += bits >> 1 & 1
@@ -150,7 +154,7 @@ def _backward_block(
 ):  # fmt: skip
     """Blend the ``count`` hits from ``queue[first]`` of the block whose corner is (x, y).
 
-    ``gradient_at``, ``behind_at`` and ``at`` are where the block begins in the arrays before them.
+    ``gradient_at``, ``behind_at`` and ``at`` are the block's offsets in the preceding arrays.
     """
     zero, stop = splat(ZERO), splat(STOP)
     px, py = add(load(lane_x, 0), splat(x + HALF)), add(load(lane_y, 0), splat(y + HALF))
@@ -159,7 +163,7 @@ def _backward_block(
     v2, v3 = load(gradient, gradient_at + 2 * LANES), load(gradient, gradient_at + 3 * LANES)
     for begin in range(first, first + count, LANES):
         end = min(begin + LANES, first + count)
-        # Alphas first: they wait for nothing, and so run ahead of what does.
+        # Alphas first: they are independent, and overlap with the dependent chain below.
         for k in range(end - begin):
             r = RECORD * _looked_up(listed_rank, queue, begin + k)
             batch[MEANS + k] = element(records, r)
@@ -171,7 +175,7 @@ def _backward_block(
             after = fnma(t, alpha, t)  # T' = T (1 - alpha)
             alpha = select_greater(after, stop, alpha, zero)
             weight = multiply(t, alpha)
-            # shade = gradient . c, and far = gradient . (colour of all that lies behind)
+            # shade = gradient . c, and far = gradient . (colour behind this Gaussian)
             shade = multiply(v0, broadcast(records, r + 7))
             shade = fma(v1, broadcast(records, r + 8), shade)
             shade = fma(v2, broadcast(records, r + 9), shade)
@@ -198,13 +202,13 @@ def _backward_block(
 
 @always_inline
 def _looked_up(array, queue, place):
-    """The element of an int32 array that an entry of the queue is about, int64."""
+    """The element of an int32 array at the list entry in a place of the queue, int64."""
     return np.int64(element(array, np.int64(element(queue, place))))
 
 
 @always_inline
 def _alpha(records, r, px, py):
-    """Alpha where it counts (alpha >= 1/255), else 0."""
+    """min(0.999, exp(8 h)) where that is at least 1/255, else 0."""
     dx, dy = subtract(broadcast(records, r), px), subtract(broadcast(records, r + 1), py)
     a, b, c = broadcast(records, r + 2), broadcast(records, r + 3), broadcast(records, r + 4)
     h = fma(multiply(c, dy), dy, broadcast(records, r + 5))
@@ -215,8 +219,9 @@ def _alpha(records, r, px, py):
 
 @always_inline
 def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
-    """From p, weights and means of sixteen hits to their sums over the block, one row each."""
+    """From p, weights and means of sixteen hits to their sums over the block, one per row."""
     zero = splat(ZERO)
+    # Moments of p over x within each row of the block, then over y: s = sum p, x = sum p x, ...
     s0, x0, xx0 = _moments(load_columns(batch, 0))
     s1, x1, xx1 = _moments(load_columns(batch, 4))
     s2, x2, xx2 = _moments(load_columns(batch, 8))
@@ -226,9 +231,12 @@ def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
     xx = add(add(xx0, xx3), add(xx1, xx2))
     mx, my = load(batch, MEANS), load(batch, MEANS + LANES)
     mx, my = subtract(mx, splat(center_x)), subtract(my, splat(center_y))
+    # With dx = mx - x: sum p dx = mx s - x, sum p dx^2 = mx (sum p dx - x) + xx, and
+    # sum p dx dy = mx sum p dy - my x + xy
     px, py = subtract(multiply(mx, s), x), subtract(multiply(my, s), y)
     pxx, pyy = fma(mx, subtract(px, x), xx), fma(my, subtract(py, y), yy)
     pxy = fma(mx, py, fnma(my, x, xy))
+    # d channel = sum over pixels of alpha T times the pixel's gradient
     c0 = c1 = c2 = c3 = zero
     for pixel in range(0, LANES, 4):
         weights, first = load_columns(batch, WEIGHTS + pixel), gradient_at + pixel
@@ -255,7 +263,7 @@ def _moments(values):
 
 @always_inline
 def _add_products(total, weights, values, first):
-    """``total`` and weights[i] values[first + i] of four weights."""
+    """``total`` plus weights[i] values[first + i] for four weights."""
     total = fma(weights[0], broadcast(values, first), total)
     total = fma(weights[1], broadcast(values, first + 1), total)
     total = fma(weights[2], broadcast(values, first + 2), total)
@@ -264,7 +272,7 @@ def _add_products(total, weights, values, first):
 
 @always_inline
 def _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, batch, sums):
-    """What the pixels add to |d mean x| and |d mean y|, hit by hit."""
+    """Add each pixel's |a p dx + b p dy| and |b p dx + c p dy| to the absolute sums, per hit."""
     for k in range(end - begin):
         entry = queue[begin + k]
         r, s = RECORD * np.int64(listed_rank[entry]), SUMS * np.int64(listed_span[entry])

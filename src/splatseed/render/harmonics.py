@@ -1,14 +1,16 @@
-"""Colour by direction: real spherical harmonics up to degree 3, and their gradient.
+"""View-dependent colour: real spherical harmonics up to degree 3, and their gradient.
 
 Basis, order and signs are those of 3D Gaussian Splatting and gsplat (P.-P. Sloan, Efficient
 Spherical Harmonic Evaluation, 2013). The direction runs from the camera to the Gaussian and is
 normalised here.
 
-Notation: x, y, z is the unit direction. Every basis function is a *factor* (1, x, y or z) times a
-*form*, c0 + c1 xx + c2 yy + c3 zz + c4 xy + c5 yz + c6 xz: lane k of a vector holds function k. A
-*row* is the 45 numbers of a Gaussian beyond its first coefficients, three channels of 15; it is
-read as three vectors from ``FIRST`` on, which overlap. Directions are normalised in float64, the
-rest is float32.
+colour = max(0, 1/2 + sum_k y_k(d) h_k) for each channel, d the unit direction (x, y, z).
+
+Notation: every basis function y_k is a *factor* (1, x, y or z) times a *form*, c0 + c1 xx + c2 yy +
+c3 zz + c4 xy + c5 yz + c6 xz: lane k of a vector holds function k. A *row* is the 45 coefficients
+of a Gaussian beyond the first of each channel, 15 times red, green, blue; it is read as three
+overlapping vectors that start at ``FIRST``. Directions are normalised in float64, the rest is
+float32.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -40,14 +42,14 @@ TERMS = 16
 CHANNELS = 3
 ROW = 45
 CHUNKS = 64
-"""Pieces that threads take."""
+"""Pieces of work for the threads."""
 AHEAD = 10
-"""How many rows ahead memory is asked for: those of Gaussians out of sight are not read, and what
-is read in leaps does not come by itself."""
+"""How many rows ahead memory is prefetched: rows of invisible Gaussians are skipped, and skips
+defeat the hardware's own prefetching."""
 FIRST = (0, 15, 29)
-"""Where in a row its three vectors begin: the last of them ends with it."""
+"""Where in a row its three vectors of 16 begin; the last one ends with the row."""
 PART = 15
-"""How many numbers of a row count in each of its vectors."""
+"""How many numbers each vector contributes; its overlap with another counts once."""
 Y0 = np.float32(0.2820947917738781)
 Y1 = 0.48860251190292
 Y2A, Y2B, Y2C = 1.0925484305920792, 0.9461746957575601, 0.5462742152960396
@@ -55,15 +57,19 @@ Y2D = 0.3153915652525201
 Y3A, Y3B, Y3C = 0.5900435899266435, 2.890611442640554, 0.4570457994644658
 Y3D, Y3E = 0.3731763325901154, 1.445305721320277
 FUNCTIONS: tuple[tuple[str, dict[str, float]], ...] = (
+    # y_0, degree 0
     ("1", {"1": float(Y0)}),
+    # y_1 to y_3, degree 1
     ("y", {"1": -Y1}),
     ("z", {"1": Y1}),
     ("x", {"1": -Y1}),
+    # y_4 to y_8, degree 2
     ("1", {"xy": Y2A}),
     ("1", {"yz": -Y2A}),
     ("1", {"zz": Y2B, "1": -Y2D}),
     ("1", {"xz": -Y2A}),
     ("1", {"xx": Y2C, "yy": -Y2C}),
+    # y_9 to y_15, degree 3
     ("y", {"xx": -3.0 * Y3A, "yy": Y3A}),
     ("z", {"xy": Y3B}),
     ("y", {"zz": -5.0 * Y3C, "1": Y3C}),
@@ -72,19 +78,20 @@ FUNCTIONS: tuple[tuple[str, dict[str, float]], ...] = (
     ("z", {"xx": Y3E, "yy": -Y3E}),
     ("x", {"xx": -Y3A, "yy": 3.0 * Y3A}),
 )
-"""Factor and form of the basis functions."""
+"""Factor and form of the basis functions, one per lane."""
 FACTORS, FORMS = ("1", "x", "y", "z"), ("1", "xx", "yy", "zz", "xy", "yz", "xz")
 FORM, LIVE = LANES * len(FACTORS), LANES * (len(FACTORS) + len(FORMS))
-"""Where in a table the forms begin, and the marks of the numbers of a row that count."""
+"""Offsets in a table. Its rows of 16 lanes: factors 1, x, y, z; the form's coefficients of 1, xx,
+yy, zz, xy, yz, xz, from FORM on; and three rows of marks, from LIVE on, of which lanes count."""
 
 
 def _coefficient_of(number: int) -> int:
-    """Which coefficient a number of a row belongs to."""
+    """The index k of the coefficient that a number of a row is a channel of."""
     return 1 + number // CHANNELS
 
 
 def _table(degree: int) -> np.ndarray:
-    """What the kernels read, flat: factors, forms, and which lanes of a row's vectors count."""
+    """The table of a degree, flat: factors, forms, and which lanes of a row's vectors count."""
     terms = (degree + 1) ** 2
     table = np.zeros((len(FACTORS) + len(FORMS) + len(FIRST), LANES), np.float32)
     for k, (factor, form) in enumerate(FUNCTIONS[:terms]):
@@ -98,13 +105,13 @@ def _table(degree: int) -> np.ndarray:
 
 
 TABLES = tuple(map(_table, range(MAX_DEGREE + 1)))
-"""By degree, float32 [224]."""
+"""The tables by degree, float32 [224]."""
 
-# Lane k of the basis to the three numbers of a row that it goes with, in each of the vectors.
+# y_k from lane k to the three numbers of a row that it multiplies, in each of the vectors.
 spread_0, spread_1, spread_2 = (
     permutation([_coefficient_of(first + j) for j in range(LANES)]) for first in FIRST
 )
-# A colour to the channels of a row's vectors; of the first two they are the same.
+# Red, green, blue from lanes 0 to 2 to the channels of a row's vectors; the first two coincide.
 channels_01, channels_2 = (
     permutation([(first + j) % CHANNELS for j in range(LANES)]) for first in FIRST[1:]
 )
@@ -116,14 +123,14 @@ lane_0, lane_1, lane_2, lane_4, lane_8 = map(lane, (0, 1, 2, 4, 8))
 
 @kernel
 def harmonics(means, origin, base, rest, skipped, radii, table, colors):
-    """Colours of N Gaussians: 0.5 more than their harmonics, and at least 0.
+    """Colours of N Gaussians: max(0, 1/2 + sum_k y_k h_k).
 
     Args:
         means: float32 [N, 3].
-        origin: Where the camera stands, float32 [3].
+        origin: The camera's centre, float32 [3].
         base: First coefficients, float32 [N, 1 or 16, 3].
         rest: The rows one after the other, float32 [N (skipped + 45)].
-        skipped: How many numbers stand before each row.
+        skipped: Numbers before each row.
         radii: int32 [N, 2]; where one is 0 the colour is 0.
         table: The degree's of ``TABLES``.
         colors: Written, float32 [N, 3].
@@ -137,6 +144,7 @@ def harmonics(means, origin, base, rest, skipped, radii, table, colors):
                 factor, form = _basis(*_vectors(x, y, z), table)
                 basis = multiply(factor, form)
                 _prefetch(rest, (i + AHEAD) * (skipped + ROW))
+                # sum_k y_k h_k over k >= 1, one channel in each of lanes 0 to 2
                 a, b, c = _row(rest, i * (skipped + ROW) + skipped, table)
                 total = fma(spread_1(basis), b, multiply(spread_0(basis), a))
                 total = _by_channel(add(total, later_1(multiply(spread_2(basis), c))))
@@ -154,7 +162,7 @@ def harmonics_vjp(
     """Gradients of ``harmonics``.
 
     Args:
-        means: As in ``harmonics``, and so on to ``colors``.
+        means: As in ``harmonics``, as are all up to ``colors``.
         origin: [3].
         rest: [N (skipped + 45)].
         skipped: Numbers before each row.
@@ -163,8 +171,8 @@ def harmonics_vjp(
         colors: What ``harmonics`` wrote, [N, 3].
         d_colors: d loss / d colors, float32 [N, 3].
         d_means: Written, float32 [N, 3].
-        d_base: Written, float32 like ``base``, of which only the first coefficients.
-        d_rest: Written, float32 like ``rest``, of which only the rows.
+        d_base: Written, float32 like ``base``, first coefficients only.
+        d_rest: Written, float32 like ``rest``, rows only.
     """
     for chunk in parallel_range(CHUNKS):
         for i in range(chunk * len(means) // CHUNKS, (chunk + 1) * len(means) // CHUNKS):
@@ -172,9 +180,9 @@ def harmonics_vjp(
             dx = dy = dz = 0.0
             row = i * (skipped + ROW) + skipped
             if radii[i, 0] > 0 and radii[i, 1] > 0:
-                red = _unless_held(d_colors[i, 0], colors[i, 0])
-                green = _unless_held(d_colors[i, 1], colors[i, 1])
-                blue = _unless_held(d_colors[i, 2], colors[i, 2])
+                red = _unless_clamped(d_colors[i, 0], colors[i, 0])
+                green = _unless_clamped(d_colors[i, 1], colors[i, 1])
+                blue = _unless_clamped(d_colors[i, 2], colors[i, 2])
                 x, y, z = _offset(means, origin, i)
                 inverse = 1.0 / _length(x, y, z)
                 x, y, z = x * inverse, y * inverse, z * inverse
@@ -183,6 +191,7 @@ def harmonics_vjp(
                 d_color = triple(red, green, blue)
                 gradients = _row_vjp(*_vectors(x, y, z), d_color, rest, row, table, d_rest)
                 dx, dy, dz = lane_0(gradients), lane_4(gradients), lane_8(gradients)
+                # d (v / |v|) = (I - d d') / |v|
                 along = dx * x + dy * y + dz * z
                 dx, dy = (dx - along * x) * inverse, (dy - along * y) * inverse
                 dz = (dz - along * z) * inverse
@@ -197,7 +206,7 @@ def harmonics_vjp(
 
 @always_inline
 def _offset(means, origin, i):
-    """From the camera to a Gaussian, float64."""
+    """The vector from the camera to a Gaussian, float64."""
     return (
         np.float64(means[i, 0] - origin[0]), np.float64(means[i, 1] - origin[1]),
         np.float64(means[i, 2] - origin[2]),
@@ -216,9 +225,11 @@ def _vectors(x, y, z):
 
 @always_inline
 def _basis(x, y, z, table):
-    """Factors and forms of the basis functions."""
+    """Factors and forms of the basis functions, y_k = factor_k form_k, one per lane."""
+    # factor = f0 + f1 x + f2 y + f3 z, one of the f being 1
     factor = fma(load(table, LANES), x, load(table, 0))
     factor = fma(load(table, 3 * LANES), z, fma(load(table, 2 * LANES), y, factor))
+    # form = c0 + c1 xx + c2 yy + c3 zz + c4 xy + c5 yz + c6 xz
     form = fma(load(table, FORM + LANES), multiply(x, x), load(table, FORM))
     form = fma(load(table, FORM + 2 * LANES), multiply(y, y), form)
     form = fma(load(table, FORM + 3 * LANES), multiply(z, z), form)
@@ -237,7 +248,7 @@ def _prefetch(rows, row):
 def _row(rest, row, table):
     """A row's three vectors.
 
-    What does not count is 0, also if it is NaN, and so are repetitions.
+    Unused and repeated numbers become 0, even if they are NaN.
     """
     return (
         _live(load(rest, row + FIRST[0]), load(table, LIVE)),
@@ -261,20 +272,20 @@ def _by_channel(v):
 
 @always_inline
 def _shade(base, others):
-    """The colour; NaN stays NaN, for who blends leaves it out."""
+    """max(0, 1/2 + y_0 h_0 + others); NaN stays NaN, as blending leaves such Gaussians out."""
     shade = (Y0 * base + others) + np.float32(0.5)
     return np.float32(0.0) if shade < np.float32(0.0) else shade  # noqa: FURB136  (NaN)
 
 
 @always_inline
-def _unless_held(d_color, color):
-    """The gradient of a colour that is not held at 0."""
+def _unless_clamped(d_color, color):
+    """The gradient of a colour, 0 where the colour is clamped at 0."""
     return d_color if color > np.float32(0.0) else np.float32(0.0)
 
 
 @always_inline
 def _row_vjp(x, y, z, d_color, rest, row, table, d_rest):
-    """Write a row's gradient; return those of x, y and z in lanes 0, 4 and 8."""
+    """Write d h = y d_color; return d loss / d (x, y, z) in lanes 0, 4 and 8."""
     factor, form = _basis(x, y, z, table)
     basis = multiply(factor, form)
     red_first, blue_first = channels_01(d_color), channels_2(d_color)
@@ -284,9 +295,10 @@ def _row_vjp(x, y, z, d_color, rest, row, table, d_rest):
     a, b, c = _row(rest, row, table)
     a, b, c = multiply(a, red_first), multiply(b, red_first), multiply(c, blue_first)
     xx, yy, zz = add(x, x), add(y, y), add(z, z)
-    by_x = _slope(xx, y, z, FORM + LANES, FORM + 4 * LANES, FORM + 6 * LANES, table)
-    by_y = _slope(yy, x, z, FORM + 2 * LANES, FORM + 4 * LANES, FORM + 5 * LANES, table)
-    by_z = _slope(zz, y, x, FORM + 3 * LANES, FORM + 5 * LANES, FORM + 6 * LANES, table)
+    by_x = _derivative(xx, y, z, FORM + LANES, FORM + 4 * LANES, FORM + 6 * LANES, table)
+    by_y = _derivative(yy, x, z, FORM + 2 * LANES, FORM + 4 * LANES, FORM + 5 * LANES, table)
+    by_z = _derivative(zz, y, x, FORM + 3 * LANES, FORM + 5 * LANES, FORM + 6 * LANES, table)
+    # d y_k / dx = (d factor_k / dx) form_k + factor_k (d form_k / dx); likewise y and z
     return three_sums(
         _weighted(fma(load(table, LANES), form, multiply(factor, by_x)), a, b, c),
         _weighted(fma(load(table, 2 * LANES), form, multiply(factor, by_y)), a, b, c),
@@ -295,14 +307,15 @@ def _row_vjp(x, y, z, d_color, rest, row, table, d_rest):
 
 
 @always_inline
-def _slope(twice, one, other, square, with_one, with_other, table):
-    """Derivatives of the forms along an axis: its square, and its products with the others."""
-    slope = fma(load(table, with_one), one, multiply(load(table, with_other), other))
-    return fma(load(table, square), twice, slope)
+def _derivative(twice, one, other, square, with_one, with_other, table):
+    """Derivatives of the forms along an axis, through its square and its two products."""
+    # d form / dx = 2 c1 x + c4 y + c6 z, and likewise for the other axes
+    products = fma(load(table, with_one), one, multiply(load(table, with_other), other))
+    return fma(load(table, square), twice, products)
 
 
 @always_inline
 def _weighted(gradients, a, b, c):
-    """Slopes times the numbers of a row, to be summed over lanes."""
+    """Derivatives of the y_k times the numbers of a row, to be summed over lanes."""
     total = fma(spread_1(gradients), b, multiply(spread_0(gradients), a))
     return fma(spread_2(gradients), c, total)

@@ -1,8 +1,8 @@
-"""The ``info`` of ``rasterization``: gsplat's dictionary, of which the costly entries wait.
+"""The ``info`` of ``rasterization``: gsplat's dictionary, with its costly entries computed lazily.
 
-Notation: N Gaussians, C cameras, G = C N, or packed the number of those seen, camera by camera.
-Promise: gsplat 1.5.3's keys, shapes and types; a training step pays for none of the lists of
-intersections, which are made when one of them is read for the first time.
+Notation: N Gaussians, C cameras, G = C N, or if packed the number of visible ones, camera by
+camera. Promise: gsplat 1.5.3's keys, shapes and types; a training step does not pay for the lists
+of intersections, which are made when one of them is first read.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ class View(NamedTuple):
 
 
 class _Wait(Enum):
-    """What stands in a list's place."""
+    """Placeholder of a list."""
 
-    UNTIL_READ = "made when it is read"
+    UNTIL_READ = "made when first read"
 
 
 class Info(dict[str, Any]):
     """A dictionary whose lists of intersections are made when one of them is read.
 
-    ``in``, ``len``, ``keys()`` and printing know all names and make nothing; whatever hands out an
-    entry, a copy of the dictionary too, makes it.
+    ``in``, ``len``, ``keys()`` and printing know all names and make nothing; whatever returns an
+    entry makes it, and so does copying the dictionary.
     """
 
     def __getitem__(self, name: str) -> Any:
@@ -67,8 +67,8 @@ class Info(dict[str, Any]):
         return dict(self)
 
     def get(self, name: str, default: Any = None) -> Any:
-        """The entry, or the default where there is none."""
-        return self[name] if name in self else default  # noqa: SIM401  (which is this)
+        """The entry, or the default if there is none."""
+        return self[name] if name in self else default  # noqa: SIM401  (this method is ``get`` itself)
 
     def items(self) -> Any:
         """Names and entries."""
@@ -76,12 +76,12 @@ class Info(dict[str, Any]):
         return super().items()
 
     def pop(self, name: str, *default: Any) -> Any:
-        """The entry, taken out; the default where there is none."""
+        """The entry, removed; the default if there is none."""
         self.get(name)
         return super().pop(name, *default)
 
     def setdefault(self, name: str, default: Any = None) -> Any:
-        """The entry, which becomes the default where there is none."""
+        """The entry, set to the default if there is none."""
         self.get(name)
         return super().setdefault(name, default)
 
@@ -91,38 +91,37 @@ class Info(dict[str, Any]):
         return super().values()
 
     def _make_lists(self) -> None:
-        """Put the lists in the places that wait for them."""
+        """Replace the placeholders by the lists."""
         places = [name for name in _LISTS if super(Info, self).get(name) is _Wait.UNTIL_READ]
         if places:
             made = self._intersections()._asdict()
             self.update({name: made[name] for name in places})
 
     def _intersections(self) -> Intersections:
-        """Those of the Gaussians as they are listed here."""
+        """The intersections of the Gaussians in the order listed here."""
         depths, cameras = self["depths"], self["camera_ids"]
         if cameras is None:
             cameras = torch.arange(len(depths)).repeat_interleave(depths.shape[1])
         names = ("n_cameras", "width", "height", "tile_size")
-        found = intersect(
+        made = intersect(
             self["means2d"].reshape(-1, 2), self["radii"].reshape(-1, 2), depths.flatten(), cameras,
             Grid(*(self[name] for name in names)),
         )  # fmt: skip
-        return found._replace(tiles_per_gauss=found.tiles_per_gauss.view_as(depths))
+        return made._replace(tiles_per_gauss=made.tiles_per_gauss.view_as(depths))
 
 
 _LISTS = Intersections._fields
 
 
 def make_info(views: Sequence[View], packed: bool, width: int, height: int, tile_size: int) -> Info:
-    """What ``rasterization`` says of C cameras.
+    """The ``info`` of C cameras.
 
     Args:
         views: The N Gaussians in each.
-        packed: Whether only the Gaussians that are seen are listed, camera by camera; stacked
-            otherwise.
+        packed: Whether only visible Gaussians are listed, camera by camera; stacked otherwise.
         width: Pixels.
         height: Pixels.
-        tile_size: Pixels a tile of the lists is wide and high.
+        tile_size: Side in pixels of the tiles in the lists.
     """
     grid = Grid(len(views), width, height, tile_size)
     return Info(
@@ -155,7 +154,7 @@ def _packed(views: Sequence[View]) -> dict[str, Tensor]:
 
 
 def _stacked(views: Sequence[View]) -> dict[str, Tensor | None]:
-    """Camera by camera along a new axis; what is of one camera is not copied."""
+    """Camera by camera along a new axis; a single camera's entries are not copied."""
     entries: dict[str, Tensor | None] = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
     for name in View._fields:
         tensors = [getattr(view, name) for view in views]

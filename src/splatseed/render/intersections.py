@@ -1,11 +1,11 @@
 """Which Gaussians touch which tiles, in gsplat's layout.
 
-For whoever asks: the CPU rasteriser has its own.
+Only for callers that read them: the CPU rasteriser has its own.
 
 Notation: G projected Gaussians, C cameras one after the other, I pairs of a Gaussian and a tile,
-and ceil(height / size) x ceil(width / size) tiles a camera. A pair's id is, from the highest bit
-down, its camera, its tile (row by row, in as many bits as write down the number of tiles) and the
-32 bits of its depth, so that sorted ids are camera by camera, tile by tile, front to back. Promise:
+and ceil(height / size) x ceil(width / size) tiles per camera. A pair's id is, from the highest bit
+down, its camera, its tile (row by row, in as many bits as the number of tiles needs) and the 32
+bits of its depth, so that sorted ids are camera by camera, tile by tile, front to back. Promise:
 the numbers of gsplat 1.5.3's ``isect_tiles`` and ``isect_offset_encode``.
 """
 
@@ -31,11 +31,11 @@ class Grid(NamedTuple):
     height: int
     """Pixels."""
     size: int
-    """Pixels a tile is wide and high."""
+    """Side of a tile in pixels."""
 
     @property
     def columns(self) -> int:
-        """Tiles in a row."""
+        """Tiles per row."""
         return -(-self.width // self.size)
 
     @property
@@ -52,9 +52,9 @@ class Intersections(NamedTuple):
     isect_ids: Int[Tensor, " I"]
     """The pairs' ids, sorted, int64."""
     flatten_ids: Int[Tensor, " I"]
-    """Which of the G Gaussians each pair is of, int32."""
+    """The Gaussian of each pair, int32."""
     isect_offsets: Int[Tensor, "C rows columns"]
-    """Which pair is each tile's first, int32."""
+    """The first pair of each tile, int32."""
 
 
 @torch.no_grad()
@@ -65,20 +65,20 @@ def intersect(
     cameras: Int[Tensor, " G"],
     grid: Grid,
 ) -> Intersections:
-    """Pair Gaussians with the tiles that their boxes reach.
+    """Pair Gaussians with the tiles that their bounding boxes reach.
 
     Args:
         means2d: Centres, px, float32 [G, 2].
         radii: Half the sizes of the boxes, px, int32 [G, 2]; culled where one is 0.
         depths: z, float32 [G].
-        cameras: Whose image each is in, int64 [G].
+        cameras: The camera of each, int64 [G].
         grid: The images' tiles.
 
     Example:
-        >>> found = intersect(
+        >>> pairs = intersect(
         ...     torch.tensor([[17.0, 9.0]]), torch.tensor([[3, 3]]), torch.ones(1),
         ...     torch.zeros(1, dtype=torch.int64), Grid(cameras=1, width=40, height=20, size=16))
-        >>> found.tiles_per_gauss, found.isect_offsets
+        >>> pairs.tiles_per_gauss, pairs.isect_offsets
         (tensor([2], dtype=torch.int32), tensor([[[0, 1, 2],
                  [2, 2, 2]]], dtype=torch.int32))
     """
@@ -99,7 +99,7 @@ def intersect(
 def _boxes(
     means2d: Tensor, radii: Tensor, grid: Grid
 ) -> tuple[Int[Tensor, "G 2"], Int[Tensor, "G 2"]]:
-    """The first column and row of tiles of each box, and how many of both; none where culled."""
+    """First column and row of tiles of each box, and the number of both; 0 if culled."""
     center, reach = means2d / grid.size, radii / grid.size
     limit = torch.tensor([grid.columns, grid.rows], dtype=torch.float32)
     zero = torch.zeros(2)

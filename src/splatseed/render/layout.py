@@ -1,10 +1,10 @@
-"""Between PyTorch's arrays and those of the blending kernels.
+"""Conversion between PyTorch's arrays and those of the blending kernels.
 
-Notation: N Gaussians of which G are visible; ``order`` [G] leads from depth rank to index; an image
-is [H, W, D]; records and block images are ``blending``'s. ``first`` is the first of the up to four
-channels that one pass of blending takes.
-Promise: every array is read and written once, in a fixed order; NumPy's gathers and transpositions
-of the same took a tenth of a training step.
+Notation: N Gaussians of which G are visible; ``order`` [G] maps depth rank to index; an image is
+[H, W, D]; records and block images are defined in ``blending``. ``first`` is the first of the up to
+four channels that one pass of blending takes.
+Promise: every array is read and written once, in a fixed order; the same with NumPy's gathers and
+transpositions took a tenth of a training step.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -23,16 +23,16 @@ from splatseed.render.blending import BLOCKS, CHANNELS
 __all__ = ["from_blocks", "gather", "mark_visible", "scatter", "to_blocks"]
 
 NEEDLE = 1.0 - 2.0**-22
-"""Enough less than 1 for float32 to round to an ellipse."""
+"""The largest factor below 1 after which float32 rounding still leaves an ellipse."""
 RGB = 3
-"""Channels that have code of their own."""
+"""Number of channels that gets its own specialised code."""
 
 
 @kernel
 def mark_visible(radii, opacities, colors, least, visible):
     """Which Gaussians are drawn.
 
-    A colour that is not finite is left out: 0 times NaN would carry it to every pixel of a tile.
+    A colour that is not finite is left out: 0 times NaN would spread it to every pixel of a tile.
 
     Args:
         radii: int32 [N, 2]; 0 = culled.
@@ -42,7 +42,7 @@ def mark_visible(radii, opacities, colors, least, visible):
         visible: Written, bool [N].
     """
     for i in parallel_range(len(radii)):
-        # No branch: the processor would guess it wrong as often as not.
+        # Branch-free: the processor would mispredict half of the time.
         seen = (radii[i, 0] > 0) & (radii[i, 1] > 0) & (opacities[i] >= least)
         zero = np.float32(0.0)
         for channel in range(colors.shape[1]):
@@ -79,7 +79,7 @@ def gather(order, means2d, conics, log_opacities, colors, first, records):
 
 @always_inline
 def _held(a, b, c):
-    """b, or as much as leaves the conic an ellipse, where float32 rounded a needle past one.
+    """b, reduced to keep the conic an ellipse where float32 rounding broke that for a needle.
 
     Blending relies on sigma >= 0.
     """
@@ -93,7 +93,7 @@ def _held(a, b, c):
 def scatter(
     order, totals, first, conics, opacities, d_means2d, d_conics, d_opacities, d_colors, d_absolute
 ):
-    """Sums by depth rank to gradients by index; those of what is not visible stay.
+    """Sums by depth rank to gradients by index; those of invisible Gaussians stay.
 
     Args:
         order: uint32 [G].
@@ -125,7 +125,7 @@ def scatter(
 
 @always_inline
 def _first_lane(x, y, columns):
-    """Of all lanes, that of a pixel, a block's first in its row."""
+    """The lane, over all tiles, of a pixel that is the first of its row in a block."""
     tile, quarter = y // TILE * columns + x // TILE, y % TILE // 4 * 2 + x % TILE // 4
     return LANES * (BLOCKS * tile + quarter) + y % 4 * 4
 
@@ -150,7 +150,7 @@ def from_blocks(blocks, block_T, columns, background, first, image, transmittanc
             lane, at = _first_lane(x, y, columns), y * width + x
             colors, T = blocks[_color(lane) :], block_T[lane : lane + 4]
             row, row_T = pixels[depth * at :], out_T[at:]
-            if depth == RGB and x + 4 <= width:  # compiled for its own constants
+            if depth == RGB and x + 4 <= width:  # specialised by the compiler
                 _from_lanes(colors, T, background, 0, 4, RGB, row, row_T)
             else:
                 count = min(4, width - x)
@@ -159,13 +159,13 @@ def from_blocks(blocks, block_T, columns, background, first, image, transmittanc
 
 @always_inline
 def _color(lane):
-    """Where a block image has the first channel of a lane."""
+    """Offset of a lane's first channel in a block image."""
     return lane // LANES * (CHANNELS * LANES) + lane % LANES
 
 
 @always_inline
 def _from_lanes(colors, T, background, first, count, depth, pixels, out_T):
-    """Up to four neighbours in a row."""
+    """Up to four neighbouring pixels of a row: colour + T background."""
     for k in range(count):
         out_T[k] = T[k]
         for channel in range(min(CHANNELS, depth - first)):
@@ -176,9 +176,9 @@ def _from_lanes(colors, T, background, first, count, depth, pixels, out_T):
 
 @kernel
 def to_blocks(d_image, image, d_alphas, transmittance, columns, first, gradient, behind):
-    """This pass's gradient channels as a block image, and what lies behind the first Gaussian.
+    """This pass's gradient channels as a block image, and the initial value of ``behind``.
 
-    Every pass takes its own channels' part of what lies behind; the first takes that of alpha too.
+    Every pass takes the part of ``behind`` of its own channels; the first also takes that of alpha.
 
     Args:
         d_image: d loss / d image, float32 [H, W, D].
@@ -187,7 +187,7 @@ def to_blocks(d_image, image, d_alphas, transmittance, columns, first, gradient,
         transmittance: T, float32 [H, W].
         columns: Tiles in a row.
         first: First channel.
-        gradient: Written, block image, float32 [t * 4 * CHANNELS * 16]; 0 outside of the image.
+        gradient: Written, block image, float32 [t * 4 * CHANNELS * 16]; 0 outside the image.
         behind: Written, gradient . colour - (d loss / d alpha) T, float32 [t * 4 * 16]; likewise.
     """
     height, width, depth = image.shape
@@ -212,7 +212,7 @@ def to_blocks(d_image, image, d_alphas, transmittance, columns, first, gradient,
 
 @always_inline
 def _to_lanes(d_pixels, pixels, d_alpha, T, first, count, depth, gradients, after):
-    """Up to four neighbours in a row, and 0 in what is left of four and of the channels."""
+    """Up to four neighbouring pixels of a row; zeros fill up the four and the channels."""
     wide = min(CHANNELS, depth - first)
     for k in range(count):
         total = -d_alpha[k] * T[k] if first == 0 else np.float32(0.0)

@@ -1,6 +1,6 @@
 """gsplat's MCMC strategy on either device.
 
-Needs gsplat, unlike the rest of ``splatseed.render``, which imports it when it is first asked for.
+Needs gsplat, unlike the rest of ``splatseed.render``, which imports it on demand.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ __all__ = ["MCMCStrategy"]
 
 
 class MCMCStrategy(gsplat.MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
-    """gsplat's ``MCMCStrategy``, which moves and adds Gaussians, for CPU tensors too.
+    """gsplat's ``MCMCStrategy``, which relocates and adds Gaussians, for CPU tensors too.
 
-    Arguments, methods and results are gsplat's. Its own class runs CUDA kernels when it relocates,
-    adds and shakes Gaussians; on CUDA tensors this one does so as well.
+    Arguments, methods and results are gsplat's. Its own class runs CUDA kernels to relocate, add
+    and perturb Gaussians; for CUDA tensors this one does too.
 
     Example:
         >>> from splatseed.render import MCMCStrategy
@@ -27,6 +27,6 @@ class MCMCStrategy(gsplat.MCMCStrategy):  # type: ignore[misc]  # gsplat has no 
     """
 
     def step_post_backward(self, *args: Any, **kwargs: Any) -> None:
-        """Do gsplat's step behind the optimisers; params, optimizers, state, step, info, lr."""
+        """Run gsplat's step after the optimisers; params, optimizers, state, step, info, lr."""
         with mcmc_on_cpu():
             super().step_post_backward(*args, **kwargs)

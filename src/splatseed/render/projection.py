@@ -2,15 +2,14 @@
 
 Specification (``reference.py`` is its readable form). With W, t the camera's rotation and
 translation, m_c = W m + t = (x, y, z), R = R(q / |q|), s the scales and J the Jacobian of the
-pinhole projection at m_c (its x / z and y / z held within 15% of the image's size beyond its
-edges), the 2D covariance is P P' + eps2d I with P = U diag(s), U = T R and T = J W; its inverse is
-the conic (a, b, c). (M. Zwicker et al., EWA Splatting, 2002; conventions and cut-offs as gsplat
-1.5.3 publishes them.)
+pinhole projection at m_c (its x / z and y / z clamped to 15% of the image's size beyond its edges),
+the 2D covariance is P P' + eps2d I with P = U diag(s), U = T R and T = J W; its inverse is the
+conic (a, b, c). (M. Zwicker et al., EWA Splatting, 2002; conventions and cut-offs of gsplat 1.5.3.)
 
-Culled, with a radius of 0: z outside of the near and far planes, opacity under 1/255, nothing of
-the bounding box in the image, and whatever is not finite. Arithmetic is float64 inside, float32 in
-and out. Gaussians are worked on in blocks, a quantity per row, so that the compiler takes several
-at once; every one's numbers are as if it stood alone.
+Culled, with radius 0: z outside the near and far planes, opacity under 1/255, bounding box outside
+the image, and anything not finite. Arithmetic is float64 inside, float32 in and out. Gaussians are
+processed in blocks, one quantity per row, so that the compiler vectorises over them; the numbers of
+each are as if it stood alone.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -26,21 +25,21 @@ from splatseed.kernels.jit import always_inline, kernel, parallel_range
 __all__ = ["CHUNKS", "EDGE", "MAX_SIGMAS", "MIN_ALPHA", "project", "project_vjp"]
 
 MIN_ALPHA = 1.0 / 255.0
-"""Least opacity that counts."""
+"""Smallest opacity that is drawn."""
 MAX_SIGMAS = 3.33
-"""Half of the bounding box at the most: exp(-3.33^2 / 2) is 1/255."""
+"""Largest half-size of the bounding box in sigmas: exp(-3.33^2 / 2) is 1/255."""
 EDGE = 0.15
-"""How far beyond the image's edges J is taken as it is, as a share of the image's size."""
+"""How far beyond the image's edges J is not clamped, as a fraction of the image's size."""
 CHUNKS = 16
-"""Pieces whose camera gradients are summed apart, whatever the number of threads."""
+"""Pieces whose camera gradients are summed separately, whatever the number of threads."""
 BLOCK = 32
-"""Gaussians to a block."""
+"""Gaussians per block."""
 X, Q, S, GIVEN = 0, 3, 7, 10
-"""Rows of a block: the mean in the world, the quaternion, the scales, and what else is given."""
+"""First rows of a block: the mean in the world, the quaternion, the scales, further inputs."""
 U, V, DEPTH, A, B, C, COMPENSATION, SIGMA_X, SIGMA_Y, OPACITY = range(10)
 """Rows of a projected block; SIGMA are standard deviations."""
 DU, DV, DDEPTH, DCOMPENSATION, DCONIC = range(GIVEN, GIVEN + 5)
-"""Rows of gradients given."""
+"""Rows of the input gradients."""
 
 
 @kernel
@@ -59,19 +58,19 @@ def project(
         K: float32 [3, 3].
         width: Pixels.
         height: Pixels.
-        near: Least z.
-        far: Greatest z.
+        near: Smallest z.
+        far: Largest z.
         eps2d: Blur added to the covariance, px^2.
         radius_clip: Gaussians whose radii are no larger are culled, px.
-        antialiased: Whether the opacity is to be compensated for the blur.
+        antialiased: Whether the opacity is compensated for the blur.
         radii: Written, int32 [N, 2]; 0 = culled.
-        means2d: Written, float32 [N, 2], px; 0 where culled, and so on.
+        means2d: Written, float32 [N, 2], px; 0 where culled, as are the following.
         depths: Written, float32 [N], z.
         conics: Written, float32 [N, 3].
         compensations: Written, float32 [N].
     """
     for chunk in parallel_range(CHUNKS):
-        # One allocation per chunk: one per Gaussian takes as long as all of the arithmetic.
+        # One allocation per chunk: one per Gaussian would take as long as all of the arithmetic.
         block, projected = np.ones((GIVEN + 1, BLOCK), np.float32), np.empty((10, BLOCK))
         lanes = np.empty(BLOCK, np.intp)
         pose, lens = _pose(view), _lens(K, width, height)
@@ -87,7 +86,7 @@ def project(
             means2d[first:last], depths[first:last] = np.float32(0.0), np.float32(0.0)
             conics[first:last], compensations[first:last] = np.float32(0.0), np.float32(0.0)
             count = 0
-            for lane in range(last - first):  # no branch, which could not be foretold
+            for lane in range(last - first):  # branch-free compaction
                 lanes[count] = lane
                 count += projected[OPACITY, lane] > 0.0
             for lane in lanes[:count]:
@@ -111,7 +110,7 @@ def _pose(view):
 
 @always_inline
 def _lens(K, width, height):
-    """fx, fy, cx, cy, and between what x / z and y / z are held."""
+    """fx, fy, cx, cy, and the bounds that x / z and y / z are clamped to in J."""
     fx, fy = np.float64(K[0, 0]), np.float64(K[1, 1])
     cx, cy = np.float64(K[0, 2]), np.float64(K[1, 2])
     beyond_x, beyond_y = EDGE * width / fx, EDGE * height / fy
@@ -137,13 +136,13 @@ def _dot(a, b):
 
 @always_inline
 def _times(a, b):
-    """Number by number."""
+    """The elementwise product."""
     return a[0] * b[0], a[1] * b[1], a[2] * b[2]
 
 
 @always_inline
 def _mix(wa, a, wb, b):
-    """The vectors a and b with weights."""
+    """The weighted sum of the vectors a and b."""
     return wa * a[0] + wb * b[0], wa * a[1] + wb * b[1], wa * a[2] + wb * b[2]
 
 
@@ -156,7 +155,7 @@ def _of_rows(weights, rows):
 
 @always_inline
 def _project_block(block, pose, lens, eps2d, projected):
-    """Project all of a block, and whatever its lanes hold."""
+    """Project all lanes of a block, used or not."""
     for lane in range(BLOCK):
         x, y, z = _in_camera(block, lane, pose)  # m_c = W m + t
         J = _jacobian(x, y, z, lens)
@@ -183,7 +182,7 @@ def _project_block(block, pose, lens, eps2d, projected):
 
 @always_inline
 def _column(array, row, column):
-    """Three numbers one below the other, float64."""
+    """Three consecutive numbers of a column, float64."""
     a, b, c = array[row, column], array[row + 1, column], array[row + 2, column]
     return np.float64(a), np.float64(b), np.float64(c)
 
@@ -196,7 +195,7 @@ def _in_camera(block, lane, pose):
 
 @always_inline
 def _jacobian(x, y, z, lens):
-    """J00, J02, J11 and J12 of J = [fx/z, 0, -fx x/z^2; 0, fy/z, -fy y/z^2], x/z and y/z held."""
+    """J00, J02, J11 and J12 of J = [fx/z, 0, -fx x/z^2; 0, fy/z, -fy y/z^2], clamped."""
     fx, fy, _, _, low_x, high_x, low_y, high_y = lens
     over = 1.0 / z
     x_z, y_z = min(max(x * over, low_x), high_x), min(max(y * over, low_y), high_y)
@@ -213,7 +212,7 @@ def _quaternion(block, lane):
 
 @always_inline
 def _rotation(quat):
-    """The rows of R."""
+    """The rows of R(q) for a unit quaternion."""
     w, x, y, z = quat
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -224,7 +223,7 @@ def _rotation(quat):
 
 @always_inline
 def _cull(block, near, far, width, height, antialiased, projected):
-    """Write each Gaussian's opacity, or 0 where it is culled, over 1 / determinant in that row."""
+    """Overwrite 1 / determinant, in the row OPACITY, by the opacity, or 0 if culled."""
     for lane in range(BLOCK):
         u, v, z = projected[U, lane], projected[V, lane], projected[DEPTH, lane]
         over = projected[OPACITY, lane]
@@ -241,8 +240,9 @@ def _cull(block, near, far, width, height, antialiased, projected):
 
 @always_inline
 def _radii(projected, lane, width, height, radius_clip):
-    """Half of the bounding box, of where alpha is 1/255 or more; 0 where it is to be culled."""
+    """Half-size of the bounding box within which alpha >= 1/255; 0 to cull the Gaussian."""
     u, v = projected[U, lane], projected[V, lane]
+    # opacity exp(-sigmas^2 / 2) = 1/255
     sigmas = min(MAX_SIGMAS, math.sqrt(2.0 * math.log(projected[OPACITY, lane] / MIN_ALPHA)))
     rx, ry = np.ceil(sigmas * projected[SIGMA_X, lane]), np.ceil(sigmas * projected[SIGMA_Y, lane])
     inside = u + rx > 0 and u - rx < width and v + ry > 0 and v - ry < height
@@ -259,7 +259,7 @@ def project_vjp(
     """Gradients of ``project``.
 
     Args:
-        means: As in ``project``, and so on to ``radii``.
+        means: As in ``project``, as are all up to ``radii``.
         quats: [N, 4].
         scales: [N, 3].
         view: [4, 4].
@@ -268,11 +268,11 @@ def project_vjp(
         height: Pixels.
         eps2d: px^2.
         radii: [N, 2].
-        d_means2d: d loss / d means2d, [N, 2], and so on.
+        d_means2d: d loss / d means2d, [N, 2]; likewise the following.
         d_depths: [N].
         d_conics: [N, 3].
         d_compensations: [N].
-        d_means: Written, float32 [N, 3]; 0 where culled, and so on.
+        d_means: Written, float32 [N, 3]; 0 where culled, as are the following.
         d_quats: Written, float32 [N, 4].
         d_scales: Written, float32 [N, 3].
         d_view: Written, float64 [CHUNKS, 3, 4].
@@ -314,7 +314,7 @@ def project_vjp(
 
 @always_inline
 def _block_vjp(block, pose, lens, eps2d, gradients, sums):
-    """The gradients of a block's means, quaternions and scales; those of the pose are added up."""
+    """The gradients of a block's means, quaternions and scales; the pose's are accumulated."""
     for lane in range(BLOCK):
         x, y, z = _in_camera(block, lane, pose)
         J = _jacobian(x, y, z, lens)
@@ -337,7 +337,7 @@ def _block_vjp(block, pose, lens, eps2d, gradients, sums):
         along = (
             d_quat[0] * quat[0] + d_quat[1] * quat[1] + d_quat[2] * quat[2] + d_quat[3] * quat[3]
         )
-        for k in range(4):  # the length of q changes nothing
+        for k in range(4):  # d (q / |q|): the component along q vanishes
             gradients[Q + k, lane] = (d_quat[k] - along * quat[k]) * over
         dT0 = _dot(R[0], dU0), _dot(R[1], dU0), _dot(R[2], dU0)
         dT1 = _dot(R[0], dU1), _dot(R[1], dU1), _dot(R[2], dU1)
@@ -356,7 +356,7 @@ def _block_vjp(block, pose, lens, eps2d, gradients, sums):
 
 @always_inline
 def _covariance_vjp(block, lane, P0, P1, eps2d):
-    """From the conic and the compensation to the covariance."""
+    """D covariance (xx, xy, yy), from d conic and d compensation."""
     raw_xx, xy, raw_yy = _dot(P0, P0), _dot(P0, P1), _dot(P1, P1)
     xx, yy = raw_xx + eps2d, raw_yy + eps2d
     over = 1.0 / (xx * yy - xy * xy)
@@ -365,6 +365,7 @@ def _covariance_vjp(block, lane, P0, P1, eps2d):
     # d covariance = -X G X for the inverse X and the symmetric gradient G
     ga, gb = da * a + 0.5 * db * b, da * b + 0.5 * db * c
     ha, hb = 0.5 * db * a + dc * b, 0.5 * db * b + dc * c
+    # compensation = sqrt(raw over): by d raw / (2 raw) and d over / (2 over)
     raw = raw_xx * raw_yy - xy * xy
     scaled = 0.5 * block[DCOMPENSATION, lane] * math.sqrt(max(raw * over, 0.0))
     by_raw = scaled / raw if raw > 0.0 else 0.0
@@ -378,7 +379,7 @@ def _covariance_vjp(block, lane, P0, P1, eps2d):
 
 @always_inline
 def _rotation_vjp(quat, dR):
-    """From R to the normalised quaternion, as if it were any."""
+    """D quaternion from d R, before the projection onto unit quaternions."""
     w, x, y, z = quat
     (d00, d01, d02), (d10, d11, d12), (d20, d21, d22) = dR
     skew_x, skew_y, skew_z = d21 - d12, d02 - d20, d10 - d01
@@ -393,11 +394,11 @@ def _rotation_vjp(quat, dR):
 
 @always_inline
 def _place_vjp(block, lane, x, y, z, lens, J, dJ):
-    """From J, the 2D mean and the depth to the mean in camera axes."""
+    """D (x, y, z) in camera axes, from d J, d mean2d and d depth."""
     _, _, _, _, low_x, high_x, low_y, high_y = lens
     over = 1.0 / z
     x_z, y_z = x * over, y * over
-    # Where x / z is not held back, J02 also follows it.
+    # J02 = -J00 x / z depends on x only where x / z is not clamped; J12 likewise.
     by_x = dJ[1] * J[0] * over if low_x <= x_z <= high_x else 0.0
     by_y = dJ[3] * J[2] * over if low_y <= y_z <= high_y else 0.0
     du, dv = block[DU, lane] * J[0], block[DV, lane] * J[2]

@@ -1,8 +1,8 @@
 """``rasterization``: gsplat's signature, on the CPU.
 
-Meant for code written against gsplat 1.5.3: arguments, results and the ``info`` dict are gsplat's,
-so that its default densification runs unchanged, and MCMC by way of
-``splatseed.render.MCMCStrategy``. What the CPU does not do (fisheye and orthographic cameras,
+For code written against gsplat 1.5.3: arguments, results and the ``info`` dict are gsplat's, so
+that its default densification runs unchanged, and MCMC through
+``splatseed.render.MCMCStrategy``. What the CPU does not support (fisheye and orthographic cameras,
 distributed rendering, rolling shutter) is refused, never ignored.
 """
 
@@ -74,23 +74,21 @@ def rasterization(
         Ks: Pinhole matrices in px, [C, 3, 3].
         width: Pixels.
         height: Pixels.
-        near_plane: Least z.
-        far_plane: Greatest z.
+        near_plane: Smallest z.
+        far_plane: Largest z.
         radius_clip: Gaussians no larger than this are left out, px.
         eps2d: Blur added to the 2D covariance, px^2.
-        sh_degree: Degree of spherical harmonics, 0 to 3; None takes colours as they are.
+        sh_degree: Degree of spherical harmonics, 0 to 3; None uses colours directly.
         packed: Whether ``info`` lists visible Gaussians only; the image is the same.
-        tile_size: Pixels a tile of ``info``'s lists is wide and high; the image has tiles of its
-            own.
+        tile_size: Side in pixels of the tiles in ``info``'s lists; rendering uses tiles of its own.
         backgrounds: Colours behind everything, [C, D].
         render_mode: Colour, depth accumulated (D) or expected (ED), or both.
-        sparse_grad: Whether what comes through projection to the gradients of means, quats and
-            scales is sparse (COO) and lists only the Gaussians that are seen; needs ``packed``.
-            Means that also get a gradient from harmonics' directions end with a dense one, as in
-            gsplat.
+        sparse_grad: Whether the gradients of means, quats and scales through projection are sparse
+            (COO) and list only the visible Gaussians; needs ``packed``. Means that also get a
+            gradient from the harmonics' directions have a dense one, as in gsplat.
         absgrad: Whether ``info["means2d"].absgrad`` is set by backward.
-        rasterize_mode: "antialiased" lowers opacities by what the blur adds.
-        channel_chunk: Kept for gsplat's sake.
+        rasterize_mode: "antialiased" compensates opacities for the blur.
+        channel_chunk: Accepted for compatibility with gsplat.
         unsupported: gsplat's further arguments; only their defaults are accepted.
 
     Returns:
@@ -197,14 +195,14 @@ def _colors(
         base = base[camera]
     if sh_degree is None:
         return base
-    # The general inverse, as gsplat takes it: the rigid one has another gradient off the rotations.
+    # The general inverse, as in gsplat: the rigid one has another gradient off the rotations.
     origin = torch.linalg.inv_ex(viewmats[camera]).inverse[:3, 3]
     shades: Tensor = Harmonics.apply(means, origin, base, rest, view.radii, sh_degree)  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
     return shades
 
 
 def _with_depth(colors: Tensor, view: View, render_mode: RenderMode) -> Tensor:
-    """The channels that the mode asks for, depth last."""
+    """The channels of a render mode, depth last."""
     if render_mode == "RGB":
         return colors
     depth = view.depths[:, None]
@@ -212,7 +210,7 @@ def _with_depth(colors: Tensor, view: View, render_mode: RenderMode) -> Tensor:
 
 
 def _background(backgrounds: Tensor | None, render_mode: RenderMode) -> Tensor | None:
-    """Backgrounds with a depth of 0 where there is a depth channel."""
+    """Backgrounds, with depth 0 if there is a depth channel."""
     if backgrounds is None or render_mode == "RGB":
         return backgrounds
     depth = torch.zeros_like(backgrounds[..., :1])
@@ -246,8 +244,8 @@ def _blend(
         )  # fmt: skip
         images.append(image)
         alphas.append(alpha[..., None])
-    # Copies also of one: backward reads the image, and who changes it in place must not disturb
-    # that.
+    # Copied even for one camera: backward reads the image, so in-place changes by the caller must
+    # not reach it.
     return torch.stack(images), torch.stack(alphas)
 
 

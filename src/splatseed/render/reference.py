@@ -1,8 +1,8 @@
 """The specification of the rasteriser: slow, dense, readable, float64 if its inputs are.
 
-Every Gaussian meets every pixel; PyTorch's autograd gives all gradients. The fast stages are held
-to this file by tests; where they disagree, this file is right. Conventions: OpenCV camera axes,
-pixel centres at +0.5, quaternions wxyz. Cut-offs are those that gsplat 1.5.3 publishes.
+Every Gaussian meets every pixel; PyTorch's autograd gives all gradients. Tests compare the fast
+stages with this file; where they disagree, this file is right. Conventions: OpenCV camera axes,
+pixel centres at +0.5, quaternions wxyz. Cut-offs are those of gsplat 1.5.3.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def rasterize_reference(
         K: [3, 3], px.
         width: Pixels.
         height: Pixels.
-        near_plane: Least z.
-        far_plane: Greatest z.
+        near_plane: Smallest z.
+        far_plane: Largest z.
         eps2d: px^2.
         background: [D].
         antialiased: Whether opacities are compensated for the blur.
@@ -58,7 +58,7 @@ def rasterize_reference(
     """
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     in_range = (points[:, 2] >= near_plane) & (points[:, 2] <= far_plane)
-    # Culled ones stand far in front of the camera: their gradients must not be NaN.
+    # Culled Gaussians are moved far in front of the camera: their gradients must not be NaN.
     points = torch.where(in_range[:, None], points, torch.tensor([0.0, 0.0, 1.0]).to(points))
     means2d = points[:, :2] / points[:, 2:] * _focal(K) + K[:2, 2]
     covariance, raw = _covariance2d(points, quats, scales, viewmat, K, width, height, eps2d)
@@ -136,7 +136,7 @@ def _touches_image(
 def _blend(
     means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
-    """Gaussians in depth order into pixels: image [H, W, D] and what passes, [H, W]."""
+    """Gaussians in depth order into pixels: image [H, W, D] and the final transmittance [H, W]."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     pixels = torch.stack([x, y], dim=-1).to(means2d) + 0.5
     transmittance = torch.ones(height, width).to(means2d)

@@ -1,12 +1,12 @@
-"""What gsplat's MCMC strategy has in CUDA only, for the CPU: splitting a Gaussian, and covariances.
+"""gsplat's CUDA-only helpers of its MCMC strategy, for the CPU: relocation and covariances.
 
-Notation: o opacity, s scales, n how many Gaussians share the place. With o' = 1 - (1 - o)^(1/n)
+Notation: o opacity, s scales, n the number of Gaussians at one place. With o' = 1 - (1 - o)^(1/n)
 (3DGS as MCMC, Kheradmand et al. 2024, eq. 9; the double sum folded by the hockey-stick identity):
 
     s' = s o / sum_{k=0}^{n-1} (-1)^k C(n, k+1) o'^(k+1) / sqrt(k+1)
 
-Promise: float64 inside, as the sum alternates; gsplat's files are not touched, and CUDA tensors go
-to gsplat's own functions.
+Promise: float64 inside, because the sum alternates; gsplat's files are not touched, and CUDA
+tensors go to gsplat's own functions.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ def compute_relocation(
     ratios: Int[Tensor, " N"],
     binoms: Float[Tensor, "M M"],
 ) -> tuple[Tensor, Float[Tensor, "N 3"]]:
-    """Opacities, shaped as they came, and scales [N, 3] of each of ``ratios`` Gaussians for one.
+    """Opacities (in their shape) and scales [N, 3] of ``ratios`` Gaussians that replace one.
 
     Args:
         opacities: From 0 to 1, [N] or [N, 1].
         scales: Standard deviations, [N, 3].
-        ratios: How many share the place, [N]; taken as at most M.
+        ratios: Number of Gaussians at one place, [N]; limited to M.
         binoms: gsplat's table of binomial coefficients; only its size is used.
     """
     if opacities.is_cuda:
@@ -64,14 +64,14 @@ def covariances(
     compute_preci: bool = False,
     triu: bool = False,
 ) -> tuple[Float[Tensor, "N 3 3"], None]:
-    """R S S R' of each Gaussian, [N, 3, 3]; element by element, as small products are slow in BLAS.
+    """R S S R' of each Gaussian, [N, 3, 3]; written out, because small products are slow in BLAS.
 
     Args:
         quats: wxyz rotations of any length, [N, 4].
         scales: Standard deviations, [N, 3].
-        compute_covar: gsplat's flag; on the CPU covariances are always given.
+        compute_covar: gsplat's flag; on the CPU covariances are always returned.
         compute_preci: gsplat's flag; on the CPU precisions never are.
-        triu: gsplat's flag; on the CPU matrices are always whole.
+        triu: gsplat's flag; on the CPU matrices are always full.
     """
     if quats.is_cuda:
         from gsplat import quat_scale_to_covar_preci as on_cuda  # noqa: PLC0415  (needs CUDA)
@@ -93,7 +93,7 @@ def _coefficients(largest: int) -> Float[Tensor, "n k"]:
 
 
 class _Replaced:
-    """gsplat's own functions while any block of ``mcmc_on_cpu`` runs, in whatever thread."""
+    """gsplat's own functions, while any ``mcmc_on_cpu`` block runs in any thread."""
 
     lock = Lock()
     blocks = 0
@@ -102,10 +102,10 @@ class _Replaced:
 
 @contextmanager
 def mcmc_on_cpu() -> Iterator[None]:
-    """While the block runs, gsplat's MCMC strategy takes CPU tensors; CUDA tensors as ever.
+    """While the block runs, gsplat's MCMC strategy accepts CPU tensors; CUDA tensors as ever.
 
-    For code that makes gsplat's ``MCMCStrategy``, or one derived from it, and is left as it is: put
-    its training loop into the block. Blocks may lie within one another and run in several threads.
+    For code that uses gsplat's ``MCMCStrategy``, or a subclass, and stays unchanged: put its
+    training loop into the block. Blocks may be nested and run in several threads.
 
     Raises:
         MissingDependencyError: gsplat is absent.

@@ -1,8 +1,8 @@
-"""What ``rasterization`` accepts on the CPU; kernels index without bounds checks and rely on it.
+"""Checks of ``rasterization``'s arguments on the CPU; kernels rely on them to skip bounds checks.
 
 Notation: N Gaussians, C cameras, D channels, K coefficients a channel, as in ``rasterization``.
 Promise: whatever the kernels could not read, and whatever only gsplat's CUDA code does, raises one
-``ParameterError`` here; nothing is ignored and nothing is rendered before.
+``ParameterError`` here; nothing is ignored and nothing is rendered first.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ CUDA_ONLY: Mapping[str, object] = {
 
 
 def check_unsupported(arguments: Mapping[str, object]) -> None:
-    """Refuse what only gsplat's CUDA code does, and what nobody does.
+    """Refuse arguments that only gsplat's CUDA code supports, and unknown ones.
 
     Raises:
         ParameterError: An unknown name, or one of ``CUDA_ONLY`` that is not at its default.
@@ -50,7 +50,7 @@ def check_unsupported(arguments: Mapping[str, object]) -> None:
                 found=repr(name),
                 fix="Correct the name, or leave it out.",
             )
-        # gsplat's own default for the shutter is an enumeration's member, known here by its name.
+        # gsplat's default for the shutter is an enumeration member, recognised by its name.
         is_default = value is CUDA_ONLY[name] or getattr(value, "name", None) == "GLOBAL"
         if not is_default and not (isinstance(value, str) and value == CUDA_ONLY[name]):
             raise ParameterError(
@@ -69,13 +69,13 @@ def check_numbers(
     sh_degree: int | None,
     **choices: tuple[str, object],
 ) -> None:
-    """Check what is not a tensor.
+    """Check the arguments that are not tensors.
 
     Args:
         width: Pixels, at least 1.
         height: Pixels, at least 1.
         tile_size: Pixels, at least 1.
-        near_plane: At least 0: depths sort as their bits do only where they are not negative.
+        near_plane: At least 0: depths sort like their bits only if not negative.
         eps2d: px^2, at least 0.
         sh_degree: None, or 0 to ``MAX_DEGREE``.
         choices: By name, a value and the ``Literal`` of those allowed.
@@ -104,7 +104,7 @@ def check_tensors(
     """Check types and shapes: colors, means, quats, scales, opacities, viewmats, Ks, backgrounds.
 
     Raises:
-        ParameterError: One is not a float32 CPU tensor or its shape does not go with the others'.
+        ParameterError: One is not a float32 CPU tensor, or its shape does not fit the others.
     """
     parts = colors if isinstance(colors, tuple) else (colors,)
     for name, each in (*tensors.items(), *(("colors", part) for part in parts)):
@@ -134,7 +134,7 @@ def check_tensors(
 def _check_colors(
     colors: Any, n: tuple[int, ...], cameras: tuple[int, ...], sh_degree: int | None
 ) -> None:
-    """Shared by the cameras or one set per camera: only the number of axes tells them apart."""
+    """Colours shared by the cameras or one set per camera: the number of axes decides."""
     terms = 0 if sh_degree is None else (sh_degree + 1) ** 2
     one, axes = ("D", 2) if sh_degree is None else (f"K >= {terms}, 3", 3)
     shape = tuple(colors.shape)
@@ -161,7 +161,7 @@ def _check_pair(colors: tuple[Tensor, ...], n: tuple[int, ...], sh_degree: int |
 
 
 def check_absgrad(absgrad: bool, channels: int) -> None:
-    """Refuse absolute gradients of more channels than one pass takes: they do not add up.
+    """Refuse absolute gradients of more channels than one pass takes: they are not additive.
 
     Raises:
         ParameterError: There are more than ``CHANNELS``, depth included.
@@ -171,7 +171,7 @@ def check_absgrad(absgrad: bool, channels: int) -> None:
 
 
 def check_sparse(sparse_grad: bool, packed: bool) -> None:
-    """Refuse sparse gradients of what is not packed, as gsplat does.
+    """Refuse sparse gradients without packing, as gsplat does.
 
     Raises:
         ParameterError: ``sparse_grad`` without ``packed``.

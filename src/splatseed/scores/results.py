@@ -1,8 +1,8 @@
-"""Scores: how well test views were rendered, at the end of a run and on its way there.
+"""Scores: how well test views were rendered, at the end of a run and during it.
 
-Notation: PSNR in dB, SSIM and LPIPS without unit; seconds are wall time. Promise: these are the
-types of results from evaluation through training to a benchmark's ledger; means are means over
-images of per-image values; what was not measured is None, with the reason beside it.
+Notation: PSNR in dB, SSIM and LPIPS without unit; seconds are wall time. Promise: results have
+these types from evaluation through training to a benchmark's ledger; means are means over images of
+per-image values; what was not measured is None, with the reason beside it.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ class ViewScore:
         name: The image's name in its scene.
         psnr: Peak signal-to-noise ratio in dB; higher is better, infinite for equal images.
         ssim: Structural similarity, 1 for equal images.
-        lpips: Perceptual distance, 0 for equal images; None where it was not measured.
+        lpips: Perceptual distance, 0 for equal images; None if not measured.
         seconds: Time to render it.
-        covisible_psnr: PSNR over the pixels that at least two training views see; None where
-            these are not known or there are none.
-        covisible_share: The share of such pixels; None where they are not known.
+        covisible_psnr: PSNR over the pixels that at least two training views see; None if unknown,
+            or if there are none.
+        covisible_share: The share of such pixels; None if unknown.
     """
 
     name: str
@@ -48,9 +48,9 @@ class EvalResult:
 
     Args:
         per_image: One score per view, in the views' order; at least one.
-        lpips_net: The network that LPIPS was measured with; None where it was not measured.
-        lpips_reason: Why LPIPS was not measured; empty where it was.
-        num_gaussians: How many Gaussians were rendered; None where the renderer is a black box.
+        lpips_net: The network of LPIPS; None if not measured.
+        lpips_reason: Why LPIPS was not measured; empty if it was.
+        num_gaussians: How many Gaussians were rendered; None if the renderer is a black box.
         model_bytes: Bytes of their parameters as float32; None likewise.
     """
 
@@ -91,7 +91,7 @@ class EvalResult:
         return _mean(score.seconds for score in self.per_image)
 
     def to_dict(self) -> dict[str, Any]:
-        """The result as plain values; a number that JSON does not know (infinite) is None."""
+        """The result as plain values; infinity, which JSON lacks, becomes None."""
         means = {
             "psnr": self.psnr,
             "ssim": self.ssim,
@@ -112,7 +112,7 @@ class EvalResult:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """What ``to_dict`` gave; means are taken anew, and keys that are not known passed over."""
+        """The inverse of ``to_dict``; means are recomputed, and unknown keys ignored."""
         per_image = tuple(_view_score(each) for each in values["per_image"])
         known = {each.name for each in fields(cls)} - {"per_image"}
         return cls(per_image, **{key: values[key] for key in known if key in values})
@@ -120,13 +120,13 @@ class EvalResult:
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """The test views on the way.
+    """Scores of the test views during training.
 
     Args:
         step: Steps done.
-        seconds: Spent training until then.
+        seconds: Seconds of training so far.
         psnr: Mean PSNR in dB.
-        num_gaussians: How many there were.
+        num_gaussians: Number of Gaussians.
         ssim: Mean SSIM; None in results of versions that did not measure it.
     """
 
@@ -139,15 +139,15 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a training run gave.
+    """The result of a training run.
 
     Args:
-        scores: Of the test views at the end.
-        curve: The test views on the way, in order of steps.
+        scores: Scores of the test views at the end.
+        curve: Scores of the test views during training, in order of steps.
         steps: Steps done.
         train_seconds: Wall time of the training steps alone.
         num_seeds: Points that training began with.
-        held_by_memory_at: Gaussians at which a lack of memory ended growth; None where none did.
+        held_by_memory_at: Gaussians at which a lack of memory ended growth; None if it did not.
     """
 
     scores: EvalResult
@@ -158,7 +158,7 @@ class TrainingResult:
     held_by_memory_at: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """As ``metrics.json`` has it: the scores' values and the others side by side."""
+        """The content of ``metrics.json``: the scores' values and the others side by side."""
         others = {key: getattr(self, key) for key in ("steps", "train_seconds", "num_seeds")}
         tests = [_finite(asdict(point)) for point in self.curve]
         held = {"held_by_memory_at": self.held_by_memory_at}
@@ -166,7 +166,7 @@ class TrainingResult:
 
 
 def _view_score(values: Mapping[str, Any]) -> ViewScore:
-    """A view's scores; JSON has no infinity, which the PSNR of equal images is."""
+    """A view's scores; equal images have an infinite PSNR, which JSON lacks."""
     known = {each.name for each in fields(ViewScore)}
     told = {key: value for key, value in values.items() if key in known}
     psnr = math.inf if told["psnr"] is None else told["psnr"]

@@ -1,8 +1,8 @@
-"""Seeding: seeds where the photographs need them, as many as are asked for.
+"""Seeding: as many seeds as asked for, where the photographs need them.
 
-``cover`` puts one where no point is seen, ``budget`` chooses which are kept. Import from the
-modules: ``splatseed.seeding.cover`` and its neighbours, so that none is loaded before it is needed.
-The methods that look at photographs join ``METHODS`` here.
+``cover`` puts one wherever no point is seen, ``budget`` chooses which are kept. Import from the
+modules, as in ``splatseed.seeding.cover``, so that none is loaded before it is needed. The methods
+that look at photographs join ``METHODS`` here.
 """
 
 from splatseed.upsample.registry import add_built_in

@@ -1,14 +1,14 @@
-"""A budget: how many seeds, and which are kept of too many.
+"""A budget: how many seeds there may be, and which are kept if there are more.
 
-Notation: N points, of which ``num`` are kept. The views that see a point most closely are those in
-whose frame it falls at the smallest depth / focal length: ``CLOSEST`` of them. With a *spacing* of
+Notation: N points, of which ``num`` are kept. The views that see a point most closely are the
+``CLOSEST`` ones in whose frame it falls at the smallest depth / focal length. With a *spacing* of
 s pixels, a view's frame is cut into cells of s x s pixels, and its depth into slices of ``DEEP``
 times that. A point is *needed* at a spacing if, in the view that sees it most closely, no kept
 point lies in its cell.
-Promise: points are asked in order, the originals first and then by priority; each is kept if it is
-needed, at the smallest spacing that keeps no more than ``num``; what is left of the number is
-filled up at smaller spacings. So the only point of a cell is kept before the second of any, nothing
-is drawn at random, and the bytes do not depend on the threads.
+Promise: points are visited in order, the originals first and then by priority; each is kept if it
+is needed, at the smallest spacing that keeps no more than ``num``; the remainder is filled up at
+smaller spacings. So the only point of a cell is kept before the second of any, nothing is random,
+and the bytes do not depend on the threads.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from splatseed.views.view import View
 __all__ = ["median_pixels", "parse_budget", "thin"]
 
 CLOSEST = 4
-"""Views in which a kept point is marked: enough that neighbours share one, few enough to be
+"""Views in which a kept point is marked: enough for neighbours to share one, few enough to be
 quick."""
 DEEP = 4.0
 """Slices of depth, in cells: deep enough that noise along the ray makes no new cell."""
 CHUNKS = 64
 BLOCK = 512
 FINEST, COARSEST = 1.0 / 16, 1 << 14
-"""Spacings that are tried, in pixels."""
+"""Range of spacings that are tried, in pixels."""
 CLOSE_ENOUGH = 0.02
-"""How many fewer than the number a spacing may keep."""
+"""By how many points a spacing may fall short of the number."""
 STEPS = 24
 LEAST_POWER = 0.2
 """Least exponent e assumed in: number kept ~ (1 / spacing)^e; bounds a step. On surfaces e is 2."""
 ACROSS = 4096.0
-"""Pixels that a cloud without views is taken to measure."""
+"""Nominal width in pixels of a cloud without views."""
 FREE = np.uint64(0)
 
 
@@ -51,7 +51,8 @@ def parse_budget(budget: str | float, pixels: float) -> int:
     """The number of seeds that a budget asks for.
 
     Args:
-        budget: A number such as 50000 or "50000", or "0.25rho", Gaussians per pixel of one image.
+        budget: A number such as 50000 or "50000", or "0.25rho" for Gaussians per pixel of one
+            image.
         pixels: Pixels of one image; see ``median_pixels``.
 
     Raises:
@@ -73,7 +74,7 @@ def parse_budget(budget: str | float, pixels: float) -> int:
 
 
 def median_pixels(views: Sequence[View]) -> float:
-    """Pixels of the median view.
+    """The number of pixels of the median view.
 
     Raises:
         ParameterError: There is no view.
@@ -93,16 +94,16 @@ def thin(
     first: int = 0,
     priority: Float[np.ndarray, " N"] | None = None,
 ) -> Int64[np.ndarray, " num"]:
-    """Which points to keep of too many.
+    """Which points to keep.
 
     Args:
         xyz: The points, in the world.
-        views: Of which only cameras and sizes are looked at. Without any, cells are cubes in space.
+        views: Only their cameras and sizes matter. Without any, cells are cubes in space.
         num: How many to keep, at least 1.
-        first: How many of the points, from the first on, are asked before the others: the
+        first: How many of the points, from the first on, are visited before the others: the
             originals.
-        priority: The higher is asked earlier, among originals and among the others; all equal when
-            left out. Points of equal priority are asked in their order.
+        priority: Higher ones are visited earlier, among originals and among the others; all equal
+            when left out. Points of equal priority are visited in their order.
 
     Returns:
         Indices, rising, int64 [min(num, N)].
@@ -122,7 +123,7 @@ def thin(
     while spacing > FINEST and np.count_nonzero(kept) < num:
         spacing /= 2
         places.keep(order, spacing, num, kept)
-    rest = order[~kept[order]]  # they coincide with others, or, asked last, no view has them
+    rest = order[~kept[order]]  # they coincide with others, or no view sees them
     rest = rest[np.argsort(places.group[rest, 0] < 0, stable=True)]
     kept[rest[: num - np.count_nonzero(kept)]] = True
     return np.flatnonzero(kept)
@@ -135,7 +136,7 @@ def _check_bare(xyz: Float32[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N 3"]:
 def _order(
     num: int, first: int, priority: Float[np.ndarray, " N"] | None
 ) -> Int64[np.ndarray, " N"]:
-    """The points in the order in which they are asked."""
+    """The points in the order in which they are visited."""
     if priority is None:
         return np.arange(num)
     priority = np.asarray(priority, np.float64)
@@ -150,7 +151,7 @@ def _order(
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Where points are in the views that see them most closely.
+    """Where points lie in the views that see them most closely.
 
     Args:
         group: The views, closest first, int32 [N, k]; -1 where there are no more.
@@ -167,7 +168,7 @@ class _Places:
         limit: int,
         kept: Bool[np.ndarray, " N"],
     ) -> int:
-        """Keep more points, up to ``limit`` in all, and say how many are kept then."""
+        """Keep more points, up to ``limit`` in all, and return how many are kept then."""
         slots = 1 << int(2 * limit * self.group.shape[1]).bit_length()  # at most half full
         return int(_keep(order, self.group, self.place, spacing, limit, slots, kept))
 
@@ -175,7 +176,7 @@ class _Places:
 def _keep_at_one_spacing(
     places: _Places, order: Int64[np.ndarray, " N"], num: int
 ) -> tuple[Bool[np.ndarray, " N"], float]:
-    """What the smallest spacing keeps that keeps no more than ``num``, and that spacing."""
+    """Which points the smallest spacing with at most ``num`` keeps, and that spacing."""
     best = np.zeros(len(order), np.bool_)
     low, high = FINEST, float(COARSEST)
     target, spacing, power = (1.0 - CLOSE_ENOUGH / 2) * num, 2.0, 2.0
@@ -190,7 +191,7 @@ def _keep_at_one_spacing(
             best, high = kept, spacing
             if count >= (1.0 - CLOSE_ENOUGH) * num or spacing == FINEST:
                 break
-        if count < limit:  # else it is where counting stopped
+        if count < limit:  # else counting stopped early
             if known is not None and count != known[1]:
                 power = math.log(count / known[1]) / math.log(known[0] / spacing)
             known = spacing, count
@@ -201,7 +202,7 @@ def _keep_at_one_spacing(
 
 
 def _places_in_space(xyz: Float32[np.ndarray, "N 3"]) -> _Places:
-    """Places without views: the cloud is taken to be some thousand pixels across."""
+    """Places without views: the cloud counts as about a thousand pixels across."""
     finite = np.isfinite(xyz).all(axis=1)
     inside = xyz[finite].astype(np.float64)
     low = inside.min(axis=0, initial=np.inf)
@@ -223,7 +224,7 @@ def _places_in_views(xyz: Float32[np.ndarray, "N 3"], views: Sequence[View]) -> 
 
 
 @kernel
-def _find_closest(xyz, matrices, focals, sizes, group, place):  # type: ignore[no-untyped-def]
+def _find_closest(xyz, matrices, focals, sizes, group, place):  # type: ignore[no-untyped-def]  # Numba's types
     for c in parallel_range(CHUNKS):
         at = np.empty((3, BLOCK))
         stop = len(xyz) * (c + 1) // CHUNKS
@@ -244,8 +245,8 @@ def _find_closest(xyz, matrices, focals, sizes, group, place):  # type: ignore[n
 
 
 @inline
-def _insert(close, v, at, closeness, group, place):  # type: ignore[no-untyped-def]
-    """Put a view in its place among the closest; of equals the earlier stays before."""
+def _insert(close, v, at, closeness, group, place):  # type: ignore[no-untyped-def]  # Numba's types
+    """Insert a view among the closest; among equals the earlier stays first."""
     k = len(closeness) - 1
     while k > 0 and closeness[k - 1] < close:
         closeness[k], group[k], place[k] = closeness[k - 1], group[k - 1], place[k - 1]
@@ -256,8 +257,8 @@ def _insert(close, v, at, closeness, group, place):  # type: ignore[no-untyped-d
 
 
 @inline
-def _keep(order, group, place, spacing, limit, slots, kept):  # type: ignore[no-untyped-def]
-    """Mark the points that are needed, in order, beside those that are marked already."""
+def _keep(order, group, place, spacing, limit, slots, kept):  # type: ignore[no-untyped-def]  # Numba's types
+    """Mark the points that are needed, in order, besides those already marked."""
     table = np.full(slots, FREE)
     count = 0
     for i in order:
@@ -277,7 +278,7 @@ def _keep(order, group, place, spacing, limit, slots, kept):  # type: ignore[no-
 
 
 @inline
-def _mark_cells(group, place, spacing, table):  # type: ignore[no-untyped-def]
+def _mark_cells(group, place, spacing, table):  # type: ignore[no-untyped-def]  # Numba's types
     for k in range(len(group)):
         if group[k] >= 0:
             key = _key(group[k], place[k], spacing)
@@ -285,8 +286,8 @@ def _mark_cells(group, place, spacing, table):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _key(group, place, spacing):  # type: ignore[no-untyped-def]
-    """A number of 64 bits for a cell of a view; that two share one is not to be expected."""
+def _key(group, place, spacing):  # type: ignore[no-untyped-def]  # Numba's types
+    """A 64-bit key for a cell of a view; collisions are not to be expected."""
     key = scramble(np.uint64(group))
     for axis in range(3):
         key = scramble(key ^ np.uint64(np.int64(np.floor(place[axis] / spacing))))
@@ -294,8 +295,8 @@ def _key(group, place, spacing):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _slot(key, table):  # type: ignore[no-untyped-def]
-    """Where a key is in a hash table with open addressing, or the free slot where it belongs."""
+def _slot(key, table):  # type: ignore[no-untyped-def]  # Numba's types
+    """The slot of a key in a hash table with open addressing, or the free slot where it belongs."""
     last = np.uint64(len(table) - 1)
     slot = key & last
     while table[slot] != FREE and table[slot] != key:

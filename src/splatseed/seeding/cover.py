@@ -1,14 +1,14 @@
 """Cover: a seed in every part of every photograph that no point covers.
 
-Notation: cells, their depths and *covered* are those of ``coverage``. Views are taken in random
-order, each seeing the seeds of those before. An empty cell gets one seed on the ray through its
-centre, at the depth that ``guess`` finds: a median over the covered cells around it, in which
-depths count less that other views look through. Where a view has no covered cell, the median depth
-of all views must do.
+Notation: cells, their depths and *covered* are defined in ``coverage``. Views are taken in random
+order, each seeing the seeds of the views before. An empty cell gets one seed on the ray through its
+centre, at the depth that ``guess`` estimates: a median over the covered cells around it, in which
+depths count less if other views look through them. If a view has no covered cell, the median depth
+of all views is used.
 Promise: a cover seed is a guess and says so by its confidence; the same seed gives the same bytes
-on any number of cores: the views follow each other, on one.
+on any number of cores: views are processed one after another.
 
-How the rule was chosen is in ``benchmarks/README.md``.
+benchmarks/README.md says how the rule was chosen.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ __all__ = ["CoverSeeds", "cover"]
 WITNESSES = 12
 """Other views that are asked whether they look through a seed."""
 WITNESS_CELL = 8
-"""Their cells are no finer than this, in pixels."""
+"""Smallest cell of these views, in pixels."""
 MOST_CONFIDENT, LEAST_CONFIDENT = 0.3, 0.1
 """Confidence of a seed beside a covered cell, and of one far from all."""
 
@@ -51,7 +51,7 @@ class CoverSeeds:
     Args:
         xyz: Positions, float32 [M, 3], world.
         rgb: Mean colour of the cell, uint8 [M, 3].
-        view: Which of the views each was made for, int32 [M].
+        view: The view each was made for, int32 [M].
         size: Side of the cell at the seed's depth, float32 [M], scene units.
         confidence: 0.3 beside a covered cell, falling to 0.1, float32 [M].
     """
@@ -85,7 +85,7 @@ def cover(
 
     Args:
         views: Photographs with their cameras.
-        xyz: The points there are, in the world; those that are not finite are in no cell.
+        xyz: The existing points, in the world; those that are not finite are in no cell.
         cell: Side of a cell in pixels of the views, at least 1.
         rng: Draws the order of the views.
         masks: For each view which pixels count, or None for all. A cell gets no seed unless half of
@@ -119,7 +119,7 @@ def cover(
 
 
 def _draw_others(v: int, num: int, rng: np.random.Generator) -> Int64[np.ndarray, " K"]:
-    """Some of the other views, to be asked."""
+    """Some of the other views, drawn at random."""
     others = rng.choice(num - 1, min(WITNESSES, num - 1), replace=False)
     return others + (others >= v)
 
@@ -133,17 +133,17 @@ def _check_pixels(
             f"a mask or None for each of {len(views)} views", found=f"{len(masks)}", fix="Add None."
         )
     for view, mask in zip(views, masks, strict=True):
-        _check_size("pixels", view, view.image.shape[:2])
+        _check_size("pixels", view, view.photograph.shape[:2])
         if mask is not None:
             _check_size("a mask", view, np.shape(mask))
     return masks
 
 
-def _check_size(what: str, view: View, found: tuple[int, ...]) -> None:
-    if found != (view.height, view.width):
+def _check_size(what: str, view: View, size: tuple[int, ...]) -> None:
+    if size != (view.height, view.width):
         raise ParameterError(
             f"{what} of {view.width} x {view.height} for {view.name}",
-            found=" x ".join(map(str, reversed(found))),
+            found=" x ".join(map(str, reversed(size))),
             fix="Load the view with its photograph, and its mask at that size.",
         )
 
@@ -152,7 +152,7 @@ def _typical_depth(witnesses: Witnesses, num: int) -> np.float32:
     """The median depth of all covered cells, for views that see none.
 
     Raises:
-        PointCloudError: There is none at all.
+        PointCloudError: There are no covered cells.
     """
     depths = witnesses.depths[np.isfinite(witnesses.depths)]
     if not len(depths):
@@ -165,7 +165,7 @@ def _typical_depth(witnesses: Witnesses, num: int) -> np.float32:
 
 
 class _Growing:
-    """A cloud that points are added to, without a copy of all for each view."""
+    """A growing cloud, without a copy of everything for each view."""
 
     def __init__(self, xyz: Float32[np.ndarray, "N 3"]) -> None:
         self._room = xyz
@@ -193,12 +193,12 @@ def _make_seeds(
     guess: tuple[Float32[np.ndarray, " M"], Float32[np.ndarray, " M"]],
     mask: Mask | None,
 ) -> CoverSeeds:
-    """Seeds in empty cells at the depths that were guessed, but where too few pixels count."""
+    """Seeds in empty cells at the guessed depths, except where too few pixels count."""
     depths, reach = guess
     shape = grid_of(view, cell)
     used = np.ones((1, 1), np.bool_) if mask is None else np.asarray(mask, np.bool_)
     rgb, usable = np.empty((len(empty), 3), np.uint8), np.empty(len(empty), np.bool_)
-    _mean_colors(view.image, used, shape, empty, rgb, usable)
+    _mean_colors(view.photograph, used, shape, empty, rgb, usable)
     xyz = np.empty((len(empty), 3), np.float32)
     _lift_all(world_from_grid(view, cell), shape[1], empty, depths, xyz)
     usable &= np.isfinite(xyz).all(axis=1)
@@ -215,8 +215,8 @@ def _side_at_one(view: View, shape: tuple[int, ...]) -> float:
 
 
 @inline
-def _mean_colors(image, used, shape, empty, rgb, usable):  # type: ignore[no-untyped-def]
-    """The mean of each cell's pixels that count, and whether they are half of them."""
+def _mean_colors(image, used, shape, empty, rgb, usable):  # type: ignore[no-untyped-def]  # Numba's types
+    """The mean of each cell's pixels that count, and whether they make up half of it."""
     rows, cols = shape
     height, width = image.shape[:2]
     for k in range(len(empty)):
@@ -236,7 +236,7 @@ def _mean_colors(image, used, shape, empty, rgb, usable):  # type: ignore[no-unt
 
 
 @inline
-def _lift_all(m, cols, empty, depths, xyz):  # type: ignore[no-untyped-def]
+def _lift_all(m, cols, empty, depths, xyz):  # type: ignore[no-untyped-def]  # Numba's types
     """The points at these depths on the rays through the cells' centres."""
     point = np.empty(3)
     for k in range(len(empty)):

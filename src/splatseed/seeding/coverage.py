@@ -1,15 +1,15 @@
-"""Which parts of the pictures hold a point: the depths of a cloud on coarse cells.
+"""Which parts of the photographs hold a point: the depths of a cloud on coarse cells.
 
 Notation: a view of W x H pixels is cut into ``ceil(H / c) x ceil(W / c)`` equal cells, of c x c
-pixels or a little less. The depth (planar z) of a cell is the lower quartile of the depths of the
-points that fall into it, infinite where none does. A cell is *hidden* if at least ``HIDING`` of its
-eight neighbours are nearer by more than ``NEARER``: a surface hides what shows between its points.
-It is *covered* if it holds a point and is not hidden.
+pixels or a little less. The depth (planar z) of a cell is the lower quartile of the depths of its
+points, infinite if it has none. A cell is *hidden* if at least ``HIDING`` of its eight neighbours
+are nearer by more than ``NEARER``: a surface hides what shows between its points. A cell is
+*covered* if it holds a point and is not hidden.
 Promise: the bytes depend neither on the order of the points nor on the threads.
 
-The nearest depth, as a z-buffer keeps, will not do: of the points that their own tracks prove to be
-visible, a z-buffer that looks at neighbouring cells hides 7% (fox) to 97% (treehill), since
-Structure-from-Motion leaves a few points hanging in front of the cameras. This rule hides 0.3% to
+The nearest depth, as in a z-buffer, will not do: of the points that their own tracks prove to be
+visible, a z-buffer that looks at neighbouring cells hides 7% (fox) to 97% (treehill), because
+Structure-from-Motion leaves a few points floating in front of the cameras. This rule hides 0.3% to
 16%.
 """
 
@@ -41,13 +41,13 @@ __all__ = [
 ]
 
 NEARER = 0.1
-"""By how much of its depth a cell's neighbours must be nearer to hide it."""
+"""By what fraction of a cell's depth its neighbours must be nearer to hide it."""
 HIDING = 5
-"""How many of the eight must be."""
+"""How many of the eight neighbours must be nearer."""
 BLOCK = 512
-"""Points that are projected before any is put into its cell, so that the former is vectorised."""
+"""Points projected at a time before being sorted into cells, so that projection is vectorised."""
 GREATEST_DEPTH = 3e38
-"""Depths that float32 holds."""
+"""Depths that float32 can hold."""
 NONE = np.float32(np.inf)
 
 
@@ -57,10 +57,10 @@ def covered_share(
     cell: float = 8,
     progress: Progress = silent,
 ) -> float:
-    """The share of the cells of a view that are covered, 0 to 1, in the mean over the views.
+    """The fraction of a view's cells that are covered, 0 to 1, averaged over the views.
 
     Args:
-        views: The views; only their cameras and sizes are looked at.
+        views: The views; only their cameras and sizes matter.
         xyz: The points, in the world.
         cell: Side of a cell in pixels, at least 1.
         progress: Told how far it is.
@@ -78,14 +78,14 @@ def covered_cells(
     cell: float = 8,
     progress: Progress = silent,
 ) -> tuple[Bool[np.ndarray, "rows cols"], ...]:
-    """Which cells of each view are covered; takes and raises what ``covered_share`` does."""
+    """Which cells of each view are covered; arguments and errors as in ``covered_share``."""
     xyz = check_points(views, xyz, cell)
-    found: list[Bool[np.ndarray, "rows cols"]] = []
+    covered: list[Bool[np.ndarray, "rows cols"]] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the kernels release the GIL
         for depths in pool.map(lambda view: cell_depths(view, xyz, cell), views):
-            found.append(np.isfinite(depths))
-            progress("look for uncovered cells", len(found) / len(views))
-    return tuple(found)
+            covered.append(np.isfinite(depths))
+            progress("look for uncovered cells", len(covered) / len(views))
+    return tuple(covered)
 
 
 def check_points(
@@ -117,7 +117,7 @@ def grid_of(view: View, cell: float) -> tuple[int, int]:
 def grid_from_world(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
     """Homogeneous world coordinates to columns and rows of cells, and depth; float64 [3, 4].
 
-    Cell (i, j) reaches from row i to i + 1 and from column j to j + 1.
+    Cell (i, j) spans rows i to i + 1 and columns j to j + 1.
     """
     rows, cols = grid_of(view, cell)
     grid_from_pixels = np.diag([cols / view.width, rows / view.height, 1.0])
@@ -140,7 +140,7 @@ def cell_depths(
 
 
 @inline
-def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-untyped-def]
+def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-untyped-def]  # Numba's types
     """The cell and the depth of each point; -1 outside of the view and behind it."""
     at = np.empty((3, BLOCK))
     for start in range(0, len(xyz), BLOCK):
@@ -154,14 +154,14 @@ def _find_cells(xyz, matrix, rows, cols, cells, depths):  # type: ignore[no-unty
 
 
 @inline
-def project_block(xyz, m, at):  # type: ignore[no-untyped-def]
+def project_block(xyz, m, at):  # type: ignore[no-untyped-def]  # Numba's types
     """Column, row and depth of points [N, 3] into ``at`` [3, >= N]; NaN or infinite at depth 0."""
     for k in range(len(xyz)):
         at[0, k], at[1, k], at[2, k] = place(xyz[k], m)
 
 
 @inline
-def _sort_by_cell(cells, depths, num_cells):  # type: ignore[no-untyped-def]
+def _sort_by_cell(cells, depths, num_cells):  # type: ignore[no-untyped-def]  # Numba's types
     """Where each cell's depths begin, and the depths cell by cell: a counting sort."""
     starts = np.zeros(num_cells + 1, np.int64)
     for cell in cells:
@@ -179,8 +179,8 @@ def _sort_by_cell(cells, depths, num_cells):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _lower_quartiles(starts, by_cell, quartiles):  # type: ignore[no-untyped-def]
-    """Of n depths the n // 4-th in order, counted from 0."""
+def _lower_quartiles(starts, by_cell, quartiles):  # type: ignore[no-untyped-def]  # Numba's types
+    """The n // 4-th of n depths in order, counted from 0."""
     rows, cols = quartiles.shape
     for i in range(rows):
         for j in range(cols):
@@ -189,8 +189,8 @@ def _lower_quartiles(starts, by_cell, quartiles):  # type: ignore[no-untyped-def
 
 
 @inline
-def _select(values, k):  # type: ignore[no-untyped-def]
-    """The k-th smallest, by Hoare's quickselect, which moves the values."""
+def _select(values, k):  # type: ignore[no-untyped-def]  # Numba's types
+    """The k-th smallest, by Hoare's quickselect, which reorders the values."""
     low, high = 0, len(values) - 1
     while low < high:
         pivot = values[(low + high) // 2]
@@ -213,7 +213,7 @@ def _select(values, k):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _drop_hidden(depths, visible):  # type: ignore[no-untyped-def]
+def _drop_hidden(depths, visible):  # type: ignore[no-untyped-def]  # Numba's types
     rows, cols = depths.shape
     for i in range(rows):
         for j in range(cols):

@@ -1,11 +1,11 @@
-"""Guesses of the depth of a view's empty cells, from the covered cells around and from other views.
+"""Guesses of the depth of a view's empty cells, from surrounding covered cells and other views.
 
-Notation: of each of eight sectors of 45 degrees around an empty cell the nearest covered cell is
-asked, no farther than ``2 r + 1`` cells where r is how far the first is. A seed at its depth, on
-the ray through the empty cell's centre, is *contradicted* by another view if it stands there in
-front of a covered cell, nearer by more than ``NEARER``: that view looks through it. The guess is
-the median of the sectors' depths, weighted by ``1 / ((1 + contradictions) distance^2)``.
-Promise: a guess is a depth of the view; the bytes do not depend on the threads.
+Notation: in each of eight sectors of 45 degrees around an empty cell the nearest covered cell is
+consulted, up to ``2 r + 1`` cells away, where r is the distance of the first one. A seed at its
+depth, on the ray through the empty cell's centre, is *contradicted* by another view if it lies in
+front of a covered cell there, nearer by more than ``NEARER``: that view looks through it. The guess
+is the median of the sectors' depths, weighted by ``1 / ((1 + contradictions) distance^2)``.
+Promise: a guess is one of the view's depths; the bytes do not depend on the threads.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ SECTORS = 8
 
 @dataclass(frozen=True, eq=False)
 class Witnesses:
-    """What each of V views sees of the points that were there first.
+    """What each of V views sees of the initial points.
 
     Args:
         grid_from_world: To columns and rows of cells, and depth, float64 [V, 3, 4].
         shapes: Rows and columns of each view, int64 [V, 2].
-        starts: Where each view's depths begin, int64 [V].
+        starts: Start of each view's depths, int64 [V].
         depths: Of all cells, view by view and row by row, float32; infinite where not covered.
     """
 
@@ -50,17 +50,17 @@ def call_witnesses(
     views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], cell: float, progress: Progress
 ) -> Witnesses:
     """What each view sees of the points, on cells of ``cell`` pixels."""
-    found: list[Float32[np.ndarray, "rows cols"]] = []
+    maps: list[Float32[np.ndarray, "rows cols"]] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the kernels release the GIL
         for depths in pool.map(lambda view: cell_depths(view, xyz, cell), views):
-            found.append(depths)
-            progress("look for uncovered cells", len(found) / len(views))
-    sizes = np.array([depths.size for depths in found])
+            maps.append(depths)
+            progress("look for uncovered cells", len(maps) / len(views))
+    sizes = np.array([depths.size for depths in maps])
     return Witnesses(
         np.stack([grid_from_world(view, cell) for view in views]),
-        np.array([depths.shape for depths in found]),
+        np.array([depths.shape for depths in maps]),
         np.cumsum(sizes) - sizes,
-        np.concatenate([depths.ravel() for depths in found]),
+        np.concatenate([depths.ravel() for depths in maps]),
     )
 
 
@@ -80,10 +80,10 @@ def guess_depths(
     witnesses: Witnesses,
     asked: Int64[np.ndarray, " K"],
 ) -> tuple[Float32[np.ndarray, " M"], Float32[np.ndarray, " M"]]:
-    """The depth of each empty cell, and how many cells away the nearest covered one is.
+    """The depth of each empty cell, and its distance in cells to the nearest covered one.
 
     Args:
-        depths: Of the view's cells, infinite where not covered; one at least is.
+        depths: Of the view's cells, infinite where not covered; at least one is covered.
         empty: The cells to guess, as row * cols + column.
         back: The view's ``world_from_grid``.
         witnesses: What all views see.
@@ -98,25 +98,25 @@ def guess_depths(
 
 
 @inline
-def _guess(depths, empty, back, matrices, shapes, starts, seen, guesses, reach):  # type: ignore[no-untyped-def]
-    nearest, found = np.empty(SECTORS), np.empty(SECTORS, np.float32)
+def _guess(depths, empty, back, matrices, shapes, starts, seen, guesses, reach):  # type: ignore[no-untyped-def]  # Numba's types
+    nearest, depth_of = np.empty(SECTORS), np.empty(SECTORS, np.float32)
     weights, point = np.empty(SECTORS), np.empty(3)
     for k in range(len(empty)):
         i, j = divmod(empty[k], depths.shape[1])
-        nearest[:], found[:] = np.inf, np.inf
-        _look_around(depths, i, j, nearest, found)
+        nearest[:], depth_of[:] = np.inf, np.inf
+        _look_around(depths, i, j, nearest, depth_of)
         for s in range(SECTORS):
             weights[s] = 0.0
             if nearest[s] < np.inf:
-                lift(back, i, j, found[s], point)
+                lift(back, i, j, depth_of[s], point)
                 against = _contradictions(point, matrices, shapes, starts, seen)
                 weights[s] = 1.0 / ((1.0 + against) * nearest[s])
-        guesses[k] = _weighted_median(found, weights)
+        guesses[k] = _weighted_median(depth_of, weights)
         reach[k] = np.sqrt(nearest.min())
 
 
 @inline
-def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]
+def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]  # Numba's types
     """The point at a depth on the ray through the centre of cell (i, j)."""
     z = np.float64(depth)
     x, y = (j + 0.5) * z, (i + 0.5) * z
@@ -126,7 +126,7 @@ def lift(m, i, j, depth, point):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-untyped-def]
+def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-untyped-def]  # Numba's types
     """How many views look through a point."""
     count = 0
     for v in range(len(matrices)):
@@ -140,11 +140,8 @@ def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-u
 
 
 @inline
-def _look_around(depths, i, j, nearest, found):  # type: ignore[no-untyped-def]
-    """The nearest covered cell of each sector, by squared distance.
-
-    Of equals the first, ring by ring.
-    """
+def _look_around(depths, i, j, nearest, depth_of):  # type: ignore[no-untyped-def]  # Numba's types
+    """The nearest covered cell of each sector, by squared distance; of equals, ring by ring."""
     rows, cols = depths.shape
     last = max(i, rows - 1 - i, j, cols - 1 - j)
     ring, seen = 1, False
@@ -157,13 +154,13 @@ def _look_around(depths, i, j, nearest, found):  # type: ignore[no-untyped-def]
                         seen, last = True, min(last, 2 * ring + 1)
                     sector, square = _sector(a - i, b - j), (a - i) ** 2 + (b - j) ** 2
                     if square < nearest[sector]:
-                        nearest[sector], found[sector] = square, depths[a, b]
+                        nearest[sector], depth_of[sector] = square, depths[a, b]
         ring += 1
 
 
 @inline
-def _sector(dy, dx):  # type: ignore[no-untyped-def]
-    """Which of eight sectors of 45 degrees, each with one of its borders; not both are 0."""
+def _sector(dy, dx):  # type: ignore[no-untyped-def]  # Numba's types
+    """The sector of 45 degrees, each including one of its borders; dy and dx are not both 0."""
     if dx > 0 and dy >= 0:
         quarter, u, v = 0, dx, dy
     elif dy > 0:
@@ -176,8 +173,8 @@ def _sector(dy, dx):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _weighted_median(values, weights):  # type: ignore[no-untyped-def]
-    """The least value such that it and those below it hold half of the weight."""
+def _weighted_median(values, weights):  # type: ignore[no-untyped-def]  # Numba's types
+    """The smallest value such that it and the values below it hold half of the weight."""
     order = np.argsort(values)
     half = 0.0
     for k in order:

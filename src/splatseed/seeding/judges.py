@@ -1,10 +1,10 @@
-"""Which views judge a new point: of those that see its base, the ones that see the point best.
+"""Which views judge a new point: of the views that see its base, those that see it best.
 
 Notation: M new points, V views; the *base* of a point is the original it is nearest to. A view may
 judge a point if it sees its base, and the point lies well within its frame and within those of two
-of its sources (of its only one, if it has no more). It sees a point the better, the closer and the
-more frontal it is. Promise: who judges a point depends on that point, the poses and who sees what,
-not on the other points or on threads.
+of its sources (of its only one, if it has no more). It sees a point better, the closer and the more
+frontal it is. Promise: the judges of a point depend on that point, the poses and visibility, not on
+the other points or on threads.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ __all__ = ["JUDGES", "choose_judges"]
 JUDGES = 2
 """Views that judge a point; the better verdict counts, as one of them may not see it after all."""
 WITNESSES = 2
-"""Sources that must hold a point: so many decide its cost."""
+"""Sources that must contain a point: this many determine its cost."""
 MARGIN = 5.0
 """Pixels between a point and the frame: the window around it lies inside."""
 OBLIQUE = 0.3
-"""What closeness is worth where a surface is seen edge on: normals are uncertain."""
+"""Weight of closeness for a surface seen edge on: normals are uncertain."""
 
 
 def choose_judges(
@@ -47,7 +47,7 @@ def choose_judges(
         around: Their bases and normals.
         views: The views.
         seen: The originals that each view sees.
-        num_originals: How many there are.
+        num_originals: The number of originals.
         sources: The views that each is compared with; -1 = none.
     """
     order, offsets = views_of_points(seen, num_originals)
@@ -66,7 +66,7 @@ def choose_judges(
 
 
 @kernel
-def _choose(  # type: ignore[no-untyped-def]
+def _choose(  # type: ignore[no-untyped-def]  # Numba's types
     xyz, base, normals, order, offsets, matrices, sizes, centers, focals, sources, judges
 ):
     """The best views of each point."""
@@ -88,8 +88,8 @@ def _choose(  # type: ignore[no-untyped-def]
 
 
 @inline
-def _has_witnesses(point, sources, matrices, sizes):  # type: ignore[no-untyped-def]
-    """Whether enough of a view's sources hold a point."""
+def _has_witnesses(point, sources, matrices, sizes):  # type: ignore[no-untyped-def]  # Numba's types
+    """Whether enough of a view's sources contain a point."""
     asked, holding = 0, 0
     for other in sources:
         if other >= 0:
@@ -99,7 +99,7 @@ def _has_witnesses(point, sources, matrices, sizes):  # type: ignore[no-untyped-
 
 
 @inline
-def _holds(matrix, size, point):  # type: ignore[no-untyped-def]
+def _holds(matrix, size, point):  # type: ignore[no-untyped-def]  # Numba's types
     """Whether a point lies in front of a camera and well within its frame."""
     u, v, z = place(point, matrix)
     inside = MARGIN <= u <= size[0] - MARGIN and MARGIN <= v <= size[1] - MARGIN
@@ -107,7 +107,7 @@ def _holds(matrix, size, point):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _sight(point, normal, center):  # type: ignore[no-untyped-def]
+def _sight(point, normal, center):  # type: ignore[no-untyped-def]  # Numba's types
     """How well a surface is seen: (cos of the angle to its normal + OBLIQUE) / distance."""
     dot, squared = 0.0, 0.0
     for axis in range(3):

@@ -1,9 +1,9 @@
 """Methods that look at the photographs: ``auto``, ``stereo`` and ``cover``.
 
-``stereo`` puts seeds on surfaces, found by comparing photographs; ``cover`` gives every part of
-every photograph that no point falls in one seed to look at; ``auto`` does both, in this order.
-Promise: how many seeds there are follows from the photographs, not from a ratio; held-out views are
-never looked at.
+``stereo`` puts seeds on surfaces by comparing photographs; ``cover`` puts one in every part of
+every photograph that no point falls in; ``auto`` does both, in this order.
+Promise: the photographs, not a ratio, determine the number of seeds; held-out views are never
+looked at.
 """
 
 from __future__ import annotations
@@ -39,29 +39,29 @@ __all__ = [
 ]
 
 MAX_SIZE = 800
-"""Pixels of the longer side at which photographs are looked at."""
+"""Longer side in pixels at which photographs are used."""
 
 
 class _Given(NamedTuple):
-    """What a method looks at."""
+    """The input of a method."""
 
     scene: Scene
     images: Sequence[Image]
-    """Those whose photographs are looked at."""
+    """The images whose photographs are used."""
     views: Sequence[View]
-    """These, in the same order."""
+    """Their views, in the same order."""
     rng: np.random.Generator
     progress: Progress
 
 
 @dataclass(frozen=True)
 class PhotographMethod:
-    """What the three have in common."""
+    """Shared by the three methods."""
 
     max_size: int = MAX_SIZE
-    """Photographs are made smaller by a whole factor until their longer side has so many pixels."""
+    """Photographs are downsampled by a whole factor to at most this many pixels a side."""
     hold_out: int = 0
-    """Leave out every n-th image by name, as trainers do for the test (8); 0 = use all."""
+    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
 
     name: ClassVar[str]
     traits: ClassVar[Traits] = Traits(frozenset({"photographs"}), chooses_number=True)
@@ -82,11 +82,11 @@ class PhotographMethod:
     def __call__(
         self,
         scene: Scene,
-        num_new: int,  # noqa: ARG002  (the photographs say how many)
+        num_new: int,  # noqa: ARG002  (the photographs determine the number)
         rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
-        """Look at a scene's photographs and make seeds."""
+        """Make seeds from a scene's photographs."""
         if scene.source is None and not scene.images:
             raise SceneNotFoundError(
                 f"a scene with photographs for the method {self.name}",
@@ -110,10 +110,10 @@ class PhotographMethod:
 
 @dataclass(frozen=True)
 class Stereo(PhotographMethod):
-    """Seeds on surfaces, found by comparing photographs with each other."""
+    """Seeds on surfaces, from comparing photographs with each other."""
 
     spacing: float = 8.0
-    """Pixels between stereo's seeds in the photographs; not below the grid."""
+    """Pixels between stereo's seeds in the photographs; at least the grid."""
     grid: int = 4
     """Pixels between depths, along a row and a column."""
 
@@ -122,17 +122,17 @@ class Stereo(PhotographMethod):
     def maps(
         self, scene: Scene, only: Sequence[int], seed: int, progress: Progress
     ) -> tuple[StereoMap, ...]:
-        """Depth and normals of some photographs, as ``upsample`` finds them with this seed.
+        """Depth and normals of some photographs, as ``upsample`` computes them with this seed.
 
         Args:
             scene: The scene.
-            only: Which of ``photographed(scene, hold_out)``.
+            only: Indices into ``photographed(scene, hold_out)``.
             seed: The same seed gives the same bytes.
             progress: Told how far it is.
         """
         given = self._read(scene, np.random.default_rng(seed), progress)
-        found = self.find(given, only)
-        return tuple(found.map(i) for i in only)
+        stereo = self.find(given, only)
+        return tuple(stereo.map(i) for i in only)
 
     def _look(self, given: _Given) -> NewPoints:
         from splatseed.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
@@ -172,23 +172,23 @@ class Cover(PhotographMethod):
 
 @dataclass(frozen=True)
 class Auto(Stereo):
-    """Stereo, then cover: a seed for every part of every photograph, on surfaces where found."""
+    """Stereo, then cover: a seed for every part of every photograph, on surfaces where possible."""
 
     cell: int = 8
-    """Side of the parts, in pixels, that get a seed where none falls in."""
+    """Side in pixels of the parts that get a seed if no point falls in."""
 
     name: ClassVar[str] = "auto"
 
     def _look(self, given: _Given) -> NewPoints:
-        found = super()._look(given)
-        new = PointCloud(found.xyz, found.rgb)
+        seeds = super()._look(given)
+        new = PointCloud(seeds.xyz, seeds.rgb)
         known = PointCloud.concatenate(given.scene.points.originals, new)
         gaps = cover_cloud(given.views, known, self.cell, given.rng, given.progress)
-        return _join(found, gaps)
+        return _join(seeds, gaps)
 
 
 def photographed(scene: Scene, hold_out: int = 0) -> tuple[Image, ...]:
-    """The images whose photographs are looked at, by name.
+    """The images whose photographs are used, by name.
 
     Raises:
         SceneNotFoundError: There are none.
@@ -230,7 +230,7 @@ def cover_cloud(
         views: The photographs.
         cloud: The points.
         cell: Side of a cell in pixels of the views.
-        rng: The order of the views.
+        rng: Draws the order of the views.
         progress: Told how far it is.
     """
     from splatseed.seeding.cover import cover  # noqa: PLC0415  (kernels load with use)

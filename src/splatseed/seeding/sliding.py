@@ -1,16 +1,15 @@
 """Sliding points along their normals to where photographs agree.
 
 Notation: a point of one view, seen at pixel (u, v), with the plane through it: inverse depth w and
-its slopes gx, gy a pixel (``stereo.cost``). Moving the plane by t spacings h along its normal n,
-where n X is its distance from the camera, makes all three 1 / (1 + t h / (n X)) times as large; the
-point then lies where the plane meets the ray of (u, v), so that its window in the view stays what
-it was. Among the t, the one with the least
+its slopes gx, gy per pixel (``stereo.cost``). Moving the plane by t spacings h along its normal n,
+where n X is its distance from the camera, multiplies all three by 1 / (1 + t h / (n X)); the point
+then lies where the plane meets the ray of (u, v), so that its window in the view stays the same.
+Among the t, the one with the smallest
 
     (cost(t) + FLOOR) (1 + t^2)
 
-is taken: a cost that is low for certain may move a point, small differences between high ones may
-not. Promise: a point's result depends on itself and the pictures, not on its neighbours in the
-list.
+wins: a clearly low cost may move a point, small differences between high costs may not. Promise: a
+point's result depends on itself and the pictures, not on its neighbours in the list.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -28,27 +27,27 @@ __all__ = ["REACH", "slide"]
 REACH = 1.5
 """How far a point may move, in spacings."""
 OFFSETS = 13
-"""Places that are tried first, evenly between both ends."""
+"""Number of offsets tried first, evenly spaced."""
 REFINEMENTS = 4
-"""Times that half a step to both sides of the best is tried, and the step halved."""
+"""Refinement steps: half a step to both sides of the best is tried, then the step is halved."""
 FLOOR = 0.02
-"""Cost of two photographs of one surface: what is lower is luck."""
+"""Cost of two photographs of one surface: anything lower is chance."""
 
 _FLOOR, _NOISE, _ONE = (np.float32(each) for each in (FLOOR, NOISE, 1.0))
 
 
 @inline
 def slide(pictures, uv, planes, reach, moves, costs, variances):
-    """The best place of each point.
+    """The best offset of each point.
 
     Args:
-        pictures: ``stereo.patchmatch.Pictures``; its grid and bounds are not looked at.
+        pictures: ``stereo.patchmatch.Pictures``; its grid and bounds are not used.
         uv: Pixels of the points, float32 [M, 2].
         planes: w, gx, gy through each, float32 [M, 3].
-        reach: h / (n X), float32 [M], of a size below 1 / REACH.
+        reach: h / (n X), float32 [M], magnitude below 1 / REACH.
         moves: Filled with t, float32 [M].
         costs: Filled with the cost there, float32 [M].
-        variances: Filled with that of the grey levels around the pixel, float32 [M].
+        variances: Filled with the variance of the grey levels around the pixel, float32 [M].
     """
     places, window = np.zeros((2, LANES), np.float32), np.zeros((2, SAMPLES * LANES), np.float32)
     own, tried = np.zeros((4, LANES), np.float32), np.zeros(3 * LANES, np.float32)
@@ -68,7 +67,7 @@ def slide(pictures, uv, planes, reach, moves, costs, variances):
 
 @inline
 def _fill_lanes(first, uv, planes, reach, places, own, state):
-    """Sixteen points; beyond the end the last one again."""
+    """Sixteen points; beyond the end, the last one again."""
     for lane in range(LANES):
         i = min(first + lane, len(uv) - 1)
         places[0, lane], places[1, lane] = uv[i, 0], uv[i, 1]
@@ -79,7 +78,7 @@ def _fill_lanes(first, uv, planes, reach, places, own, state):
 
 @inline
 def _search(pictures, places, window, own, tried, state):
-    """Try evenly spaced places, then ever closer ones around the best."""
+    """Try evenly spaced offsets, then ever closer ones around the best."""
     step = np.float32(2.0 * REACH / (OFFSETS - 1))
     for k in range(OFFSETS):
         state[0, :] = step * np.float32(k - OFFSETS // 2)
@@ -94,9 +93,9 @@ def _search(pictures, places, window, own, tried, state):
 
 @inline
 def _try(pictures, places, window, own, tried, state):
-    """Take the places that are tried where they are better."""
+    """Accept the offsets tried where they are better."""
     for lane in range(LANES):
-        # w(t) = w / (1 + t h / (n X)), and so its slopes
+        # w(t) = w / (1 + t h / (n X)), and likewise its slopes
         scale = _ONE / (_ONE + state[0, lane] * own[3, lane])
         for part in range(3):
             tried[part * LANES + lane] = scale * own[part, lane]

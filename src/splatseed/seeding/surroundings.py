@@ -1,4 +1,4 @@
-"""What the originals around a new point say of the surface there: its spacing and normal.
+"""The surface around each new point, from the originals there: spacing and normal.
 
 Notation: n originals, M new points; the *base* of a new point is its nearest original, and h, the
 mean distance of the base to its 6 nearest, its spacing. The normal is the last principal axis of
@@ -22,20 +22,20 @@ __all__ = ["Surroundings", "survey"]
 
 NEIGHBORS = 16
 FLAT = 0.4
-"""A neighbourhood is flat if it is so much thinner than it is wide, at most; noise alone has about
+"""A neighbourhood counts as flat up to this ratio of thickness to width; noise alone has about
 0.7."""
 BLOCK = 1 << 13
 
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What is known around each of M new points.
+    """The surroundings of M new points.
 
     Args:
-        base: The nearest original, a row of those given, int64 [M].
+        base: The nearest original, as its row, int64 [M].
         spacing: h, float64 [M], scene units.
-        normals: Unit, of either sign, float64 [M, 3]; NaN where the originals lie on a line.
-        flat: Whether the originals there lie on a plane, bool [M].
+        normals: Unit, of either sign, float64 [M, 3]; NaN where the originals are collinear.
+        flat: Whether the originals there are coplanar, bool [M].
     """
 
     base: Int64[np.ndarray, " M"]
@@ -49,11 +49,11 @@ def survey(
     xyz: Float32[np.ndarray, "M 3"],
     progress: Progress = silent,
 ) -> Surroundings:
-    """Look around each new point.
+    """The surroundings of each new point.
 
     Args:
         originals: Distinct finite positions, at least 2.
-        xyz: Of the new points.
+        xyz: The new points' positions.
         progress: Told how far it is.
     """
     nothing = np.zeros((len(originals), 3), np.uint8)
@@ -74,7 +74,7 @@ def _thickness(
     frames: Float64[np.ndarray, "n 3 3"],
     progress: Progress,
 ) -> Float64[np.ndarray, " n"]:
-    """Extent of each neighbourhood along the normal, over that along the second axis."""
+    """Extent of each neighbourhood along the normal, relative to the second axis."""
     thickness = np.empty(len(cloud))
 
     def work(start: int, stop: int) -> None:

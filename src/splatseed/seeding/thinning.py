@@ -1,7 +1,7 @@
-"""A scene's points within a budget: known ones by where they are seen, then guesses.
+"""A scene's points within a budget: measured ones by visibility, then guesses.
 
-Promise: no more points than the number, and all of it where there are as many; nothing is drawn at
-random but the order of the views in which ``cover`` fills gaps.
+Promise: no more points than the number, and exactly the number if there are enough; only the order
+of the views in which ``cover`` fills gaps is random.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ __all__ = ["frames_of", "points_within", "thin_to"]
 
 COVER = source_code("cover")
 MOST_COVER = 0.1
-"""Part of a budget that cover's guesses may take, at most; their cells grow until they fit."""
+"""Largest part of a budget for cover's guesses; their cells grow until they fit."""
 COARSER = 1.25
-"""By how much."""
+"""Growth factor of the cells."""
 
 
 def points_within(scene: Scene, budget: int | str) -> int:
     """The number of points that a budget allows a scene.
 
     Args:
-        scene: Of whose photographs a budget in rho speaks.
+        scene: The scene whose photographs define rho.
         budget: A number, or a string such as "0.25rho".
 
     Raises:
@@ -51,19 +51,19 @@ def thin_to(
     seed: int,
     progress: Progress,
 ) -> PointCloud:
-    """At most ``num`` of a cloud's points, originals before others where both would do.
+    """At most ``num`` of a cloud's points, originals before others of equal use.
 
-    Cover is made anew for what thinning leaves: a guess fills a gap, and must not take the place of
-    a point that is known. Where there are no fewer originals than may stay, only originals do: they
-    are dense where there is detail, which is where few Gaussians are needed most.
+    Cover is recomputed for what thinning leaves: a guess fills a gap, and must not replace a
+    measured point. If there are at least ``num`` originals, only originals stay: they are dense
+    where there is detail, which is where few Gaussians are needed most.
 
     Args:
-        scene: Where the points belong.
+        scene: The scene of the points.
         cloud: The points.
         num: How many, at least 1.
-        cell: Pixels a side of cover's cells, at least.
-        hold_out: Which photographs cover must not look at, as in ``PhotographMethod``.
-        seed: Of the order of the views.
+        cell: Smallest side of cover's cells, in pixels.
+        hold_out: Photographs that cover must not use, as in ``PhotographMethod``.
+        seed: Determines the order of the views.
         progress: Told how far it is.
     """
     if len(cloud) <= num:
@@ -87,12 +87,12 @@ def thin_to(
 
 
 def frames_of(scene: Scene) -> tuple[View, ...]:
-    """The views of a scene without their pixels, at the size that methods look at."""
+    """The views of a scene without their pixels, at the size that methods use."""
     return poses_of(scene.images, data_factor(scene.images, MAX_SIZE)) if scene.images else ()
 
 
 def _keep(scene: Scene, points: PointCloud, num: int) -> PointCloud:
-    """So many of the points, by the views that see them."""
+    """At most ``num`` of the points, chosen by the views that see them."""
     from splatseed.seeding.budget import thin  # noqa: PLC0415  (kernels load with use)
 
     if len(points) <= num or num < 1:

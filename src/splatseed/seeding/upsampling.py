@@ -1,8 +1,8 @@
-"""``upsample``: a scene's points and new ones, made, checked, completed and thinned.
+"""``upsample``: a scene's points and new ones: made, verified, completed and thinned.
 
-Four steps, of which all but the first are asked for: a method makes points; ``verify`` holds
-interpolated ones against the photographs; ``cover`` gives the parts of photographs that no point
-falls in a seed; a budget thins all.
+Four steps, all but the first optional: a method makes points; ``verify`` checks interpolated ones
+against the photographs; ``cover`` gives a seed to the parts of photographs that no point falls in;
+a budget thins all.
 Promise: without a budget the originals come first and unchanged; the same seed gives the same bytes
 whatever the number of threads; every point is finite.
 """
@@ -36,12 +36,12 @@ __all__ = [
 ]
 
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
-"""What makes the points, and what does where there are no photographs to look at."""
+"""The default method, and its replacement for scenes without photographs."""
 CELL = 8
 """Side in pixels of the cells by which coverage is measured."""
 
 INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
-"""Methods whose points are guesses between others, which ``verify`` holds against the
+"""Methods that interpolate between points; ``verify`` checks their points against the
 photographs."""
 
 Note = Callable[[str], None]
@@ -65,20 +65,19 @@ def upsample(
     """Better seeds for a scene.
 
     Args:
-        scene: A scene, or a bare cloud. Points with ``source`` other than 0 are put aside: new
+        scene: A scene, or a bare cloud. Points with ``source`` other than 0 are set aside: new
             points are made from originals only, and replace earlier new ones.
-        method: A key of ``METHODS``, or a method with its parameters. ``auto``, the default, looks
-            at the photographs; where there are none, ``mls`` is taken, and ``note`` is told.
+        method: A key of ``METHODS``, or a method with its parameters. ``auto``, the default, uses
+            the photographs; if there are none, ``mls`` takes its place, and ``note`` is told.
         ratio: Points in all, as a multiple of the originals (r N), for methods that interpolate; 4
-            when neither is given. The photographs say how many ``auto``, ``stereo`` and ``cover``
-            make.
+            when neither is given. For ``auto``, ``stereo`` and ``cover`` the photographs determine
+            the number.
         num_points: Points in all, instead of ``ratio``.
-        budget: Most points in all: a number, or a string such as "0.25rho", Gaussians per pixel of
-            one photograph. May be below the number of originals.
-        cover: Side in pixels of the parts of the photographs that get a seed where no point falls
-            in.
-        verify: Hold interpolated points against the photographs: slide them onto the surface, drop
-            what does not fit.
+        budget: Most points in all: a number, or a string such as "0.25rho" for Gaussians per pixel
+            of one photograph. May be below the number of originals.
+        cover: Side in pixels of the parts of the photographs that get a seed if no point falls in.
+        verify: Check interpolated points against the photographs: slide them onto the surface, drop
+            those that do not fit.
         seed: The same seed gives the same bytes, whatever the number of threads.
         profile: "default", or "paper" for the paper's text to the letter.
         progress: Told each stage and the fraction done.
@@ -86,13 +85,13 @@ def upsample(
         parameters: Fields of the method, such as ``k=12``.
 
     Returns:
-        The N originals, then the new points; ``source`` tells them apart. A budget takes points of
-        both.
+        The N originals, then the new points; ``source`` tells them apart. A budget removes points
+        of both kinds.
 
     Raises:
         ParameterError: An unknown method, profile or parameter, or a value or size out of range.
         PointCloudError: Too few distinct finite points for the method.
-        SceneNotFoundError: The method needs photographs or depth maps that are not there.
+        SceneNotFoundError: The method needs photographs or depth maps that do not exist.
         SceneFormatError: One of these files is damaged, or they do not fit the scene.
 
     Example:
@@ -110,10 +109,10 @@ def upsample(
         originals = whole.points.originals
         originals = originals.select(originals.distinct)
         plain = ratio is None and num_points is None and cover is None
-        if plain and most is not None and len(originals) >= most:  # all that thinning would leave
+        if plain and most is not None and len(originals) >= most:  # nothing else would stay
             note(
                 f"The budget of {most:,} is no more than the {len(originals):,} points there are: "
-                "they are thinned, and none is added."
+                "they are thinned, and none are added."
             )
             return thin_to(whole, originals, most, CELL, 0, seed, progress)
     cloud = add_points(
@@ -138,12 +137,12 @@ def add_cover(
     seed: int = 0,
     progress: Progress = silent,
 ) -> PointCloud:
-    """A cloud, and a seed for each part of the photographs that it leaves empty.
+    """A cloud plus a seed for each part of the photographs that it leaves empty.
 
     Args:
-        scene: Whose photographs are looked at.
+        scene: The scene with the photographs.
         cloud: The points; the scene's own when left out.
-        cell: Side of a part, in pixels of the photographs at the size that methods look at.
+        cell: Side of a part in pixels, at the size that methods use.
         seed: The same seed gives the same bytes.
         progress: Told how far it is.
 
@@ -160,13 +159,13 @@ def add_cover(
 def add_verified(
     scene: Scene, cloud: PointCloud, *, progress: Progress = silent, note: Note = lambda _: None
 ) -> PointCloud:
-    """A cloud whose interpolated points were held against the photographs: moved, kept or dropped.
+    """A cloud with its interpolated points checked against the photographs: moved, kept or dropped.
 
     Args:
-        scene: Whose photographs are looked at.
-        cloud: The points; those of ``INTERPOLATING`` methods are looked at, the others stay.
+        scene: The scene with the photographs.
+        cloud: The points; those of ``INTERPOLATING`` methods are checked, the others stay.
         progress: Told how far it is.
-        note: Told how many had which fate, one sentence each.
+        note: Told how many met which fate, one sentence each.
 
     Raises:
         SceneNotFoundError: There are no photographs.
@@ -193,10 +192,10 @@ def add_verified(
 
 
 def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
-    """The share of the photographs' cells that hold a point, at the size that methods look at.
+    """The fraction of the photographs' cells that hold a point, at the size that methods use.
 
     Args:
-        scene: Its images; their files need not be there.
+        scene: Provides the images; their files need not exist.
         cloud: The points.
         cell: Side of a cell in pixels.
     """
@@ -208,8 +207,8 @@ def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
 def method_for(
     scene: Scene | PointCloud, method: str | Upsampler = DEFAULT_METHOD, note: Note = lambda _: None
 ) -> str | Upsampler:
-    """The default method, or what stands in for it where there are no photographs."""
+    """The default method, or its replacement if there are no photographs."""
     if isinstance(scene, Scene) and scene.has_photographs:
         return method
-    note(f"There are no photographs to look at: method {FALLBACK} instead of {DEFAULT_METHOD}.")
+    note(f"The scene has no photographs: method {FALLBACK} is used instead of {DEFAULT_METHOD}.")
     return FALLBACK

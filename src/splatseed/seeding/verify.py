@@ -1,11 +1,11 @@
-"""verify: interpolated points held against the photographs, moved onto the surface or dropped.
+"""verify: interpolated points compared with the photographs, then moved or dropped.
 
 Notation: M new points, each with a spacing h and a normal from the originals around it
 (``surroundings``), and up to two views that judge it (``judges``), each with its sources. In each,
-the point slides along its normal to where the photographs agree (``sliding``), at a cost of one
-minus correlation; the better judge counts. Promise: the order of points stays; the same input gives
-the same bytes, whatever the number of threads; what no photograph can judge is kept and said to be
-unknown.
+the point slides along its normal to where the photographs agree best (``sliding``), at a cost of
+one minus correlation; the better judge counts. Promise: the order of points stays; the same input
+gives the same bytes, whatever the number of threads; points that no photograph can judge are kept
+and reported.
 """
 
 from __future__ import annotations
@@ -33,28 +33,28 @@ __all__ = ["BARE_CONFIDENCE", "MAX_COST", "verify"]
 NUM_SOURCES = 5
 """Views that a judge is compared with."""
 MAX_COST = 0.4
-"""A point whose least cost is larger agrees nowhere."""
+"""A point whose lowest cost is higher fits nowhere."""
 TEXTURE = 4.0
 """Variance of grey levels around a pixel below which there is nothing to compare."""
 BARE_CONFIDENCE = 0.1
-"""Of points on flat places without texture, which are kept where they are."""
+"""Confidence of points on flat untextured surfaces, which stay in place."""
 STEEPEST = 0.3
-"""Cosine between ray and normal: what is steeper is taken for so steep, as its normal cannot be
-right."""
+"""Smallest cosine between ray and normal; steeper normals are taken to be wrong and turned to
+this."""
 LARGEST_MOVE = 0.3
-"""Largest move of a plane along its normal, in spacings, as a share of its distance from the
+"""Largest move of a plane along its normal, in spacings, as a fraction of its distance from the
 camera."""
 MOVED = 0.25
-"""Spacings from which on a point counts as moved, in what is told."""
+"""Spacings from which on a point is reported as moved."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Trials:
-    """What the judges of M points found; cost infinite where there is no judge.
+    """The verdicts of the judges of M points; infinite cost where there is no judge.
 
     Args:
-        xyz: The best place, float32 [M, J, 3].
-        moves: How far from the point along its normal, in spacings, float32 [M, J].
+        xyz: The best position, float32 [M, J, 3].
+        moves: Its offset from the point along the normal, in spacings, float32 [M, J].
         costs: One minus correlation there, float32 [M, J].
         variances: Of the grey levels around the judge's pixel, float32 [M, J].
     """
@@ -72,24 +72,24 @@ def verify(
     new: NewPoints,
     progress: Progress = silent,
 ) -> NewPoints:
-    """Hold interpolated points against the photographs.
+    """Compare interpolated points with the photographs.
 
     A point stays, moved by up to 1.5 spacings along its normal, if the photographs agree there; its
-    confidence is their correlation. It stays where it is, with ``BARE_CONFIDENCE``, on a flat place
-    without texture, and with unknown confidence (NaN) where fewer than two photographs see it. All
+    confidence is their correlation. It stays in place, with ``BARE_CONFIDENCE``, on a flat surface
+    without texture, and with unknown confidence (NaN) if fewer than two photographs see it. All
     others are dropped.
 
     Args:
         views: The photographs, at the size to compare.
-        images: The images they are of, in the same order.
+        images: Their images, in the same order.
         visibility: The originals that the points were made from, and who sees them.
         new: The points, finite.
         progress: Told how far it is.
 
     Returns:
-        Those that stay, in their order, with confidence and normals (towards the judge; NaN where
-        the originals lie on a line); what else was known of them, and notes on how many were
-        dropped and why.
+        The points that stay, in order, with confidence and normals (towards the judge; NaN where
+        the originals are collinear), their other attributes, and notes on how many were dropped and
+        why.
     """
     if len(visibility.xyz) < 2 or not len(new.xyz) or not views:
         return _unchecked(new)
@@ -112,7 +112,7 @@ def _try_all(
     progress: Progress,
 ) -> _Trials:
     """Let every view judge its points."""
-    greys = [grey_image(view.image) for view in views]
+    greys = [grey_image(view.photograph) for view in views]
     trials = _no_trials(*judges.shape)
     order = np.argsort(judges, axis=None, kind="stable")
     starts = np.searchsorted(judges.ravel()[order], np.arange(len(views) + 1))
@@ -150,7 +150,7 @@ def _judge(
 ) -> None:
     """Let view i judge its points.
 
-    ``mine`` counts through the trials, judge by judge within point.
+    ``mine`` indexes the trials, judge by judge within each point.
     """
     view, (point, judge) = views[i], np.unravel_index(mine, trials.costs.shape)
     world = xyz[point].astype(np.float64)
@@ -194,9 +194,9 @@ def _planes(
 def _facing(
     normals: Float64[np.ndarray, "T 3"], cam: Float64[np.ndarray, "T 3"]
 ) -> Float64[np.ndarray, "T 3"]:
-    """Normals in camera axes turned towards the camera, to an angle of ``STEEPEST`` at least.
+    """Normals in camera axes turned towards the camera, at least by an angle of ``STEEPEST``.
 
-    Where there is none, the direction to the camera.
+    Unknown normals become the direction to the camera.
     """
     back = -cam / np.linalg.norm(cam, axis=1, keepdims=True)
     n = np.where(np.isnan(normals), back, normals)
@@ -214,7 +214,7 @@ def _decide(
     trials: _Trials,
     centers: Float64[np.ndarray, "M J 3"],
 ) -> NewPoints:
-    """Keep, move and drop points by what their judges found; ``centers`` are where these stand."""
+    """Keep, move and drop points by their judges' verdicts; ``centers`` are the judges' centres."""
     judged, textured = np.isfinite(trials.costs), trials.variances >= TEXTURE
     costs = np.where(textured, trials.costs, np.inf)
     rows, best = np.arange(len(costs)), costs.argmin(axis=1)
@@ -236,7 +236,7 @@ def _decide(
 
 
 def _select(new: NewPoints, kept: Bool[np.ndarray, " M"], notes: tuple[str, ...]) -> NewPoints:
-    """Some of the points, and what is to be told."""
+    """Some of the points, with notes."""
     arrays = {
         name: array[kept] for name, array in new._asdict().items() if isinstance(array, np.ndarray)
     }
@@ -249,12 +249,12 @@ def _notes(
     bare: Bool[np.ndarray, " M"],
     unknown: Bool[np.ndarray, " M"],
 ) -> tuple[str, ...]:
-    """How many points had which fate, one sentence each."""
+    """How many points met which fate, one sentence each."""
     dropped = ~(agrees | bare | unknown)
     fates = (
-        (moved, "were moved by more than a quarter of their spacing to where they do"),
-        (dropped, "do so nowhere and were dropped"),
-        (bare, "lie on flat places without texture and were kept as they are, at low confidence"),
+        (moved, "agree only after a move of more than a quarter of their spacing"),
+        (dropped, "agree nowhere and were dropped"),
+        (bare, "lie on flat surfaces without texture and were kept in place, at low confidence"),
         (unknown, "are seen by fewer than two photographs and were kept unchecked"),
     )
     first = f"{agrees.sum():,} of {len(agrees):,} new points agree with the photographs."
@@ -262,9 +262,9 @@ def _notes(
 
 
 def _unchecked(new: NewPoints) -> NewPoints:
-    """The points as they are, where there is nothing to hold them against."""
+    """The points unchanged, if there is nothing to compare them with."""
     num = len(new.xyz)
     unknown = np.full(num, np.nan, np.float32)
-    note = f"{num:,} new points could not be held against photographs and were kept unchecked."
+    note = f"{num:,} new points could not be compared with photographs and were kept unchecked."
     changed = new._replace(normals=np.full((num, 3), np.nan, np.float32), confidence=unknown)
     return changed._replace(notes=(*new.notes, note)) if num else changed

@@ -1,17 +1,17 @@
 """Structure-from-Motion: photographs to a scene folder, by pycolmap.
 
 ``reconstruct`` finds poses, lenses and points; ``triangulate`` finds points for poses that are
-already known (an RGB-D capture, a simulator, another tool's calibration); ``undistort`` takes the
-distortion out of a scene. All write the folder that every 3DGS trainer reads: ``images/`` free of
-lens distortion, ``sparse/0/*.bin`` with PINHOLE cameras.
+already known (an RGB-D capture, a simulator, another tool's calibration); ``undistort`` removes
+lens distortion from a scene. All write the folder that every 3DGS trainer reads: undistorted
+``images/`` and ``sparse/0/*.bin`` with PINHOLE cameras.
 
 Promise: the output appears whole or not at all, and every failure is one of ``splatseed.errors``.
 pycolmap is an optional dependency (``pip install "pycolmap>=4.0"``), imported when it is needed.
 
 Reproducibility: with one version of pycolmap on the CPU of one machine, features and verified
-matches are the same for the same images, options and seed. Mapping with several threads adds in an
-order of its own, and bundle adjustment can amplify that: 20 photographs gave 4095 points or 4047.
-With ``threads=1`` the files are the same byte for byte. A GPU promises nothing.
+matches are the same for the same images, options and seed. Mapping with several threads sums in
+varying order, and bundle adjustment can amplify that: 20 photographs gave 4095 points or 4047. With
+``threads=1`` the files are the same byte for byte. A GPU guarantees nothing.
 """
 
 from splatseed.sfm.pipeline import reconstruct, triangulate

@@ -20,7 +20,7 @@ __all__ = ["guess_cameras", "known_cameras"]
 def guess_cameras(
     run: Run, photos: Sequence[Photo], camera_model: str, *, shared: bool
 ) -> tuple[list[Any], list[Any]]:
-    """Cameras with EXIF's or a default focal length, and the images that they took.
+    """Cameras with EXIF's or a default focal length, and their images.
 
     Args:
         run: The run.
@@ -44,7 +44,7 @@ def guess_cameras(
 
 
 def known_cameras(run: Run, pairs: Sequence[tuple[Photo, Image]]) -> tuple[list[Any], list[Any]]:
-    """The cameras of posed photographs, exactly as given, and the images that they took."""
+    """The cameras of posed photographs, exactly as given, and their images."""
     pycolmap = run.pycolmap
     cameras: dict[int, Any] = {}
     images = []

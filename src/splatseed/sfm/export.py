@@ -18,8 +18,8 @@ __all__ = ["export_scene"]
 def export_scene(run: Run, model_dir: Path, staging: Path) -> None:
     """Write the model of ``model_dir`` to ``staging`` with distortion removed.
 
-    Images whose camera is PINHOLE already are copied byte for byte, but for an EXIF
-    orientation, which is cleared: cameras are of the pixels as stored.
+    Images whose camera is PINHOLE already are copied byte for byte, except that an EXIF
+    orientation is cleared: cameras describe the pixels as stored.
     """
     pycolmap = run.pycolmap
     dense = run.work / "dense"

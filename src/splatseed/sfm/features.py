@@ -1,6 +1,6 @@
 """Features and matches: the part that both pipelines share.
 
-The database is written before any feature is found, images with their cameras, so that ids are
+The database is written before any feature is detected, images with their cameras, so that ids are
 ours: camera i has rig i, image i has frame i, counted from 1. pycolmap then only adds to it.
 Progress is read from the database through pycolmap too: Python's sqlite3 is another copy of SQLite,
 and two copies in one process drop each other's file locks and corrupt the file.
@@ -20,12 +20,12 @@ from splatseed.sfm.stages import Stages
 
 __all__ = ["Run", "find_features", "match_features", "write_database"]
 
-_BLOCK_IMAGES = 16  # matches are committed, and progress seen, once a block of 16 x 16 pairs
+_BLOCK_IMAGES = 16  # matches are committed, and progress is visible, per block of 16 x 16 pairs
 
 
 @dataclass(frozen=True)
 class Run:
-    """What the stages of one run share.
+    """Shared by the stages of one run.
 
     Args:
         stages: Runs and times them.

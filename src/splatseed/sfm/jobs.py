@@ -1,4 +1,4 @@
-"""Jobs: what the worker process is asked to do, and what it finds.
+"""Jobs: what the worker process is asked to do, and what it returns.
 
 A job is plain data that travels to the worker; ``run`` is called there. It works in ``staging`` and
 leaves the scene there, with its scratch files in ``staging/.work``.
@@ -20,12 +20,12 @@ from splatseed.sfm.photos import Photo
 from splatseed.sfm.settings import Settings
 from splatseed.sfm.stages import Stages
 
-__all__ = ["Found", "Job", "ReconstructJob", "TriangulateJob", "UndistortJob"]
+__all__ = ["Job", "Outcome", "ReconstructJob", "TriangulateJob", "UndistortJob"]
 
 
 @dataclass(frozen=True)
-class Found:
-    """What a job found; see ``SfmReport`` for the fields."""
+class Outcome:
+    """The result of a job; see ``SfmReport`` for the fields."""
 
     registered: frozenset[str]
     num_points: int
@@ -41,7 +41,7 @@ class ReconstructJob:
     Args:
         image_dir: The photographs.
         staging: Where the scene is made.
-        settings: How.
+        settings: The settings of the run.
         photos: Which photographs.
         camera_model: COLMAP's model of the lens.
         shared_camera: One lens for all photographs of a size, or one for each.
@@ -54,7 +54,7 @@ class ReconstructJob:
     camera_model: str
     shared_camera: bool
 
-    def run(self, stages: Stages) -> Found:
+    def run(self, stages: Stages) -> Outcome:
         """Do it, in this process."""
         run = Run(stages, self.settings, self.image_dir, self.staging / ".work")
         write_database(
@@ -64,7 +64,7 @@ class ReconstructJob:
         find_features(run, names)
         match_features(run)
         export_scene(run, map_images(run, names), self.staging)
-        return _found(run, self.staging)
+        return _outcome(run, self.staging)
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class TriangulateJob:
     Args:
         image_dir: The photographs.
         staging: Where the scene is made.
-        settings: How.
+        settings: The settings of the run.
         pairs: The photographs, each with its pose and intrinsics.
     """
 
@@ -83,7 +83,7 @@ class TriangulateJob:
     settings: Settings
     pairs: tuple[tuple[Photo, Image], ...]
 
-    def run(self, stages: Stages) -> Found:
+    def run(self, stages: Stages) -> Outcome:
         """Do it, in this process."""
         run = Run(stages, self.settings, self.image_dir, self.staging / ".work")
         cameras, images = known_cameras(run, self.pairs)
@@ -92,7 +92,7 @@ class TriangulateJob:
         match_features(run)
         model_dir = triangulate_points(run, cameras, images, [image for _, image in self.pairs])
         export_scene(run, model_dir, self.staging)
-        return _found(run, self.staging)
+        return _outcome(run, self.staging)
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class UndistortJob:
     Args:
         image_dir: The photographs.
         staging: Where the scene is made.
-        settings: How.
+        settings: The settings of the run.
         model_dir: The COLMAP model.
     """
 
@@ -111,20 +111,20 @@ class UndistortJob:
     settings: Settings
     model_dir: Path
 
-    def run(self, stages: Stages) -> Found:
+    def run(self, stages: Stages) -> Outcome:
         """Do it, in this process."""
         run = Run(stages, self.settings, self.image_dir, self.staging / ".work")
         export_scene(run, self.model_dir, self.staging)
-        return _found(run, self.staging)
+        return _outcome(run, self.staging)
 
 
 Job: TypeAlias = ReconstructJob | TriangulateJob | UndistortJob
 
 
-def _found(run: Run, scene: Path) -> Found:
-    """What the scene holds, read back from its files."""
+def _outcome(run: Run, scene: Path) -> Outcome:
+    """The contents of the scene, read back from its files."""
     model = run.pycolmap.Reconstruction(scene / "sparse" / "0")
-    return Found(
+    return Outcome(
         registered=frozenset(image.name for image in model.images.values() if image.has_pose),
         num_points=model.num_points3D(),
         mean_track_length=float(model.compute_mean_track_length()),

@@ -29,7 +29,7 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
     """Solve for poses, lenses and points, and keep the model with most images.
 
     Raises:
-        ReconstructionError: No model came out, or its images are fewer than half of ``names``.
+        ReconstructionError: No model was found, or it has fewer than half of the images ``names``.
     """
     models_dir = run.work / "models"
     models_dir.mkdir()
@@ -97,13 +97,13 @@ def triangulate_points(
         poses: Their poses, in the same order.
 
     Raises:
-        ReconstructionError: Not one point came out.
+        ReconstructionError: Not a single point was found.
     """
     pycolmap = run.pycolmap
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = run.settings.threads
     options.random_seed = run.settings.seed
-    options.max_extra_param = math.inf  # a known lens is believed: Kinects have a k3 above 1
+    options.max_extra_param = math.inf  # a known lens is trusted: Kinects have a k3 above 1
     model_dir = run.work / "model"
     model_dir.mkdir()
     posed = _posed_model(pycolmap, cameras, images, poses)

@@ -1,8 +1,8 @@
-"""Orientation: the EXIF tag by which a camera says how to turn its photograph.
+"""Orientation: the EXIF tag that says how to rotate a photograph.
 
 COLMAP reads pixels as they are stored and keeps the tag in what it writes. A trainer whose image
-reader obeys the tag (OpenCV's does) would then see the picture turned against its camera. Promise:
-``clear_orientation`` changes the tag's two bytes and nothing else.
+reader obeys the tag (as OpenCV's does) would then see the photograph rotated relative to its
+camera. Promise: ``clear_orientation`` changes the tag's two bytes and nothing else.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _HEAD_BYTES = 1 << 17  # the EXIF segment, at most 64 KiB, comes first or after 
 
 
 def clear_orientation(folder: Path) -> None:
-    """Declare every JPEG below ``folder`` to be upright as it is stored."""
+    """Mark every JPEG below ``folder`` as upright in its stored orientation."""
     for path in folder.rglob("*"):
         if path.suffix.lower() in {".jpg", ".jpeg"} and _is_turned(path):
             content = bytearray(path.read_bytes())
@@ -39,7 +39,7 @@ def _is_turned(path: Path) -> bool:
 
 
 def _find_orientation(head: bytes) -> tuple[int, str] | None:
-    """Where the tag's value is, and the byte order ('<' or '>') that it is in.
+    """The position of the tag's value, and its byte order ('<' or '>').
 
     EXIF is a TIFF file in an APP1 segment (CIPA DC-008, 4.5): byte order, offset of the first
     directory, its number of entries, then 12 bytes an entry: tag, type, count, value.

@@ -1,7 +1,7 @@
 """Photographs: which images a folder holds, whether they can be read, and which have a pose.
 
-Promise: every ``Photo`` returned was decoded to its last byte. pycolmap itself takes a truncated
-JPEG for a picture with a grey lower half, and passes over a file that it cannot read.
+Promise: every ``Photo`` returned was decoded to its last byte. pycolmap itself accepts a truncated
+JPEG as a picture with a grey lower half, and skips files that it cannot read.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def match_poses(
     """
     posed = {image.name: image for image in scene.images}
     pairs = tuple(
-        (photo, replace(posed[photo.name], observations=None))  # they would travel for nothing
+        (photo, replace(posed[photo.name], observations=None))  # not needed by the worker
         for photo in photos
         if photo.name in posed
     )

@@ -16,7 +16,7 @@ from shutil import rmtree
 from splatseed.io.output.staging import MANIFEST, output_folder
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.sfm.jobs import Found, ReconstructJob, TriangulateJob
+from splatseed.sfm.jobs import Outcome, ReconstructJob, TriangulateJob
 from splatseed.sfm.photos import Photo, find_photos, match_poses
 from splatseed.sfm.report import SfmReport
 from splatseed.sfm.settings import (
@@ -80,8 +80,8 @@ def reconstruct(
     with staged(images, Path(output), overwrite=overwrite) as staging:
         job = ReconstructJob(images, staging, settings, photos, camera_model, shared_camera)
         log = staging / ".work" / "log.txt"
-        found = run_job(job, log, verbose=verbose, on_progress=on_progress)
-        report = _report(Path(output), photos, found)
+        outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
+        report = _report(Path(output), photos, outcome)
         _write_manifest(staging, "reconstruct", settings, report)
     return report
 
@@ -135,8 +135,8 @@ def triangulate(
     with staged(images, Path(output), overwrite=overwrite) as staging:
         job = TriangulateJob(images, staging, settings, pairs)
         log = staging / ".work" / "log.txt"
-        found = run_job(job, log, verbose=verbose, on_progress=on_progress)
-        report = _report(Path(output), photos, found)
+        outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
+        report = _report(Path(output), photos, outcome)
         _write_manifest(staging, "triangulate", settings, report)
     return report
 
@@ -151,16 +151,16 @@ def staged(images: Path, output: Path, *, kind: str = "sfm", overwrite: bool) ->
         rmtree(work)
 
 
-def _report(output: Path, photos: tuple[Photo, ...], found: Found) -> SfmReport:
+def _report(output: Path, photos: tuple[Photo, ...], outcome: Outcome) -> SfmReport:
     return SfmReport(
         path=output,
-        registered=len(found.registered),
+        registered=len(outcome.registered),
         total=len(photos),
-        unregistered=tuple(p.name for p in photos if p.name not in found.registered),
-        num_points=found.num_points,
-        mean_track_length=found.mean_track_length,
-        mean_reprojection_error=found.mean_reprojection_error,
-        seconds=found.seconds,
+        unregistered=tuple(p.name for p in photos if p.name not in outcome.registered),
+        num_points=outcome.num_points,
+        mean_track_length=outcome.mean_track_length,
+        mean_reprojection_error=outcome.mean_reprojection_error,
+        seconds=outcome.seconds,
     )
 
 

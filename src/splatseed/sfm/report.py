@@ -1,4 +1,4 @@
-"""SfmReport: what a run of Structure-from-Motion gave, and how long it took."""
+"""SfmReport: the result of a run of Structure-from-Motion, and how long it took."""
 
 from __future__ import annotations
 

@@ -28,18 +28,18 @@ DeviceName: TypeAlias = Literal["auto", "cpu", "cuda"]
 
 _OLDEST = 4  # the first to pose an image and its rig in one call
 _INSTALL = 'Run: pip install --upgrade "pycolmap>=4.0"'
-_MAX_SEED = 2**31 - 1  # pycolmap takes an int
+_MAX_SEED = 2**31 - 1  # pycolmap takes a 32-bit int
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How features are found and matched, and how the scene is solved.
+    """How features are detected and matched, and how the scene is solved.
 
     Args:
         matcher: ``exhaustive`` compares every pair of images; ``sequential`` each with its
             successors in the order of names, for a video.
-        device: Where features are found and matched.
-        max_image_size: Longer sides are reduced to this many pixels to find features.
+        device: Where features are detected and matched.
+        max_image_size: Longer sides are reduced to this many pixels for feature detection.
         seed: Seed of RANSAC and of the order of bundle adjustment.
         threads: Worker threads; -1 = all cores.
 

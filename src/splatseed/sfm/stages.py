@@ -1,7 +1,7 @@
-"""Stages: pycolmap's blocking calls, run so that their progress can be told.
+"""Stages: pycolmap's blocking calls, run so that their progress can be reported.
 
-pycolmap releases the GIL, so a stage runs in a worker thread while the calling thread asks every
-tenth of a second how far it is.
+pycolmap releases the GIL, so a stage runs in a worker thread while the calling thread polls its
+progress ten times a second.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Stages:
 
     Args:
         pycolmap: The pycolmap module.
-        seed: Given to pycolmap's generator, which each thread has its own of, before each stage.
+        seed: Given before each stage to pycolmap's generator, which is per thread.
         on_progress: Told of each stage's progress, from the calling thread.
         seconds: Wall time of the stages so far.
     """
@@ -44,8 +44,8 @@ class Stages:
         Args:
             stage: Its name.
             work: Calls pycolmap.
-            count: How many of ``total`` things are done, asked while ``work`` runs.
-            total: How many things there are to do.
+            count: How many of ``total`` items are done; called while ``work`` runs.
+            total: The number of items.
 
         Raises:
             ReconstructionError: pycolmap failed.

@@ -1,4 +1,4 @@
-"""``undistort``: a scene whose lenses have distortion, made into one of pinhole cameras."""
+"""``undistort``: turns a scene with lens distortion into one with pinhole cameras."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from splatseed.io import write_scene
 from splatseed.io.split import ROOT_LISTS
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.sfm.jobs import Found, UndistortJob
+from splatseed.sfm.jobs import Outcome, UndistortJob
 from splatseed.sfm.pipeline import staged
 from splatseed.sfm.settings import Settings, check_installed
 from splatseed.sfm.worker import run_job
@@ -26,14 +26,14 @@ def undistort(
     overwrite: bool = False,
     verbose: bool = False,
     on_progress: Progress = silent,
-) -> Found:
-    """Write a scene with its photographs free of lens distortion, and its cameras PINHOLE.
+) -> Outcome:
+    """Write a scene with undistorted photographs and PINHOLE cameras.
 
-    Poses, points and tracks stay; features move with the pixels. Photographs change their size a
+    Poses, points and tracks stay; features move with the pixels. The size of photographs changes a
     little.
 
     Args:
-        scene: With photographs, all of them there.
+        scene: A scene with all its photographs.
         output: The scene folder to write, in COLMAP's layout.
         threads: Worker threads; -1 = all cores.
         overwrite: Whether an earlier output of this function may be replaced.
@@ -53,28 +53,28 @@ def undistort(
     images = _photographs(scene)
     with staged(images, Path(output), kind="undistort", overwrite=overwrite) as staging:
         distorted = write_scene(scene, staging / ".work" / "distorted", format="colmap").path
-        settings = Settings("exhaustive", "cpu", 3200, 0, threads)  # of which threads alone counts
+        settings = Settings("exhaustive", "cpu", 3200, 0, threads)  # only threads matters
         job = UndistortJob(images, staging, settings, distorted / "sparse" / "0")
         log = staging / ".work" / "log.txt"
-        found = run_job(job, log, verbose=verbose, on_progress=on_progress)
+        outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
         for name in ROOT_LISTS:
             if (distorted / name).is_file():
                 shutil.copyfile(distorted / name, staging / name)
-    return found
+    return outcome
 
 
 def _photographs(scene: Scene) -> Path:
     folder = scene.source.image_dir if scene.source else None
     if folder is None or not scene.images:
-        found = "no images" if folder else "no folder of images"
+        there = "no images" if folder else "no folder of images"
         missing = ""
     else:
         missing = next((im.name for im in scene.images if not (folder / im.name).is_file()), "")
-        found = f"{missing} missing in {folder}"
+        there = f"{missing} missing in {folder}"
     if folder is None or not scene.images or missing:
         raise SceneNotFoundError(
             "a scene with all of its photographs",
-            found=found,
+            found=there,
             fix="Put them beside the model in a folder named images.",
         )
     return folder.absolute()

@@ -1,9 +1,9 @@
-"""Frames of a video to reconstruct from: sharp ones, spread by how far the picture moves.
+"""Frames of a video to reconstruct from: sharp ones, spaced by how far the picture moves.
 
-Notation: the *way* of a frame is how far the picture has moved up to it, as parts of its width: the
-sum over frames of the median shift of its blocks against the frame before, found by phase
+Notation: the *way* of a frame is the distance that the picture has moved up to it, in widths: the
+sum over frames of the median shift of its blocks relative to the previous frame, by phase
 correlation (Kuglin and Hines 1975). A frame's *sharpness* is the variance of its Laplacian.
-Promise: of each stretch of the way the sharpest frame is taken, so that a camera that stands still
+Promise: the sharpest frame of each stretch of the way is taken, so that a camera that stands still
 gives one frame, not hundreds; equal videos give equal frames.
 """
 
@@ -26,23 +26,23 @@ from splatseed.requirements import require
 __all__ = ["PickedFrames", "pick_frames"]
 
 LOOK_WIDTH = 256
-"""Width at which frames are looked at, px."""
+"""Width in pixels at which frames are analysed."""
 BLOCK = 64
-"""Side of the blocks whose shifts are found, px at that width."""
+"""Side of the blocks whose shifts are measured, in pixels at that width."""
 LEAST_STEP = 0.02
-"""Parts of the width that the picture moves at least from one frame taken to the next."""
+"""Least distance, in widths, that the picture moves between chosen frames."""
 LEAST_FRAMES = 3
 QUALITY = 95
 
 
 @dataclass(frozen=True)
 class PickedFrames:
-    """Which frames were taken.
+    """Which frames were chosen.
 
     Args:
-        numbers: Theirs, from 0.
-        total: How many the video has.
-        way: How far the picture moves in all, in widths.
+        numbers: Their numbers, from 0.
+        total: How many frames the video has.
+        way: How far the picture moves in total, in widths.
     """
 
     numbers: tuple[int, ...]
@@ -58,7 +58,7 @@ def pick_frames(
     Args:
         video: The file.
         folder: An existing folder for the frames.
-        most: Most frames to take.
+        most: The most frames to choose.
         progress: Told how far reading is.
 
     Raises:
@@ -87,12 +87,12 @@ def pick_frames(
 def choose(
     sharpness: Float64[np.ndarray, " F"], way: Float64[np.ndarray, " F"], most: int
 ) -> Int64[np.ndarray, " P"]:
-    """The sharpest frame of each of at most ``most`` equal stretches of the way.
+    """The sharpest frame in each of at most ``most`` equal stretches of the way.
 
     Args:
-        sharpness: Of each frame.
-        way: Up to each frame, ascending.
-        most: How many stretches at most.
+        sharpness: The sharpness of each frame.
+        way: The way up to each frame, ascending.
+        most: The most stretches.
     """
     if not len(way):
         return np.empty(0, np.int64)
@@ -106,7 +106,7 @@ def choose(
 def _looked_at(
     video: Path, progress: Progress
 ) -> tuple[Float64[np.ndarray, " F"], Float64[np.ndarray, " F"]]:
-    """Every frame's sharpness and way."""
+    """The sharpness and way of every frame."""
     sharpness, steps = [], []
     before: Float32[np.ndarray, "H W"] | None = None
     for grey, part in _small_frames(video):
@@ -143,7 +143,7 @@ def _blocks(grey: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "B S S"]:
 
 
 def _small_frames(video: Path) -> Iterator[tuple[Float32[np.ndarray, "H W"], float]]:
-    """Grey frames of ``LOOK_WIDTH``, and how much of the video is read with each."""
+    """Grey frames of ``LOOK_WIDTH``, with the fraction of the video read so far."""
     facts, frames = _frames(video, ["-vf", f"scale={LOOK_WIDTH}:-2"], "gray", 1)
     total = max(1.0, float(facts.get("duration") or 0) * float(facts.get("fps") or 0))
     width, height = facts["size"]
@@ -173,11 +173,11 @@ def _write(
 def _frames(
     video: Path, parameters: list[str], pixels: str, channels: int
 ) -> tuple[dict[str, Any], Iterator[bytes]]:
-    """The facts of a video, and its frames as bytes."""
+    """The metadata of a video, and its frames as bytes."""
     require("imageio_ffmpeg")
     import imageio_ffmpeg  # noqa: PLC0415  (of the extras sfm and view)
 
-    # It warns of every video that is read at another size than its own.
+    # It warns about every video that is read at another size than its own.
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
     reader = imageio_ffmpeg.read_frames(
         str(video), pix_fmt=pixels, bits_per_pixel=8 * channels,

@@ -1,10 +1,10 @@
 """The worker: pycolmap in a process of its own.
 
 A failure deep in COLMAP (a full disk under SQLite, a broken image codec) aborts the process it
-happens in, and nothing but a kill stops some of its loops. So ``run_job`` starts an interpreter
-that runs ``serve``, hands it a pickled job, and reads pickled messages back until
-``("found", Found)`` or ``("failed", error class, expected, found, fix)``; in between come
-``("progress", stage, fraction)``. An abort becomes a ``ReconstructionError``, an interrupt a kill.
+happens in, and only a kill stops some of its loops. So ``run_job`` starts an interpreter that runs
+``serve``, hands it a pickled job, and reads pickled messages back until ``("done", Outcome)`` or
+``("failed", error class, expected, found, fix)``; in between come ``("progress", stage,
+fraction)``. An abort becomes a ``ReconstructionError``, an interrupt a kill.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from splatseed import errors
 from splatseed.errors import ReconstructionError, SplatseedError
 from splatseed.process.interpreter import child_command, child_environment
 from splatseed.progress import Progress
-from splatseed.sfm.jobs import Found, Job
+from splatseed.sfm.jobs import Job, Outcome
 from splatseed.sfm.settings import check_cuda, require_pycolmap
 from splatseed.sfm.stages import Stages
 
@@ -32,7 +32,7 @@ _CHILD = "from splatseed.sfm.worker import serve; serve()"
 _REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 
 
-def run_job(job: Job, log: Path, *, verbose: bool, on_progress: Progress) -> Found:
+def run_job(job: Job, log: Path, *, verbose: bool, on_progress: Progress) -> Outcome:
     """Run ``job`` in a child process and wait for it.
 
     Args:
@@ -53,7 +53,7 @@ def run_job(job: Job, log: Path, *, verbose: bool, on_progress: Progress) -> Fou
             stdout=subprocess.PIPE,
             stderr=None if verbose else sink,
             env=child_environment(),
-            process_group=0,  # Ctrl-C comes to us alone, and we end the child
+            process_group=0,  # Ctrl-C reaches only us, and we end the child
         ) as child,
     ):
         try:
@@ -64,7 +64,7 @@ def run_job(job: Job, log: Path, *, verbose: bool, on_progress: Progress) -> Fou
             child.kill()
 
 
-def _converse(child: subprocess.Popen[bytes], job: Job, on_progress: Progress) -> Found:
+def _converse(child: subprocess.Popen[bytes], job: Job, on_progress: Progress) -> Outcome:
     commands, replies = cast("BinaryIO", child.stdin), cast("BinaryIO", child.stdout)
     pickle.dump(job, commands)
     commands.flush()
@@ -72,8 +72,8 @@ def _converse(child: subprocess.Popen[bytes], job: Job, on_progress: Progress) -
         match pickle.load(replies):  # noqa: S301  (our own child)
             case "progress", stage, fraction:
                 on_progress(stage, fraction)
-            case "found", Found() as found:
-                return found
+            case "done", Outcome() as outcome:
+                return outcome
             case "failed", name, expected, found_text, fix:
                 raise getattr(errors, name)(expected, found=found_text, fix=fix)
 
@@ -91,7 +91,7 @@ def _death(code: int, log: Path) -> ReconstructionError:
 
 
 def _serve(commands: BinaryIO, replies: BinaryIO, *, verbose: bool) -> None:
-    """The child's side: read one job, do it, and tell how it went."""
+    """The child's side: read one job, run it, and report the result."""
 
     def reply(*message: Any) -> None:
         pickle.dump(message, replies)
@@ -107,13 +107,13 @@ def _serve(commands: BinaryIO, replies: BinaryIO, *, verbose: bool) -> None:
         stages = Stages(
             pycolmap, job.settings.seed, lambda stage, done: reply("progress", stage, done)
         )
-        reply("found", job.run(stages))
+        reply("done", job.run(stages))
     except SplatseedError as error:
         reply("failed", type(error).__name__, error.expected, error.found, error.fix)
 
 
 def serve() -> None:
-    """Be the child: talk over the process's standard input and output."""
+    """Be the child: communicate over standard input and output."""
     replies = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever the C++ libraries print belongs to the log
+    os.dup2(2, 1)  # whatever the C++ libraries print goes to the log
     _serve(sys.stdin.buffer, replies, verbose=sys.argv[1] == "1")

@@ -1,1 +1,1 @@
-"""Gaussians without a trainer: from seeds, in files, in the frame of training, seen from a view."""
+"""Gaussians without a trainer: made from seeds, in files, in the training frame, rendered."""

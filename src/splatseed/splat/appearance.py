@@ -1,9 +1,9 @@
-"""What colour the photographs show a seed in, and how it changes with the direction.
+"""The colour of each seed in the photographs, and its dependence on the viewing direction.
 
-Notation: a Gaussian looks, along the unit direction d from a camera to it, like c(d) = 1/2 + sum_k
-y_k(d) h_k with the real spherical harmonics y up to degree 1, in 3DGS's order and signs: y = (C0,
--C1 d_y, C1 d_z, -C1 d_x). Promise: the same bytes whatever the number of threads; a seed that no
-view shows keeps its colour.
+Notation: seen along the unit direction d from a camera, a Gaussian has the colour c(d) = 1/2 +
+sum_k y_k(d) h_k with the real spherical harmonics y up to degree 1, in 3DGS's order and signs: y =
+(C0, -C1 d_y, C1 d_z, -C1 d_x). Promise: the same bytes whatever the number of threads; a seed that
+no view sees keeps its colour.
 """
 
 from __future__ import annotations
@@ -22,24 +22,23 @@ from splatseed.views.view import View
 __all__ = ["SH_C1", "fit_harmonics"]
 
 SH_C1 = 0.4886025119029199
-"""Of degree 1, sqrt(3 / (4 pi))."""
+"""Constant of degree 1, sqrt(3 / (4 pi))."""
 NUM_FITTED = 4
-"""Harmonics up to degree 1."""
+"""Number of harmonics up to degree 1."""
 OWN = 0.3
-"""A seed's own colour counts as so many photographs."""
+"""Weight of a seed's own colour, in photographs."""
 EVEN = 1.0
-"""And so many count against any change with the direction: of a seed that few views show it is not
-known."""
+"""Weight of the prior against view dependence, in photographs: few views do not determine it."""
 CELL = 4.0
-"""Side of the cells, in pixels, within which seeds hide each other."""
+"""Side in pixels of the cells within which seeds occlude each other."""
 MOST_PROJECTIONS = 50_000_000
-"""Seeds times views: of more, only evenly chosen views are asked."""
+"""Limit on seeds times views: beyond it, an even subset of the views is used."""
 LEAST_VIEWS = 16
-"""But never fewer than these."""
+"""But never fewer views than this."""
 
 
 class _Shown(NamedTuple):
-    """The M seeds that a view shows."""
+    """The M seeds that a view sees."""
 
     seed_idx: Int64[np.ndarray, " M"]
     column: Int64[np.ndarray, " M"]
@@ -47,9 +46,9 @@ class _Shown(NamedTuple):
 
 
 def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarray, "N 4 3"]:
-    """Coefficients h of each seed: ridge regression over the views that show it.
+    """Coefficients h of each seed: ridge regression over the views that see it.
 
-    With the colours p_v that V views show from directions d_v, and the seed's own colour p, it
+    With the colours p_v seen by V views along directions d_v, and the seed's own colour p, it
     solves min over h of sum_v |1/2 + y(d_v) h - p_v|^2 + OWN |1/2 + C0 h_0 - p|^2 + EVEN |C1
     h_1..3|^2, a ridge regression of four unknowns per colour channel.
 
@@ -69,7 +68,7 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
         shown = _shown(xyz, view)
         basis = _harmonics(xyz[shown.seed_idx], view)
         normal[shown.seed_idx] += basis[:, :, None] * basis[:, None, :]
-        colors = _colors(view.image, shown) - 0.5
+        colors = _colors(view.photograph, shown) - 0.5
         right[shown.seed_idx] += basis[:, :, None] * colors[:, None, :]
     return np.linalg.solve(normal, right).astype(np.float32)
 
@@ -81,7 +80,7 @@ def _asked(views: Sequence[View], count: int) -> list[View]:
 
 
 def _shown(xyz: Float32[np.ndarray, "N 3"], view: View) -> _Shown:
-    """The seeds within the picture that no others of their cell, or of cells around it, hide."""
+    """The seeds in the photograph that no other in their cell, or a cell beside it, occludes."""
     x, y, depth = _place(xyz, view)
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = x / depth, y / depth
@@ -113,7 +112,7 @@ def _harmonics(xyz: Float[np.ndarray, "M 3"], view: View) -> Float64[np.ndarray,
 
 
 def _colors(image: UInt8[np.ndarray, "H W 3"], shown: _Shown) -> Float64[np.ndarray, "M 3"]:
-    """Mean colours of the 3 x 3 pixels around, 0 to 1; at the border the outermost count again."""
+    """Mean colours of the 3 x 3 pixels around, 0 to 1; border pixels are repeated."""
     height, width = image.shape[:2]
     total = np.zeros((len(shown.seed_idx), 3))
     for down in (-1, 0, 1):

@@ -1,9 +1,9 @@
 """The frame that training works in: the cameras' centroid at 0, the farthest camera at distance 1.
 
-Notation: ``x_train = scale (x_world - origin)``; a *stray* camera is one so far from all others
-that its pose must be wrong. Promise: the frame depends on the training cameras alone, so that runs
-from different seeds are compared in one frame; strays have no say in it; there is no rotation, so
-quaternions and spherical harmonics stay as they are; single precision suffices for far-off origins.
+Notation: ``x_train = scale (x_world - origin)``; a *stray* camera is so far from all others that
+its pose must be wrong. Promise: the frame depends on the training cameras only, so that runs from
+different seeds are compared in one frame, and strays do not affect it; there is no rotation, so
+quaternions and spherical harmonics stay the same; single precision suffices for distant origins.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from splatseed.views.view import View
 __all__ = ["SCENE_SCALE", "TrainingFrame", "stray_note", "stray_views", "training_frame"]
 
 SCENE_SCALE = 1.1
-"""What the strategies and the learning rate of positions take as the size of the scene: the
-cameras' extent, and as in 3DGS a tenth more."""
+"""Scene size for the strategies and the learning rate of positions: the cameras' extent plus a
+tenth, as in 3DGS."""
 STRAY_SHARE = 0.1
-"""At most this share of the cameras, but always one, may be taken for strays."""
+"""At most this share of the cameras, but always one, can be strays."""
 STRAY_DISTANCE = 10.0
-"""How many times farther from the cameras' median a stray is than the farthest that cannot be
-one."""
+"""A stray is this many times farther from the cameras' median than the farthest camera that cannot
+be one."""
 MIN_CAMERAS = 5
-"""Among fewer, nobody can say which are the usual ones."""
+"""With fewer cameras, none can be called a stray."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class TrainingFrame:
         return np.asarray((xyz.astype(np.float64) - self.origin) * self.scale, np.float32)
 
     def cloud_from_world(self, cloud: PointCloud) -> PointCloud:
-        """A cloud of the world in the training frame: positions and sizes; nothing turns."""
+        """A cloud of the world in the training frame: positions and sizes change, normals stay."""
         moved = cloud.replace(xyz=self.points_from_world(cloud.xyz))
         if cloud.sizes is None:
             return moved
@@ -79,15 +79,12 @@ class TrainingFrame:
 
 
 def training_frame(views: Sequence[View]) -> TrainingFrame:
-    """The frame of these cameras but the strays.
-
-    That of the world, moved, if all are in one place.
-    """
+    """The frame of these cameras without the strays; only a translation if all are in one place."""
     centers = _centers(views)
     near = centers[~_is_stray(centers)]
     origin = near.mean(axis=0)
     extent = float(np.linalg.norm(near - origin, axis=1).max())
-    # Rounding leaves a little extent even where all cameras are in one place.
+    # Rounding leaves a little extent even if all cameras are in one place.
     rounding = 1e-9 * float(np.abs(near).max())
     return TrainingFrame(origin, 1.0 / extent if extent > rounding else 1.0)
 
@@ -99,7 +96,7 @@ def stray_views(views: Sequence[View]) -> tuple[str, ...]:
 
 
 def stray_note(name: str) -> str:
-    """What the user should know of a stray."""
+    """The note for the user about a stray camera."""
     return f"The camera of {name} is far from all others: check its pose, or leave it out."
 
 
@@ -109,7 +106,7 @@ def _centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
 
 
 def _is_stray(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
-    """Which cameras are out of all proportion to the others: a tenth at most, or one."""
+    """Which cameras are out of all proportion to the others: at most a tenth, or one."""
     if len(centers) < MIN_CAMERAS:
         return np.zeros(len(centers), bool)
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)

@@ -1,4 +1,4 @@
-"""Gaussians as the optimiser sees them, and how seeds become Gaussians.
+"""Gaussians as the optimiser sees them, and making them from seeds.
 
 Notation: N Gaussians; ``means`` [N, 3], ``scales`` [N, 3] as logarithms, ``quats`` [N, 4] wxyz of
 any length, ``opacities`` [N] as logits, ``sh0`` [N, 1, 3], ``shN`` [N, 15, 3]: gsplat's names and
@@ -22,9 +22,9 @@ SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)); colour = 0.5 + SH_C0 * sh0."""
 NEIGHBORS = 3
 GAP = 10.0
-"""An initial scale is at most this many times the median: beyond it a point stands alone."""
+"""Largest initial scale, relative to the median: beyond it a point is isolated."""
 COINCIDENT = 1e-2
-"""And at least this many times the median: a point upon another would never be seen."""
+"""Smallest initial scale, relative to the median: coincident points would stay invisible."""
 MIN_POINTS = 2
 
 
@@ -44,7 +44,7 @@ class Gaussians:
 
     @property
     def num_bytes(self) -> int:
-        """Bytes of the parameters as float32: 236 a Gaussian at degree 3."""
+        """Bytes of the parameters as float32: 236 per Gaussian at degree 3."""
         return sum(array.nbytes for array in self.arrays().values())
 
     def arrays(self) -> dict[str, Float32[np.ndarray, "N ..."]]:
@@ -62,18 +62,18 @@ def initial_gaussians(
     flatness: float = 0.1,
     harmonics: Float32[np.ndarray, "N 4 3"] | None = None,
 ) -> Gaussians:
-    """One Gaussian per seed: of the seed's size, else of the gap to its 3 nearest neighbours.
+    """One Gaussian per seed, with the seed's size or else that of the gap to its 3 neighbours.
 
-    It is round, or where the seed's normal is known a disc at right angles to it.
+    It is round, or a disc perpendicular to the seed's normal if that is known.
 
     Args:
-        seeds: Finite points; of their attributes sizes and normals count, where they are known.
-        sh_degree: Degree up to which colours may come to depend on the direction.
-        opacity: Of each, between 0 and 1.
+        seeds: Finite points; known sizes and normals are used.
+        sh_degree: Highest degree of the spherical harmonics.
+        opacity: Initial opacity, between 0 and 1.
         scale_factor: Multiplies the size.
-        largest: Most that each one's size may be, [N]; no bound when left out.
-        flatness: Thickness of a disc, as a part of its size.
-        harmonics: Coefficients up to degree 1; the seed's colour from everywhere when left out.
+        largest: Upper bound of each size, [N]; unbounded when left out.
+        flatness: Thickness of a disc, as a fraction of its size.
+        harmonics: Coefficients up to degree 1; the seed's constant colour when left out.
 
     Raises:
         PointCloudError: Fewer than two distinct finite points.
@@ -103,7 +103,7 @@ def initial_gaussians(
 
 
 def _first_sizes(seeds: PointCloud) -> Float64[np.ndarray, " N"]:
-    """Each seed's own size where it is known, else that of the gap it stands in."""
+    """Each seed's own size if known, else that of the gap around it."""
     gaps = neighbor_distances(seeds.xyz)
     if seeds.sizes is None:
         return gaps
@@ -111,10 +111,10 @@ def _first_sizes(seeds: PointCloud) -> Float64[np.ndarray, " N"]:
 
 
 def _quats_to(normals: Float32[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 4"]:
-    """Unit wxyz quaternions of the shortest turns of the z axis onto normals or their opposites.
+    """Unit wxyz quaternions of the shortest rotations of the z axis onto normals or opposites.
 
-    The turn from z to n is (1 + n_z, z x n) up to its length; a disc has no front, so the n with
-    n_z >= 0 is taken, where that never vanishes.
+    The rotation from z to n is (1 + n_z, z x n), normalised; a disc has no front, so the n with
+    n_z >= 0 is used, for which that never vanishes.
     """
     front = normals.astype(np.float64) * np.where(normals[:, 2:] < 0, -1.0, 1.0)
     x, y, z = (front / np.linalg.norm(front, axis=1, keepdims=True)).T
@@ -123,7 +123,7 @@ def _quats_to(normals: Float32[np.ndarray, "M 3"]) -> Float64[np.ndarray, "M 4"]
 
 
 def neighbor_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
-    """Root mean square distance to the 3 nearest others, kept near the median, [N].
+    """Root mean square distance to the 3 nearest others, bounded relative to the median, [N].
 
     Raises:
         PointCloudError: Fewer than two distinct finite points.

@@ -1,7 +1,7 @@
-"""Renders of views beside the truth, with an error map.
+"""Renders of views beside the photograph, with an error map.
 
-Notation: the error of a pixel is the mean over the channels of |render - truth|, 0 to 1. Promise:
-one colour scale for all pictures, so that they can be compared with one another.
+Notation: the error of a pixel is the mean over the channels of |render -
+photograph|, 0 to 1. Promise: one colour scale for all pictures, so that they can be compared.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from jaxtyping import Float32, UInt8
 
 from splatseed.io.output.staging import atomic_file
 
-__all__ = ["FULL_ERROR", "beside_truth", "error_map", "picture_name", "write_picture"]
+__all__ = ["FULL_ERROR", "beside_photograph", "error_map", "picture_name", "write_picture"]
 
 FULL_ERROR = 0.25
 """The error that is drawn brightest."""
@@ -21,30 +21,30 @@ GAP = 4
 WHITE = 255
 
 
-def beside_truth(
-    truth: UInt8[np.ndarray, "H W 3"], render: Float32[np.ndarray, "H W 3"]
+def beside_photograph(
+    photograph: UInt8[np.ndarray, "H W 3"], render: Float32[np.ndarray, "H W 3"]
 ) -> UInt8[np.ndarray, "H V 3"]:
     """Truth, render and error map in a row.
 
     Args:
-        truth: The photograph.
+        photograph: The view as captured.
         render: What the Gaussians look like, 0 to 1; clamped.
     """
-    gap = np.full((len(truth), GAP, 3), WHITE, np.uint8)
+    gap = np.full((len(photograph), GAP, 3), WHITE, np.uint8)
     drawn = np.round(np.clip(render, 0.0, 1.0) * 255).astype(np.uint8)
-    return np.concatenate([truth, gap, drawn, gap, error_map(truth, render)], axis=1)
+    return np.concatenate([photograph, gap, drawn, gap, error_map(photograph, render)], axis=1)
 
 
 def error_map(
-    truth: UInt8[np.ndarray, "H W 3"], render: Float32[np.ndarray, "H W 3"]
+    photograph: UInt8[np.ndarray, "H W 3"], render: Float32[np.ndarray, "H W 3"]
 ) -> UInt8[np.ndarray, "H W 3"]:
     """The error of each pixel as a colour: black is none, ``FULL_ERROR`` or more the brightest.
 
     Args:
-        truth: The photograph.
+        photograph: The view as captured.
         render: What the Gaussians look like, 0 to 1; clamped.
     """
-    error = np.abs(np.clip(render, 0.0, 1.0) - truth / np.float32(255)).mean(axis=2)
+    error = np.abs(np.clip(render, 0.0, 1.0) - photograph / np.float32(255)).mean(axis=2)
     return _heat(error)
 
 

@@ -2,7 +2,8 @@
 
 Notation: one vertex per Gaussian, float32 x, y, z, nx, ny, nz (zero), f_dc_0..2, f_rest_* (all of
 red, then green, then blue), opacity (logit), scale_0..2 (logarithms), rot_0..3 (wxyz). Promise:
-what was written is read back bit for bit; properties are found by name, so their order and further
+red, then green, then blue), opacity (logit), scale_0..2 (logarithms), rot_0..3 (wxyz). Promise:
+what was written is read back bit for bit; properties are found by name, so order and additional
 ones do not matter; a file appears whole or not at all.
 """
 
@@ -30,7 +31,7 @@ OPACITY = ("opacity",)
 SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3}
-"""How many f_rest there are at each degree of spherical harmonics, 3 ((degree + 1)^2 - 1)."""
+"""Number of f_rest at each degree of spherical harmonics, 3 ((degree + 1)^2 - 1)."""
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
@@ -112,23 +113,23 @@ def _check(path: Path, byte_order: str, vertex: Element) -> None:
     wanted = (*XYZ, *DC, *OPACITY, *SCALE, *ROTATION, *_rest_names(rest))
     missing = [name for name in wanted if name not in present]
     if vertex.name != "vertex" or missing:
-        found = f"no {', '.join(missing[:5])}"
+        there = f"no {', '.join(missing[:5])}"
     elif not byte_order:
-        found = "an ascii file"
+        there = "an ascii file"
     elif rest not in REST_COUNTS or vertex.num_rows == 0:
-        found = f"{rest} f_rest properties and {vertex.num_rows} vertices"
+        there = f"{rest} f_rest properties and {vertex.num_rows} vertices"
     elif any(prop.length_dtype is not None for prop in vertex.properties):
-        found = "lists among the properties"
+        there = "lists among the properties"
     else:
         return
     raise SceneFormatError(
-        f"{path} to hold trained Gaussians in 3DGS's layout, binary", found=found,
+        f"{path} to hold trained Gaussians in 3DGS's layout, binary", found=there,
         fix="Name the point_cloud.ply of a training run, not the seeds or a mesh.",
     )  # fmt: skip
 
 
 def _check_finite(path: Path, gaussians: Gaussians) -> None:
-    # Some trainers write opacity +inf for what is opaque; a position must be a place.
+    # Some trainers write opacity +inf for opaque Gaussians; positions must be finite.
     bad = ~np.isfinite(gaussians.means).all(axis=1)
     if bad.any():
         raise SceneFormatError(

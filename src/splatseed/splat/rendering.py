@@ -1,4 +1,4 @@
-"""What Gaussians look like from a view, and the photograph that they are held to.
+"""Rendering Gaussians from a view, and the photograph they are compared with.
 
 Notation: gsplat's parameter dict as tensors: ``means``, ``scales`` (logarithms), ``quats``,
 ``opacities`` (logits), ``sh0``, ``shN``. Promise: one rasteriser call serves training and scoring
@@ -18,18 +18,18 @@ from torch import Tensor
 from splatseed.render import rasterization
 from splatseed.views.view import View
 
-__all__ = ["photograph", "render_features", "render_view"]
+__all__ = ["photograph_of", "render_features", "render_view"]
 
 
 def render_view(
     params: Mapping[str, Tensor] | torch.nn.ParameterDict, view: View, sh_degree: int
 ) -> tuple[Float[Tensor, "H W 3"], dict[str, Any]]:
-    """What the Gaussians look like from a view, and the rasteriser's ``info``.
+    """The render of a view, and the rasteriser's ``info``.
 
     Args:
         params: The parameter dict, in the frame of the view's camera.
-        view: Whose camera is used.
-        sh_degree: Degree of spherical harmonics in use; coefficients beyond it are left out.
+        view: The view whose camera is used.
+        sh_degree: Degree of spherical harmonics in use; coefficients beyond it are ignored.
     """
     images, info = _rasterize(params, view, _harmonics(params, sh_degree), sh_degree)
     return images, info
@@ -40,7 +40,7 @@ def render_features(
     view: View,
     features: Float[Tensor, "N D"],
 ) -> Float[Tensor, "H W D"]:
-    """The Gaussians from a view, with these numbers, whatever they mean, as their colours."""
+    """The Gaussians rendered with arbitrary features in place of colours."""
     return _rasterize(params, view, features, None)[0]
 
 
@@ -64,13 +64,13 @@ def _rasterize(
         sh_degree=sh_degree,
         packed=False,
     )
-    return images.squeeze(0), info  # unlike an index, backward makes no image of zeros of it
+    return images.squeeze(0), info  # unlike indexing, its backward allocates no image of zeros
 
 
-def photograph(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
-    """The view's pixels as float32 from 0 to 1."""
-    # A copy: PyTorch warns on stderr of arrays that are read-only, as a view's may be.
-    return torch.tensor(view.image, device=device).to(torch.float32).div_(255.0)
+def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
+    """The view's photograph as float32 from 0 to 1."""
+    # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be.
+    return torch.tensor(view.photograph, device=device).to(torch.float32).div_(255.0)
 
 
 def _harmonics(

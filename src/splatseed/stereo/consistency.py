@@ -3,7 +3,8 @@
 Notation: view i has planes [3, h, w] on its grid; point X at one of its grid points falls on the
 grid of view j at (column, row), where j's own plane at the nearest grid point says inverse depth
 w_j. Both *agree* if |z_ij w_j - 1| <= tolerance, z_ij the depth of X in j. Promise: only maps and
-cameras are read; every pair is asked in one direction only, so the order of views does not show.
+cameras are read; every pair is compared in one direction at a time, so the order of views is
+irrelevant.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -22,17 +23,17 @@ def confirm(
     """Set a bit where another view's map agrees with a view's.
 
     Args:
-        planes: Of the view, float32 [3, h, w].
-        costs: float32 [h, w].
-        max_cost: What costs more neither asks nor answers.
+        planes: The view's planes, float32 [3, h, w].
+        costs: The view's costs, float32 [h, w].
+        max_cost: Planes of higher cost neither ask nor answer.
         grid: Pixels between grid points.
-        j_from_i: Pixels of the view times depth, and 1, to those of the other times its depth; [3,
+        j_from_i: Maps pixels of the view times depth, and 1, to the other's times its depth; [3,
             4].
-        other_planes: Of the other view, float32 [3, p, q].
-        other_costs: float32 [p, q].
+        other_planes: The other view's planes, float32 [3, p, q].
+        other_costs: The other view's costs, float32 [p, q].
         tolerance: Relative difference of depth.
-        bit: What is set, uint8.
-        out: uint8 [h, w].
+        bit: The bit to set, uint8.
+        out: The bits of each grid point, uint8 [h, w].
     """
     height, width = costs.shape
     m = j_from_i

@@ -1,6 +1,6 @@
-"""Photometric cost of planes: how unlike two photographs are around a pixel, if it lies on a plane.
+"""Photometric cost of planes: how different two photographs are around a pixel lying on a plane.
 
-Notation: sixteen pixels at a time, a lane each. A plane is its inverse depth in pixels of the
+Notation: sixteen pixels at a time, one per lane. A plane is its inverse depth in pixels of the
 reference view, w(u, v) = w0 + gx (u - u0) + gy (v - v0), which is exact for planes in space. The
 point at pixel (u, v) falls in a source view at P / P_z with
 
@@ -12,9 +12,10 @@ the cost in one source is
 
     1 - sum a_i s_i / sqrt(var_s + NOISE),    a_i = c_i (r_i - mean_r) / sqrt(var_r + NOISE),
 
-one minus the weighted normalised cross-correlation, drawn to 1 where there is no texture (NOISE).
-Promise: literal float32 arithmetic in a fixed order, so that results do not depend on threads.
-Source: bilaterally weighted NCC as in Schoenberger et al., Pixelwise View Selection (2016).
+one minus the weighted normalised cross-correlation (ZNCC), shrunk to 1 where there is no texture
+(NOISE). Promise: literal float32 arithmetic in a fixed order, so that results do not depend on
+threads. Source: bilaterally weighted NCC as in Schoenberger et al., Pixelwise View Selection
+(2016).
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
@@ -49,15 +50,15 @@ SAMPLES = SIDE * SIDE
 SIGMA_GREY = 25.0
 """Grey levels at which a sample's weight has fallen by exp(-1/2)."""
 SIGMA_PLACE = 5.0
-"""Likewise in pixels."""
+"""Likewise, in pixels."""
 NOISE = 0.1
 """Variance, grey levels squared, below which texture is noise."""
 UNSEEN = 1.0
-"""Cost in a view whose frame does not hold the point: that of no likeness."""
+"""Cost in a view whose frame does not contain the point: that of no correlation."""
 BEST = 2
-"""Sources whose costs count: those that see the pixel best, as others may not see it at all."""
+"""Number of lowest source costs that count: other sources may not see the pixel at all."""
 LEAST = np.float32(-0.7)
-"""Where ``exp_of_eighth`` ends."""
+"""End of ``exp_of_eighth``'s domain."""
 
 _GREY = np.float32(-0.5 / SIGMA_GREY**2 / 8)
 _PLACE = np.float32(-0.5 / SIGMA_PLACE**2 / 8)
@@ -109,13 +110,13 @@ def prepare_window(quads, width, height, u, v, weights, likeness):
 
 @inline
 def best_cost(sources, sizes, offsets, warps, u, v, planes, weights, likeness, out):
-    """The mean of the ``BEST`` lowest costs over the sources, for a plane in each lane.
+    """The mean of the ``BEST`` lowest costs over the sources, for one plane per lane.
 
     Args:
-        sources: Their quad images behind each other, int32, flat.
+        sources: Their quad images one after another, int32, flat.
         sizes: Width and height of each, int64 [S, 2].
-        offsets: Where each begins, int64 [S + 1].
-        warps: A row by row and b of each, float32 [S, 12].
+        offsets: Start of each, int64 [S + 1].
+        warps: A row by row, then b, of each, float32 [S, 12].
         u: float32 [16], pixels.
         v: float32 [16].
         planes: w0, gx, gy, float32 [3 * 16].
@@ -137,7 +138,7 @@ def best_cost(sources, sizes, offsets, warps, u, v, planes, weights, likeness, o
 
 @always_inline
 def _cost(quads, width, height, warp, u, v, planes, weights, likeness):
-    """One minus the correlation in one source."""
+    """The cost in one source: 1 - sum a_i s_i / sqrt(var_s + NOISE)."""
     u0, v0 = load(u, 0), load(v, 0)
     w, gx, gy = load(planes, 0), load(planes, LANES), load(planes, 2 * LANES)
     x0, ax, bx = _component(warp, 0, u0, v0, w, gx, gy)
@@ -165,7 +166,7 @@ def _cost(quads, width, height, warp, u, v, planes, weights, likeness):
 
 @always_inline
 def _component(warp, i, u, v, w, gx, gy):
-    """Component i of P at the window's centre, and what a pixel to the right and down adds."""
+    """Component i of P at the window's centre, and its change per pixel to the right and down."""
     a, b = splat(warp[3 * i]), splat(warp[3 * i + 1])
     c, d = splat(warp[3 * i + 2]), splat(warp[9 + i])
     start = fma(a, u, fma(b, v, fma(d, w, c)))
@@ -174,7 +175,7 @@ def _component(warp, i, u, v, w, gx, gy):
 
 @always_inline
 def _variance(square, mean):
-    """E[x^2] - E[x]^2, with what noise adds; never 0."""
+    """E[x^2] - E[x]^2 plus the noise; never 0."""
     noise = splat(_NOISE)
     variance = fnma(mean, mean, add(square, noise))
     return select_greater(variance, noise, variance, noise)

@@ -1,7 +1,7 @@
-"""Depth maps from photographs alone: every view compared with a few others, then with their maps.
+"""Depth maps from photographs alone: every view is compared with a few others, then the maps are.
 
 Notation: V views of a scene. Promise: the same scene, settings and seed give the same bytes,
-whatever the number of threads; a depth stands only where other views' maps, found without it,
+whatever the number of threads; a depth is kept only where other views' independently computed maps
 agree.
 """
 
@@ -39,15 +39,15 @@ def find_stereo(
     """Compare photographs with each other.
 
     Args:
-        views: The photographs at the size to compare.
-        images: The images they are of, in the same order.
-        visibility: The points that each image sees, which depth is looked for around. Where there
-            are too few, small copies of the photographs are compared first, to have some.
-        settings: How.
+        views: The photographs, at the size to compare.
+        images: Their images, in the same order.
+        visibility: The points that each image sees; depth is searched around them. If there are too
+            few, small copies of the photographs are compared first, to get some.
+        settings: The choices of stereo.
         seed: The same seed gives the same bytes.
         progress: Told how far it is.
-        only: The views whose maps are wanted: these have the same bytes as if all were, and of the
-            others no more is found than what confirms them. All when left out.
+        only: The views whose maps are wanted; the bytes are the same as if all were, and other
+            views are computed only as far as they confirm these. All when left out.
     """
     if len(visibility.xyz) < TOO_FEW:
         visibility = glimpse(views, seed, progress)
@@ -63,7 +63,7 @@ def find_stereo(
 
 
 def _hints(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Hints | None:
-    """What the points that a view sees say of its depth."""
+    """What the points that a view sees tell about its depth."""
     uv, z = Camera(view.K, view.width, view.height, view.cam_from_world).project(xyz)
     front = z > 0
     return hints_from(uv[front], 1.0 / z[front]) if front.any() else None

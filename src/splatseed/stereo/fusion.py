@@ -1,9 +1,9 @@
 """One seed for each piece of surface, from the depth maps of all views.
 
-Notation: every view's picture is divided into cells of c x c pixels. A kept pixel of view i becomes
-a seed unless, in i or in a view that confirms it, the cell that it falls in already has a seed at
-that depth. Promise: seeds come in the order of the views and, within one, of falling confidence,
-whatever the number of threads; no two of them share a cell, at one depth, in a view that confirms
+Notation: every view's photograph is divided into cells of c x c pixels. A kept pixel of view i
+becomes a seed unless the cell it falls in, in i or in a view that confirms it, already has a seed
+at that depth. Promise: seeds come in the order of the views and, within one, of falling confidence,
+whatever the number of threads; no two of them share a cell at one depth, in a view that confirms
 either.
 """
 
@@ -25,7 +25,7 @@ from splatseed.stereo.result import Stereo
 __all__ = ["StereoSeeds", "block_means", "fuse"]
 
 SAME = 0.03
-"""Relative difference of depth up to which two seeds of a cell are one."""
+"""Relative difference of depth up to which two seeds in a cell count as one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +34,8 @@ class StereoSeeds:
 
     Args:
         xyz: World positions, float32 [N, 3].
-        rgb: The mean colour of the map's pixel in the photograph, uint8 [N, 3].
-        normals: World, towards the view it comes from, float32 [N, 3].
+        rgb: Mean colour of the map pixel in the photograph, uint8 [N, 3].
+        normals: World axes, towards the view it comes from, float32 [N, 3].
         sizes: The side of a cell at that depth, scene units, float32 [N].
         confidence: From 0 to 1, float32 [N].
         view_idx: The view it comes from, int32 [N].
@@ -53,10 +53,10 @@ class StereoSeeds:
 
 
 def fuse(stereo: Stereo, cell: float, progress: Progress = silent) -> StereoSeeds:
-    """Seeds ``cell`` pixels apart in the pictures.
+    """Seeds ``cell`` pixels apart in the photographs.
 
     Args:
-        stereo: What stereo found.
+        stereo: The result of stereo.
         cell: Side of a cell in pixels of the views; not below the grid of the maps.
         progress: Told how many views are done.
     """
@@ -85,7 +85,7 @@ def _choose(
 ) -> Int64[np.ndarray, " M"]:
     """The pixels of a view that become seeds.
 
-    Their cells are taken in all views that confirm them.
+    Their cells are marked in all views that confirm them.
     """
     confidence = stereo.confidence(i).ravel()
     order = np.argsort(-confidence, kind="stable")[: np.count_nonzero(confidence)]
@@ -104,7 +104,7 @@ def _choose(
 
 @inline
 def _take(order, planes, agreeing, own, others, matrices, grid, cell, taken, offsets, shapes, good):
-    """Take the cells of a view's pixels, one after another."""
+    """Mark the cells of a view's pixels, one after another."""
     width = agreeing.shape[1]
     num = len(others)
     places, depths = np.zeros(num + 1, np.int64), np.zeros(num + 1, np.float32)
@@ -143,7 +143,7 @@ def _seeds(stereo: Stereo, i: int, chosen: Int64[np.ndarray, " M"], cell: float)
     normals = stereo.normals(i)[row, column] @ view.cam_from_world[:3, :3]
     return StereoSeeds(
         camera.unproject(uv, z).astype(np.float32),
-        block_means(view.image, grid)[row, column],
+        block_means(view.photograph, grid)[row, column],
         normals.astype(np.float32),
         (cell * z / view.K[0, 0]).astype(np.float32),
         stereo.confidence(i)[row, column],

@@ -1,7 +1,7 @@
-"""StereoMap: what photographs say of the depth and the normal at the pixels of one of them.
+"""StereoMap: depth and normals at the pixels of one photograph, from comparing it with others.
 
-Notation: a map is H x W pixels; ``camera`` is the photograph's with its pixels those of the map,
-the centre of the first at (0.5, 0.5). Promise: what is not confirmed by other views is NaN, and its
+Notation: a map is H x W pixels; ``camera`` is the photograph's, scaled to the map's pixels, with
+the centre of the first at (0.5, 0.5). Promise: what other views do not confirm is NaN, and its
 confidence 0.
 """
 
@@ -22,13 +22,13 @@ class StereoMap:
     """Depth, normal and confidence of one view.
 
     Args:
-        name: Of the image.
+        name: The image's name.
         camera: Pinhole, in pixels of the map.
         depth: Planar z, scene units, float32 [H, W]; NaN where unknown.
         normal: Unit vectors in camera axes, towards the camera, float32 [H, W, 3]; NaN where
             unknown.
         confidence: From 0, unknown, to 1, float32 [H, W].
-        sources: The names of the views it was compared with, best first; 8 at most.
+        sources: Names of the views it was compared with, best first; 8 at most.
         agreeing: Bit k is set where source k confirms the depth, uint8 [H, W].
     """
 
@@ -42,5 +42,5 @@ class StereoMap:
 
     @property
     def known_share(self) -> float:
-        """The share of pixels that have a depth."""
+        """The fraction of pixels that have a depth."""
         return float(np.isfinite(self.depth).mean())

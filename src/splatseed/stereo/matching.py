@@ -1,7 +1,7 @@
-"""Planes of every view by comparing it with others, and which of these others' planes agree.
+"""Planes of every view by comparing it with others, and which of the others' planes agree.
 
-Notation: as in ``result``. Promise: a view's planes depend on the photographs, what is known
-beforehand and the seed alone: threads take whole views.
+Notation: as in ``result``. Promise: a view's planes depend only on the photographs, its hints and
+the seed: threads take whole views.
 """
 
 from __future__ import annotations
@@ -25,21 +25,20 @@ from splatseed.views.view import View
 __all__ = ["check_stereo_memory", "make_pictures", "match_views", "other_from_view"]
 
 BYTES_A_DEPTH = 3 * 4 + 4 + 1
-"""A plane, its cost, and who agrees."""
+"""A view's planes, costs, and agreement bits."""
 
-Found = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
+Matched = tuple[Float32[np.ndarray, "3 h w"], Float32[np.ndarray, "h w"]]
 Grey = UInt8[np.ndarray, "H W"]
 
 
 def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None:
-    """Refuse what stereo cannot hold beside the photographs.
+    """Refuse what does not fit into memory beside the photographs.
 
-    These are: all photographs in grey, what is found at each pixel of the grid, and for each thread
-    the quads (4 bytes a pixel) of the view it is at and of the views that this one is compared
-    with.
+    That is: all photographs in grey, the planes at each grid point, and for each thread the quads
+    (4 bytes per pixel) of its view and of the views that it is compared with.
 
     Raises:
-        ParameterError: It does not fit the memory.
+        ParameterError: It does not fit.
     """
     grid, sizes = settings.grid, [view.width * view.height for view in views]
     depths = sum((view.width // grid) * (view.height // grid) for view in views)
@@ -48,7 +47,7 @@ def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None
     check_memory(
         depths,
         BYTES_A_DEPTH + -(-(sum(sizes) + quads) // max(depths, 1)),
-        "depths found at once",
+        "depths held at once",
         found=f"{depths:,}, at a grid of {grid} in {len(views)} photographs",
         fix="Choose a larger grid, smaller or fewer photographs, or free some memory.",
     )
@@ -66,24 +65,24 @@ def match_views(
 
     Args:
         views: The photographs.
-        hints: What is known of each one's depth; None: it gets none.
+        hints: Prior depth of each photograph; None: it gets no map.
         sources: The views to compare each with, best first, int64 [V, K]; -1 = none.
-        settings: How.
+        settings: The choices of stereo.
         seed: The same seed gives the same bytes.
         progress: Told how far it is.
     """
     check_stereo_memory(views, settings)
-    greys = [grey_image(view.image) for view in views]
-    found: list[Found] = [None] * len(views)  # type: ignore[list-item]  # filled in below
+    greys = [grey_image(view.photograph) for view in views]
+    matched: list[Matched] = [None] * len(views)  # type: ignore[list-item]  # filled in below
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):
             others = sources[i][sources[i] >= 0][: settings.num_sources].tolist()
             rng = np.random.default_rng([seed, i])
-            found[i] = _match(i, others, views, greys, hints[i], settings, rng)
+            matched[i] = _match(i, others, views, greys, hints[i], settings, rng)
 
     in_threads(work, len(views), 1, "compare photographs", progress)
-    planes, costs = [each[0] for each in found], [each[1] for each in found]
+    planes, costs = [each[0] for each in matched], [each[1] for each in matched]
     agreeing = _confirm_all(views, planes, costs, sources, settings, progress)
     return Stereo(tuple(views), planes, costs, agreeing, sources, settings)
 
@@ -96,7 +95,7 @@ def _match(
     hints: Hints | None,
     settings: StereoSettings,
     rng: np.random.Generator,
-) -> Found:
+) -> Matched:
     """The planes of one view."""
     view, grid = views[i], settings.grid
     shape = (view.height // grid, view.width // grid)
@@ -116,7 +115,7 @@ def _match(
 
 
 def _blocks_known(mask: Bool[np.ndarray, "H W"], grid: int) -> Bool[np.ndarray, "h w"]:
-    """Which blocks of grid x grid pixels have all of them in the photograph."""
+    """Which blocks of grid x grid pixels lie entirely in the photograph."""
     rows, columns = mask.shape[0] // grid, mask.shape[1] // grid
     blocks = mask[: rows * grid, : columns * grid].reshape(rows, grid, columns, grid)
     return np.asarray(blocks.all(axis=(1, 3)))
@@ -130,15 +129,15 @@ def make_pictures(
     grid: int,
     bounds: Float32[np.ndarray, " 2"],
 ) -> Pictures:
-    """A view and those it is compared with, as kernels take them.
+    """A view and its sources, as kernels take them.
 
     Args:
         view: The reference.
         grey: Its brightness.
-        others: The views it is compared with.
+        others: Its sources.
         greys: Their brightness.
         grid: Pixels between grid points.
-        bounds: Least and largest inverse depth that is tried.
+        bounds: Smallest and largest inverse depth that is tried.
     """
     offsets = np.cumsum([0, *(each.size for each in greys)])
     sources: Int32[np.ndarray, " Q"] = np.empty(offsets[-1], np.int32)
@@ -154,7 +153,7 @@ def make_pictures(
 
 
 def other_from_view(view: View, other: View) -> Float64[np.ndarray, "3 4"]:
-    """Pixels (u, v, 1) of a view times depth, and 1, to those of another: K_s [R K_r^-1, t]."""
+    """Maps pixels (u, v, 1) of a view times depth, and 1, to another's: K_s [R K_r^-1, t]."""
     relative = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
     return np.asarray(
         other.K @ np.hstack([relative[:3, :3] @ np.linalg.inv(view.K), relative[:3, 3:]])

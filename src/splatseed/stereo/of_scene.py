@@ -1,4 +1,4 @@
-"""``stereo_depths``: what stereo finds in all photographs of a scene."""
+"""``stereo_depths``: stereo between all photographs of a scene."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ def stereo_depths(
     """Depth, normals and confidence of every photograph of a scene.
 
     Args:
-        scene: With photographs.
-        settings: How; the defaults when left out.
+        scene: A scene with photographs.
+        settings: The choices of stereo; the defaults when left out.
         seed: The same seed gives the same bytes.
         progress: Told how far it is.
         choices: Fields of the settings, such as ``grid=2``.
 
     Raises:
         ParameterError: A choice is out of range.
-        SceneNotFoundError: There are no photographs, or less than two.
+        SceneNotFoundError: There are fewer than two photographs.
         SceneFormatError: A photograph cannot be used.
     """
     from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
@@ -45,7 +45,7 @@ def stereo_depths(
         raise SceneNotFoundError(
             "at least two photographs with a pose",
             found=f"{len(scene.images)}",
-            fix="Name a scene with photographs: depth is found by comparing them.",
+            fix="Name a scene with photographs: depth comes from comparing them.",
         )
     views = load_views(
         scene,

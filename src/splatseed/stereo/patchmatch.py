@@ -1,11 +1,11 @@
-"""PatchMatch: planes passed from pixel to pixel, or changed at random, if that costs less.
+"""PatchMatch: planes are propagated between pixels, or perturbed at random, if that costs less.
 
-Notation: planes (w, gx, gy) float32 [3, h, w], inverse depth at a grid point's place and its slopes
+Notation: planes (w, gx, gy) float32 [3, h, w] are the inverse depth at a grid point and its slopes
 per pixel; costs float32 [h, w]. Grid point (i, j) lies at pixel ((j + 0.5) g, (i + 0.5) g). Points
-are red and black as on a chequerboard; a half sweep visits those of one colour, sixteen of a row at
-a time, and reads only the other colour.
-Promise: the planes depend on the pictures, the start and ``key`` alone: random numbers are hashed
-from the key and the point, so no order of work shows.
+are red and black as on a chequerboard; a half sweep visits the points of one colour, sixteen of a
+row at a time, and reads only the other colour.
+Promise: the planes depend only on the pictures, the start and ``key``: random numbers are hashed
+from the key and the point, so the order of work is irrelevant.
 Source: PatchMatch stereo (Bleyer et al. 2011), in the chequerboard order of Gipuma (Galliani et al.
 2015), with the best of each arm as in ACMH (Xu and Tao 2019).
 """
@@ -26,37 +26,37 @@ from splatseed.stereo.cost import SAMPLES, best_cost, prepare_window
 __all__ = ["Pictures", "begin", "sweep"]
 
 ARM = 11
-"""How far a plane may come from in one visit, in grid points."""
+"""How far a plane may propagate in one visit, in grid points."""
 REFINEMENTS = 3
-"""Random changes of the best plane a visit, each half of the one before."""
+"""Random perturbations of the best plane per visit, each half the size of the one before."""
 STEEPEST = 6.0
-"""Slope of a surface against the picture, as the tangent of the angle: 80 degrees."""
+"""Steepest surface relative to the image plane, as the tangent of the angle: 80 degrees."""
 DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5
-"""Largest random changes, of inverse depth as a share and of the tangent; halved each sweep."""
+"""Largest perturbations: a fraction of inverse depth, and of the tangent; halved each sweep."""
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_A, _MIX_B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 
 class Pictures(NamedTuple):
-    """A view and those it is compared with, as kernels take them."""
+    """A view and its sources, as kernels take them."""
 
     quads: Int32[np.ndarray, " P"]
     """The view's quad image, flat."""
     size: Int64[np.ndarray, " 2"]
     """Its width and height."""
     sources: Int32[np.ndarray, " Q"]
-    """Quad images of the others, one after another."""
+    """Quad images of the sources, one after another."""
     sizes: Int64[np.ndarray, "S 2"]
     offsets: Int64[np.ndarray, " S+1"]
     warps: Float32[np.ndarray, "S 12"]
-    """A row by row and b of each (see ``cost``)."""
+    """A row by row, then b, of each (see ``cost``)."""
     grid: int
     """Pixels between grid points."""
     focal: float
     """Pixels."""
     bounds: Float32[np.ndarray, " 2"]
-    """Least and largest inverse depth that is tried."""
+    """Smallest and largest inverse depth that is tried."""
 
 
 @inline
@@ -71,7 +71,7 @@ def begin(pictures, guesses, planes, costs):
     """
     height, width = costs.shape
     costs[:] = np.inf
-    lanes, places, window, tried, found = _buffers()
+    lanes, places, window, tried, trial_costs = _buffers()
     for row in range(height):
         for first in range(0, width, LANES):
             _fill_lanes(first, 1, width, lanes)
@@ -80,7 +80,7 @@ def begin(pictures, guesses, planes, costs):
                 for lane in range(LANES):
                     for part in range(3):
                         tried[part * LANES + lane] = guesses[k, part, row, lanes[lane]]
-                _try(pictures, row, lanes, places, window, tried, found, planes, costs)
+                _try(pictures, row, lanes, places, window, tried, trial_costs, planes, costs)
 
 
 @inline
@@ -90,29 +90,29 @@ def sweep(pictures, color, number, key, planes, costs):
     Args:
         pictures: ``Pictures``.
         color: 0 or 1.
-        number: Of the sweep, from 0.
+        number: The sweep's number, from 0.
         key: uint64, what random numbers are hashed from.
         planes: Changed in place, float32 [3, h, w].
         costs: Likewise, float32 [h, w].
     """
     height, width = costs.shape
-    lanes, places, window, tried, found = _buffers()
+    lanes, places, window, tried, trial_costs = _buffers()
     for row in range(height):
         for first in range((row + color) % 2, width, 2 * LANES):
             _fill_lanes(first, 2, width, lanes)
             _look(pictures, row, lanes, places, window)
             for way in range(8):
-                _hand_on(pictures.grid, way, row, lanes, planes, costs, tried)
-                _try(pictures, row, lanes, places, window, tried, found, planes, costs)
+                _propagate(pictures.grid, way, row, lanes, planes, costs, tried)
+                _try(pictures, row, lanes, places, window, tried, trial_costs, planes, costs)
             for k in range(REFINEMENTS):
                 change = 0.5 ** (number + k)
-                _change(pictures, row, lanes, change, key + np.uint64(k), planes, tried)
-                _try(pictures, row, lanes, places, window, tried, found, planes, costs)
+                _perturb(pictures, row, lanes, change, key + np.uint64(k), planes, tried)
+                _try(pictures, row, lanes, places, window, tried, trial_costs, planes, costs)
 
 
 @inline
 def _buffers():
-    """Lanes' columns, pixels u and v, weights and likeness of windows, planes and costs."""
+    """Buffers: lanes' columns, pixels u and v, window weights and likeness, planes, costs."""
     return (
         np.zeros(LANES, np.int64),
         np.zeros((2, LANES), np.float32),
@@ -124,7 +124,7 @@ def _buffers():
 
 @inline
 def _fill_lanes(first, step, width, lanes):
-    """Sixteen columns; beyond the row's end the last one again."""
+    """Sixteen columns; beyond the row's end, its last one again."""
     last = first + (width - 1 - first) // step * step
     for lane in range(LANES):
         lanes[lane] = min(first + lane * step, last)
@@ -141,23 +141,23 @@ def _look(pictures, row, lanes, places, window):
 
 
 @inline
-def _try(pictures, row, lanes, places, window, tried, found, planes, costs):
-    """Take the planes that are tried where they cost less."""
+def _try(pictures, row, lanes, places, window, tried, trial_costs, planes, costs):
+    """Accept the planes tried where they cost less."""
     best_cost(
         pictures.sources, pictures.sizes, pictures.offsets, pictures.warps,
-        places[0], places[1], tried, window[0], window[1], found,
+        places[0], places[1], tried, window[0], window[1], trial_costs,
     )  # fmt: skip
     for lane in range(LANES):
         column = lanes[lane]
-        if found[lane] < costs[row, column] and _allowed(pictures, tried, lane):
-            costs[row, column] = found[lane]
+        if trial_costs[lane] < costs[row, column] and _allowed(pictures, tried, lane):
+            costs[row, column] = trial_costs[lane]
             for part in range(3):
                 planes[part, row, column] = tried[part * LANES + lane]
 
 
 @always_inline
 def _allowed(pictures, tried, lane):
-    """Whether a plane lies between the bounds and is not too steep."""
+    """Whether a plane lies within the bounds and is not too steep."""
     w, gx, gy = tried[lane], tried[LANES + lane], tried[2 * LANES + lane]
     if not pictures.bounds[0] <= w <= pictures.bounds[1]:
         return False
@@ -166,8 +166,8 @@ def _allowed(pictures, tried, lane):
 
 
 @inline
-def _hand_on(grid, way, row, lanes, planes, costs, tried):
-    """The planes of neighbours: next to each point (ways 0-3), or the best along an arm (4-7)."""
+def _propagate(grid, way, row, lanes, planes, costs, tried):
+    """Neighbours' planes: adjacent to each point (ways 0-3), or the best along an arm (4-7)."""
     height, width = costs.shape
     across, down = _direction(way % 4)
     for lane in range(LANES):
@@ -190,13 +190,13 @@ def _hand_on(grid, way, row, lanes, planes, costs, tried):
 
 @always_inline
 def _direction(way):
-    """Columns and rows to go: right, left, down, up."""
+    """Step in columns and rows: right, left, down, up."""
     return (1 - 2 * way if way < 2 else 0), (5 - 2 * way if way >= 2 else 0)
 
 
 @inline
-def _change(pictures, row, lanes, share, key, planes, tried):
-    """The planes of the points themselves, changed at random: in depth, or in slope as well."""
+def _perturb(pictures, row, lanes, share, key, planes, tried):
+    """The points' own planes, perturbed at random: in depth, or in slope as well."""
     width = planes.shape[2]
     for lane in range(LANES):
         column = lanes[lane]
@@ -212,7 +212,7 @@ def _change(pictures, row, lanes, share, key, planes, tried):
 
 @always_inline
 def _random(key, number):
-    """Evenly from -1 to 1, hashed (SplitMix64)."""
+    """Uniform in [-1, 1], hashed (SplitMix64)."""
     z = key + (number + np.uint64(1)) * _GOLDEN
     z = (z ^ (z >> np.uint64(30))) * _MIX_A
     z = (z ^ (z >> np.uint64(27))) * _MIX_B

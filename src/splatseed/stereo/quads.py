@@ -1,9 +1,9 @@
-"""A grey image as words of four pixels, read between pixels sixteen places at a time.
+"""A grey image as words of four pixels, interpolated at sixteen positions at a time.
 
 Notation: word (y, x) of a *quad image* holds the 8-bit pixels (y, x), (y, x+1), (y+1, x), (y+1,
-x+1) from its lowest byte on, so that one load of a lane brings all that bilinear interpolation
+x+1) from its lowest byte on, so that one load per lane brings all that bilinear interpolation
 needs. Column and row count from the centre of the first pixel. Promise: the value is the bilinear
-one, exact to float32 rounding; places outside the image take its border.
+one, exact to float32 rounding; positions outside the image take the border's value.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, misc"
@@ -35,7 +35,7 @@ def grey_image(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
 
 
 def make_quads(grey: UInt8[np.ndarray, "H W"]) -> Int32[np.ndarray, "H W"]:
-    """The quad image of a grey one."""
+    """The quad image of a grey image."""
     out = np.empty(grey.shape, np.int32)
     _pack(grey, out)
     return out
@@ -64,7 +64,7 @@ def _pack(grey, out):
 
 @intrinsic
 def sample(typing_context, quads, width, height, column, row):
-    """The image between its pixels: lane i at (column i, row i); NaN reads the first pixel.
+    """The interpolated image: lane i at (column i, row i); NaN reads the first pixel.
 
     ``quads`` is the flattened quad image, int32 [height * width]; ``width`` and ``height`` are
     int64.
@@ -98,7 +98,7 @@ def square_root(typing_context, v):
 
 
 def _split(builder, place, size):
-    """Whole and remaining part of coordinates, held between 0 and ``size - 1``."""
+    """Integer and fractional parts of coordinates, clamped to 0 and ``size - 1``."""
     last = builder.sitofp(builder.sub(size, ir.Constant(size.type, 1)), ir.FloatType())
     place = _limit(builder, place, "maxnum", ir.Constant(VECTOR, [0.0] * LANES))
     place = _limit(builder, place, "minnum", _splat(builder, last, VECTOR))
@@ -123,7 +123,7 @@ def _splat_index(builder, value):
 
 
 def _gather(builder, data, index):
-    """Sixteen words; LLVM takes the processor's own gather where that is worth it."""
+    """Gather sixteen words; LLVM uses the processor's own gather where that pays."""
     places = builder.gep(data, [index], source_etype=ir.IntType(32))
     places.type = ir.VectorType(ir.PointerType(), LANES)  # llvmlite takes it for one pointer
     mask = ir.VectorType(ir.IntType(1), LANES)

@@ -1,7 +1,7 @@
-"""Stereo: what was found of all views, from which maps and seeds are made.
+"""Stereo: the result for all views, from which maps and seeds are made.
 
-Notation: V views of W x H pixels; maps have a pixel for every block of g x g pixels. Promise: a
-depth stands only where other views' maps, found without it, agree.
+Notation: V views of W x H pixels; maps have one pixel per block of g x g pixels. Promise: a depth
+is kept only where other views' independently computed maps agree.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ __all__ = ["Stereo"]
 
 @dataclass(frozen=True, eq=False)
 class Stereo:
-    """What stereo found.
+    """The result of stereo.
 
     Args:
         views: The photographs at the size that was compared.
         planes: Of each view, float32 [3, h, w]: inverse depth and its slopes per pixel of the view.
         costs: Of each view, float32 [h, w].
-        agreeing: Of each view, which of its witnesses confirm a pixel, one bit per witness, uint8
+        agreeing: Which of a view's witnesses confirm each pixel, one bit per witness, uint8
             [h, w].
         sources: The views that each was compared with, best first, int64 [V, K]; -1 = none.
-        settings: How.
+        settings: The choices of stereo.
     """
 
     views: tuple[View, ...]
@@ -47,7 +47,7 @@ class Stereo:
         return np.asarray(np.bitwise_count(self.agreeing[i]) >= needed)
 
     def map(self, i: int) -> StereoMap:
-        """What is known of view i."""
+        """The map of view i."""
         view, kept = self.views[i], self.kept(i)
         height, width = kept.shape
         K = np.diag([1 / self.settings.grid, 1 / self.settings.grid, 1.0]) @ view.K
@@ -59,7 +59,7 @@ class Stereo:
         return StereoMap(view.name, camera, depth, normal, self.confidence(i), names, agreeing)
 
     def confidence(self, i: int) -> Float32[np.ndarray, "h w"]:
-        """The correlation, and half as much doubt with each view that agrees; 0 where not kept."""
+        """The correlation, with doubt halved by each view that agrees; 0 where not kept."""
         likeness = np.clip(1.0 - self.costs[i], 0.0, 1.0)
         belief = 1.0 - 0.5 ** np.bitwise_count(self.agreeing[i])
         return np.where(self.kept(i), likeness * belief, 0.0).astype(np.float32)

@@ -9,29 +9,29 @@ from splatseed.errors import ParameterError
 __all__ = ["StereoSettings"]
 
 MOST_SOURCES = 8
-"""Bits of the byte that says who agrees."""
+"""Bits of the byte that records which views agree."""
 
 
 @dataclass(frozen=True)
 class StereoSettings:
-    """How depth is found from photographs alone."""
+    """The choices of stereo: depth from photographs alone."""
 
     max_size: int = 800
-    """Photographs are made smaller by a whole factor until their longer side has so many pixels."""
+    """Photographs are downsampled by a whole factor to at most this many pixels a side."""
     grid: int = 4
     """Pixels between depths, along a row and a column."""
     sweeps: int = 4
-    """Times that planes are handed on and refined."""
+    """PatchMatch iterations: each propagates and refines all planes."""
     num_sources: int = 5
-    """Views that a plane is tried in."""
+    """Views that a plane is compared in."""
     num_witnesses: int = 8
     """Views that may confirm a depth."""
     min_agreeing: int = 2
-    """How many of them must."""
+    """How many of them must confirm it."""
     tolerance: float = 0.01
     """Relative difference at which two depths agree."""
     max_cost: float = 0.5
-    """Pixels whose cost (one minus correlation, 0 to 2) is larger are left out."""
+    """Pixels of higher cost (one minus correlation, 0 to 2) are left out."""
 
     def __post_init__(self) -> None:
         _check(self.max_size >= 32, "stereo.max_size of at least 32", self.max_size)

@@ -1,8 +1,8 @@
-"""Planes to begin with: through the points that Structure-from-Motion has near a pixel.
+"""Initial planes: through the points that Structure-from-Motion has near a pixel.
 
 Notation: a view sees M points at pixels uv [M, 2] with inverse depth w [M]; the grid has h x w
-points. Promise: K guesses a grid point, finite and positive; where a view sees too few points,
-inverse depths drawn evenly between the bounds.
+points. Promise: K guesses per grid point, finite and positive; if a view sees too few points,
+inverse depths drawn uniformly between the bounds.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from scipy.spatial import cKDTree
 __all__ = ["Hints", "first_planes", "hints_from"]
 
 NEAREST = 3
-"""Points whose depth is tried as it is."""
+"""Points whose depth is tried as a fronto-parallel plane."""
 FITTED = 8
-"""Points that a plane is laid through."""
+"""Points that a plane is fitted through."""
 RANDOM = 16
 """Guesses where nothing is known."""
 MARGIN = 1.3
-"""Bounds reach so many times beyond the nearest and the farthest point."""
+"""Bounds reach this many times beyond the nearest and the farthest point."""
 RIDGE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Hints:
-    """What is known of a view's depth before it is compared.
+    """What is known about a view's depth before it is compared.
 
     Args:
         uv: Pixels of points that it sees, float64 [M, 2].
         w: Their inverse depths, float64 [M].
-        bounds: Least and largest inverse depth that is looked for, float32 [2].
+        bounds: Smallest and largest inverse depth that is searched, float32 [2].
     """
 
     uv: Float64[np.ndarray, "M 2"]
@@ -42,7 +42,7 @@ class Hints:
 
 
 def hints_from(uv: Float64[np.ndarray, "M 2"], w: Float64[np.ndarray, " M"]) -> Hints:
-    """Hints by some points, at least one: planes are looked for a little beyond them."""
+    """Hints from at least one point: planes are searched a little beyond the points."""
     low, high = np.percentile(w, [0.5, 99.5])
     return Hints(uv, w, np.array([low / MARGIN, high * MARGIN], np.float32))
 
@@ -53,7 +53,7 @@ def first_planes(
     """The planes to try first at each grid point.
 
     Args:
-        hints: Of the view.
+        hints: The view's hints.
         shape: Rows and columns of the grid, neither 0.
         grid: Pixels between grid points.
         rng: For guesses where too few points are seen.
@@ -75,7 +75,7 @@ def first_planes(
 def _fit(
     apart: Float64[np.ndarray, "G K 2"], w: Float64[np.ndarray, "G K"]
 ) -> Float64[np.ndarray, "3 G"]:
-    """Least-squares w + gx du + gy dv through K points each, slopes drawn a little to 0."""
+    """Least-squares w + gx du + gy dv through K points each, slopes shrunk a little to 0."""
     design = np.concatenate([np.ones((*w.shape, 1)), apart], axis=2)
     normal = np.swapaxes(design, 1, 2) @ design
     spread = np.trace(normal[:, 1:, 1:], axis1=1, axis2=2)

@@ -1,11 +1,11 @@
 """Points for a scene that has none: from its depth maps, or from a glimpse at small photographs.
 
-Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, twice. First some views are
-compared with neighbours chosen by pose, and any depth is tried at which the picture moves by less
-than its width; half of the good pixels are nearer than the *middle* depth that this gives. Then all
-views are compared with those that see such depths from well beside, and what others confirm are
-points. Promise: as for all of stereo, the same bytes for a seed; points that no photographs confirm
-are not made up.
+Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, in two steps. First some
+views are compared with neighbours chosen by pose, over every depth at which the parallax is less
+than the photograph's width; half of the good pixels are nearer than the resulting *middle* depth.
+Then all views are compared with the views that see such depths at a good angle, and what others
+confirm becomes points. Promise: as for all of stereo, one seed gives one result; points that no
+photographs confirm are not made up.
 """
 
 from __future__ import annotations
@@ -30,30 +30,27 @@ from splatseed.views.visibility import Visibility, find_visibility
 __all__ = ["TOO_FEW", "glimpse", "known_visibility"]
 
 TOO_FEW = 30
-"""With fewer points a scene counts as having none."""
+"""A scene with fewer points counts as having none."""
 SMALL = 200
-"""Pixels of the longer side of a small photograph."""
+"""Longer side of a small photograph, in pixels."""
 LOOK = StereoSettings(grid=2, sweeps=6, tolerance=0.03, max_cost=0.4)
 CELL = 4.0
 """Pixels of the small photographs between points."""
 LOOKED_AT = 24
-"""Views that tell the middle depths of all."""
+"""Number of views that determine the middle depths of all."""
 GOOD = 0.15
-"""Cost of a pixel that may tell."""
+"""Highest cost of a pixel that counts there."""
 LEAST_MOVE = 0.2
-"""Pixels that a picture moves by at the farthest depth that is tried first."""
+"""Parallax in pixels at the farthest depth tried first."""
 AROUND = 3.0
-"""Depth is then looked for up to so many times beyond that of the nearest and farthest tenth."""
+"""The second search reaches this many times beyond the nearest and farthest tenth."""
 MOST_POINTS = 30_000
 SAMPLES = 18
-"""Rows and columns at which a depth map is asked."""
+"""Rows and columns at which a depth map is sampled."""
 
 
 def known_visibility(scene: Scene) -> Visibility:
-    """The points that each image sees: SfM's.
-
-    Where there are none, places of the scene's depth maps.
-    """
+    """The points that each image sees: from SfM, else sampled from the scene's depth maps."""
     visibility, maps = find_visibility(scene), scene.depths
     if len(visibility.xyz) >= TOO_FEW or maps is None:
         return visibility
@@ -76,8 +73,8 @@ def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
     centers = np.stack([_camera(view).center for view in small])
     sources = choose_sources(seen, xyz, centers, LOOK.num_witnesses)
     hints = [_between(low / AROUND, high * AROUND) for low, _, high in spread]
-    found = match_views(small, hints, sources, LOOK, seed, progress)
-    return _unseen(fuse(found, CELL).xyz.astype(np.float64))
+    stereo = match_views(small, hints, sources, LOOK, seed, progress)
+    return _unseen(fuse(stereo, CELL).xyz.astype(np.float64))
 
 
 def _places(image: Image, depth: DepthMap) -> Float64[np.ndarray, "N 3"]:
@@ -99,7 +96,7 @@ def _places(image: Image, depth: DepthMap) -> Float64[np.ndarray, "N 3"]:
 
 
 def _unseen(xyz: Float64[np.ndarray, "N 3"]) -> Visibility:
-    """Points of which it is not known who sees them, not too many."""
+    """A subset of points whose visibility is unknown."""
     every = max(1, -(-len(xyz) // MOST_POINTS))
     return Visibility(xyz[::every], np.empty(0, np.int64), {}, {})
 
@@ -109,9 +106,9 @@ def _camera(view: View) -> Camera:
 
 
 def _small(view: View) -> View:
-    """A view made smaller by a whole factor."""
+    """A view downsampled by a whole factor."""
     factor = max(1, round(max(view.width, view.height) / SMALL))
-    image = block_means(view.image, factor)
+    image = block_means(view.photograph, factor)
     K = np.diag([1 / factor, 1 / factor, 1.0]) @ view.K
     mask = None
     if view.mask is not None:
@@ -120,21 +117,21 @@ def _small(view: View) -> View:
 
 
 def _between(low: float, high: float) -> Hints:
-    """Hints of a view of whose depth only bounds are known."""
+    """Hints for a view whose depth is only known to lie between bounds."""
     return Hints(np.empty((0, 2)), np.empty(0), np.array([low, high], np.float32))
 
 
 def _spread_of_depth(
     views: Sequence[View], seed: int, progress: Progress
 ) -> Float64[np.ndarray, "V 3"]:
-    """Of each view, inverse depths at the 10th, 50th and 90th percentile of its pixels."""
+    """Inverse depths of each view at the 10th, 50th and 90th percentiles of its pixels."""
     sources = choose_by_pose(np.stack([view.cam_from_world for view in views]), LOOK.num_sources)
     looked = np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).round().astype(np.int64))
     hints: list[Hints | None] = [None] * len(views)
     for i in looked:
         hints[i] = _any_depth(views, int(i), sources[i])
-    found = match_views(views, hints, sources, LOOK, seed, progress)
-    good = [found.planes[i][0][found.costs[i] < GOOD] for i in looked]
+    stereo = match_views(views, hints, sources, LOOK, seed, progress)
+    good = [stereo.planes[i][0][stereo.costs[i] < GOOD] for i in looked]
     told = np.array([np.quantile(w, [0.1, 0.5, 0.9]) if len(w) else [np.nan] * 3 for w in good])
     if np.isnan(told).all():
         return np.ones((len(views), 3))
@@ -144,7 +141,7 @@ def _spread_of_depth(
 
 
 def _any_depth(views: Sequence[View], i: int, sources: Int64[np.ndarray, " K"]) -> Hints | None:
-    """From where the picture hardly moves to where it moves by its width."""
+    """From the depth where the photograph hardly moves to where it moves by its width."""
     others = sources[sources >= 0]
     apart = [np.linalg.norm(_camera(views[j]).center - _camera(views[i]).center) for j in others]
     moves = views[i].K[0, 0] * float(np.median(apart)) if apart else 0.0
@@ -154,7 +151,7 @@ def _any_depth(views: Sequence[View], i: int, sources: Int64[np.ndarray, " K"]) 
 def _imagined_points(
     views: Sequence[View], spread: Float64[np.ndarray, "V 3"]
 ) -> tuple[Float64[np.ndarray, "P 3"], list[Int64[np.ndarray, " M"]]]:
-    """Places that views may be seeing, and which of them fall into each view."""
+    """Positions that views may be seeing, and which of them fall into each view."""
     points = []
     for view, inverse in zip(views, spread, strict=True):
         share = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]

@@ -1,4 +1,4 @@
-"""A capture made from nothing, with known surfaces, for the demo, the tests and the benchmarks.
+"""A synthetic capture with known surfaces, for the demo, the tests and the benchmarks.
 
 ``make_capture`` photographs a small room by ray casting and finds points in the photographs as
 Structure-from-Motion would; ``SHAPES`` holds single surfaces to measure a method on.

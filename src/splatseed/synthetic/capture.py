@@ -1,4 +1,4 @@
-"""make_capture: the demo's photographs, depth and points, from nothing but a seed.
+"""make_capture: the demo's photographs, depth and points, from a seed alone.
 
 Notation: V views of H x W pixels; depth is planar z in metres, 0 where nothing was hit. Promise: a
 seed gives the same capture everywhere; the scene has a COLMAP model's parts (poses, features,
@@ -37,7 +37,7 @@ CAMERA_ID = 1
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A made-up capture and the truth behind it.
+    """A synthetic capture and its ground truth.
 
     Args:
         scene: Cameras, images with their features, points and tracks; ``source`` is None.
@@ -63,12 +63,12 @@ class Capture:
     ) -> Float64[np.ndarray, "num 3"]:
         """Points uniform by area on the parts of the surfaces that some camera sees, [num, 3].
 
-        Coverage is asked of these alone: no method can know the inside of the flower pot.
+        Coverage is measured on these alone: no method can know the inside of the flower pot.
 
         Args:
             num: How many.
             rng: Draws them.
-            bare: Whether the bare wall is included. It has no points to upsample, so that it would
+            bare: Whether the bare wall is included. It has no points to upsample, so it would
                 outweigh everything else, and a method that strews points at random would win.
         """
         surfaces = self.surfaces if bare else self.room.without(BARE)
@@ -76,7 +76,7 @@ class Capture:
         while sum(len(batch) for batch in batches) < num:
             xyz = surfaces.sample(num, rng)
             batches.append(xyz[self._seen_by_any(xyz)])
-        # Union samples part by part; the order must not matter to who takes the first few.
+        # Union samples part by part; whoever takes the first few must not depend on that order.
         return np.asarray(rng.permutation(np.concatenate(batches))[:num])
 
     def _seen_by_any(self, xyz: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
@@ -111,8 +111,8 @@ def make_capture(
     room = build_room(rng)
     cameras = orbit_cameras(num_views, width, height)
     images, depths = render_views(room, cameras)
-    found = track_points(room.surfaces, cameras, images, depths, rng)
-    return Capture(_scene(cameras, images, found), images, depths, room, found.outliers)
+    tracked = track_points(room.surfaces, cameras, images, depths, rng)
+    return Capture(_scene(cameras, images, tracked), images, depths, room, tracked.outliers)
 
 
 def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False) -> Path:
@@ -147,59 +147,59 @@ def write_capture(capture: Capture, path: Path | str, *, overwrite: bool = False
 
 
 def _scene(
-    cameras: Sequence[Camera], images: UInt8[np.ndarray, "V H W 3"], found: TrackedPoints
+    cameras: Sequence[Camera], images: UInt8[np.ndarray, "V H W 3"], tracked: TrackedPoints
 ) -> Scene:
-    """The COLMAP model of the points found; point i has id i + 1, view v has id v + 1."""
+    """The COLMAP model of the points; point i has id i + 1, view v has id v + 1."""
     K = cameras[0].K
     params = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     intrinsics = Intrinsics(CAMERA_ID, "PINHOLE", cameras[0].width, cameras[0].height, params)
-    points = PointCloud(found.xyz.astype(np.float32), _point_colors(images, found))
+    points = PointCloud(tracked.xyz.astype(np.float32), _point_colors(images, tracked))
     return Scene(
         points,
-        tuple(_image(v, camera, intrinsics, found) for v, camera in enumerate(cameras)),
+        tuple(_image(v, camera, intrinsics, tracked) for v, camera in enumerate(cameras)),
         (intrinsics,),
-        _tracks(found),
+        _tracks(tracked),
     )
 
 
-def _image(view: int, camera: Camera, intrinsics: Intrinsics, found: TrackedPoints) -> Image:
-    mine = found.view_idx == view
+def _image(view: int, camera: Camera, intrinsics: Intrinsics, tracked: TrackedPoints) -> Image:
+    mine = tracked.view_idx == view
     return Image(
         f"view_{view:03d}.png",
         view + 1,
         intrinsics,
         quat_from_rotation(camera.cam_from_world[:3, :3]),
         camera.cam_from_world[:3, 3],
-        Observations(found.uv[mine], found.point_idx[mine] + 1),
+        Observations(tracked.uv[mine], tracked.point_idx[mine] + 1),
     )
 
 
-def _tracks(found: TrackedPoints) -> Tracks:
+def _tracks(tracked: TrackedPoints) -> Tracks:
     """Tracks in COLMAP's terms; a feature's index counts its image's observations in order."""
-    by_view = np.argsort(found.view_idx, kind="stable")
-    counts = np.bincount(found.view_idx)
+    by_view = np.argsort(tracked.view_idx, kind="stable")
+    counts = np.bincount(tracked.view_idx)
     first = np.repeat(np.cumsum(counts) - counts, counts)
     point2d_idx = np.empty(len(by_view), np.uint32)
     point2d_idx[by_view] = np.arange(len(by_view)) - first
-    num = len(found.xyz)
+    num = len(tracked.xyz)
     return Tracks(
         point_ids=np.arange(1, num + 1),
-        xyz=found.xyz,
-        errors=found.errors,
-        offsets=np.searchsorted(found.point_idx, np.arange(num + 1)),
-        image_ids=(found.view_idx + 1).astype(np.uint32),
+        xyz=tracked.xyz,
+        errors=tracked.errors,
+        offsets=np.searchsorted(tracked.point_idx, np.arange(num + 1)),
+        image_ids=(tracked.view_idx + 1).astype(np.uint32),
         point2d_idx=point2d_idx,
     )
 
 
 def _point_colors(
-    images: UInt8[np.ndarray, "V H W 3"], found: TrackedPoints
+    images: UInt8[np.ndarray, "V H W 3"], tracked: TrackedPoints
 ) -> UInt8[np.ndarray, "N 3"]:
     """Mean colour of each point over the pixels that observed it."""
     limits = np.array(images.shape[2:0:-1]) - 1
-    column, row = np.clip(np.floor(found.uv), 0, limits).astype(np.int64).T
-    pixels = images[found.view_idx, row, column].astype(np.float64)
-    starts = np.searchsorted(found.point_idx, np.arange(len(found.xyz)))
+    column, row = np.clip(np.floor(tracked.uv), 0, limits).astype(np.int64).T
+    pixels = images[tracked.view_idx, row, column].astype(np.float64)
+    starts = np.searchsorted(tracked.point_idx, np.arange(len(tracked.xyz)))
     sums = np.add.reduceat(pixels, starts)
-    counts = np.bincount(found.point_idx, minlength=len(found.xyz))
+    counts = np.bincount(tracked.point_idx, minlength=len(tracked.xyz))
     return np.round(sums / counts[:, None]).astype(np.uint8)

@@ -58,7 +58,7 @@ class Discs:
         """See ``Surface.sample``."""
         leaf = rng.choice(len(self.radii), num, p=self.radii**2 / (self.radii**2).sum())
         axis = self.axes[leaf]
-        # Any direction across the leaf will do; one from a random vector is uniform in angle.
+        # Any direction in the leaf's plane will do; one from a random vector is uniform in angle.
         across = np.cross(axis, rng.normal(size=(num, 3)))
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         radius = self.radii[leaf] * np.sqrt(rng.random(num))

@@ -26,8 +26,8 @@ AMBIENT = 0.45
 BACKGROUND = np.array([0.72, 0.78, 0.84])
 
 BUNDLE = 16_384
-"""Rays at a time: temporaries stay in the cache, and products too small for BLAS's own threads,
-which would fight with ours."""
+"""Rays per bundle: temporaries stay in the cache, and products are too small for BLAS's own
+threads, which would compete with ours."""
 
 
 def pixel_rays(camera: Camera, dx: float = 0.0, dy: float = 0.0) -> Float64[np.ndarray, "HW 3"]:
@@ -71,7 +71,7 @@ def render_view(
 def _in_bundles(
     function: Callable[[np.ndarray], np.ndarray], directions: Float64[np.ndarray, "N 3"]
 ) -> np.ndarray:
-    """``function`` of the rays, ``BUNDLE`` of them at a time."""
+    """``function`` of the rays, ``BUNDLE`` at a time."""
     bundles = range(0, len(directions), BUNDLE)
     return np.concatenate([function(directions[start : start + BUNDLE]) for start in bundles])
 
@@ -94,7 +94,7 @@ def _shade(
 def _lambert(
     normals: Float64[np.ndarray, "N 3"], directions: Float64[np.ndarray, "N 3"]
 ) -> Float64[np.ndarray, " N"]:
-    """Brightness 0..1 of the side that is seen: sheets and leaves have two."""
+    """Lambertian brightness 0..1 of the visible side: sheets and leaves have two."""
     facing = -np.sign(np.einsum("ij,ij->i", normals, directions))
     return np.asarray(AMBIENT + (1.0 - AMBIENT) * np.maximum(facing * (normals @ SUN), 0.0))
 
@@ -102,7 +102,7 @@ def _lambert(
 def visible(
     surfaces: Surface, camera: Camera, xyz: Float64[np.ndarray, "N 3"]
 ) -> Bool[np.ndarray, " N"]:
-    """Which points on the surfaces the camera sees: inside the image and nothing in front, [N]."""
+    """Which points on the surfaces the camera sees: in the image and not occluded, [N]."""
     uv, depth = camera.project(xyz)
     inside = (depth > 0) & (uv >= 0).all(axis=1) & (uv < [camera.width, camera.height]).all(axis=1)
     seen: Int64[np.ndarray, " M"] = np.flatnonzero(inside)

@@ -1,7 +1,7 @@
-"""The demo's room: what stands where, and how it is painted.
+"""The demo's room: its surfaces, where they stand and their textures.
 
 Notation: world axes x and y along the floor, z up, in metres; the room's corner is at (-1.6, -1.6).
-Promise: every kind of surface on which upsampling behaves differently is there: flat with texture
+Promise: it has every kind of surface on which upsampling behaves differently: flat with texture
 (floor, brick wall, box), curved (sphere, cylinder, wavy screen), foliage, and a bare wall.
 """
 
@@ -31,7 +31,7 @@ NUM_LEAVES = 300
 UP = np.array([0.0, 0.0, 1.0])
 LOOK_AT = np.array([-0.15, -0.15, 0.45])
 FOCAL = 0.95
-"""Focal length in image widths: a 55 degree lens, as of a phone."""
+"""Focal length in image widths: a 55 degree lens, like a phone's."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def _furniture() -> dict[str, tuple[Surface, Texture]]:
 
 
 def _plant(rng: np.random.Generator) -> dict[str, tuple[Surface, Texture]]:
-    """Leaves in a ball above the cylinder, which is their pot; each turned at random."""
+    """Leaves in a ball above the cylinder, their pot; each turned at random."""
     direction = rng.normal(size=(NUM_LEAVES, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     # The cube root fills the ball evenly; starting at 0.5 leaves the middle to the stem.

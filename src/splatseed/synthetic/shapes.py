@@ -1,7 +1,7 @@
-"""Simple known shapes, on which a method's errors have a name.
+"""Simple known shapes, each of which provokes one kind of error.
 
 Notation: each shape is a ``Surface`` of about unit size, centred near the origin and tilted off the
-world's axes where it is flat, since a method that works in world axes shows it there. Promise:
+world's axes where it is flat, because that reveals methods that work in world axes. Promise:
 fixed, nothing random.
 """
 
@@ -46,7 +46,7 @@ def cylinder() -> Cylinder:
 
 
 def sine_sheet() -> SineSheet:
-    """A 2 x 2 sheet of three and a third waves, 0.1 up and down."""
+    """A 2 x 2 sheet of three and a third waves with an amplitude of 0.1."""
     return SineSheet(np.array([-1.0, -1.0, 0.0]), np.eye(3), np.array([2.0, 2.0]), 0.1, 0.6)
 
 

@@ -1,4 +1,4 @@
-"""Analytic surfaces that can be measured, sampled and seen.
+"""Analytic surfaces that can be measured, sampled and rendered.
 
 Notation: a surface is a set of points in the world, scene units. A ray is ``origin`` [3] plus
 ``t`` times ``directions`` [N, 3], which need not have unit length: with directions that advance one
@@ -21,7 +21,7 @@ __all__ = ["Box", "Cylinder", "Rectangle", "Sphere", "Surface", "Union", "yaw_fr
 
 
 class Surface(Protocol):
-    """What the demo scene and the benchmarks ask of a surface."""
+    """What the demo scene and the benchmarks need from a surface."""
 
     @property
     def area(self) -> float:
@@ -54,7 +54,7 @@ def yaw_frame(degrees: float) -> Float64[np.ndarray, "3 3"]:
 
 
 def _first_hit(*candidates: tuple[np.ndarray, np.ndarray]) -> Float64[np.ndarray, " N"]:
-    """The smallest positive t [N] among pairs (t, whether it is a hit); inf where there is none.
+    """The smallest positive t [N] among pairs (t, whether it is a hit); inf if there is none.
 
     Pairs, not a table: NumPy's reductions over an axis of two are many times slower.
     """
@@ -334,7 +334,7 @@ def slab_interval(
     low: Float64[np.ndarray, " 3"],
     high: Float64[np.ndarray, " 3"],
 ) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
-    """Where rays enter and leave the box low..high, all in its axes; near > far for a miss."""
+    """Where rays enter and leave the box low..high, in the box's axes; near > far for a miss."""
     near = np.full(len(directions), -np.inf)
     far = np.full(len(directions), np.inf)
     for i in range(3):
@@ -352,7 +352,7 @@ def _roots(
 ) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
     """Both roots of a t² + 2 half_b t + c, [N] each, and whether they are real, [N].
 
-    The product form of the smaller root avoids the cancellation of the school formula.
+    The product form of the smaller root avoids cancellation.
     """
     discriminant = half_b * half_b - a * c
     real = discriminant >= 0

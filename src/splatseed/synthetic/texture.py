@@ -2,8 +2,8 @@
 
 Notation: a texture maps points [N, 3] to colours [N, 3], 0..1, as they would be displayed. Palettes
 are [C, 3] and are read with a value in 0..1. Promise: the same point has the same colour from every
-view, so that what is a corner in one image is one in the next; details end near a few pixels of the
-demo's photographs, so that they do not flicker.
+view, so a corner in one image is a corner in the next; details end near a few pixels of the demo's
+photographs, so that they do not alias.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Texture(Protocol):
 
 @dataclass(frozen=True)
 class Plain:
-    """One colour everywhere: the surface on which no feature can be found.
+    """One colour everywhere: no feature can be detected on it.
 
     Args:
         color: The colour, 0..1.
@@ -50,10 +50,10 @@ class Mottled:
 
     Args:
         palette: Colours for noise from low to high, each 0..1.
-        frequency: Cells a scene unit of the coarsest octave along x, y and z.
+        frequency: Cells per scene unit of the coarsest octave along x, y and z.
         octaves: How many octaves, each twice as fine and 0.7 times as strong as the one before.
-        contrast: Noise is spread by this factor about its mean before the palette is read.
-        seed: Which noise.
+        contrast: Noise is scaled by this factor about its mean before the palette is read.
+        seed: Selects the noise.
     """
 
     palette: tuple[Color, ...]
@@ -73,11 +73,11 @@ class Tiles:
     """Bricks, boards or checks: cells of one colour each, joints between them, grain on top.
 
     Args:
-        palette: A cell's colour is read from it at random, each 0..1.
+        palette: Each cell's colour is drawn from it, 0..1.
         cell: Size of a cell along x, y and z in scene units.
         grain: Noise that darkens and lightens the cells; its palette is a factor on the colour.
         joint: Width of the dark joints in scene units.
-        seed: Which colours.
+        seed: Selects the colours.
     """
 
     palette: tuple[Color, ...]
@@ -89,8 +89,7 @@ class Tiles:
     def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
         """Colours in 0..1 of points, [N, 3]."""
         size = np.array(self.cell)
-        # Off the origin by a fraction of a cell, so that no wall at a round coordinate lies on a
-        # joint.
+        # Offset by a fraction of a cell, so that no wall at a round coordinate lies on a joint.
         position = xyz / size + 0.37
         colors = _read_palette(self.palette, _lattice_values(np.floor(position), self.seed))
         from_joint = np.abs(position - np.round(position)) * size
@@ -114,7 +113,7 @@ def value_noise(
 ) -> Float64[np.ndarray, " N"]:
     """Smooth noise in 0..1 with cells of size 1, 1/2, 1/4 ..., [N].
 
-    Random values sit at integer lattice points and are joined by smoothstep interpolation; each
+    Random values at integer lattice points are joined by smoothstep interpolation; each
     octave is 0.7 times as strong as the one before.
     """
     return np.asarray(_noise_sum(np.ascontiguousarray(xyz, np.float64), octaves, seed))

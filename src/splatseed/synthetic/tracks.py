@@ -1,11 +1,10 @@
-"""Points as Structure-from-Motion would have found them in rendered photographs.
+"""Points as Structure-from-Motion would have reconstructed them from rendered photographs.
 
 Notation: V views, N points, T observations; observation t says that view ``view_idx[t]`` saw point
 ``point_idx[t]`` at pixel ``uv[t]``, and observations are sorted by point, then view. Promise:
 candidates are corners of the images, so texture decides where points are; positions are the
-least-squares triangulation of noisy observations, so that errors are longest along the viewing
-rays and for short tracks, as in a real model, and the reprojection errors are those of the
-observations given.
+least-squares triangulation of noisy observations, so errors are largest along the viewing rays and
+for short tracks, as in a real model; reprojection errors are those of the observations.
 """
 
 from __future__ import annotations
@@ -24,30 +23,30 @@ from splatseed.synthetic.surfaces import Surface
 __all__ = ["TrackNoise", "TrackedPoints", "corner_strength", "find_corners", "track_points"]
 
 MIN_STRENGTH = 6e-5
-"""Least corner strength of a feature, for grey values 0..1: above a bare wall's, below
-texture's."""
+"""Least corner strength of a feature, for grey values 0..1: above that of a bare wall, below that
+of texture."""
 
 MERGE_PIXELS = 2.4
 """Corners of different views that unproject to within this many pixels are one point."""
 
 FULL_STRENGTH = 2e-3
-"""Corners at least this strong are always candidates, weaker ones in proportion."""
+"""Corners at least this strong are always candidates, weaker ones in proportion to strength."""
 
 MIN_COSINE = 0.25
-"""A surface seen more obliquely than this does not match: 75 degrees."""
+"""Angle in degrees beyond which a surface is seen too obliquely to match."""
 
 MISMATCH_NOISE = 2.5
-"""Observations of a mismatch agree this much worse."""
+"""Factor on the observation noise of mismatches."""
 
 
 @dataclass(frozen=True)
 class TrackNoise:
-    """How the found points differ from the truth.
+    """How the reconstructed points differ from the truth.
 
     Args:
-        pixel_sigma: Typical standard deviation of an observation in pixels, each axis.
+        pixel_sigma: Typical standard deviation of an observation in pixels, per axis.
         outlier_share: Share of points that are mismatches: wrong by 15-80% of their depth.
-        min_track: Fewest views of a point that is no mismatch.
+        min_track: Fewest views of a point that is not a mismatch.
     """
 
     pixel_sigma: float = 0.5
@@ -77,7 +76,7 @@ class TrackedPoints:
 
 
 def corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
-    """The smaller eigenvalue of the structure tensor of the grey image, 0..1 a pixel, [H, W].
+    """The smaller eigenvalue of the structure tensor of the grey image, 0..1 per pixel, [H, W].
 
     Source: Shi and Tomasi, Good Features to Track, 1994.
     """
@@ -91,7 +90,7 @@ def corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H
 def find_corners(strength: Float32[np.ndarray, "H W"]) -> Int64[np.ndarray, "M 2"]:
     """Row and column of the local maxima above ``MIN_STRENGTH``, [M, 2]."""
     peak = (strength == ndimage.maximum_filter(strength, 3)) & (strength > MIN_STRENGTH)
-    peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = (False,) * 4  # filters see no further
+    peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = (False,) * 4  # filters need neighbours
     rows, cols = np.nonzero(peak)
     return np.stack([rows, cols], axis=1)
 
@@ -112,7 +111,7 @@ def track_points(
         images: The photographs, uint8 [V, H, W, 3].
         depths: Their planar z-depths, float32 [V, H, W]; 0 = none.
         rng: Decides which views see a corner, the noise and the mismatches.
-        noise: How much of the latter two.
+        noise: Parameters of the noise and the mismatches.
     """
     noise = noise or TrackNoise()
     strengths = np.stack([corner_strength(image) for image in images])
@@ -157,14 +156,14 @@ def _candidates(
     rng: np.random.Generator,
 ) -> Float64[np.ndarray, "N 3"]:
     """Exact surface points under the corners of all views, near-duplicates merged."""
-    found = []
+    per_view = []
     for camera, strength, depth in zip(cameras, strengths, depths, strict=True):
         corners = find_corners(strength)
         at_corner = strength[corners[:, 0], corners[:, 1]]
         chosen = rng.random(len(corners)) < at_corner / FULL_STRENGTH
-        found.append(_unproject_corners(camera, corners[chosen], depth))
-    xyz = np.concatenate([points for points, _ in found])
-    footprint = np.median(np.concatenate([size for _, size in found]))
+        per_view.append(_unproject_corners(camera, corners[chosen], depth))
+    xyz = np.concatenate([points for points, _ in per_view])
+    footprint = np.median(np.concatenate([size for _, size in per_view]))
     cells = np.floor(xyz / (MERGE_PIXELS * footprint)).astype(np.int64)
     return np.asarray(xyz[np.sort(np.unique(cells, axis=0, return_index=True)[1])])
 
@@ -218,7 +217,7 @@ def _observe(
 def _renumber(
     keep: Bool[np.ndarray, " N"], point_idx: Int64[np.ndarray, " T"], view_idx: np.ndarray
 ) -> tuple[Int64[np.ndarray, " S"], Int64[np.ndarray, " S"]]:
-    """The observations of the points kept, with the points counted anew."""
+    """The observations of the points kept, with the points renumbered."""
     mine = keep[point_idx]
     return (np.cumsum(keep) - 1)[point_idx[mine]], view_idx[mine]
 
@@ -233,7 +232,7 @@ def _displace(
 ) -> tuple[Float64[np.ndarray, "N 3"], Bool[np.ndarray, " T"]]:
     """Move mismatches along the ray of their first view, and cut their tracks to three views.
 
-    Returns the positions, and which observations remain: the moved point must lie in the image.
+    Returns the positions, and which observations remain: the moved point must be in the image.
     """
     first = np.searchsorted(point_idx, np.arange(len(xyz)))
     eyes = np.stack([camera.center for camera in cameras])[view_idx[first]]

@@ -3,8 +3,7 @@
 Notation: in the sheet's frame (rows of ``frame``, origin at ``corner``) a point is (u, v, w) and
 the sheet is w = height(u) = A sin(2 pi u / wavelength) for 0 <= u <= size[0], 0 <= v <= size[1].
 Promise: distances and depths are refined by bisection to 1e-10 of the sheet's size.
-A ray that only grazes a crest, entering and leaving within a 48th of a wave, may be taken to miss
-it.
+A ray that only grazes a crest, entering and leaving within a 48th of a wave, may count as a miss.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from splatseed.synthetic.surfaces import slab_interval
 __all__ = ["SineSheet"]
 
 _BISECTIONS = 36
-"""Halvings of a bracket that is a small part of the sheet to begin with."""
+"""Halvings of a bracket that starts as a small part of the sheet."""
 
 _STEPS_PER_WAVE = 48
 _GRID_PER_WAVE = 32
@@ -110,9 +109,9 @@ class SineSheet:
     def _first_crossing(
         self, start: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray
     ) -> np.ndarray:
-        """March from near to far, then halve the first step whose ends lie on different sides.
+        """March from near to far, then bisect the first step whose ends lie on different sides.
 
-        A step covers a fixed part of a wave, so that rays across the sheet take few.
+        A step covers a fixed part of a wave, so that rays across the sheet need few.
         """
         at_start = self._above(start, directions, near)
         along_wave = np.maximum(np.abs(directions[:, 0]), 1e-12)
@@ -141,7 +140,7 @@ class SineSheet:
         return high
 
     def _above(self, start: np.ndarray, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """Whether the rays are above the wave at t, their own frame's w upward."""
+        """Whether the rays are above the wave at t, along w."""
         u, w = (start[i] + t * directions[:, i] for i in (0, 2))
         return np.asarray(w > self._height(u))
 

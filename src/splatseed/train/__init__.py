@@ -1,8 +1,8 @@
 """Training: from a scene and its seeds to Gaussians that look like the photographs.
 
-``prepare_run`` reads what a run needs and opens its folder; the ``TrainingRun`` that it returns
-trains and writes the results. ``TrainSettings`` alone can be used without PyTorch: the rest is
-imported when it is first asked for (``pip install ".[train]"``).
+``prepare_run`` reads what a run needs and opens its folder; the ``TrainingRun`` it returns trains
+and writes the results. ``TrainSettings`` can be used without PyTorch: the rest is imported when
+first accessed (``pip install ".[train]"``).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The mean of the Gaussians over the end of a run, which is what the run ends with.
+"""The mean of the Gaussians over the last steps of a run, which becomes the result.
 
-Steps on one photograph each leave the parameters shaking about their best values, since only the
-rate of positions falls; their mean does not shake (Polyak and Juditsky, 1992). Promise: the mean
-begins anew where the number of Gaussians changes, so that each value in it is of one Gaussian.
+Steps on single photographs keep the parameters oscillating about their best values, since only the
+learning rate of positions decays; the mean does not oscillate (Polyak and Juditsky, 1992). Promise:
+the mean restarts when the number of Gaussians changes, so that each value averages one Gaussian.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ COUNT = "count"
 
 @torch.no_grad()
 def add_to_mean(mean: dict[str, Any], params: Parameters) -> None:
-    """Have the mean take in the parameters as they are now.
+    """Add the current parameters to the mean.
 
     Args:
-        mean: The means by name, and how many steps they are of; empty at first, changed in place.
-        params: All that is learnt of them counts.
+        mean: The means by name, and the number of steps; empty at first, changed in place.
+        params: All learnt parameters are averaged.
     """
     count = len(params["means"])
     if not mean or len(mean["means"]) != count:
@@ -42,7 +42,7 @@ def add_to_mean(mean: dict[str, Any], params: Parameters) -> None:
 
 @torch.no_grad()
 def take_mean(params: Parameters, mean: dict[str, Any]) -> None:
-    """Set the parameters to their means, where there are any of these Gaussians."""
+    """Set the parameters to their means, if there are any for these Gaussians."""
     if mean and len(mean["means"]) == len(params["means"]):
         for name, value in params.items():
             if name in mean:

@@ -1,16 +1,16 @@
-"""Where to train, and how many Gaussians fit the memory there.
+"""Where to train, and how many Gaussians fit into memory there.
 
-Promise: a GPU that is asked for is used or an error, never replaced in silence; a cloud that cannot
-be trained is refused before the first step, with the number that can, and one that grows is held at
-what fits.
+Promise: a requested GPU is used or an error, never silently replaced; a cloud too large to train is
+refused before the first step, with the number that fits, and a growing one is held at what fits.
 """
 
 from __future__ import annotations
 
 import torch
 
-from splatseed.errors import ParameterError, PointCloudError
+from splatseed.errors import PointCloudError
 from splatseed.process.memory import free_memory
+from splatseed.process.torch_device import pick_torch_device
 from splatseed.train.settings import BYTES_EACH, Backend
 
 __all__ = [
@@ -25,14 +25,7 @@ def pick_device(backend: Backend) -> torch.device:
     Raises:
         ParameterError: CUDA is asked for and there is none.
     """
-    seen = torch.cuda.is_available()
-    if backend == "cuda" and not seen:
-        raise ParameterError(
-            "a GPU for --backend cuda",
-            found="none that PyTorch sees",
-            fix="Pass --backend cpu, or install PyTorch's CUDA build.",
-        )
-    return torch.device("cuda" if seen and backend != "cpu" else "cpu")
+    return pick_torch_device(backend, "--backend")
 
 
 def device_name(device: torch.device) -> str:
@@ -60,14 +53,14 @@ def check_fits(count: int, device: torch.device) -> None:
 
 
 class Capacity:
-    """How many Gaussians a run may grow to: the cap's number, or what fits the memory if less.
+    """How many Gaussians a run may grow to: the cap, or what fits into memory if that is less.
 
     Args:
-        cap: The most that are wanted; None for any number.
+        cap: The most Gaussians wanted; None for any number.
         device: Where they are.
 
     Attributes:
-        held_at: To how many memory first held a run that would have gone on, else None. Such a run
+        held_at: The number at which memory first stopped a run from growing, else None. Such a run
             depends on the machine.
     """
 
@@ -77,7 +70,7 @@ class Capacity:
         self._device = device
 
     def limit(self, count: int, wanted: int) -> int:
-        """The most that ``count`` Gaussians may become where the strategy wants ``wanted``."""
+        """The most that ``count`` Gaussians may become if the strategy wants ``wanted``."""
         most = wanted if self.cap is None else min(self.cap, wanted)
         free = free_bytes(self._device)
         if free is None or most - count <= free // BYTES_EACH:
@@ -96,5 +89,5 @@ def free_bytes(device: torch.device) -> int | None:
 
 
 def peak_gpu_bytes(device: torch.device) -> int | None:
-    """Most bytes that PyTorch held on a GPU so far; None for the CPU."""
+    """Peak memory of PyTorch on a GPU so far, in bytes; None for the CPU."""
     return torch.cuda.max_memory_allocated(device) if device.type == "cuda" else None

@@ -1,8 +1,8 @@
-"""The depth that stereo finds in the training views, for strategies that place Gaussians by it.
+"""Stereo's depth in the training views, for strategies that place Gaussians by it.
 
 Notation: maps are smaller than the photographs and cover all of them; depths are planar, in
-training units, 0 where other views do not confirm any. Promise: the test views are not looked at;
-the same scene and seed give the same bytes, so that a run which goes on has those it began with.
+training units, 0 where other views do not confirm any. Promise: the test views are not used; the
+same scene and seed give the same bytes, so that a resumed run has the maps it began with.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ def known_depths(
     note: Callable[[str], None] = lambda _: None,
     progress: Progress = silent,
 ) -> Mapping[str, Float[Tensor, "h w"]]:
-    """Depth maps of the training views by name; none where the settings have no use for them.
+    """Depth maps of the training views by name; none if the settings have no use for them.
 
     Args:
-        scene: With photographs.
+        scene: A scene with photographs.
         frame: The training frame.
         settings: Whose strategy, seed and test views count.
         device: Where the maps are wanted.
@@ -73,7 +73,7 @@ def known_depths(
     share = np.mean([np.isfinite(depth).mean() for depth in known.values()])
     took = "" if stereo else f" ({seconds_of(kept, time.perf_counter() - start):.0f} s)"
     note(
-        f"Stereo knows the depth of {share:.0%} of the pixels{took}: strategy grow places half of "
+        f"Stereo knows the depth of {share:.0%} of the pixels{took}: strategy grow places most of "
         "what it adds there. --placing none only splits."
     )
     return {

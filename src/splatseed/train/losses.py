@@ -22,29 +22,29 @@ SSIM_WEIGHT = 0.2
 
 
 def photometric_loss(
-    render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]
+    render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
 ) -> Float[Tensor, ""]:
     """0.8 L1 + 0.2 (1 - SSIM), differentiable in ``render`` (Kerbl et al. 2023, eq. 7).
 
     Args:
-        render: What the Gaussians look like, float32; at least 11 pixels a side.
-        truth: The photograph.
+        render: The rendered view, float32; at least 11 pixels a side.
+        photograph: The view as captured, likewise.
     """
     if render.device.type == "cpu":
-        loss: Tensor = _CpuLoss.apply(render, truth)
+        loss: Tensor = _CpuLoss.apply(render, photograph)
         return loss
-    l1 = (render - truth).abs().mean()
-    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim(render, truth))
+    l1 = (render - photograph).abs().mean()
+    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim(render, photograph))
 
 
 class _CpuLoss(torch.autograd.Function):
-    """The loss and, at once, its gradient: the loss is the end of the graph."""
+    """The loss together with its gradient: the loss is the end of the graph."""
 
     @staticmethod
-    def forward(ctx: Any, render: Tensor, truth: Tensor) -> Tensor:
+    def forward(ctx: Any, render: Tensor, photograph: Tensor) -> Tensor:
         l1, similarity, gradient = l1_and_ssim(
             render.detach().contiguous().numpy(),
-            truth.contiguous().numpy(),
+            photograph.contiguous().numpy(),
             1 - SSIM_WEIGHT,
             SSIM_WEIGHT,
         )
@@ -54,5 +54,5 @@ class _CpuLoss(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
         (gradient,) = ctx.saved_tensors
-        # The loss is most often where backward begins, and multiplying by one takes a pass.
+        # backward mostly starts at the loss, and multiplying by one takes a whole pass.
         return gradient if float(upstream[0]) == 1.0 else gradient * upstream[0], None

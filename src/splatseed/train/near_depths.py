@@ -1,10 +1,9 @@
-"""How near the photographs come to each point: the yardstick of its Gaussian's size and rate.
+"""How close any photograph gets to each point: the unit of its Gaussian's size and learning rate.
 
-Notation: N points and the training views, both in the training frame; a *near depth* is the least
-depth at which a view sees a point. A length divided by it is an angle, so a rate or a size stated
-in near depths is the same in the pictures wherever a Gaussian stands: in front of cameras that
-stand close together, on a table between them, or far behind both. 3DGS takes the cameras' extent
-for all.
+Notation: N points and the training views, both in the training frame; a *near depth* is the
+smallest depth at which a view sees a point. A length divided by it is an angle, so a rate or size
+in units of near depth looks the same in the photographs wherever a Gaussian is: in front of closely
+spaced cameras, on a table between them, or far behind both. 3DGS uses the cameras' extent for all.
 Promise: every near depth is positive and finite; the same bytes whatever the number of threads.
 """
 
@@ -20,18 +19,18 @@ from splatseed.views.view import View
 __all__ = ["near_depths"]
 
 MOST_PROJECTIONS = 20_000_000
-"""Points times views: of a large capture with many points, only evenly chosen views are asked."""
+"""Limit on points times views: beyond it, an even subset of the views is used."""
 LEAST_VIEWS = 64
-"""But never fewer than these."""
+"""But never fewer views than this."""
 MARGIN = 0.1
-"""A point that misses the picture by up to this share of its size counts as seen: a large Gaussian
-there reaches in."""
+"""A point outside the photograph by up to this fraction of its size counts as seen: a large
+Gaussian there reaches in."""
 LEAST = 0.01
 """The rasteriser's near plane: nothing nearer is drawn."""
 
 
 def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32[np.ndarray, " N"]:
-    """The least depth of each point among the views that see it; what no view sees gets the median.
+    """The smallest depth of each point among the views that see it; the median if none does.
 
     Args:
         xyz: Points.
@@ -51,7 +50,7 @@ def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32
 def _seen_depths(
     columns: Float[np.ndarray, "3 N"], view: View
 ) -> tuple[Float[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
-    """Depths in a view, and whether they are in front of it and about within its picture."""
+    """Depths in a view, and whether points are in front of it and roughly within its frame."""
     # Sums are written out: BLAS may add in another order when it has more threads.
     x, y, depths = (
         row[0] * columns[0] + row[1] * columns[1] + row[2] * columns[2] + row[3]

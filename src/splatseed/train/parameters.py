@@ -1,9 +1,9 @@
 """The trained parameters in PyTorch, and their optimisers.
 
 Notation: gsplat's parameter dict: ``means``, ``scales`` (logarithms), ``quats``, ``opacities``
-(logits), ``sh0``, ``shN``; one Adam each, as gsplat's strategies need them. Beside them stand, in
-splatseed's conventions, ``near_depths`` [N], which are not learnt: whatever adds, moves or removes
-Gaussians hands them on with the rest.
+(logits), ``sh0``, ``shN``; one Adam each, as gsplat's strategies need them. In splatseed's
+conventions they are accompanied by ``near_depths`` [N], which are not learnt: whatever adds, moves
+or removes Gaussians treats them like the rest.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ def make_parameters(
     device: torch.device,
     near_depths: Float32[np.ndarray, " N"] | None = None,
 ) -> Parameters:
-    """Trainable copies of the Gaussians' arrays on a device, and their yardsticks beside them.
+    """Trainable copies of the Gaussians' arrays on a device, with their yardsticks.
 
     Args:
-        gaussians: The first ones.
+        gaussians: The initial ones.
         device: Where they are trained.
-        near_depths: Their near depths; left out, the cameras' extent is the yardstick of all.
+        near_depths: Their near depths; when left out, the cameras' extent is the yardstick for all.
     """
     arrays = gaussians.arrays()
     if near_depths is not None:
@@ -59,7 +59,7 @@ def make_parameters(
 
 
 def as_parameters(tensors: Mapping[str, Tensor]) -> Parameters:
-    """The parameter dict of these tensors: near depths are kept, all else is learnt."""
+    """The parameter dict of these tensors: near depths are constant, all else is learnt."""
     return Parameters(
         {
             name: torch.nn.Parameter(value, requires_grad=name != NEAR_DEPTHS)
@@ -69,13 +69,13 @@ def as_parameters(tensors: Mapping[str, Tensor]) -> Parameters:
 
 
 def gaussians_of(params: Parameters | Mapping[str, Tensor]) -> Gaussians:
-    """The parameters as NumPy arrays (those of the CPU share their memory)."""
+    """The parameters as NumPy arrays (sharing memory on the CPU)."""
     names = (field.name for field in dataclasses.fields(Gaussians))
     return Gaussians(**{name: params[name].detach().cpu().numpy() for name in names})
 
 
 def yardsticks(params: Parameters) -> Float[Tensor, "#N"]:
-    """The length that each Gaussian's size and rate are measured by; one number if it is all's."""
+    """The unit of each Gaussian's size and learning rate; a single number if all share it."""
     if NEAR_DEPTHS in params:
         lengths: Tensor = params[NEAR_DEPTHS].detach()
     else:
@@ -84,7 +84,7 @@ def yardsticks(params: Parameters) -> Float[Tensor, "#N"]:
 
 
 def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
-    """One Adam a parameter, with the schedule's learning rates."""
+    """One Adam per parameter, with the schedule's learning rates."""
     betas = (ADAM_BETA1, schedule.beta2)
     return {
         name: torch.optim.Adam(
@@ -100,22 +100,24 @@ def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
 
 
 def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, float]) -> None:
-    """Take the step that the gradients ask for, and clear them.
+    """Take an optimiser step and clear the gradients.
 
     Args:
-        params: With their gradients.
-        optimizers: Theirs.
-        rates: Their learning rates; that of positions in yardsticks.
+        params: The parameters, with their gradients.
+        optimizers: Their optimisers.
+        rates: Their learning rates; for positions in yardsticks.
     """
     means, lengths = params["means"], yardsticks(params)
     positions = means.data
-    means.data = torch.zeros_like(positions)  # a step from 0 loses no digits, however far off it is
+    means.data = torch.zeros_like(
+        positions
+    )  # a step from 0 loses no digits, however distant the position
     for name, optimizer in optimizers.items():
         optimizer.param_groups[0]["lr"] = rates[name]
         optimizer.step()
         optimizer.zero_grad()
-    # Adam's step is in proportion to its rate, so it can be scaled afterwards; an axis at a time,
-    # as PyTorch broadcasts over rows of three half as fast.
+    # Adam's step is proportional to its rate, so it can be scaled afterwards; one axis at a time,
+    # because PyTorch broadcasts over rows of three at half the speed.
     for axis in range(3):
         positions[:, axis].addcmul_(means.data[:, axis], lengths)
     means.data = positions

@@ -1,7 +1,7 @@
 """A training run, from a scene to a folder of results.
 
-Promise: nothing is written before the scene is known to be trainable; a run that was interrupted
-goes on where it stopped, with the settings that it began with; results are in the scene's world.
+Promise: nothing is written before the scene is known to be trainable; an interrupted run resumes
+where it stopped, with its original settings; results are in the scene's world.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
 from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, training_frame
-from splatseed.splat.pictures import beside_truth, picture_name, write_picture
+from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
 from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
 from splatseed.train.known_depths import known_depths, seconds_of
@@ -46,7 +46,7 @@ __all__ = ["Render", "RunOptions", "Score", "TrainingRun", "prepare_run"]
 
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
 Score: TypeAlias = Callable[[Render, Sequence[View]], EvalResult]
-"""Scores renders of views against them, as ``evaluate.evaluate_views`` does."""
+"""Scores renders against views, as ``evaluate.evaluate_views`` does."""
 
 SAVE_EVERY = 60.0
 """Least seconds between checkpoints, so that saving stays a small part of the time."""
@@ -54,13 +54,13 @@ SAVE_EVERY = 60.0
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What a run does beside training.
+    """What a run does besides training.
 
     Args:
-        resume: Go on with the run in the folder, if there is one, with its own settings.
+        resume: Resume the run in the folder, if there is one, with its own settings.
         overwrite: Replace an earlier run in the folder.
         tensorboard: Also write TensorBoard's log.
-        cache_dir: Where smaller photographs are kept for the next run; nowhere when left out.
+        cache_dir: Where smaller photographs are cached; nowhere when left out.
         depths: The file in which the depth that stereo finds, for growth, is kept for other runs
             on the same photographs with the same seed; nowhere when left out. Each run's time
             counts what finding it took.
@@ -92,15 +92,15 @@ def prepare_run(
         output: The folder of the run.
         settings: How to train.
         options: What else to do.
-        note: Told what the user should know, one sentence each.
+        note: Told notes for the user, one sentence each.
         progress: Told how far reading is.
 
     Raises:
         OutputError: ``output`` is taken, protected or cannot be written.
         SceneNotFoundError: Photographs are missing.
-        SceneFormatError: A camera, a photograph or the run to go on with cannot be used.
-        PointCloudError: Too few points, or more than fit the memory.
-        ParameterError: No GPU where one is asked for; settings that are not those of the run.
+        SceneFormatError: A camera, a photograph or the run to resume cannot be used.
+        PointCloudError: Too few points, or more than fit into memory.
+        ParameterError: No GPU although one was requested; settings that differ from the run's.
         MissingDependencyError: TensorBoard is asked for and absent.
     """
     options = options or RunOptions()
@@ -142,7 +142,7 @@ def prepare_run(
         state.watch.seconds += seconds  # what growth needs to know is part of what it costs
         folder.begin(config)
     if state.step:
-        note(f"Going on after step {state.step:,} of {settings.max_steps:,}.")
+        note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
     board = Board(folder.tensorboard, state.step) if options.tensorboard else None
     if board:
         folder.claim([folder.tensorboard])
@@ -161,7 +161,7 @@ class TrainingRun:
         frame: The training frame.
         state: The run, at its first step or where it stopped.
         views: Training and test views, in the world.
-        board: TensorBoard's log, if there is to be one.
+        board: TensorBoard's log, if requested.
     """
 
     def __init__(
@@ -194,7 +194,7 @@ class TrainingRun:
         return peak_gpu_bytes(self.trainer.device)
 
     def train(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
-        """Train to the end, or until the user interrupts: then a checkpoint is there.
+        """Train to the end, or until the user interrupts: then a checkpoint is saved.
 
         Args:
             on_step: Told the number of steps done, after each.
@@ -207,15 +207,15 @@ class TrainingRun:
         """
         with self._told_of_checkpoint():
             if self._saved_step is None:
-                self._save()  # better now than after hours, if the disk has no room
+                self._save()  # fail now rather than after hours if the disk is full
             done = self.trainer.run(on_step)
             if self._board:
                 self._board.close()
-            self._save()  # also of a finished run: scoring and writing its results may fail
+            self._save()  # for a finished run too: scoring and writing results may fail
         return done
 
     def finish(self, score: Score, progress: Progress = silent) -> TrainingResult:
-        """Score the test views and write the results; the checkpoint, no longer needed, goes.
+        """Score the test views and write the results; the checkpoint, no longer needed, is removed.
 
         Args:
             score: Scores the test views.
@@ -277,15 +277,13 @@ class TrainingRun:
 
     @contextmanager
     def _told_of_checkpoint(self) -> Iterator[None]:
-        """Say of a failure to write that not all is lost, and how to go on."""
+        """Add to a failure to write that not all is lost, and how to resume."""
         try:
             yield
         except OutputError as error:
             if self._saved_step is None:
                 raise
-            kept = (
-                f"The run is kept as it was after step {self._saved_step:,}: go on with --resume."
-            )
+            kept = f"The run as of step {self._saved_step:,} is kept: continue it with --resume."
             raise OutputError(
                 error.expected, found=error.found, fix=f"{error.fix} {kept}"
             ) from error
@@ -298,13 +296,13 @@ class TrainingRun:
         names = [picture_name(view.name) for view in views]
         self.folder.claim([self.folder.renders / name for name in names])
         for i, (view, name) in enumerate(zip(views, names, strict=True)):
-            picture = beside_truth(view.image, self.trainer.render(view).cpu().numpy())
+            picture = beside_photograph(view.photograph, self.trainer.render(view).cpu().numpy())
             write_picture(staged.renders / name, picture)
             progress("write", (i + 1) / len(views))
 
 
 def _checked_folder(output: Path, scene: Scene, options: RunOptions) -> RunFolder:
-    """The folder, found fit to be written to; and TensorBoard, found installed if asked for."""
+    """The folder, checked to be writable; and TensorBoard, checked if requested."""
     if options.tensorboard:
         require("tensorboard")
     folder = RunFolder(Path(output))
@@ -322,7 +320,7 @@ def _state(
     strategy: Strategy,
     device: torch.device,
 ) -> TrainState:
-    """The state of a run that has begun, if it left a checkpoint, else the first state."""
+    """The state of a run that left a checkpoint, else the first state."""
     schedule = settings.schedule
     if begun and begun.checkpoint.is_file():
         return load_checkpoint(begun.checkpoint, strategy, schedule, device)

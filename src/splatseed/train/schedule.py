@@ -1,10 +1,10 @@
-"""The numbers that a run is made of and when things happen: splatseed's own, and 3DGS's.
+"""The hyperparameters of a run and their timing: splatseed's own, and 3DGS's.
 
-Notation: a *full* run has 30,000 steps, and all numbers of 3DGS are stated for it; T are the steps
-of the run at hand. Lengths, and so the rates of positions, are in *yardsticks*: a Gaussian's near
-depth (``near_depths``) in splatseed's conventions, the cameras' extent in 3DGS's. Promise: a full
-run of splatseed's differs from 3DGS's by the yardstick, the bound on first sizes and MCMC's start;
-these and each departure in short runs were chosen on held-out training views: see
+Notation: a *full* run has 30,000 steps, for which all of 3DGS's numbers are stated; T is the number
+of steps of the run at hand. Lengths, and so the rates of positions, are in *yardsticks*: a
+Gaussian's near depth (``near_depths``) in splatseed's conventions, the cameras' extent in 3DGS's.
+Promise: a full run of splatseed's differs from 3DGS's in the yardstick, the bound on initial sizes
+and MCMC's start; these and each departure in short runs were chosen on held-out training views: see
 benchmarks/README.md.
 """
 
@@ -33,65 +33,65 @@ LEARNING_RATES: Mapping[str, float] = MappingProxyType(
 )
 """3DGS's."""
 DECAYS: Mapping[str, float] = MappingProxyType({"means": 0.01})
-"""What learning rates fall to by the end, as a part of the first; exponential between."""
+"""Final learning rates as a fraction of the initial ones; exponential in between."""
 GROWTH = 1.05
-"""By what MCMC multiplies the number of Gaussians at a time, until the cap."""
+"""Factor by which MCMC grows the number of Gaussians at a time, up to the cap."""
 LEAST_ROUNDS: Mapping[Densification, int] = MappingProxyType(
     {"default": 6, "grow": 1, "mcmc": 24, "none": 1}
 )
-"""A short run densifies so many times, if need be more often than every 100 steps: gradients
-averaged over few photographs are noise."""
+"""Number of densifications in a short run, which may come more often than every 100 steps, but not
+too often: gradients averaged over few photographs are noise."""
 MOST_SPEEDUP: Mapping[str, float] = MappingProxyType(
     {"means": 20.0, "scales": 4.0, "quats": 4.0, "opacities": 1.0, "sh0": 4.0, "shN": 4.0}
 )
-"""Learning rates of a short run are multiplied by how many times shorter it is than a full one, but
-by no more than this. Positions have as far to go in a short run as in a long one; with a higher
-rate of opacities, Gaussians die that are needed later."""
+"""A short run's learning rates are multiplied by how many times shorter it is than a full one, but
+at most by this. Positions have as far to go in a short run as in a long one; with a higher rate of
+opacities, Gaussians die that are needed later."""
 FORGETTING = 1e-3
-"""1 - beta2 of Adam, what it forgets of the squared gradients in a step, as in 3DGS."""
+"""1 - beta2 of Adam, the fraction of the squared gradients forgotten per step, as in 3DGS."""
 MOST_FORGETTING = 1e-2
-"""A short run forgets so many times faster as it is shorter than a full one, but no faster than
-this: its gradients shrink within some hundred steps, and steps are divided by what is
-remembered."""
+"""A short run forgets faster in proportion to how much shorter it is than a full one, but at most
+by this factor: its gradients shrink within some hundred steps, and steps are divided by the
+remembered ones."""
 GROW_EVERY = FULL_RUN // 15
-"""Steps of a full run from one round of ``grow`` to the next, and to the first: each round looks at
+"""Steps of a full run between rounds of ``grow``, and before the first: each round looks at
 contributions for as many photographs as it can."""
 LEAST_ROUND = 20
-"""Steps of a round of ``grow`` in the shortest run: halves that are split again before they have
-found their places are noise."""
+"""Steps per round of ``grow`` in the shortest run: splitting halves again before they have found
+their places is noise."""
 MEAN_FROM = 0.8
-"""Part of a run from which on the mean of the Gaussians is taken."""
+"""Fraction of a run after which the mean of the Gaussians is taken."""
 LARGEST = 0.05
-"""Largest size of a first Gaussian, in near depths. Where SfM has few points the gaps between them
-are wide, and what fills one hides all that lies behind it."""
+"""Largest initial size of a Gaussian, in near depths. Where SfM has few points the gaps between
+them are wide, and a Gaussian that fills one hides all that lies behind it."""
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """A run's numbers.
+    """The hyperparameters of a run.
 
     Args:
         max_steps: T.
         near_depths: Whether each Gaussian's near depth is its yardstick, else the cameras' extent.
-        learning_rates: Of each parameter at the first step; positions' in yardsticks.
-        decays: What some of them fall to by the end, as a part of the first.
-        beta2: Adam's: what it keeps of its mean of squared gradients at each step.
-        sh_every: Steps from one degree of the spherical harmonics to the next.
+        learning_rates: Initial rate of each parameter; for positions in yardsticks.
+        decays: Final fraction of those rates that decay.
+        beta2: Adam's: the fraction of the mean squared gradient kept at each step.
+        sh_every: Steps between degrees of the spherical harmonics.
         refine_start: Densification begins after this step.
-        refine_stop: And ends before this one.
-        refine_every: Steps from one densification to the next.
-        reset_every: From one reset of the opacities to the next, where they are asked for; also the
-            step from which on Gaussians that are too large are pruned.
-        prune_size: How large that is, in yardsticks.
-        growth: What MCMC multiplies the number of Gaussians by at a time.
-        noise: What it multiplies 3DGS's learning rate of positions by, for its noise.
-        penalty: What it weighs mean opacity and mean size by, each, beside the loss.
-        opacity: Of the first Gaussians.
-        scale_factor: Size of the first Gaussians, as a multiple of the gaps between them.
-        largest: And at most so many near depths.
-        flatness: Thickness of the first Gaussians whose normals are used, as a part of their size.
-        mean_from: After so many steps the mean of the Gaussians is taken, with which the run ends;
-            None for the last step's.
+        refine_stop: Densification ends before this step.
+        refine_every: Steps between densifications.
+        reset_every: Steps between resets of the opacities, if enabled; also the step after which
+            Gaussians that are too large are pruned.
+        prune_size: The size that is too large, in yardsticks.
+        growth: Factor by which MCMC grows the number of Gaussians at a time.
+        noise: Factor on 3DGS's learning rate of positions, for MCMC's noise.
+        penalty: Weight of mean opacity and of mean size in MCMC's loss.
+        opacity: Initial opacity.
+        scale_factor: Initial size, as a multiple of the gap between Gaussians.
+        largest: Upper bound of the initial size, in near depths.
+        flatness: Initial thickness of Gaussians with normals, as a fraction of their size.
+        mean_from: Step after which the mean of the Gaussians is taken as the run's result; None to
+            end with the last step's.
     """
 
     max_steps: int
@@ -123,7 +123,7 @@ class Schedule:
         return {name: rate * self.decay(name, step) for name, rate in self.learning_rates.items()}
 
     def decay(self, name: str, step: int) -> float:
-        """What a learning rate has fallen to, as a part of the first."""
+        """The fraction of the initial learning rate at a step."""
         return float(self.decays.get(name, 1.0) ** (step / self.max_steps))
 
 
@@ -133,8 +133,8 @@ def make_schedule(densification: Densification, max_steps: int, *, as_3dgs: bool
     Args:
         densification: How Gaussians are added and removed.
         max_steps: T.
-        as_3dgs: Whether in 3DGS's conventions, as gsplat's trainer has them with its
-            ``steps_scaler``: every step number shrinks with T, no other number does.
+        as_3dgs: Whether to use 3DGS's conventions, as gsplat's trainer with its ``steps_scaler``:
+            every step number shrinks with T, no other number does.
     """
     return (_as_3dgs if as_3dgs else _own)(densification, max_steps)
 
@@ -187,5 +187,5 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
 
 
 def _scaled(steps: int, max_steps: int) -> int:
-    """What ``steps`` of a full run are in this one, at least 1."""
+    """The steps of this run that correspond to ``steps`` of a full run, at least 1."""
     return max(1, round(steps * max_steps / FULL_RUN))

@@ -1,7 +1,7 @@
 """The points that a run starts from.
 
-Promise: points that are left out are reported; which ones are kept depends on points and cameras
-alone; of what is known of them they have what the run uses, and nothing else.
+Promise: points that are left out are reported; which ones are kept depends only on points and
+cameras; the points have the attributes that the run uses, and no others.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
 __all__ = ["SEEDS_SHARE", "seeded", "seeds_digest", "usable_seeds"]
 
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
-"""Seeds at most, as a part of the cap, of strategies that add to what is there; of the others all
-of it."""
+"""Most seeds as a fraction of the cap, for strategies that add Gaussians; for the others the whole
+cap."""
 
 
 def seeded(
     scene: Scene, settings: TrainSettings, note: Callable[[str], None], progress: Progress
 ) -> tuple[Scene, Stereo | None]:
-    """The scene with the points that method ``auto`` gives it, where the settings ask for them.
+    """The scene with the points that method ``auto`` makes, if the settings ask for them.
 
-    And the depth maps that it found on the way, if any: growth looks at them too.
+    Also returns the depth maps that it computed, if any: growth uses them too.
 
     Args:
-        scene: Where no point is one that splatseed added.
-        settings: Whose cap bounds the points, and which say what photographs are not looked at.
+        scene: A scene without points added by splatseed.
+        settings: Their cap limits the points, and they say which photographs are held out.
         note: Told what was made, and how to do without.
         progress: Told how far it is.
 
@@ -54,12 +54,12 @@ def seeded(
     from splatseed.seeding.photographs import Auto  # noqa: PLC0415  (loads with its use)
     from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
 
-    found: list[Stereo] = []
+    results: list[Stereo] = []
 
     class Remembering(Auto):
         def find(self, *given: Any) -> Stereo:
-            found.append(super().find(*given))
-            return found[-1]
+            results.append(super().find(*given))
+            return results[-1]
 
     start = time.perf_counter()
     part = SEEDS_SHARE.get(settings.densification, 1.0)
@@ -76,11 +76,11 @@ def seeded(
         f"in {time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as "
         "they are."
     )
-    return scene.replace(points=cloud), found[-1] if found else None
+    return scene.replace(points=cloud), results[-1] if results else None
 
 
 def _was_seeded(scene: Scene) -> bool:
-    """Whether ``splatseed upsample`` has chosen these points, be it only by thinning them."""
+    """Whether ``splatseed upsample`` made or thinned these points."""
     written = scene.source is not None and kind_of(scene.source.root) == "upsample"
     return written or scene.points.num_original < len(scene.points)
 
@@ -91,16 +91,16 @@ def usable_seeds(
     note: Callable[[str], None],
     views: Sequence[View] = (),
 ) -> PointCloud:
-    """The finite points, thinned if there are more than the cap, for a run to begin with.
+    """The finite points that a run begins with, thinned if there are more than the cap.
 
-    What crowds in the views goes first, new points before originals where both would do.
+    Points in crowded parts of the views go first, new points before originals of equal use.
 
     Args:
-        points: Those of the scene.
-        settings: Whose cap counts, and which say if sizes and normals are used.
-        note: Told what was left out, and what is asked for and not known.
-        views: The training views, of which only cameras and sizes are looked at; crowds are judged
-            in space when left out.
+        points: The scene's points.
+        settings: Provide the cap, and say whether sizes and normals are used.
+        note: Told what was left out, and what was requested but unknown.
+        views: The training views, for their cameras and sizes; when left out, crowding is measured
+            in space.
     """
     finite = points.select(points.finite)
     if len(finite) < len(points):
@@ -133,11 +133,11 @@ def _within_cap(
 def _without_unused(
     points: PointCloud, settings: TrainSettings, note: Callable[[str], None]
 ) -> PointCloud:
-    """The points without the attributes that a run with these settings does not look at."""
+    """The points without the attributes that a run with these settings does not use."""
     used = {"sizes": settings.seed_sizes, "normals": settings.seed_normals}
     for name, asked in used.items():
         if asked and np.isnan(points.attributes.get(name, np.nan)).all():
-            note(f"--seed-{name} changes nothing: the {name} of no seed are known.")
+            note(f"--seed-{name} has no effect: no seed has known {name}.")
     return points.replace(**dict.fromkeys(n for n in points.attributes if not used.get(n)))
 
 

@@ -1,7 +1,7 @@
 """The settings of a run: what a user may choose.
 
-Notation: a *step* shows one photograph. A strategy's name that ends in ``-3dgs`` trains in 3DGS's
-conventions, as gsplat's trainer has them, to compare with published numbers; see ``schedule``.
+Notation: a *step* shows one photograph. A strategy whose name ends in ``-3dgs`` trains in 3DGS's
+conventions, as gsplat's trainer has them, for comparison with published numbers; see ``schedule``.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ Placing = Literal["stereo", "none"]
 Seeding = Literal["auto", "scene"]
 
 BUDGET = 1_000_000
-"""Most Gaussians of the strategies that have a budget, where none is given."""
+"""Default cap of the strategies that have a budget."""
 AS_3DGS = "-3dgs"
 
 LONG_RUN = 4000
-"""Steps from which on strategy ``auto`` is ``mcmc``, ahead in long runs (see benchmarks)."""
+"""From this many steps on, strategy ``auto`` is ``mcmc``, which is ahead in long runs."""
 
 BYTES_EACH = 2000
-"""Memory of a Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
+"""Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
 and as much again for the rasteriser's lists and for copies while Gaussians are added."""
 
 
@@ -48,9 +48,9 @@ and as much again for the rasteriser's lists and for copies while Gaussians are 
 class TrainSettings:
     """How to train.
 
-    The one place of a setting beside the code that heeds it: the options of ``train`` and
-    ``bench``, plans, ledgers and ``config.json`` take these fields, their defaults and docstrings
-    as they are.
+    A setting is declared only here, besides the code that uses it: the options of ``train`` and
+    ``bench``, plans, ledgers and ``config.json`` take these fields, defaults and docstrings as they
+    are.
 
     Raises:
         ParameterError: A value is out of its range.
@@ -58,11 +58,11 @@ class TrainSettings:
 
     strategy: StrategyName = "default"
     """Densify as 3DGS does (default), grow within a budget where renders are wrong, densify as MCMC
-    does up to a cap, keep the number of seeds, or take grow in short runs and mcmc in long ones
-    (auto); -3dgs: in 3DGS's own conventions of rates, sizes and schedules, to compare with
+    does up to a cap, keep the number of seeds, or use grow in short runs and mcmc in long ones
+    (auto); -3dgs: in 3DGS's own conventions for rates, sizes and schedules, to compare with
     published numbers."""
     max_steps: int = FULL_RUN
-    """Training steps; schedules and learning rates are adapted to them."""
+    """Training steps; schedules and learning rates adapt to them."""
     data_factor: int = 1
     """Divide the width and height of the photographs by this whole number."""
     seed: int = 0
@@ -73,29 +73,30 @@ class TrainSettings:
             constructor=int, metavar="INT", help_behavior_hint="(default: 1000000 for grow, mcmc)"
         ),
     ] = None
-    """Most Gaussians; more seeds than that are thinned."""
+    """Most Gaussians; if there are more seeds, they are thinned."""
     backend: Backend = "auto"
     """Where to train; auto takes a GPU if PyTorch sees one."""
     sh_degree: int = 3
-    """Degree of the spherical harmonics: how finely colours depend on the direction, 0 to 3."""
+    """Degree of the spherical harmonics: how finely colours depend on the viewing direction, 0 to
+    3."""
     test_every: int = 8
-    """Keep every n-th image, sorted by name, for the test."""
+    """Keep every n-th image, sorted by name, for testing."""
     placing: Placing = "stereo"
-    """Strategy grow: put half of the new Gaussians on wrong pixels, at the depth that stereo finds
-    there (stereo), or split Gaussians alone (none)."""
+    """Strategy grow: put most of the new Gaussians on wrong pixels, at the depth that stereo finds
+    there (stereo), or only split Gaussians (none)."""
     opacity_reset: bool = False
     """Lower all opacities from time to time, as 3DGS does (strategy default; gsplat 1.5.3 does
     not)."""
     seed_sizes: bool = False
-    """Begin with the sizes in the scene's seeds.npz, not those of the gaps between seeds."""
+    """Start with the sizes in the scene's seeds.npz, not those of the gaps between seeds."""
     seed_normals: bool = False
-    """Begin with flat discs where the scene's seeds.npz has normals."""
+    """Start with flat discs where the scene's seeds.npz has normals."""
     seed_colors: bool = False
-    """Begin with the colours that the training photographs show each seed in, by direction."""
+    """Start with the colours that the training photographs show for each seed, by direction."""
     seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds: its default is "auto"
-    """Begin with the scene's points as they are, or let method ``auto`` add to them what the
-    training photographs ask for. Points that splatseed has added already, and 3DGS's conventions,
-    are left alone."""
+    """Start from the scene's points as they are, or let method ``auto`` add the points that the
+    training photographs need. Points that splatseed has added already, and 3DGS's conventions, are
+    left alone."""
 
     def __post_init__(self) -> None:
         for name, kind in (("backend", Backend), ("placing", Placing), ("seeding", Seeding)):
@@ -116,14 +117,14 @@ class TrainSettings:
 
     @property
     def densification(self) -> Densification:
-        """The strategy, whatever the conventions; of ``auto`` the one for so many steps."""
+        """The strategy, whatever the conventions; for ``auto`` the one for this many steps."""
         if self.strategy == "auto":
             return "mcmc" if self.max_steps >= LONG_RUN else "grow"
         return cast("Densification", self.strategy.removesuffix(AS_3DGS))
 
     @property
     def schedule(self) -> Schedule:
-        """The run's numbers, and when things happen."""
+        """The run's hyperparameters and their timing."""
         as_3dgs = self.strategy.endswith(AS_3DGS)
         return make_schedule(self.densification, self.max_steps, as_3dgs=as_3dgs)
 

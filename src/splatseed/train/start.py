@@ -25,12 +25,12 @@ __all__ = ["first_gaussians", "gaussians_of_scene"]
 def first_gaussians(
     seeds: PointCloud, views: Sequence[View], settings: TrainSettings
 ) -> tuple[Gaussians, Float32[np.ndarray, " N"]]:
-    """One Gaussian a seed, and its near depth [N].
+    """One Gaussian per seed, and its near depth [N].
 
     Args:
         seeds: Finite points, in the training frame.
         views: The training views, likewise.
-        settings: Whose schedule says how large and how opaque they are, and what of them is fitted.
+        settings: Their schedule gives sizes and opacities; they also say what is fitted.
 
     Raises:
         PointCloudError: Fewer than two distinct points.
@@ -56,7 +56,7 @@ def first_gaussians(
 def gaussians_of_scene(
     cloud: PointCloud, views: Sequence[View], settings: TrainSettings
 ) -> Gaussians:
-    """The start that training from a cloud would have, in the scene's world.
+    """The initial Gaussians of training from a cloud, in the scene's world.
 
     Args:
         cloud: Seeds in the world; those without finite coordinates are left out.

@@ -1,8 +1,8 @@
-"""Everything that changes while a run goes on, and its checkpoints.
+"""Everything that changes during a run, and its checkpoints.
 
-Promise: a run that is continued from a checkpoint takes, on the CPU, bit for bit the steps that it
-would have taken: what is random depends on the seed and the step alone, so no generator is kept. A
-checkpoint appears whole or not at all, and loading one executes nothing that is in it.
+Promise: a run resumed from a checkpoint takes, on the CPU, bit for bit the steps that it would have
+taken: randomness depends only on the seed and the step, so no generator is stored. A checkpoint
+appears whole or not at all, and loading one executes nothing in it.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ FORMAT = 3
 
 
 class Stopwatch:
-    """Seconds spent training; stands still while the rest is done."""
+    """Seconds spent training; paused during everything else."""
 
     def __init__(self, seconds: float = 0.0) -> None:
         self.seconds = seconds
         self._since: float | None = None
 
     def start(self) -> None:
-        """Begin, or go on."""
+        """Start or resume."""
         self._since = time.perf_counter()
 
     def stop(self) -> None:
-        """Stand still."""
+        """Pause."""
         if self._since is not None:
             self.seconds += time.perf_counter() - self._since
             self._since = None
@@ -58,8 +58,8 @@ class TrainState:
         step: Steps done.
         records: The curve so far.
         watch: Time spent training.
-        losses: Of the steps since the last record.
-        mean: Of the Gaussians over the end of the run; see ``averaging``.
+        losses: Losses of the steps since the last record.
+        mean: Mean of the Gaussians over the end of the run; see ``averaging``.
     """
 
     params: Parameters
@@ -73,7 +73,7 @@ class TrainState:
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
-    """Write all of a run's state, replacing an older checkpoint.
+    """Write the whole state of a run, replacing an older checkpoint.
 
     Raises:
         OutputError: The file cannot be written.
@@ -101,9 +101,9 @@ def load_checkpoint(
 
     Args:
         path: The checkpoint.
-        strategy: A new one of the run's settings; its state is replaced.
-        schedule: The run's.
-        device: Where to go on.
+        strategy: A new one from the run's settings; its state is replaced.
+        schedule: The run's schedule.
+        device: Where to resume.
 
     Raises:
         SceneFormatError: The file is no checkpoint of this version.
@@ -131,9 +131,9 @@ def _state_of(content: Mapping[str, Any], strategy: Strategy, schedule: Schedule
 
 def _load(path: Path, device: torch.device) -> dict[str, Any]:
     try:
-        with warnings.catch_warnings(action="ignore"):  # of what a foreign file might be
+        with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
             content = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # noqa: BLE001  (of a damaged file, PyTorch raises what it likes)
+    except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
         raise _misfit(path, f"a file that cannot be read ({type(error).__name__})") from None
     if isinstance(content, dict) and content.get("format") == FORMAT:
         return content

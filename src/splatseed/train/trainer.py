@@ -1,4 +1,4 @@
-"""The training loop: show a photograph, compare, improve, change the number of Gaussians.
+"""The training loop: render a photograph's view, compare, optimise, densify.
 
 Notation: a step shows one training view; all cameras are in the training frame. Promise: on the CPU
 equal settings and seeds give equal bytes, whatever the number of threads and however often the run
@@ -19,7 +19,7 @@ from torch import Tensor
 from splatseed.evaluate.images import psnr, ssim_of_all
 from splatseed.process.allocator import keep_freed_memory
 from splatseed.process.interruption import interruption
-from splatseed.splat.rendering import photograph, render_view
+from splatseed.splat.rendering import photograph_of, render_view
 from splatseed.train.averaging import add_to_mean, take_mean
 from splatseed.train.losses import photometric_loss
 from splatseed.train.parameters import optimize
@@ -31,7 +31,7 @@ from splatseed.views.view import View
 __all__ = ["Trainer"]
 
 RECORDS = 200
-"""Points of the curve of a run."""
+"""Number of records in the curve of a run."""
 TESTS = 20
 """How often the test views are rendered during a run."""
 
@@ -42,9 +42,9 @@ class Trainer:
     Args:
         state: The run, at any step; changed in place.
         settings: Its settings.
-        train_views: What is learnt from, in the training frame.
-        test_views: What is only looked at, likewise.
-        on_record: Told of each record, and whether the test views were rendered for it.
+        train_views: The views to learn from, in the training frame.
+        test_views: The views to evaluate on, likewise.
+        on_record: Told each record, and whether the test views were rendered for it.
     """
 
     def __init__(
@@ -75,11 +75,11 @@ class Trainer:
         with interruption() as stop, torch.random.fork_rng(self._cuda_devices()):
             state.watch.start()
             while state.step < self.settings.max_steps and not stop.requested:
-                render, truth = self._advance(state.step)
+                render, photograph = self._advance(state.step)
                 state.step += 1
                 on_step(state.step)
                 if self._is_due(RECORDS) or self._is_due(TESTS):
-                    self._record(render, truth)
+                    self._record(render, photograph)
             state.watch.stop()
         return state.step >= self.settings.max_steps
 
@@ -87,13 +87,13 @@ class Trainer:
         """Render and compare once, so that kernels are compiled before the clock runs."""
         view = self.train_views[0]
         render, _ = render_view(self.state.params, view, self.settings.sh_degree)
-        photometric_loss(render, photograph(view, self.device)).backward()
+        photometric_loss(render, photograph_of(view, self.device)).backward()
         for value in self.state.params.values():
             value.grad = None
 
     @torch.no_grad()
     def render(self, view: View) -> Float[Tensor, "H W 3"]:
-        """What a view looks like now."""
+        """The current render of a view."""
         degree = self.settings.schedule.sh_degree(self.state.step, self.settings.sh_degree)
         return render_view(self.state.params, view, degree)[0]
 
@@ -103,18 +103,18 @@ class Trainer:
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
         torch.manual_seed(_step_seed(self.settings.seed, step))
         view = self.train_views[self._view_index(step)]
-        truth = photograph(view, self.device)
+        photograph = photograph_of(view, self.device)
         render, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
         strategy.before(params, optimizers, step, info)
-        loss = photometric_loss(render, truth)
+        loss = photometric_loss(render, photograph)
         state.losses.append(loss.detach())
         penalty = strategy.regularization(params)
         (loss if penalty is None else loss + penalty).backward()
         optimize(params, optimizers, schedule.rates(step))
-        strategy.observe(params, view, render, truth, step)
+        strategy.observe(params, view, render, photograph, step)
         strategy.after(params, optimizers, step, info)
         self._average(step + 1)
-        return render.detach(), truth
+        return render.detach(), photograph
 
     def _average(self, steps_done: int) -> None:
         """Take the Gaussians into their mean at the end of a run, and end with it."""
@@ -124,14 +124,14 @@ class Trainer:
             if steps_done == self.settings.max_steps:
                 take_mean(state.params, state.mean)
 
-    def _record(self, render: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> None:
+    def _record(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> None:
         """Note how far the run is; the clock stands still meanwhile."""
         state = self.state
         loss = float(torch.stack(state.losses).mean(dtype=torch.float64))
         state.watch.stop()
         state.losses.clear()
         tested = self.test_scores() if self._is_due(TESTS) else None
-        count, shown = len(state.params["means"]), round(psnr(render, truth), 4)
+        count, shown = len(state.params["means"]), round(psnr(render, photograph), 4)
         tested_psnr, tested_ssim = tested or (None, None)
         seconds = round(state.watch.seconds, 3)
         record = Record(state.step, seconds, loss, shown, tested_psnr, count, tested_ssim)
@@ -143,8 +143,8 @@ class Trainer:
         """Means over the test views of each one's PSNR, dB, and SSIM."""
         scores = []
         for view in self.test_views:
-            render, truth = self.render(view), photograph(view, self.device)
-            scores.append((psnr(render, truth), ssim_of_all(render, truth)))
+            render, photograph = self.render(view), photograph_of(view, self.device)
+            scores.append((psnr(render, photograph), ssim_of_all(render, photograph)))
         psnrs, ssims = zip(*scores, strict=True)
         return round(sum(psnrs) / len(psnrs), 4), round(sum(ssims) / len(ssims), 5)
 

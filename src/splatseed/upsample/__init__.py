@@ -1,4 +1,4 @@
-"""Upsampling: more points from the ones there are.
+"""Upsampling: making more points from the existing ones.
 
 ``upsample`` takes a scene or a cloud, ``upsample_points`` bare arrays; ``METHODS`` has the methods.
 Promise: the originals come first and unchanged; the same seed gives the same bytes whatever the
@@ -43,9 +43,9 @@ __all__ = [
 Profile = Literal["default", "paper"]
 DEFAULT_RATIO = 4.0
 BYTES_EACH = 200
-"""Of a point while it is made and written; measured as 125, from 1 to 3 million points."""
+"""Memory per point while it is made and written; measured as 125, from 1 to 3 million points."""
 MAX_POINTS = 1 << 32
-"""More points than this are a slip of the keyboard, not a wish."""
+"""A request for more points than this is a typo."""
 
 
 def configure(method: str, profile: Profile = "default", **parameters: Any) -> Upsampler:
@@ -53,7 +53,7 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
 
     Args:
         method: A key of ``METHODS``.
-        profile: "default" treats the paper's traps, "paper" follows its text to the letter.
+        profile: "default" avoids the paper's traps, "paper" follows its text to the letter.
         parameters: Fields of the method that differ from the profile's.
 
     Raises:
@@ -82,7 +82,7 @@ def configure(method: str, profile: Profile = "default", **parameters: Any) -> U
 
 
 def chooses_number(method: str | Upsampler) -> bool:
-    """Whether a method makes as many points as the photographs need, not a number asked for."""
+    """Whether the photographs, not the caller, determine how many points a method makes."""
     return traits_of(configure(method) if isinstance(method, str) else method).chooses_number
 
 
@@ -120,7 +120,7 @@ def upsample(
 
     Returns:
         The N originals, first and unchanged, then the new points; ``source`` tells them apart, and
-        their attributes are those that the method knows.
+        their attributes are those that the method provides.
     """
     whole = scene if isinstance(scene, Scene) else Scene(scene)
     originals = whole.points.originals
@@ -136,7 +136,7 @@ def upsample(
             found=f"{len(originals)} points, none of them finite and original",
             fix="Check that the scene holds the point cloud you meant.",
         )
-    if num_new == 0:  # and no originals, of which a ratio could be
+    if num_new == 0:  # no originals that a ratio could multiply
         raise ParameterError(
             "a number of points where there are no originals",
             found="a ratio, or 0",
@@ -157,11 +157,11 @@ def number_of_new(
     ratio: float | None,
     num_points: int | None,
 ) -> int | None:
-    """How many points are to be made; None where the photographs say it.
+    """How many points to make; None if the photographs determine it.
 
     Raises:
-        ParameterError: A number is given though the photographs say it, it is out of range, or so
-            many points do not fit the memory.
+        ParameterError: A number is given though the photographs determine it, it is out of range,
+            or so many points do not fit into memory.
     """
     if not chooses_number(method):
         total = planned_size(num_original, ratio, num_points)
@@ -170,9 +170,9 @@ def number_of_new(
         return total - num_original
     if ratio is not None or num_points is not None:
         raise ParameterError(
-            f"no number of points for the method {name}, which the photographs decide on",
+            f"no number of points for the method {name}, which the photographs determine",
             found="a ratio" if ratio is not None else "a number of points",
-            fix="Leave it out, bound it with --budget, or choose --method mls.",
+            fix="Leave it out, limit it with --budget, or choose --method mls.",
         )
     return None
 
@@ -203,11 +203,11 @@ def upsample_points(
 
 
 def planned_size(num_original: int, ratio: float | None, num_points: int | None) -> int:
-    """How many points there will be in all.
+    """The number of points in all.
 
     Raises:
-        ParameterError: Both are given, the ratio is below 1, or the number is not whole, below the
-            originals' or beyond all reason.
+        ParameterError: Both are given, the ratio is below 1, or the number is not whole, below that
+            of the originals or absurdly large.
     """
     if ratio is not None and num_points is not None:
         raise ParameterError(
@@ -261,7 +261,7 @@ def _generator(seed: int) -> np.random.Generator:
 
 
 def _check_finite(new: NewPoints) -> None:
-    """Hold every method, also a third party's, to the promise of finite points."""
+    """Check every method, including third parties', for the promise of finite points."""
     if not np.isfinite(new.xyz).all():
         bad = int(np.flatnonzero(~np.isfinite(new.xyz).all(axis=1))[0])
         raise PointCloudError(
@@ -272,10 +272,10 @@ def _check_finite(new: NewPoints) -> None:
 
 
 def _as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
-    """The new points with all that their method knows of them.
+    """The new points with all attributes from their method.
 
     Raises:
-        PointCloudError: Arrays that do not fit, or new points that are said to be originals.
+        PointCloudError: Arrays do not fit, or new points claim to be originals.
     """
     source = np.full(num_new, code, np.uint8) if new.source is None else np.asarray(new.source)
     if source.dtype != np.uint8 or (source == ORIGINAL).any():

@@ -1,7 +1,7 @@
 """Colours of new points: inverse-distance weights over the base point and its neighbours.
 
 c = sum_j w_j c_j / sum_j w_j with w_j = 1 / max(|p - p_j|, 0.01 h), h the base point's spacing, in
-linear arithmetic on the 8-bit values as the paper has it, rounded to the nearest.
+linear arithmetic on the 8-bit values as in the paper, rounded to the nearest.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 __all__ = ["interpolate_colors"]
 
 FLOOR = 0.01
-"""Shortest distance that counts, in units of the base point's spacing."""
+"""Lower limit of distances, in units of the base point's spacing."""
 
 
 def interpolate_colors(
@@ -34,7 +34,7 @@ def interpolate_colors(
 
 
 @kernel
-def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # type: ignore[no-untyped-def]
+def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(len(xyz)):
         if count[i] > 0:
             around, color = _gather(xyz, rgb, i, idx[i])
@@ -49,8 +49,8 @@ def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # t
 
 
 @inline
-def _gather(xyz, rgb, i, rows):  # type: ignore[no-untyped-def]
-    """Positions relative to the base [3, k + 1] and colours [k + 1, 3], for all its outputs."""
+def _gather(xyz, rgb, i, rows):  # type: ignore[no-untyped-def]  # Numba's types
+    """Positions relative to the base [3, k + 1] and colours [k + 1, 3], for all its new points."""
     k = rows.size
     around, color = np.zeros((3, k + 1), np.float32), np.empty((k + 1, 3), np.float32)
     for axis in range(3):
@@ -62,8 +62,8 @@ def _gather(xyz, rgb, i, rows):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _weights(around, x, y, z, nearest, weight):  # type: ignore[no-untyped-def]
-    """Inverse distances; apart from the sums, so that the square roots run in vector registers."""
+def _weights(around, x, y, z, nearest, weight):  # type: ignore[no-untyped-def]  # Numba's types
+    """Inverse distances; separate from the sums, so that the square roots are vectorised."""
     for j in range(weight.size):
         dx, dy, dz = x - around[0, j], y - around[1, j], z - around[2, j]
         squared = max(dx * dx + dy * dy + dz * dz, nearest)
@@ -71,7 +71,7 @@ def _weights(around, x, y, z, nearest, weight):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _mix(weight, color, out):  # type: ignore[no-untyped-def]
+def _mix(weight, color, out):  # type: ignore[no-untyped-def]  # Numba's types
     total = red = green = blue = np.float32(0.0)
     for j in range(weight.size):
         total += weight[j]

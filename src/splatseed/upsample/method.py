@@ -1,9 +1,9 @@
-"""What every upsampling method is: a frozen dataclass of parameters that can be called.
+"""The contract of upsampling methods: a frozen dataclass of parameters that can be called.
 
 A method gets the scene, the number of points to make and a random generator, and returns positions
-in the world and colours. Methods that begin with the originals get them clean, centred and with
+in the world and colours. Methods that start from the originals get them clean, centred and with
 their neighbours from ``neighbors.prepare_scene``. Putting originals first, counting and the origin
-of points are done once, around the method.
+of points are handled once, around the method.
 """
 
 from __future__ import annotations
@@ -34,21 +34,20 @@ __all__ = ["Need", "NewPoints", "Traits", "Upsampler", "check_fields", "require"
 
 
 class NewPoints(NamedTuple):
-    """What a method returns: positions, colours, and whatever more it knows of its points."""
+    """What a method returns: positions, colours, and optional attributes of its points."""
 
     xyz: Float32[np.ndarray, "M 3"]
     """World positions, float32 [M, 3]."""
     rgb: UInt8[np.ndarray, "M 3"]
     """Colours, uint8 [M, 3]."""
     notes: tuple[str, ...] = ()
-    """What the user should know of them, one sentence each."""
+    """Notes for the user, one sentence each."""
     normals: Float32[np.ndarray, "M 3"] | None = None
     """Unit normals, world axes, float32 [M, 3]; NaN where unknown."""
     sizes: Float32[np.ndarray, " M"] | None = None
-    """Radius that a Gaussian there should begin with, float32 [M], scene units; NaN where
-    unknown."""
+    """Initial radius of a Gaussian there, float32 [M], scene units; NaN where unknown."""
     confidence: Float32[np.ndarray, " M"] | None = None
-    """How sure it is that a surface is there, float32 [M], 0 to 1; NaN where unknown."""
+    """Confidence that a surface is there, float32 [M], 0 to 1; NaN where unknown."""
     source: UInt8[np.ndarray, " M"] | None = None
     """Codes of the methods that made them, uint8 [M], never 0; the method's own when left out."""
 
@@ -58,12 +57,12 @@ Need = Literal["points", "depth", "photographs"]
 
 @dataclasses.dataclass(frozen=True)
 class Traits:
-    """What a method needs of a scene, and who says how many points it makes.
+    """What a method needs from a scene, and who determines its number of points.
 
     Args:
-        needs: What it cannot do without.
-        chooses_number: Whether it makes as many points as the photographs need, not a number
-            asked for; it is then called with 0.
+        needs: What the scene must have.
+        chooses_number: Whether the photographs determine the number of points; the method is then
+            called with 0.
     """
 
     needs: frozenset[Need] = frozenset({"points"})
@@ -74,8 +73,8 @@ class Traits:
 class Upsampler(Protocol):
     """An upsampling method. Third parties register classes under ``splatseed.methods``.
 
-    Two members are optional. ``traits`` (``Traits``) is for a method that does not make a number of
-    points that it is asked for from points alone. ``paper()``, a class method, gives the parameters
+    Two members are optional. ``traits`` (``Traits``) is for a method that needs more than points,
+    or chooses the number of new points itself. ``paper()``, a class method, gives the parameters
     that follow a paper to the letter; without it both profiles are the same.
     """
 
@@ -106,7 +105,7 @@ def require(condition: bool, expected: str, found: object) -> None:
 
 
 def check_fields(method: Any) -> None:
-    """Hold the fields of a method's dataclass to their annotations: a typo must not pass silently.
+    """Check the fields of a method's dataclass against their annotations, to catch typos.
 
     Raises:
         ParameterError: A field is not of its type, or not one of its choices.
@@ -119,7 +118,7 @@ def check_fields(method: Any) -> None:
 
 
 def _fits(value: object, hint: Any) -> bool:
-    """Whether a value is of a type: a plain one, a choice of literals, or a union of these."""
+    """Whether a value has a type: a plain one, a choice of literals, or a union of these."""
     if get_origin(hint) is Literal:
         return isinstance(value, str) and value in get_args(hint)
     if get_origin(hint) in {Union, types.UnionType}:

@@ -1,4 +1,4 @@
-"""The frame of every method that starts from a base point and its nearest neighbours."""
+"""The base of every method that starts from a base point and its nearest neighbours."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class NearestMethod:
     """Base of the methods that need only the nearest neighbours of a base point."""
 
     reject_isolated: bool = True
-    """Start nothing from points that stand alone, or whose track is short and bad (paper: no)."""
+    """Start nothing from isolated points, or from ones with a short, bad track (paper: no)."""
 
     min_points: ClassVar[int] = 2
 

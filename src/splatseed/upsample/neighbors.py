@@ -1,4 +1,4 @@
-"""The originals, prepared once for every method: clean, centred, in spatial order, with neighbours.
+"""The originals, prepared once for every method: clean, centred, spatially sorted, with neighbours.
 
 Notation: n distinct finite originals in *rows* (kd-tree leaf order: neighbouring rows are
 neighbours in space, which keeps every later pass in cache); ``rank`` is a row's place among them
@@ -58,7 +58,7 @@ class Neighbors:
 
     @cached_property
     def spacing(self) -> Float64[np.ndarray, " n"]:
-        """Local spacing h of every row: mean distance to the 6 nearest (or to all there are)."""
+        """Local spacing h of every row: mean distance to the 6 nearest (fewer if k < 6)."""
         return np.asarray(self.distance[:, :SPACING_NEIGHBORS].mean(axis=1))
 
     def nearest(self, k: int) -> Neighbors:
@@ -96,7 +96,7 @@ class PreparedCloud:
         return len(self.xyz)
 
     def neighbors(self, k: int) -> Neighbors:
-        """The ``k`` nearest other rows of every row (all of them where there are fewer).
+        """The ``k`` nearest other rows of every row (all of them if there are fewer).
 
         Raises:
             PointCloudError: There is only one point, which has no neighbour.
@@ -110,16 +110,16 @@ class PreparedCloud:
             )
         idx = np.empty((len(self), k), np.int32)
         distance = np.empty((len(self), k))
-        # Points closer than float64 tells apart after centring must not come to lie at distance 0.
+        # Points that float64 cannot tell apart after centring must not end up at distance 0.
         least = np.finfo(np.float64).eps * np.abs(self.xyz).max()
         row_of_rank = np.empty(len(self), np.int32)
         row_of_rank[self.rank] = np.arange(len(self), dtype=np.int32)
 
         def query(start: int, stop: int) -> None:
-            found, ranks = self.tree.query(self.xyz[start:stop], k + 1)
+            distances, ranks = self.tree.query(self.xyz[start:stop], k + 1)
             # Column 0 is the row itself: rows are distinct, so nothing else is at distance 0.
             idx[start:stop] = row_of_rank[ranks[:, 1:]]
-            np.maximum(found[:, 1:], least, out=distance[start:stop])
+            np.maximum(distances[:, 1:], least, out=distance[start:stop])
 
         in_threads(query, len(self), QUERY_BLOCK, "neighbours", self.progress)
         return Neighbors(idx, distance)
@@ -135,7 +135,7 @@ def prepare(
     Args:
         points: The cloud; only points with ``source`` 0 take part.
         trusted: Which of the N points may serve as bases; all when left out.
-        progress: Called with the stage "neighbours" while neighbours are sought.
+        progress: Called with the stage "neighbours" during the neighbour query.
 
     Raises:
         PointCloudError: No finite original is left.
@@ -158,11 +158,11 @@ def prepare(
 
 
 def prepare_scene(scene: Scene, progress: Progress = silent) -> PreparedCloud:
-    """The originals of a scene, prepared; only those that are trusted may serve as bases.
+    """The originals of a scene, prepared; only trusted ones may serve as bases.
 
     Args:
-        scene: The scene; its tracks say which originals are trusted.
-        progress: Called with the stage "neighbours" while neighbours are sought.
+        scene: The scene; its tracks determine which originals are trusted.
+        progress: Called with the stage "neighbours" during the neighbour query.
 
     Raises:
         PointCloudError: No finite original is left.
@@ -174,12 +174,12 @@ def prepare_scene(scene: Scene, progress: Progress = silent) -> PreparedCloud:
 class Bases:
     """How many new points each row makes, and where they go (a CSR layout).
 
-    Row i makes outputs ``start[i] : start[i] + count[i]``. Outputs are ordered by rank.
+    Row i makes the new points ``start[i] : start[i] + count[i]``, ordered by rank.
 
     Args:
-        start: First output of each row, int64 [n].
-        count: Outputs of each row, int64 [n].
-        total: All outputs, M.
+        start: First new point of each row, int64 [n].
+        count: New points of each row, int64 [n].
+        total: All new points, M.
     """
 
     start: Int64[np.ndarray, " n"]

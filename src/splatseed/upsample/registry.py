@@ -1,9 +1,9 @@
 """METHODS: every upsampling method by name, imported when first looked up.
 
-Built-in methods come first: those of ``methods/``, and those that parts of the package above it add
-when they are imported, as all are with the package (``add_built_in``). Then come what installed
-packages register under the entry-point group ``splatseed.methods`` (``name =
-"package.module:Class"``). A built-in name cannot be taken over.
+Built-in methods come first: those in ``methods/``, and those that higher parts of the package add
+when they are imported along with it (``add_built_in``). Then come those that installed packages
+register under the entry-point group ``splatseed.methods`` (``name = "package.module:Class"``). A
+built-in name cannot be overridden.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SOURCE_CODES = {
     "stereo": 8,
     "cover": 9,
 }
-"""What ``PointCloud.source`` holds for the points of each built-in method."""
+"""The ``PointCloud.source`` code of each built-in method."""
 
 
 class MethodRegistry(Mapping[str, type[Upsampler]]):
@@ -80,7 +80,7 @@ METHODS = MethodRegistry()
 
 
 def add_built_in(methods: Mapping[str, str]) -> None:
-    """Let a part of the package that imports this one have methods of its own.
+    """Let a part of the package that imports this one add methods of its own.
 
     Args:
         methods: "module:Class" by name; none is imported before it is looked up.
@@ -89,11 +89,11 @@ def add_built_in(methods: Mapping[str, str]) -> None:
 
 
 def source_code(name: str) -> int:
-    """The ``PointCloud.source`` code of a method; 255 for every method of a third party."""
+    """The ``PointCloud.source`` code of a method; 255 for every third-party method."""
     return SOURCE_CODES.get(name, GENERATED)
 
 
 def origin_name(code: int) -> str:
-    """What made the points of a ``PointCloud.source`` code, in a word."""
+    """The name of a ``PointCloud.source`` code."""
     names = {ORIGINAL: "original", **{code: name for name, code in SOURCE_CODES.items()}}
     return names.get(code, "other")

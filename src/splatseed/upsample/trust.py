@@ -1,11 +1,11 @@
-"""Which originals may serve as bases, by what Structure-from-Motion knows of them.
+"""Which originals may serve as bases, by their tracks.
 
 A point that few images saw and that reprojects badly is often a mismatch. On the demo capture,
-whose outliers are planted, the rule below finds 43% of them and costs 0.8% of the rest, and
+whose outliers are planted, the rule below catches 43% of them and costs 0.8% of the rest, and
 together with the rule for isolated points (``neighbors.sound_bases``) 75% and 0.9%. On real Kinect
-data (7-Scenes red kitchen against its depth maps) it finds only 3% of the points over 40 cm off: it
-is a safeguard, and therefore cautious. A point that is not trusted stays in the output; only
-nothing grows from it.
+data (7-Scenes red kitchen against its depth maps) it catches only 3% of the points over 40 cm off:
+it is a safeguard, and therefore cautious. An untrusted point stays in the output; only nothing is
+made from it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """The canvas of a browser as a camera of the scene's world, and photographs laid onto it.
 
-Notation: the *stage* is the viewer's world: the scene's, moved and scaled as its training frame is, so that a
-browser's single precision suffices; poses are OpenCV's there and here. A canvas pixel's centre is at +0.5.
+Notation: the *stage* is the viewer's world: the scene's, moved and scaled into its training frame
+so that a browser's single precision suffices. Poses follow OpenCV. A canvas pixel's centre is at
++0.5.
 """
 
 from __future__ import annotations
@@ -47,16 +48,16 @@ def canvas_view(
 def stage_pose(
     camera: Camera, frame: TrainingFrame
 ) -> tuple[Float64[np.ndarray, " 4"], Float64[np.ndarray, " 3"]]:
-    """A camera of the scene as a rotation wxyz and a centre on the stage."""
+    """A camera's pose on the stage: rotation stage_from_cam as wxyz, and centre."""
     center = (camera.center - frame.origin) * frame.scale
     return quat_from_rotation(camera.world_from_cam[:3, :3]), center
 
 
 def fitted_fov(camera: Camera, aspect: float) -> float:
-    """The vertical field of view, radians, with which a canvas shows all that a camera saw.
+    """The vertical field of view, radians, at which a canvas shows everything the camera saw.
 
     Args:
-        camera: Its principal point is taken to be in the middle.
+        camera: Its principal point is assumed to be central.
         aspect: Width of the canvas over its height.
     """
     by_height = camera.height / camera.K[1, 1]
@@ -67,12 +68,12 @@ def fitted_fov(camera: Camera, aspect: float) -> float:
 def laid_onto(
     canvas: View, picture: UInt8[np.ndarray, "h w 3"], camera: Camera, *, smooth: bool = True
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A camera's picture as a canvas with the same pose shows it, black beyond its border.
+    """A camera's picture as seen on a canvas with the same pose; black outside the picture.
 
     Args:
-        canvas: Where to.
-        picture: What the camera saw, of any size.
-        camera: Its own.
+        canvas: The view to draw.
+        picture: What the camera saw, at any size.
+        camera: The intrinsics of the picture.
         smooth: Interpolate between pixels.
     """
     from PIL import Image  # noqa: PLC0415  (slow to import)

@@ -23,7 +23,7 @@ __all__ = [
 LINE = 2
 WHITE = 255
 SAMPLES = 7
-"""Frames of a path that the range of its depths is taken from."""
+"""How many frames of a path are rendered to find its depth range."""
 
 
 def flight_frames(
@@ -38,7 +38,7 @@ def flight_frames(
 
     Args:
         renderers: One model, or two.
-        names: Theirs, shown where there are two.
+        names: The models' names, shown when there are two.
         path: The cameras.
         depth: Show depth, not colour.
         progress: Told how far it is.
@@ -54,12 +54,12 @@ def flight_frames(
 
 
 def as_bytes(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Colours of 0 to 1 in 8 bits."""
+    """Colours in [0, 1] as 8-bit integers."""
     return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
 
 
 def depth_range(renderer: ModelRenderer, path: Sequence[View]) -> tuple[float, float]:
-    """Near and far of what a path sees: the 2nd and 98th percentile, in units of the world."""
+    """Near and far along a path: the 2nd and 98th percentiles of depth, in world units."""
     every = max(1, len(path) // SAMPLES)
     depths = np.concatenate([renderer.depth(view).reshape(-1) for view in path[::every]])
     seen = depths[depths > 0]
@@ -72,7 +72,7 @@ def depth_range(renderer: ModelRenderer, path: Sequence[View]) -> tuple[float, f
 def depth_colors(
     depth: Float32[np.ndarray, "H W"], limits: tuple[float, float]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth as colours, even steps of 1 / depth; near is bright, nothing is black."""
+    """Depth as colours, spaced evenly in 1 / depth; near is bright, and nothing is black."""
     from matplotlib import colormaps  # noqa: PLC0415  (slow to import)
 
     near, far = (1 / max(limit, 1e-12) for limit in limits)
@@ -90,7 +90,7 @@ def split_picture(
     *,
     at: float = 0.5,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The left part of one picture and the right part of another, a white line between them, named."""
+    """The left of one picture and the right of another, labelled, with a white line between."""
     column = round(at * left.shape[1])
     named = (
         labelled(left, left_name, 0)[:, :column],
@@ -104,7 +104,7 @@ def split_picture(
 def labelled(
     picture: UInt8[np.ndarray, "H W 3"], name: str, column: int
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture with a name at its lower edge, from a column on."""
+    """A picture with a name at its lower edge, starting at a given column."""
     from PIL import Image, ImageDraw  # noqa: PLC0415  (slow to import)
 
     if not name:

@@ -1,7 +1,8 @@
 """Pictures that follow a browser's camera: coarse while it moves, full when it is still.
 
-Notation: a *frame* is one picture sent; the scale of a frame is its size over the canvas's. Promise: the newest
-camera is drawn, never a queue of old ones; a browser that has gone ends its thread and nothing else.
+Notation: a *frame* is one picture sent; the scale of a frame is its size divided by the canvas's.
+Promise: the newest camera is drawn, never a queue of old ones; a browser that disconnects ends only
+its own thread.
 """
 
 from __future__ import annotations
@@ -15,21 +16,21 @@ import numpy as np
 __all__ = ["FrameLoop"]
 
 MOVING_SECONDS = 0.12
-"""What a frame may take while the camera moves."""
+"""Seconds a frame may take while the camera moves."""
 STILL_AFTER = 0.2
-"""Seconds without a movement after which the full picture is drawn."""
+"""Seconds without movement after which the full picture is drawn."""
 LEAST_SCALE, FIRST_SCALE = 0.12, 0.3
 CLOSE_SECONDS = 2.0
-"""How long a frame in hand is waited for."""
+"""Seconds to wait for the frame being drawn."""
 MEMORY = 0.5
-"""How much of what a pixel took is believed of the latest frame."""
+"""Weight of the latest frame in the running estimate of the cost per pixel."""
 
 
 class FrameLoop:
-    """Draws whenever it is told that something changed.
+    """Draws a frame whenever it is told that something has changed.
 
     Args:
-        draw: Draws and sends a picture at a scale; returns how many pixels it drew, 0 for nothing.
+        draw: Draws and sends a picture at a scale; returns the number of pixels drawn, 0 for none.
     """
 
     def __init__(self, draw: Callable[[float], int]) -> None:
@@ -43,11 +44,11 @@ class FrameLoop:
         self._thread.start()
 
     def change(self) -> None:
-        """The camera moved, or what is shown is another."""
+        """The camera moved, or something else is shown."""
         self._changed.set()
 
     def close(self) -> None:
-        """End; a frame in hand is finished."""
+        """End the loop once the current frame is finished."""
         self._closed = True
         self._changed.set()
         self._thread.join(CLOSE_SECONDS)
@@ -64,7 +65,7 @@ class FrameLoop:
                 self._frame(1.0, learn=False)
 
     def _scale(self) -> float:
-        """The size at which a frame takes as long as it may."""
+        """The scale at which a frame just meets its time budget."""
         if self._pixel_seconds is None:
             return FIRST_SCALE
         affordable = MOVING_SECONDS / self._pixel_seconds / self._full_pixels
@@ -77,7 +78,7 @@ class FrameLoop:
             return
         self.frames += 1
         self._full_pixels = pixels / scale**2
-        if not learn:  # all Gaussians were drawn, not those alone that show most
+        if not learn:  # a full frame draws all Gaussians, a coarse one only the most visible
             return
         took = (time.perf_counter() - began) / pixels
         before = took if self._pixel_seconds is None else self._pixel_seconds

@@ -1,8 +1,8 @@
 """Camera paths: smooth ones through a scene's cameras, orbits, and nerfstudio's files.
 
-Notation: a path is a sequence of views without pixels, one a frame, world coordinates, OpenCV axes; a *stop* is a
-camera that a path begins from. Promise: equal input gives equal paths; cameras that stand far from all
-others are left out.
+Notation: a path is a sequence of views without pixels, one per frame, in world coordinates with
+OpenCV axes; a *stop* is a camera that a path is made from. Promise: equal input gives equal paths;
+cameras far from all others are left out.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from splatseed.views.viewpoint import look_at
 __all__ = ["check_path", "focus_of", "orbit", "path_of_file", "smooth_path", "views_from"]
 
 SMOOTHING = 0.02
-"""Standard deviation of the filter along a path, as a part of its length."""
+"""Standard deviation of the filter along a path, as a fraction of the path's length."""
 FINE = 8
-"""Places a path is smoothed at for each frame of it."""
+"""Samples per frame at which a path is smoothed."""
 DETOUR = 2.0
-"""A path in the order of names that is so many times as long as from neighbour to neighbour is in no order."""
+"""Names give no order if following them takes this many times the way by nearest neighbours."""
 MOST_FRAMES = 100_000
 MADE_UP_SIZE = (960, 720)
 LOOKS, LOOKED_AT = 60, 5000
-"""How many views and Gaussians tell whether a path leads past the model."""
+"""Views and Gaussians sampled to decide whether a path misses the model."""
 LEAST_SEEN, HALF = 0.002, 0.5
-"""Less of the Gaussians is next to none of them; in more of the views than this it is no chance."""
+"""A view that sees a smaller share of the Gaussians misses them; most views must not."""
 FAR_AWAY = 10.0
-"""Times the reach of the cameras."""
+"""A path is far away beyond this many times the cameras' extent."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -50,12 +50,12 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
     """A path past all cameras, at even speed.
 
     Args:
-        views: The cameras, in an order that their photographs may have been taken in.
+        views: The cameras, in the order in which the photographs may have been taken.
         frames: How many views to return.
         size: Their width and height.
 
     Raises:
-        ParameterError: Fewer than two cameras, or all in one place.
+        ParameterError: There are fewer than two cameras, or all are in one place.
     """
     strays = stray_views(views)
     stops = _in_order([view for view in views if view.name not in strays])
@@ -67,7 +67,7 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
             found=f"{len(views)} cameras",
             fix="Pass --orbit, or --path FILE.",
         )
-    # Turning by a radian counts as moving as far as the cameras reach.
+    # Turning by one radian counts as moving by the extent of the cameras.
     steps = np.linalg.norm(np.diff(poses * np.r_[np.ones(3) / reach, np.ones(6)], axis=0), axis=1)
     places = np.linspace(0, 1, FINE * frames + 1)
     fine = _interpolated(poses, steps, places)
@@ -81,7 +81,7 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
 def orbit(
     views: Sequence[View], gaussians: Gaussians, frames: int, size: tuple[int, int]
 ) -> list[View]:
-    """Once around what the cameras look at, at their distance and height; around the Gaussians without cameras.
+    """Circle what the cameras look at, at their distance and height; without cameras, the model.
 
     Args:
         views: The cameras, or none.
@@ -116,12 +116,12 @@ def orbit(
 
 
 def focus_of(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
-    """The point nearest to all cameras' axes; where these are parallel, ahead of the cameras' middle."""
+    """The point nearest to all cameras' axes; a point ahead of them if these are parallel."""
     centers = _centers(views)
     axes = np.array([view.cam_from_world[2, :3] for view in views])
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     middle, spread = centers.mean(axis=0), np.linalg.norm(centers - centers.mean(axis=0), axis=1)
-    # Weakly pulled towards a place ahead, that decides where the axes do not.
+    # A weak pull towards a point ahead decides where the axes do not.
     ahead = middle + axes.mean(axis=0) * (spread.max() or 1.0)
     weight = 1e-2 * len(views)
     normal = across.sum(axis=0) + weight * np.eye(3)
@@ -131,15 +131,15 @@ def focus_of(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
 
 
 def path_of_file(path: Path, size: tuple[int, int]) -> tuple[list[View], float | None]:
-    """The views of a camera path in nerfstudio's JSON, and its frames per second where it names them.
+    """The views of a camera path in nerfstudio's JSON, and its frame rate if the file gives one.
 
     Args:
-        path: The file; its cameras are taken to be in the model's world.
+        path: The file; its cameras are assumed to be in the model's world.
         size: Width and height of the views; fields of view are vertical, in degrees.
 
     Raises:
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no camera path.
+        SceneFormatError: It is not a camera path.
     """
     try:
         content = json.loads(read_bytes(path))
@@ -156,11 +156,11 @@ def path_of_file(path: Path, size: tuple[int, int]) -> tuple[list[View], float |
 
 
 def views_from(world: Similarity, views: Sequence[View]) -> list[View]:
-    """Views of another world, in the model's.
+    """Views of another world, transformed into the model's.
 
     Args:
         world: From the model's world to that of the views.
-        views: There.
+        views: The views in that world.
     """
     back = world.inverse
     return [
@@ -177,7 +177,7 @@ def check_path(
         path: Its file.
         views: Its cameras.
         gaussians: The model.
-        cameras: Those that the model was trained from, or none.
+        cameras: The cameras that the model was trained from, or none.
 
     Raises:
         SceneFormatError: Most of the views see next to nothing, or are out of reach.
@@ -204,7 +204,7 @@ def check_path(
 
 
 def _share_seen(view: View, xyz: Float64[np.ndarray, "N 3"]) -> float:
-    """Which share of the points is in the picture."""
+    """The share of the points that the view sees."""
     cam = xyz @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
     u, v, depth = view.K @ cam.T
     inside = (u >= 0) & (u < view.width * depth) & (v >= 0) & (v < view.height * depth)
@@ -217,7 +217,8 @@ def _centers(views: Sequence[View]) -> Float64[np.ndarray, "N 3"]:
 
 def _no_path(path: Path, found: str) -> SceneFormatError:
     return SceneFormatError(
-        f"{path} to be a camera path as nerfstudio's viewer writes it: camera_path, with camera_to_world and fov",
+        f"{path} to be a camera path as nerfstudio's viewer writes it: "
+        "camera_path, with camera_to_world and fov",
         found=found[:120],
         fix="Export the path again.",
     )
@@ -239,7 +240,7 @@ def _view_of_frame(frame: dict[str, Any], size: tuple[int, int], i: int) -> View
 
 
 def _in_order(views: Sequence[View]) -> list[View]:
-    """By name, as a walk or a video is; from neighbour to neighbour if that is no order."""
+    """Views sorted by name, as in a walk or video; by nearest neighbour if names give no order."""
     by_name = sorted(views, key=lambda view: view.name)
     if len(views) < 3:
         return by_name
@@ -258,7 +259,7 @@ def _in_order(views: Sequence[View]) -> list[View]:
 
 
 def _pose_vector(view: View) -> Float64[np.ndarray, " 9"]:
-    """Centre, forward and up: what can be averaged."""
+    """Centre, forward and up: quantities that can be averaged."""
     rotation, translation = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
     return np.concatenate([-rotation.T @ translation, rotation[2], -rotation[1]])
 
@@ -273,14 +274,14 @@ def _interpolated(
     steps: Float64[np.ndarray, " N-1"],
     at: Float64[np.ndarray, " M"],
 ) -> Float64[np.ndarray, "M 9"]:
-    """Poses at parts, 0 to 1, of a way whose steps have these lengths."""
+    """Poses at fractions in [0, 1] of a path whose segments have these lengths."""
     way = np.concatenate([[0.0], np.cumsum(steps)])
     place = at * way[-1]
     return np.stack([np.interp(place, way, column) for column in poses.T], axis=1)
 
 
 def _median_camera(views: Sequence[View]) -> View:
-    """The camera with the usual lens."""
+    """A camera with the median lens."""
     focals = [view.K[1, 1] / view.height for view in views]
     return views[int(np.argsort(focals)[len(focals) // 2])]
 

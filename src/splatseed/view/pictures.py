@@ -1,8 +1,9 @@
-"""The pictures that the viewer shows behind its points: renders, photographs, what is wrong, what is missing.
+"""The pictures behind the viewer's points: renders, photographs, errors and uncovered cells.
 
-Notation: an *entry* is one of the things that a user opened; *at* is the image whose camera the canvas stands at,
-or None. Promise: pictures are drawn one at a time, whatever the number of browsers: PyTorch's and Numba's threads are
-shared; what cannot be drawn is None, with the reason beside it.
+Notation: an *entry* is one of the things the user opened; *at* is the image whose camera the canvas
+stands at, or None. Promise: pictures are drawn one at a time, however many browsers are connected,
+because PyTorch's and Numba's threads are shared; a picture that cannot be drawn is None, with a
+reason.
 """
 
 from __future__ import annotations
@@ -32,15 +33,15 @@ from splatseed.view.renderer import ModelRenderer
 from splatseed.view.shown import Shown
 from splatseed.views.view import View, poses_of
 
-__all__ = ["NOTHING", "Entry", "Found"]
+__all__ = ["NOTHING", "Drawn", "Entry"]
 
-Found = tuple[UInt8[np.ndarray, "H W 3"] | None, str]
-"""A picture, or None and why there is none."""
+Drawn = tuple[UInt8[np.ndarray, "H W 3"] | None, str]
+"""A picture, or None and the reason why there is none."""
 NOTHING = "points only"
 MOST_MOVING = 250_000
-"""Gaussians that are rendered while a camera moves: projecting a million takes longer than all pixels."""
+"""Gaussians rendered while a camera moves: projecting a million takes longer than all pixels."""
 CELL = 8
-"""Pixels a side of the cells that hold a seed or none."""
+"""Side in pixels of the cells that are tested for seeds."""
 PHOTOGRAPH_SIDE = 1600
 CELLS_SIDE = 800
 PAPER = (255, 255, 255)
@@ -49,11 +50,11 @@ _DRAWING = threading.Lock()
 
 
 class Entry:
-    """Something opened, and the pictures that can be made of it.
+    """Something the user opened, and the pictures that can be made of it.
 
     Args:
-        shown: It.
-        frame: The stage, which models are rendered in.
+        shown: The scene, model or both.
+        frame: The stage, in which models are rendered.
         device: Where to render; the CPU when left out.
     """
 
@@ -68,13 +69,13 @@ class Entry:
 
     @cached_property
     def renderer(self) -> ModelRenderer:
-        """The model's."""
+        """The renderer of the whole model."""
         assert self.shown.gaussians is not None  # noqa: S101  (kinds says so)
         return ModelRenderer(self.shown.gaussians, self.frame, self._device)
 
     @cached_property
     def quick_renderer(self) -> ModelRenderer:
-        """Of the Gaussians that show most, for pictures of a moving camera; of all, if they are few."""
+        """A renderer of the most visible Gaussians, for moving cameras; of all if there are few."""
         gaussians = self.shown.gaussians
         if gaussians is None or len(gaussians) <= MOST_MOVING:
             return self.renderer
@@ -90,8 +91,8 @@ class Entry:
         """The pictures that can be asked for."""
         return tuple(self._painters)
 
-    def draw(self, kind: str, canvas: View, at: Image | None, *, quick: bool = False) -> Found:
-        """A picture of a kind, as large as the canvas; a quick one may leave out what shows least."""
+    def draw(self, kind: str, canvas: View, at: Image | None, *, quick: bool = False) -> Drawn:
+        """A picture as large as the canvas; a quick one may skip the least visible Gaussians."""
         if quick and kind == "Gaussians" and self.has_model:
             with _DRAWING:
                 return as_bytes(self.quick_renderer.color(canvas)), ""
@@ -102,49 +103,49 @@ class Entry:
                 return None, str(error)
 
     def warm_up(self) -> None:
-        """Compile what renders need, so that no browser waits for it."""
+        """Compile the kernels that renders need, so that no browser waits for them."""
         if self.has_model:
             K = np.array([[32.0, 0, 16], [0, 32.0, 12], [0, 0, 1]])
             view = View("", np.empty((0, 0, 3), np.uint8), K, 32, 24, np.eye(4))
             for quick in (True, False):
                 self.draw("Gaussians", view, None, quick=quick)
 
-    def _available(self) -> dict[str, Callable[[View, Image | None], Found]]:
-        found: dict[str, Callable[[View, Image | None], Found]] = {}
+    def _available(self) -> dict[str, Callable[[View, Image | None], Drawn]]:
+        available: dict[str, Callable[[View, Image | None], Drawn]] = {}
         scene = self.shown.scene
         if self.has_model:
-            found |= {"Gaussians": self._gaussians, "depth": self._depth}
+            available |= {"Gaussians": self._gaussians, "depth": self._depth}
         if scene is not None and scene.has_photographs:
-            found["photograph"] = self._photograph
+            available["photograph"] = self._photograph
             if self.has_model:
-                found["error"] = self._error
+                available["error"] = self._error
         if scene is not None and scene.depths is not None:
-            found["depth map"] = self._depth_map
+            available["depth map"] = self._depth_map
         if scene is not None and len(scene.points):
-            found |= {"points": self._points, "origins": self._origins}
+            available |= {"points": self._points, "origins": self._origins}
             if scene.images:
-                found["uncovered cells"] = self._uncovered
-        return found
+                available["uncovered cells"] = self._uncovered
+        return available
 
-    def _gaussians(self, canvas: View, at: Image | None) -> Found:
+    def _gaussians(self, canvas: View, at: Image | None) -> Drawn:
         del at
         return as_bytes(self.renderer.color(canvas)), ""
 
-    def _depth(self, canvas: View, at: Image | None) -> Found:
+    def _depth(self, canvas: View, at: Image | None) -> Drawn:
         del at
         return _depth_picture(self.renderer.depth(canvas)), ""
 
-    def _points(self, canvas: View, at: Image | None) -> Found:
+    def _points(self, canvas: View, at: Image | None) -> Drawn:
         del at
         return render_points(self._scene.points, _camera_of(canvas), background=PAPER), ""
 
-    def _origins(self, canvas: View, at: Image | None) -> Found:
+    def _origins(self, canvas: View, at: Image | None) -> Drawn:
         del at
         points = self._scene.points
         colored = points.replace(rgb=origin_colors(points.source))
         return render_points(colored, _camera_of(canvas), background=PAPER), ""
 
-    def _photograph(self, canvas: View, at: Image | None) -> Found:
+    def _photograph(self, canvas: View, at: Image | None) -> Drawn:
         if at is None:
             return None, GO
         photograph = _photograph_of(self._scene, at, PHOTOGRAPH_SIDE)
@@ -152,22 +153,22 @@ class Entry:
             return None, f"The photograph {at.name} cannot be read."
         return laid_onto(canvas, photograph, at.camera), ""
 
-    def _error(self, canvas: View, at: Image | None) -> Found:
-        truth, why = self._photograph(canvas, at)
-        if truth is None or at is None:
+    def _error(self, canvas: View, at: Image | None) -> Drawn:
+        photograph, why = self._photograph(canvas, at)
+        if photograph is None or at is None:
             return None, why
         white = np.full((2, 2, 3), 255, np.uint8)
         inside = laid_onto(canvas, white, at.camera, smooth=False) > 0
-        return np.where(inside, error_map(truth, self.renderer.color(canvas)), 0), ""
+        return np.where(inside, error_map(photograph, self.renderer.color(canvas)), 0), ""
 
-    def _depth_map(self, canvas: View, at: Image | None) -> Found:
+    def _depth_map(self, canvas: View, at: Image | None) -> Drawn:
         maps = self._scene.depths
         if at is None or maps is None or at.name not in maps:
             return None, GO if at is None else f"{at.name} has no depth map."
         values = np.nan_to_num(maps.read(at.name).values, nan=0.0, posinf=0.0)
         return laid_onto(canvas, _depth_picture(values), at.camera, smooth=False), ""
 
-    def _uncovered(self, canvas: View, at: Image | None) -> Found:
+    def _uncovered(self, canvas: View, at: Image | None) -> Drawn:
         if at is None:
             return None, GO
         view = _sized(at, CELLS_SIDE)
@@ -184,7 +185,7 @@ class Entry:
 
 
 def most_seen(gaussians: Gaussians, count: int) -> Gaussians:
-    """The Gaussians of greatest opacity times area, in their order."""
+    """The Gaussians with the largest opacity times area, in their original order."""
     wide = np.sort(gaussians.scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
     weight = wide - np.logaddexp(0, -gaussians.opacities.astype(np.float64))
     keep = np.sort(np.argpartition(-weight, count)[:count])
@@ -196,14 +197,14 @@ def _camera_of(canvas: View) -> Camera:
 
 
 def _depth_picture(depth: np.ndarray) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth in the colours of what is seen now: its 2nd to 98th percentile."""
+    """Depth as colours between the 2nd and 98th percentiles of this picture."""
     seen = depth[depth > 0]
     limits = tuple(np.percentile(seen, [2, 98]).tolist()) if seen.size else (1.0, 2.0)
     return depth_colors(depth, (limits[0], max(limits[1], 1.001 * limits[0])))
 
 
 def _sized(image: Image, side: int) -> View:
-    """An image's view, its longer side at most so many pixels."""
+    """An image's view, its longer side at most ``side`` pixels."""
     (view,) = poses_of([image], max(1, -(-max(image.camera.width, image.camera.height) // side)))
     return view
 

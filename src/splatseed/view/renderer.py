@@ -1,8 +1,8 @@
 """Rendering a model from any camera, in colour and in depth.
 
-Notation: the *frame* is the one that the model was trained in, where its scene is known, else one about its
-Gaussians; depth is planar z, in units of the world, 0 where nothing is. Promise: no gradients, and nothing
-of a render is kept.
+Notation: the *frame* is the one the model was trained in, if its scene is known, else one fitted to
+its Gaussians; depth is planar z in world units, 0 where there is none. Promise: no gradients are
+computed, and renders are not cached.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from splatseed.views.view import View, poses_of
 __all__ = ["ModelRenderer", "model_frame", "resized"]
 
 CORE = 0.6
-"""Share of the Gaussians, the nearest to their median, that the frame of a model without a scene is of."""
+"""Share of Gaussians, nearest to their median, that the frame of a lone model is fitted to."""
 LEAST_ALPHA = 0.05
-"""Where less is covered there is no depth to speak of."""
+"""Alpha below which a pixel has no depth."""
 
 
 def model_frame(gaussians: Gaussians, scene: Scene | None, test_every: int = 8) -> TrainingFrame:
-    """The frame to render in: near planes and single precision are right there."""
+    """The frame to render in: near planes and single precision work there."""
     if scene is not None and len(scene.images) > 1:
         return training_frame(poses_of(scene.split(test_every)[0]))
     origin = np.median(gaussians.means.astype(np.float64), axis=0)
@@ -39,12 +39,12 @@ def model_frame(gaussians: Gaussians, scene: Scene | None, test_every: int = 8) 
 
 
 class ModelRenderer:
-    """Renders Gaussians of the world.
+    """Renders Gaussians given in world coordinates.
 
     Args:
-        gaussians: In the world.
-        frame: To render in.
-        device: Where; the CPU when left out.
+        gaussians: In world coordinates.
+        frame: The frame to render in.
+        device: Where to render; the CPU when left out.
     """
 
     def __init__(
@@ -64,12 +64,12 @@ class ModelRenderer:
 
     @torch.no_grad()
     def color(self, view: View) -> Float32[np.ndarray, "H W 3"]:
-        """What the view looks like, 0 to 1; what is behind all is black."""
+        """The rendered view, in [0, 1]; the background is black."""
         return np.asarray(self._images(view, "RGB")[0].clamp_(0, 1).cpu().numpy())
 
     @torch.no_grad()
     def depth(self, view: View) -> Float32[np.ndarray, "H W"]:
-        """Expected planar depth in units of the world; 0 where there is none."""
+        """Expected planar depth in world units; 0 where there is none."""
         images, alphas = self._images(view, "ED")
         depth = torch.where(alphas > LEAST_ALPHA, images, 0)[..., 0] / self.frame.scale
         return np.asarray(depth.cpu().numpy())
@@ -91,7 +91,7 @@ class ModelRenderer:
 
 
 def resized(view: View, width: int, height: int) -> View:
-    """A camera whose picture has another size: as much is seen from top to bottom as before."""
+    """A camera with another picture size and the same vertical field of view."""
     scale = height / view.height
     K = np.diag([scale, scale, 1.0]) @ view.K
     K[0, 2] += (width - scale * view.width) / 2

@@ -1,6 +1,6 @@
-"""One browser that looks on: its controls, its camera, and the pictures that it is sent.
+"""One connected browser: its controls, its camera, and the pictures sent to it.
 
-Promise: two browsers have nothing in common but what is shown; a browser that goes away takes its thread along.
+Promise: two browsers share nothing but what is shown; when a browser disconnects, its thread ends.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from splatseed.scene import Image
 from splatseed.view.canvas import canvas_view, fitted_fov, stage_pose
 from splatseed.view.frames import split_picture
 from splatseed.view.live import FrameLoop
-from splatseed.view.pictures import NOTHING, Entry, Found
+from splatseed.view.pictures import NOTHING, Drawn, Entry
 from splatseed.view.stage import add_cameras, add_clouds, clouds_of, point_size
 from splatseed.views.view import View
 
 __all__ = ["MOST_POINTS", "Session"]
 
 MOST_PIXELS = 1_600_000
-"""Of a full picture; larger canvases are drawn smaller and stretched."""
+"""Longest side of a full picture; on larger canvases it is stretched."""
 THUMBNAIL = 96
 MOST_POINTS = 5_000_000
-"""For a browser to draw; more are thinned evenly."""
+"""Points sent to a browser; larger clouds are thinned evenly."""
 FLIGHT_SECONDS, FLIGHT_STEPS = 0.5, 15
 _LOG = logging.getLogger(__name__)
 ARRIVED = 1e-3
@@ -44,7 +44,7 @@ class Session:
     Args:
         client: viser's handle of the browser.
         entries: What was opened; at least one.
-        most_points: Most points that the browser gets to draw.
+        most_points: The most points that the browser draws.
     """
 
     def __init__(self, client: Any, entries: list[Entry], most_points: int = MOST_POINTS) -> None:
@@ -63,13 +63,13 @@ class Session:
         self._fill_stage()
 
     def close(self) -> None:
-        """The browser has gone."""
+        """The browser has disconnected."""
         self._closed = True
         self._loop.close()
 
     @property
     def gui(self) -> Any:
-        """The browser's controls, for whoever has some to add."""
+        """The browser's controls, for callers that add their own."""
         return self._client.gui
 
     def refresh(self) -> None:
@@ -83,7 +83,9 @@ class Session:
         first = self._entries[names[0]]
         self._what = gui.add_dropdown("Show", names, visible=len(names) > 1)
         kinds = self._kinds(first)
-        self._kind = gui.add_dropdown("Picture", kinds, initial_value=kinds[1 if first.has_model else 0])  # fmt: skip
+        self._kind = gui.add_dropdown(
+            "Picture", kinds, initial_value=kinds[1 if first.has_model else 0]
+        )
         seconds = self._second_choices()
         self._second = gui.add_dropdown("Beside it", seconds)
         self._split = gui.add_slider("Border at", 0.05, 0.95, 0.01, 0.5, visible=False)
@@ -112,7 +114,7 @@ class Session:
         return (NOTHING, *entry.kinds)
 
     def _second_choices(self) -> tuple[str, ...]:
-        """Every picture of every entry, named by entry where there is more than one."""
+        """Every picture of every entry, prefixed with the entry's name if there are several."""
         several = len(self._entries) > 1
         pairs = [(entry, kind) for entry in self._entries.values() for kind in entry.kinds]
         self._seconds = {
@@ -125,7 +127,7 @@ class Session:
         return self._entries[self._what.value]
 
     def _switched(self) -> None:
-        """Another entry is shown: its pictures, points and cameras take the places of the old ones."""
+        """Another entry was chosen: replace pictures, points and cameras by its own."""
         kinds = self._kinds(self._entry)
         self._kind.options = kinds
         if self._kind.value not in kinds:
@@ -166,7 +168,7 @@ class Session:
         threading.Thread(target=self._add_thumbnails, daemon=True).start()
 
     def _restyle(self) -> None:
-        """Points and cameras as the switches say."""
+        """Style points and cameras as the switches say."""
         for name, node in self._nodes.items():
             node.visible = self._points_on.value and self._origins[name].value
             node.point_size = self._base_size * self._size.value
@@ -236,7 +238,7 @@ class Session:
 
     @property
     def at(self) -> Image | None:
-        """The image at whose camera the browser's stands, having flown there; None elsewhere."""
+        """The image whose camera the browser flew to and still stands at, or None."""
         if self._goal is None:
             return None
         camera = self._client.camera
@@ -248,13 +250,13 @@ class Session:
     # Pictures -----------------------------------------------------------------------------------
 
     def _draw(self, scale: float) -> int:
-        """Draw what is asked for and send it; how many pixels that were."""
+        """Draw what is asked for and send it; returns the number of pixels drawn."""
         try:
             return self._drawn(scale)
         except SplatseedError as error:
             self._say(str(error))
         except Exception as error:  # noqa: BLE001  (the thread must live on)
-            if self._closed:  # the browser went away meanwhile
+            if self._closed:  # the browser has disconnected meanwhile
                 return 0
             _LOG.exception("a picture could not be drawn")
             self._say(f"{type(error).__name__}: {error}")
@@ -269,13 +271,13 @@ class Session:
             return 0
         canvas = self._canvas(scale)
         at = self.at
-        found: list[Found] = [(None, "")]
+        drawn: list[Drawn] = [(None, "")]
         if kind != NOTHING:
-            found = [self._entry.draw(kind, canvas, at, quick=scale < 1)]
+            drawn = [self._entry.draw(kind, canvas, at, quick=scale < 1)]
         if second is not None:
-            found.append(second[0].draw(second[1], canvas, at, quick=scale < 1))
-        self._say(" ".join(dict.fromkeys(why for _, why in found if why)))
-        picture = self._joined(found, canvas, named=scale == 1)
+            drawn.append(second[0].draw(second[1], canvas, at, quick=scale < 1))
+        self._say(" ".join(dict.fromkeys(why for _, why in drawn if why)))
+        picture = self._joined(drawn, canvas, named=scale == 1)
         self._show(picture, JPEG_STILL if scale == 1 else JPEG_MOVING)
         return canvas.width * canvas.height
 
@@ -286,15 +288,15 @@ class Session:
         size = (max(8, round(scale * width)), max(8, round(scale * height)))
         return canvas_view(camera.wxyz, camera.position, camera.fov, size, self._entry.frame)
 
-    def _joined(self, found: list[Found], canvas: View, *, named: bool) -> np.ndarray | None:
+    def _joined(self, drawn: list[Drawn], canvas: View, *, named: bool) -> np.ndarray | None:
         white = np.full((canvas.height, canvas.width, 3), 255, np.uint8)
-        pictures = [white if picture is None else picture for picture, _ in found]
+        pictures = [white if picture is None else picture for picture, _ in drawn]
         if len(pictures) == 1:
-            return found[0][0]
+            return drawn[0][0]
         names = (self._kind.value, self._second.value)
         if len(self._entries) > 1:
             names = (f"{self._entry.name}: {names[0]}", names[1])
-        names = names if named else ("", "")  # letters of a coarse picture would be huge
+        names = names if named else ("", "")  # letters would be huge in a coarse picture
         return split_picture(pictures[0], pictures[1], *names, at=float(self._split.value))
 
     def _show(self, picture: np.ndarray | None, quality: int) -> None:
@@ -309,7 +311,7 @@ class Session:
             self._note.content, self._note.visible = shown, bool(shown)
 
     def _screenshot(self) -> None:
-        """Send what the browser shows, points over picture, as a PNG to keep."""
+        """Send what the browser shows, points over picture, as a PNG to save."""
         from PIL import Image as PillowImage  # noqa: PLC0415  (slow to import)
 
         camera = self._client.camera

@@ -1,6 +1,7 @@
-"""What a user names to look at: a scene, a run, a file of Gaussians or of points.
+"""What a user names to look at: a scene, a run, or a file of Gaussians or points.
 
-Promise: a file's content decides what it is; a model knows its scene where the run or the user says so.
+Promise: a file's content decides what it is; a model knows its scene if the run or the user names
+it.
 """
 
 from __future__ import annotations
@@ -26,14 +27,14 @@ _HEADER = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Something to look at: a scene, a model, or a model and its scene.
+    """Something to look at: a scene, a model, or a model with its scene.
 
     Args:
         name: What to call it.
         path: What the user named.
-        scene: Points, cameras and photographs; None for a model alone.
-        gaussians: The model, in the scene's world; None for a scene alone.
-        config: The run's, if it is one.
+        scene: Points, cameras and photographs; None for a lone model.
+        gaussians: The model, in the scene's world; None for a lone scene.
+        config: The run's, if it is a run.
     """
 
     name: str
@@ -44,12 +45,12 @@ class Shown:
 
     @property
     def data_factor(self) -> int:
-        """By how much the run's photographs were made smaller; 1 where nobody says."""
+        """The factor by which the run downsampled its photographs; 1 if unknown."""
         return int(self.config.get("data_factor", 1))
 
     @property
     def test_every(self) -> int:
-        """Of the images sorted by name, every so many-th is a test view."""
+        """Every ``test_every``-th image, sorted by name, is a test view."""
         return int(self.config.get("test_every", 8))
 
 
@@ -57,12 +58,12 @@ def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
     """Read what a user names.
 
     Args:
-        path: A scene, a run's folder, a file of Gaussians or of points.
-        scene_path: The scene that a model is of; a run's own when left out, if it is still there.
+        path: A scene, a run folder, or a file of Gaussians or points.
+        scene_path: The scene a model belongs to; if left out, the one its run names, if it exists.
 
     Raises:
-        SceneNotFoundError: There is nothing, or the scene that the user names is not there.
-        SceneFormatError: It is damaged, or nothing that can be shown.
+        SceneNotFoundError: ``path``, or the scene that the user names, does not exist.
+        SceneFormatError: It is damaged, or cannot be shown.
     """
     folder = RunFolder(path)
     if path.is_dir() and folder.is_run:
@@ -92,7 +93,7 @@ def _open_run(folder: RunFolder, scene_path: Path | None) -> Shown:
 
 
 def _is_model(path: Path) -> bool:
-    """Whether a file is of Gaussians: a .ply of points is a scene."""
+    """Whether a file holds Gaussians: a .ply of points is a scene."""
     if path.suffix.lower() in MODEL_SUFFIXES:
         return True
     data = read_bytes(path)

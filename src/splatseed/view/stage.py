@@ -1,6 +1,6 @@
 """What the browser itself draws: points by origin, and cameras with their photographs.
 
-Promise: what a browser is sent is its own, so that switches of one do not move another's.
+Promise: each browser gets its own copy, so that the switches of one do not affect another.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from splatseed.view.canvas import stage_pose
 __all__ = ["Cloud", "add_cameras", "add_clouds", "clouds_of", "point_size"]
 
 MOST_CAMERAS = 400
-"""More are thinned evenly."""
+"""Larger clouds are thinned evenly to this many points."""
 FRUSTUM, LEAST_FRUSTUM, MOST_FRUSTUM = 0.5, 0.008, 0.05
-"""Size of a camera over the distance to the next one, and its bounds on the stage."""
+"""Size of a camera relative to the distance to the next one, and its bounds on the stage."""
 POINT_PIXELS = 1.4
-"""Diameter of a point as the first camera sees it, of a picture 1000 pixels high."""
+"""Diameter of a point in pixels, as the first camera sees it in a picture 1000 pixels high."""
 TEST_COLOR, TRAIN_COLOR = (213, 94, 0), (0, 114, 178)
 
 
@@ -35,11 +35,11 @@ class Cloud:
     """Points of one origin, on the stage.
 
     Args:
-        name: The origin's.
-        xyz: Where, [N, 3].
-        rgb: As photographed.
-        color: The origin's.
-        count: How many there are in the scene, of which these may be a part.
+        name: The origin's name.
+        xyz: Positions on the stage, [N, 3].
+        rgb: Photographed colours.
+        color: The origin's colour.
+        count: How many the scene has; ``xyz`` may hold only some of them.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Cloud:
 
 
 def clouds_of(points: PointCloud, frame: TrainingFrame, most: int) -> list[Cloud]:
-    """A cloud's finite points by origin, moved onto the stage; of more than so many, some evenly."""
+    """A cloud's finite points by origin, moved onto the stage and thinned evenly to ``most``."""
     every = max(1, -(-len(points) // most))
     finite = points.select(points.finite)
     codes, counts = np.unique(finite.source, return_counts=True)
@@ -64,14 +64,14 @@ def clouds_of(points: PointCloud, frame: TrainingFrame, most: int) -> list[Cloud
 
 
 def point_size(clouds: Sequence[Cloud], images: Sequence[Image], frame: TrainingFrame) -> float:
-    """The diameter of points on the stage, with which the first camera sees them a few pixels wide."""
+    """The diameter on the stage at which the first camera sees a point a few pixels wide."""
     xyz = np.concatenate([cloud.xyz[:: max(1, len(cloud.xyz) // 5000)] for cloud in clouds])
     eye = stage_pose(images[0].camera, frame)[1] if images else 3 * np.ones(3)
     return float(np.median(np.linalg.norm(xyz - eye, axis=1))) * POINT_PIXELS / 1000
 
 
 def add_clouds(scene: Any, clouds: Sequence[Cloud], size: float) -> dict[str, Any]:
-    """Add clouds to a browser's scene; the handles by origin."""
+    """Add clouds to a browser's scene; returns the handles by origin."""
     return {
         cloud.name: scene.add_point_cloud(
             f"/points/{cloud.name}",
@@ -92,11 +92,11 @@ def add_cameras(
     """Add a frustum for each camera to a browser's scene; a click on one flies there.
 
     Args:
-        gui_scene: The browser's.
-        scene: Whose cameras.
+        gui_scene: The browser's scene.
+        scene: The scene whose cameras to add.
         frame: The stage.
-        fly: What a click does.
-        every: Of the images sorted by name, every so many-th is a test view, of another colour.
+        fly: Called with the image whose camera was clicked.
+        every: Every ``every``-th image, sorted by name, is a test view and gets another colour.
     """
     tested = {image.name for image in scene.split(every)[1]}
     images = scene.images[:: max(1, -(-len(scene.images) // MOST_CAMERAS))]
@@ -122,7 +122,7 @@ def add_cameras(
 
 
 def _frustum_size(images: Sequence[Image], frame: TrainingFrame) -> float:
-    """As large as cameras can be drawn that stand so close to each other."""
+    """The largest size at which neighbouring cameras do not overlap."""
     centers = np.array([stage_pose(image.camera, frame)[1] for image in images])
     if len(centers) < 2:
         return MOST_FRUSTUM

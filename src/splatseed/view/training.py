@@ -1,7 +1,7 @@
-"""Watching a run learn: its renders in the browser, its numbers, a pause, a stop that keeps what there is.
+"""Watching a run train: its renders in the browser, its progress, pausing, and stopping early.
 
-Promise: renders are drawn by the thread that trains, between two steps, so that nothing changes under them;
-the steps are those that they would have been; time that browsers take is not counted as training.
+Promise: the training thread itself draws, between two steps, so nothing changes under a render; the
+training steps are the same as without a viewer; time spent on browsers does not count as training.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxtyping import Float32
 from splatseed.scene import Image, Scene
 from splatseed.splat.frame import training_frame
 from splatseed.train.run import TrainingRun
-from splatseed.view.pictures import Entry, Found
+from splatseed.view.pictures import Drawn, Entry
 from splatseed.view.session import Session
 from splatseed.view.shown import Shown
 from splatseed.view.viewer import Viewer
@@ -28,32 +28,36 @@ from splatseed.views.view import View, poses_of
 __all__ = ["TrainingViewer"]
 
 REFRESH_SECONDS = 2.0
-"""How often a browser gets a new picture unasked."""
+"""Seconds between pictures that are sent unasked."""
 PATIENCE = 60.0
-"""Seconds that a picture waits for the step in hand."""
+"""Seconds that a picture waits for the current step."""
 PAUSED_POLL = 0.05
 ENDED = "The training has ended: look at the run with splatseed view."
 
 
 class _LiveRenderer:
-    """What the Gaussians look like now."""
+    """Renders the Gaussians as they are now."""
 
     def __init__(self, run: TrainingRun, entry: Entry) -> None:
         self._run, self._entry = run, entry
 
     def color(self, view: View) -> Float32[np.ndarray, "H W 3"]:
-        """A view of the world, 0 to 1."""
+        """A view of the world, in [0, 1]."""
         image = self._run.trainer.render(self._entry.frame.view(view))
         return np.asarray(image.clamp(0, 1).cpu().numpy())
 
 
 class _LiveEntry(Entry):
-    """A run's scene and its Gaussians as they are; drawn by the thread that calls ``serve``."""
+    """A run's scene and its current Gaussians, drawn by the thread that calls ``serve``."""
 
     def __init__(self, shown: Shown, run: TrainingRun) -> None:
-        super().__init__(shown, training_frame(poses_of(shown.scene.split(shown.test_every)[0])))  # type: ignore[union-attr]  # a run has a scene
+        assert shown.scene is not None  # noqa: S101  (a run has a scene)
+        train_images = shown.scene.split(shown.test_every)[0]
+        super().__init__(shown, training_frame(poses_of(train_images)))
         self.renderer = _LiveRenderer(run, self)  # type: ignore[assignment]  # it has what is used
-        self._asked: queue.SimpleQueue[tuple[Future[Found], Callable[[], Found]]] = queue.SimpleQueue()  # fmt: skip
+        self._asked: queue.SimpleQueue[tuple[Future[Drawn], Callable[[], Drawn]]] = (
+            queue.SimpleQueue()
+        )
         self._painters.pop("depth", None)
         self._open = True
 
@@ -61,21 +65,21 @@ class _LiveEntry(Entry):
     def has_model(self) -> bool:
         return True
 
-    def draw(self, kind: str, canvas: View, at: Image | None, *, quick: bool = False) -> Found:
+    def draw(self, kind: str, canvas: View, at: Image | None, *, quick: bool = False) -> Drawn:
         """Have the training thread draw, and wait for it."""
-        del quick  # they change from step to step
+        del quick  # the Gaussians change from step to step
         if not self._open:
             return None, ENDED
-        future: Future[Found] = Future()
+        future: Future[Drawn] = Future()
         draw = super().draw
         self._asked.put((future, lambda: draw(kind, canvas, at)))
         try:
             return future.result(PATIENCE)
         except (TimeoutError, CancelledError):
-            return None, ENDED if not self._open else "The step in hand takes long."
+            return None, ENDED if not self._open else "The current step takes long."
 
     def serve(self, wait: float = 0.0) -> None:
-        """Draw what was asked for, waiting so many seconds for the first."""
+        """Draw what was asked for, waiting up to ``wait`` seconds for the first request."""
         while True:
             try:
                 future, draw = self._asked.get(timeout=wait) if wait else self._asked.get_nowait()
@@ -88,7 +92,7 @@ class _LiveEntry(Entry):
                 future.set_exception(error)
 
     def close(self) -> None:
-        """Answer nobody any more."""
+        """Stop answering requests."""
         self._open = False
         while not self._asked.empty():
             self._asked.get()[0].cancel()
@@ -102,7 +106,7 @@ class TrainingViewer(Viewer):
         scene: Its scene.
         name: What to call it.
         host: The address to listen at.
-        port: As ``free_port`` found it.
+        port: The port that ``free_port`` returned.
     """
 
     def __init__(self, run: TrainingRun, scene: Scene, name: str, host: str, port: int) -> None:
@@ -116,7 +120,7 @@ class TrainingViewer(Viewer):
         super().__init__([shown], host, port, entries=[self._live])
 
     def greet(self, session: Session) -> None:
-        """Add the run's numbers, a pause and a stop."""
+        """Add the run's progress, a pause and a stop button."""
         gui = session.gui
         with gui.add_folder("Training", order=-1.0):
             numbers = gui.add_markdown(self._numbers())
@@ -127,18 +131,18 @@ class TrainingViewer(Viewer):
         self._panels[id(session)] = (session, numbers, pause)
 
     def pause(self, *, on: bool) -> None:
-        """Stand still after the step in hand, or go on."""
+        """Pause after the current step, or resume."""
         self._paused = on
         for _, _, box in list(self._panels.values()):
             if box.value != on:
                 box.value = on
 
     def stop_and_keep(self) -> None:
-        """End after the step in hand, and finish the run as it is."""
+        """End after the current step, and finish the run as it is."""
         self.kept = True
 
     def on_step(self, step: int) -> None:
-        """Between two steps: draw for whoever looks on, stand still while paused, stop if so asked."""
+        """Between two steps: draw for the browsers, wait while paused, stop if asked to."""
         del step
         if not self.sessions and not self.kept and not self._paused:
             return
@@ -150,10 +154,10 @@ class TrainingViewer(Viewer):
             self._live.serve(PAUSED_POLL)
         watch.start()
         if self.kept:
-            signal.raise_signal(signal.SIGINT)  # as Ctrl-C: the trainer stops after the step
+            signal.raise_signal(signal.SIGINT)  # like Ctrl-C: the trainer stops after the step
 
     def close(self) -> None:
-        """Let go of all browsers."""
+        """Disconnect all browsers."""
         self._live.close()
         self.stop()
 
@@ -163,7 +167,7 @@ class TrainingViewer(Viewer):
         return bool(getattr(handler, "requested", False))
 
     def _refresh(self) -> None:
-        """Tell the numbers, and have pictures drawn anew, now and then."""
+        """Update the numbers and ask for new pictures, now and then."""
         if time.monotonic() < self._next:
             return
         looking = self.sessions
@@ -177,10 +181,14 @@ class TrainingViewer(Viewer):
 
     def _numbers(self) -> str:
         state, settings = self._run.state, self._run.settings
-        lines = [f"**step {state.step:,}** of {settings.max_steps:,}", f"{len(state.params['means']):,} Gaussians"]  # fmt: skip
+        lines = [
+            f"**step {state.step:,}** of {settings.max_steps:,}",
+            f"{len(state.params['means']):,} Gaussians",
+        ]
         if state.records:
             last = state.records[-1]
-            tested = next((r.test_psnr for r in reversed(state.records) if r.test_psnr is not None), None)  # fmt: skip
+            tests = (r.test_psnr for r in reversed(state.records) if r.test_psnr is not None)
+            tested = next(tests, None)
             lines.append(f"PSNR {last.train_psnr:.2f} dB in training")
             lines += [] if tested is None else [f"PSNR **{tested:.2f} dB** on test views"]
             lines.append(f"loss {last.loss:.4f}")

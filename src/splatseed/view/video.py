@@ -15,16 +15,16 @@ from splatseed.requirements import require
 __all__ = ["VIDEO_SUFFIXES", "check_video_name", "even_size", "write_video"]
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov")
-"""Names of files that are written, all of H.264."""
+"""File name suffixes that can be written, all holding H.264."""
 QUALITY = 8
 """Of 10."""
 
 
 def check_video_name(path: Path) -> None:
-    """Refuse a name whose end is no video's that is written.
+    """Refuse a name whose suffix is not one of ``VIDEO_SUFFIXES``.
 
     Raises:
-        ParameterError: It is.
+        ParameterError: It is refused.
     """
     if path.suffix.lower() not in VIDEO_SUFFIXES:
         raise ParameterError(
@@ -35,12 +35,12 @@ def check_video_name(path: Path) -> None:
 
 
 def even_size(width: int, height: int, most: int | None = None) -> tuple[int, int]:
-    """A size as near as H.264 can have it, both sides even.
+    """The nearest size that H.264 allows, both sides even.
 
     Args:
         width: Pixels.
         height: Pixels.
-        most: The longer side's limit; none when left out.
+        most: Limit of the longer side; unlimited when left out.
     """
     scale = min(1.0, most / max(width, height)) if most else 1.0
     width, height = (max(2, 2 * round(scale * side / 2)) for side in (width, height))
@@ -67,15 +67,20 @@ def write_video(
 
     with atomic_file(path) as partial:
         writer = imageio_ffmpeg.write_frames(
-            str(partial), size, fps=fps, quality=QUALITY, macro_block_size=2,
-            ffmpeg_log_level="error", output_params=["-movflags", "+faststart"],
-        )  # fmt: skip
+            str(partial),
+            size,
+            fps=fps,
+            quality=QUALITY,
+            macro_block_size=2,
+            ffmpeg_log_level="error",
+            output_params=["-movflags", "+faststart"],
+        )
         writer.send(None)
         try:
             for frame in frames:
                 writer.send(np.ascontiguousarray(frame))
             writer.close()
-        except (OSError, RuntimeError) as error:  # ffmpeg has ended early
+        except (OSError, RuntimeError) as error:  # ffmpeg ended early
             raise OutputError(
                 f"{path} to be written",
                 found=" ".join(str(error).split())[-160:] or type(error).__name__,

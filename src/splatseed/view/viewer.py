@@ -1,7 +1,7 @@
-"""The viewer's server: one page, as many browsers as come.
+"""The viewer's server: one page, any number of browsers.
 
-Promise: nothing is asked of the network beyond the host and port that it listens at; a port that is taken is an
-error, not another port.
+Promise: nothing but the host and port it listens on is used of the network; a port that is taken is
+an error, and no other port is tried.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ __all__ = ["Viewer", "free_port"]
 
 CORE = 0.6
 STEP_BACK = 0.6
-"""Of the distance of the cameras from their middle."""
+"""Length of the axes, as a fraction of the cameras' distance from their middle."""
 
 
 def free_port(host: str, port: int) -> int:
-    """A port that can be listened at: the one asked for, or for 0 any.
+    """A port that can be listened on: the one asked for, or any free port for 0.
 
     Raises:
-        ParameterError: It is taken, or the host is none of this machine.
+        ParameterError: The port is taken, or the host is not this machine's.
     """
     try:
         with socket.socket() as probe:
@@ -49,9 +49,9 @@ def free_port(host: str, port: int) -> int:
             return int(probe.getsockname()[1])
     except (OSError, OverflowError) as error:
         raise ParameterError(
-            f"to listen at --host {host} --port {port}",
+            f"to listen on --host {host} --port {port}",
             found=getattr(error, "strerror", None) or str(error),
-            fix="Pass another --port, 0 for any that is free; --host 127.0.0.1 is this machine alone.",
+            fix="Pass another --port (0: any free one); --host 127.0.0.1 is this machine alone.",
         ) from None
 
 
@@ -60,11 +60,11 @@ class Viewer:
 
     Args:
         opened: What to show; the first defines the stage.
-        host: The address to listen at.
-        port: As ``free_port`` found it.
+        host: The address to listen on.
+        port: The port that ``free_port`` returned.
         device: Where to render; the CPU when left out.
-        entries: What to show of it, if it is not simply that.
-        most_points: Most points that a browser gets to draw.
+        entries: The entries to show instead of one per item of ``opened``.
+        most_points: The most points that a browser draws.
 
     Raises:
         MissingDependencyError: viser is absent.
@@ -87,19 +87,21 @@ class Viewer:
         self._most_points = most_points
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
-        # A browser may go at any moment; it is no news that it does not hear the rest.
+        # A browser may disconnect at any moment; that it misses the rest is no news.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
-        with redirect_stdout(io.StringIO()):  # it prints an address of its own
+        with redirect_stdout(io.StringIO()):  # viser prints its own address
             self.server: Any = viser.ViserServer(
                 host=host, port=port, label="splatseed", verbose=False
             )
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")  # fmt: skip
+        self.server.gui.configure_theme(
+            show_logo=False, show_share_button=False, control_width="large"
+        )
         self._place_camera(opened[0])
         self.server.on_client_connect(self._welcome)
         self.server.on_client_disconnect(self._leave)
 
     def refresh(self) -> None:
-        """Have every browser draw again."""
+        """Have every browser redraw."""
         for session in self.sessions:
             session.refresh()
 
@@ -112,12 +114,12 @@ class Viewer:
 
     @property
     def sessions(self) -> list[Session]:
-        """Of the browsers that look on."""
+        """The sessions of the connected browsers."""
         with self._lock:
             return list(self._sessions.values())
 
     def greet(self, session: Session) -> None:
-        """A browser has come: the place to add controls."""
+        """A browser has connected: subclasses add controls here."""
 
     def _welcome(self, client: Any) -> None:
         session = Session(client, self.entries, self._most_points)
@@ -132,7 +134,7 @@ class Viewer:
             session.close()
 
     def _place_camera(self, shown: Shown) -> None:
-        """Begin where the scene shows most, or outside of a model."""
+        """Begin where the scene shows most, or outside the model."""
         scene = shown.scene
         if scene is not None and (scene.images or len(scene.points)):
             image = choose_image(scene) if len(scene.points) else scene.images[0]
@@ -158,7 +160,7 @@ class Viewer:
 
 
 def stage_frame(shown: Shown) -> TrainingFrame:
-    """The stage: the training frame, or one about the points or the model where there are no cameras."""
+    """The stage: the training frame or, without cameras, one fitted to the points or the model."""
     scene = shown.scene
     if shown.gaussians is not None:
         return model_frame(shown.gaussians, scene, shown.test_every)

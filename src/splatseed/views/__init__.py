@@ -1,4 +1,4 @@
-"""Photographs at a size, with their cameras: what points, depth, seeds and training look at.
+"""Photographs at a size, with their cameras: the input of depth, stereo, seeding and training.
 
 ``view`` reads a scene's images as pinhole views, ``photographs`` their pixels.
 """

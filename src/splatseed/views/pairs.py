@@ -1,10 +1,10 @@
 """Which views to compare each view with: those that see the same places from another side.
 
 Notation: V views, P points. The *worth* of a pair is the sum, over the points that both see, of a
-weight by the angle between their two rays: none where the rays nearly coincide, as depth then moves
-a point hardly at all in the pictures, full between ``FULL`` and ``WIDE`` degrees, and falling
-beyond, as a surface looks another then.
-Promise: the pairs depend on poses and on who sees what, not on threads or the order of points.
+weight by the angle between their two rays: 0 where the rays nearly coincide, as depth then hardly
+moves a point in the photographs; full between ``FULL`` and ``WIDE`` degrees; and falling beyond, as
+a surface then looks different.
+Promise: the pairs depend on poses and visibility only, not on threads or the order of points.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ __all__ = ["choose_by_pose", "choose_sources", "views_of_points"]
 LEAST, FULL, WIDE, MOST = 1.0, 4.0, 15.0, 45.0
 """Degrees between which the weight rises, stays full, and falls."""
 ALIKE = 30.0
-"""Degrees between the axes of cameras that look the same way."""
+"""Largest angle in degrees between the axes of cameras that look the same way."""
 SAME_PLACE = 1e-6
-"""Share of the cameras' spread within which two stand at one place."""
+"""Share of the cameras' spread within which two cameras count as coincident."""
 MOST_POINTS = 4000
-"""Points of a view that are asked about: more do not change the order of its pairs."""
+"""Points tested per view: more do not change the order of its pairs."""
 
 
 def choose_sources(
@@ -35,15 +35,13 @@ def choose_sources(
     centers: Float64[np.ndarray, "V 3"],
     num: int,
 ) -> Int64[np.ndarray, "V num"]:
-    """The ``num`` views to compare each view with, best first, int64 [V, num].
-
-    -1 where there is none.
+    """The ``num`` views to compare each view with, best first, int64 [V, num]; -1 for none.
 
     Args:
         seen: The points that each view sees, as rows of ``xyz``.
         xyz: World positions, float64 [P, 3].
         centers: The cameras' positions, float64 [V, 3].
-        num: How many.
+        num: How many views to choose.
     """
     count = len(seen)
     worth = np.zeros((count, count))
@@ -62,9 +60,9 @@ def choose_sources(
 def choose_by_pose(
     cam_from_world: Float64[np.ndarray, "V 4 4"], num: int
 ) -> Int64[np.ndarray, "V num"]:
-    """The same where nothing is known but poses: of the views that look the same way, near ones.
+    """The same from poses alone: of the views that look the same way, the near ones.
 
-    Not the very nearest, where there are more: from a place too near, everything looks the same.
+    But not the very nearest, if there are more: the parallax between close cameras is too small.
     """
     centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
     gap = np.linalg.norm(centers[:, None] - centers, axis=2)
@@ -98,7 +96,7 @@ def views_of_points(
 
 
 @kernel
-def _add_up(rows, starts, xyz, centers, order, offsets, worth):  # type: ignore[no-untyped-def]
+def _add_up(rows, starts, xyz, centers, order, offsets, worth):  # type: ignore[no-untyped-def]  # Numba's types
     """The worth of all pairs."""
     for i in parallel_range(len(centers)):
         for k in range(starts[i], starts[i + 1]):
@@ -110,8 +108,8 @@ def _add_up(rows, starts, xyz, centers, order, offsets, worth):  # type: ignore[
 
 
 @inline
-def _weight(point, first, second):  # type: ignore[no-untyped-def]
-    """By the angle at a point between the rays of two cameras."""
+def _weight(point, first, second):  # type: ignore[no-untyped-def]  # Numba's types
+    """The weight of a point by the angle between its rays to two cameras."""
     cosine = cosine_between(point, first, second)
     angle = np.degrees(np.arccos(min(max(cosine, -1.0), 1.0)))
     rising = min(max((angle - LEAST) / (FULL - LEAST), 0.0), 1.0)

@@ -13,7 +13,7 @@ __all__ = ["cosine_between"]
 
 
 @always_inline
-def cosine_between(point, first, second):  # type: ignore[no-untyped-def]
+def cosine_between(point, first, second):  # type: ignore[no-untyped-def]  # Numba's types
     """Cosine of the angle at a point [3] between rays to cameras at ``first`` and ``second``."""
     dot, first_squared, second_squared = 0.0, 0.0, 0.0
     for axis in range(3):

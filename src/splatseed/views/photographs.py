@@ -1,9 +1,9 @@
 """Photographs as pixels: decoded, made smaller by a whole factor, and kept for the next run.
 
-Promise: a smaller copy is the mean over f x f blocks, rounded (a few pixels at the right and lower
-edge that make no whole block are cut off), so intrinsics divide by f and nothing else; it is looked
-up by the content of the original, so a changed photograph is never mistaken for the old one. Only
-``cache_dir`` is written to, and what cannot be written there is not missed.
+Promise: a smaller copy is the mean over f x f blocks, rounded (pixels at the right and lower edge
+that do not fill a block are cut off), so intrinsics are divided by f and nothing else changes; it
+is looked up by the content of the original, so a changed photograph is never mistaken for the old
+one. Only ``cache_dir`` is written to, and a failure to write there is ignored.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["load_photograph", "user_cache_dir"]
 
 FILTER = "box-2"
-"""Goes into the key: change it with the way copies are made."""
+"""Part of the key: change it whenever the downsampling changes."""
 
 
 def load_photograph(
@@ -52,21 +52,21 @@ def load_photograph(
         raise ParameterError(
             "--data-factor of 1 or more", found=f"{factor}", fix="Images are never enlarged."
         )
-    raw = photograph_bytes(path)
-    kept = None if cache_dir is None or factor == 1 else cache_dir / _key(raw, factor)
+    encoded = photograph_bytes(path)
+    kept = None if cache_dir is None or factor == 1 else cache_dir / _key(encoded, factor)
     if kept is not None and kept.is_file():
         with suppress(SceneFormatError):  # a damaged copy is made again
-            smaller = decode_photograph(kept, photograph_bytes(kept))
-            return np.array(smaller), open_photograph(path, raw).size
-    picture = decode_photograph(path, raw)
-    smaller = _reduce(path, picture, factor)
+            photograph = decode_photograph(kept, photograph_bytes(kept))
+            return np.array(photograph), open_photograph(path, encoded).size
+    original = decode_photograph(path, encoded)
+    photograph = _reduce(path, original, factor)
     if kept is not None:
-        _keep(smaller, kept)
-    return np.array(smaller), picture.size
+        _keep(photograph, kept)
+    return np.array(photograph), original.size
 
 
 def user_cache_dir() -> Path:
-    """Where this user's programs keep what they can make again (not created here)."""
+    """Where this user's programs cache files (not created here)."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
     elif sys.platform == "darwin":
@@ -76,24 +76,24 @@ def user_cache_dir() -> Path:
     return Path(base) / "splatseed" / "images"
 
 
-def _key(raw: bytes, factor: int) -> str:
-    digest = hashlib.blake2b(raw, digest_size=16, person=FILTER.encode())
+def _key(encoded: bytes, factor: int) -> str:
+    digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode())
     return f"{digest.hexdigest()}_{factor}.png"
 
 
-def _reduce(path: Path, picture: PilImage.Image, factor: int) -> PilImage.Image:
+def _reduce(path: Path, original: PilImage.Image, factor: int) -> PilImage.Image:
     if factor == 1:
-        return picture
-    width, height = picture.width // factor, picture.height // factor
+        return original
+    width, height = original.width // factor, original.height // factor
     if not width or not height:
         raise SceneFormatError(
             f"{path} to be larger than --data-factor {factor}",
-            found=f"{picture.width} x {picture.height}",
+            found=f"{original.width} x {original.height}",
             fix="Choose a smaller --data-factor.",
         )
-    return picture.reduce(factor, (0, 0, width * factor, height * factor))
+    return original.reduce(factor, (0, 0, width * factor, height * factor))
 
 
-def _keep(picture: PilImage.Image, path: Path) -> None:
+def _keep(photograph: PilImage.Image, path: Path) -> None:
     with suppress(OutputError), atomic_file(path) as partial:
-        picture.save(partial, compress_level=1)
+        photograph.save(partial, compress_level=1)

@@ -17,7 +17,7 @@ __all__ = ["place"]
 
 
 @inline
-def place(point, matrix):  # type: ignore[no-untyped-def]
+def place(point, matrix):  # type: ignore[no-untyped-def]  # Numba's types
     """Column, row and planar depth of a world point [3], as floats.
 
     The point is behind the camera if the depth is negative; at 0 column and row are not finite.

@@ -1,10 +1,10 @@
 """Photographs of a distorted lens as a pinhole camera would have taken them.
 
 Notation: the pinhole camera has the lens's own focal length, centre and size. The pixel (i, j) of
-its image looks along the ray K^-1 (j + 0.5, i + 0.5, 1), which the lens maps to a place in the
+its image looks along the ray K^-1 (j + 0.5, i + 0.5, 1), which the lens maps to a position in the
 photograph.
-Promise: colours are interpolated between the four pixels around that place and rounded; pixels that
-the photograph does not show, or shows a second time beyond a fold, are black and known to be
+Promise: colours are interpolated between the four pixels around that position and rounded; pixels
+that the photograph does not show, or shows a second time beyond a fold, are black and marked as
 unknown.
 """
 
@@ -20,21 +20,21 @@ from splatseed.lens import distort, fold_radius
 __all__ = ["undistort"]
 
 ROWS = 64
-"""Rows that are computed at a time, which bounds the memory of their rays."""
+"""Rows computed at a time, which bounds the memory of their rays."""
 
 
 def undistort(
-    pixels: UInt8[np.ndarray, "H W 3"], lens: Intrinsics, K: Float64[np.ndarray, "3 3"]
+    photograph: UInt8[np.ndarray, "H W 3"], lens: Intrinsics, K: Float64[np.ndarray, "3 3"]
 ) -> tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]]:
     """The photograph without distortion, and which of its pixels are known.
 
     Args:
-        pixels: The photograph, of any size.
+        photograph: The photograph, of any size.
         lens: Its camera, of which the distortion counts.
-        K: The matrix of the camera in pixels of ``pixels``; that of the result as well.
+        K: The matrix of the camera in pixels of ``photograph``; that of the result as well.
     """
-    height, width = pixels.shape[:2]
-    out, known = np.zeros_like(pixels), np.zeros((height, width), np.bool_)
+    height, width = photograph.shape[:2]
+    out, known = np.zeros_like(photograph), np.zeros((height, width), np.bool_)
     corners = _rays(K, np.array([0.0, width]), np.array([0.0, height]))
     limit = fold_radius(lens, float(np.linalg.norm(corners, axis=-1).max()))
     column = np.arange(width) + 0.5
@@ -44,7 +44,7 @@ def undistort(
         with np.errstate(all="ignore"):  # beyond the fold nothing needs to be finite
             uv = distort(lens, rays) * K[[0, 1], [0, 1]] + K[:2, 2]
         uv[np.linalg.norm(rays, axis=-1) > limit] = np.nan
-        _resample(pixels, uv, out[rows], known[rows])
+        _resample(photograph, uv, out[rows], known[rows])
     return out, known
 
 
@@ -57,21 +57,25 @@ def _rays(
 
 
 @inline
-def _resample(pixels, uv, out, known):  # type: ignore[no-untyped-def]
-    """Colours at places in a photograph, NaN = nowhere; its edge pixels reach to its border."""
-    height, width = pixels.shape[:2]
+def _resample(photograph, uv, out, known):  # type: ignore[no-untyped-def]  # Numba's types
+    """Bilinear colours at positions, NaN = outside; edge pixels extend to the border."""
+    height, width = photograph.shape[:2]
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             u, v = uv[i, j, 0], uv[i, j, 1]
             if not (0.0 <= u <= width and 0.0 <= v <= height):
                 continue
             known[i, j] = True
-            x = min(max(u - 0.5, 0.0), width - 1.0)  # in units where pixels' centres are whole
+            x = min(max(u - 0.5, 0.0), width - 1.0)  # pixel centres at whole numbers
             y = min(max(v - 0.5, 0.0), height - 1.0)
             left, top = int(x), int(y)
             right, below = min(left + 1, width - 1), min(top + 1, height - 1)
             a, b = x - left, y - top
             for channel in range(3):
-                upper = (1 - a) * pixels[top, left, channel] + a * pixels[top, right, channel]
-                lower = (1 - a) * pixels[below, left, channel] + a * pixels[below, right, channel]
+                upper = (1 - a) * photograph[top, left, channel] + a * photograph[
+                    top, right, channel
+                ]
+                lower = (1 - a) * photograph[below, left, channel] + a * photograph[
+                    below, right, channel
+                ]
                 out[i, j, channel] = int((1 - b) * upper + b * lower + 0.5)

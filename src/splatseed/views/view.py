@@ -1,8 +1,8 @@
-"""Views: posed photographs in memory, at the size at which they are looked at.
+"""Views: posed photographs in memory, at the size they are used at.
 
 Notation: a view is W x H pixels; ``K`` is in its own pixels, the centre of the top-left one at
-(0.5, 0.5); ``cam_from_world`` maps the scene's world to OpenCV camera axes. Promise: views are
-of pinhole cameras only; a photograph is made smaller by whole factors, once, and never larger.
+(0.5, 0.5); ``cam_from_world`` maps the scene's world to OpenCV camera axes. Promise: views have
+pinhole cameras only; a photograph is downsampled once, by a whole factor, and never enlarged.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from splatseed.views.photographs import load_photograph
 __all__ = ["View", "check_lens", "data_factor", "load_split", "load_views", "poses_of"]
 
 ASPECT_SLACK = 0.02
-"""By how much a file may be stretched against its camera: rounding of a resized copy."""
+"""By how much a file's aspect ratio may differ from its camera's: the rounding of a copy."""
 READERS = 4
 BYTES_A_PIXEL = 3
-"""Of a photograph that is held: three colours."""
+"""Bytes per pixel of a photograph in memory: three colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,8 @@ class View:
 
     Args:
         name: The image's name in its scene.
-        image: Its pixels, sRGB, uint8 [H, W, 3].
-        K: Pinhole matrix in pixels of ``image``, float64 [3, 3].
+        photograph: Its pixels, sRGB, uint8 [H, W, 3].
+        K: Pinhole matrix in pixels of ``photograph``, float64 [3, 3].
         width: W.
         height: H.
         cam_from_world: World to OpenCV camera axes, float64 [4, 4].
@@ -48,7 +48,7 @@ class View:
     """
 
     name: str
-    image: UInt8[np.ndarray, "H W 3"]
+    photograph: UInt8[np.ndarray, "H W 3"]
     K: Float64[np.ndarray, "3 3"]
     width: int
     height: int
@@ -57,11 +57,11 @@ class View:
 
 
 def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
-    """The views of some images without their pixels, for whoever needs their frames alone.
+    """The views of some images without their pixels, where only their frames matter.
 
     Args:
-        images: Which.
-        data_factor: By how much photographs are made smaller.
+        images: The images.
+        data_factor: The factor by which photographs are downsampled.
     """
     unseen = np.empty((0, 0, 3), np.uint8)
     shrink = np.diag([1 / data_factor, 1 / data_factor, 1.0])
@@ -80,7 +80,7 @@ def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
 
 
 def data_factor(images: Sequence[Image], max_size: int) -> int:
-    """Whole factor that makes the largest photograph at most ``max_size`` pixels a side."""
+    """The whole factor that makes the longest side at most ``max_size`` pixels."""
     side = max(max(image.camera.width, image.camera.height) for image in images)
     return max(1, -(-side // max_size))
 
@@ -94,13 +94,13 @@ def load_split(
     cache_dir: Path | None = None,
     progress: Progress = silent,
 ) -> tuple[tuple[View, ...], tuple[View, ...]]:
-    """The training and the test views of a scene: names sorted, every 8th is a test view.
+    """The training and the test views of a scene, sorted by name; see ``Scene.split``.
 
     Args:
         scene: A scene with images, as read from files.
-        data_factor: By how much photographs are made smaller.
-        test_every: Which views are kept for the test.
-        min_side: Pixels that the shorter side of a view must have.
+        data_factor: The factor by which photographs are downsampled.
+        test_every: Every ``test_every``-th image, sorted by name, is a test view.
+        min_side: The least number of pixels of a view's shorter side.
         cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
         progress: Told how far reading is.
 
@@ -139,18 +139,18 @@ def load_views(
     """The views of some of a scene's images, in their order.
 
     Args:
-        scene: Where they belong, for the folder.
-        images: Which.
-        data_factor: By how much photographs are made smaller.
-        min_side: Pixels that the shorter side of a view must have.
-        undistort: Take the distortion out of photographs that have some, instead of refusing them.
+        scene: Their scene, for its folder.
+        images: The images.
+        data_factor: The factor by which photographs are downsampled.
+        min_side: The least number of pixels of a view's shorter side.
+        undistort: Remove lens distortion from photographs that have some, instead of refusing them.
         cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
         progress: Told how far reading is.
 
     Raises:
-        ParameterError: They do not fit the memory all together.
+        ParameterError: They do not fit into memory all together.
         SceneNotFoundError: An image is missing.
-        SceneFormatError: A camera has distortion that is to stay, or an image cannot be used.
+        SceneFormatError: A camera has distortion that is not removed, or an image is unusable.
     """
     folder = _image_folder(scene)
     for image in images if not undistort else ():
@@ -169,14 +169,14 @@ def load_views(
 
 
 def _check_memory(first: Path, count: int, data_factor: int) -> None:
-    """Refuse photographs that would not fit the memory all together, if all are like the first."""
+    """Refuse photographs that would not fit into memory together, if all are like the first."""
     width, height = open_photograph(first, photograph_bytes(first)).size
     check_memory(
         count * width * height // data_factor**2,
         BYTES_A_PIXEL,
         "pixels of photographs",
-        found=f"{count} of {width} x {height}, made smaller {data_factor} times",
-        fix="Make them smaller (--data-factor), take fewer, or free some memory.",
+        found=f"{count} of {width} x {height}, downsampled by {data_factor}",
+        fix="Downsample more (--data-factor), take fewer, or free some memory.",
     )
 
 
@@ -191,19 +191,22 @@ def _image_folder(scene: Scene) -> Path:
     return folder
 
 
-def check_lens(image: Image, scene: Path | None = None) -> None:
+def check_lens(
+    image: Image, scene: Path | None = None, reason: str = "which Gaussians are drawn with"
+) -> None:
     """Refuse an image whose camera has lens distortion.
 
     Args:
         image: The image.
-        scene: The folder of its scene, for the command that mends it.
+        scene: The folder of its scene, for the command in the advice.
+        reason: Why the camera must be a pinhole.
 
     Raises:
-        SceneFormatError: It has.
+        SceneFormatError: It has distortion.
     """
     if image.intrinsics.has_distortion:
         raise SceneFormatError(
-            "cameras without lens distortion (PINHOLE), which Gaussians are drawn with",
+            f"cameras without lens distortion (PINHOLE), {reason}",
             found=f"{image.intrinsics.model} for {image.name}",
             fix=undistort_first(scene),
         )
@@ -213,8 +216,8 @@ def _load_view(
     image: Image, folder: Path, data_factor: int, min_side: int, cache_dir: Path | None
 ) -> View:
     path = folder / image.name
-    pixels, file_size = load_photograph(path, data_factor, cache_dir)
-    height, width = pixels.shape[:2]
+    photograph, file_size = load_photograph(path, data_factor, cache_dir)
+    height, width = photograph.shape[:2]
     if min(width, height) < min_side:
         raise SceneFormatError(
             f"{path} to have at least {min_side} pixels a side at --data-factor {data_factor}",
@@ -225,11 +228,11 @@ def _load_view(
     scale = _file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor
     K = np.diag([*scale, 1.0]) @ camera.K
     if not image.intrinsics.has_distortion:
-        return View(image.name, pixels, K, width, height, camera.cam_from_world)
+        return View(image.name, photograph, K, width, height, camera.cam_from_world)
     from splatseed.views.undistortion import undistort  # noqa: PLC0415  (loads Numba)
 
-    pixels, known = undistort(pixels, image.intrinsics, K)
-    return View(image.name, pixels, K, width, height, camera.cam_from_world, known)
+    photograph, known = undistort(photograph, image.intrinsics, K)
+    return View(image.name, photograph, K, width, height, camera.cam_from_world, known)
 
 
 def _file_from_camera(
@@ -239,7 +242,7 @@ def _file_from_camera(
     scale = np.array(file_size) / np.array(camera_size)
     if abs(scale[0] / scale[1] - 1) > ASPECT_SLACK:
         raise SceneFormatError(
-            f"{path} to have the shape of its camera, {camera_size[0]} x {camera_size[1]}",
+            f"{path} to have the aspect ratio of its camera, {camera_size[0]} x {camera_size[1]}",
             found=f"{file_size[0]} x {file_size[1]}",
             fix="Use the images that the model was made from, or a resized copy of them.",
         )

@@ -1,7 +1,7 @@
-"""From where to look at a scene.
+"""Choosing a camera from which to look at a scene.
 
 Notation: ``uv`` are pixels [M, 2]; an image's *fill* is how much of its frame has points. Promise:
-the choice is deterministic; it is one of the scene's own cameras where it has any, else one made up
+the choice is deterministic; it is one of the scene's own cameras if it has any, else one made up
 from the cloud alone.
 """
 
@@ -17,10 +17,10 @@ from splatseed.scene import Image, Scene
 __all__ = ["choose_camera", "choose_image", "look_at"]
 
 SAMPLE = 20_000
-"""Points that are looked at to choose a camera."""
+"""Points considered when choosing a camera."""
 
 FRAME_CELLS = (16, 12)
-"""Columns and rows into which a frame is divided to see how much of it is filled."""
+"""Columns and rows of the grid by which a frame's fill is measured."""
 
 CORE_SHARE = 0.6
 """Share of the points, those nearest to the median, that a made-up camera frames."""
@@ -66,10 +66,10 @@ def choose_camera(scene: Scene) -> Camera:
 
 
 def choose_image(scene: Scene) -> Image | None:
-    """The image whose points fill most of its frame; of equals, the one with the most points.
+    """The image whose points fill most of its frame; among equals, the one with the most points.
 
-    Its points are its features that belong to one, where the scene has features at all, else those
-    of a sample that lie in its frame. The mere number of points would choose close-ups of the
+    An image's points are its features with a 3D point if the scene has features at all, else those
+    of a sample that project into its frame. The mere number of points would favour close-ups of the
     richest texture. None for a scene without images.
 
     Raises:
@@ -91,7 +91,7 @@ def _features(image: Image) -> Float64[np.ndarray, "M 2"]:
 
 
 def _fill(camera: Camera, uv: Float64[np.ndarray, "M 2"]) -> tuple[int, int]:
-    """How many cells of a grid over the frame hold a point, and how many points are in it."""
+    """How many cells of a grid over the frame hold a point, and how many points it has."""
     cells = uv / [camera.width, camera.height] * FRAME_CELLS
     inside = ((cells >= 0) & (cells < FRAME_CELLS)).all(axis=1)  # NaN compares false
     column, row = cells[inside].astype(np.int64).T
@@ -129,6 +129,6 @@ def _made_up_camera(xyz: Float64[np.ndarray, "N 3"]) -> Camera:
 def _thin_side(
     offsets: Float64[np.ndarray, "N 3"], axis: Float64[np.ndarray, " 3"]
 ) -> Float64[np.ndarray, " 3"]:
-    """The axis, pointing to where the cloud has its longer tail: off the ground, as a rule."""
+    """The axis, directed to the cloud's longer tail: usually away from the ground."""
     low, middle, high = np.percentile(offsets @ axis, [5, 50, 95])
     return axis if high - middle >= middle - low else -axis

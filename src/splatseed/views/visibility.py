@@ -1,10 +1,10 @@
-"""Which SfM points each image sees: what depth maps are held against.
+"""Which SfM points each image sees: the reference for aligning depth maps.
 
 Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the scene's
 world.
-Promise: only distinct finite originals take part. Where Structure-from-Motion says which features a
-point has (its track), that is taken; without tracks, points are projected, and of those that fall
-close together in the image only the nearest stay, as the others are probably hidden.
+Promise: only distinct finite originals take part. If Structure-from-Motion says which features a
+point has (its track), those count; without tracks, points are projected, and of those that fall
+close together in an image only the nearest are kept, as the others are probably hidden.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from splatseed.scene import Image, Scene
 __all__ = ["SeenPoints", "Visibility", "camera_points", "find_visibility"]
 
 CELLS = 40
-"""Columns and rows of an image within which points are taken to hide each other."""
+"""Columns and rows of the grid over an image in whose cells points hide each other."""
 
 HIDDEN = 1.1
-"""A point this many times as far as the nearest one of its cell is taken for hidden."""
+"""A point this many times as far as the nearest one in its cell counts as hidden."""
 
 
 class SeenPoints(NamedTuple):
@@ -38,7 +38,7 @@ class SeenPoints(NamedTuple):
 
 
 def camera_points(camera: Camera, xyz: Float64[np.ndarray, "N 3"]) -> SeenPoints:
-    """Those of N world points that lie in front of a camera and within its image."""
+    """The world points that lie in front of a camera and within its image."""
     uv, z = camera.project(xyz)
     inside = ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)  # NaN behind the camera
     return SeenPoints(uv[inside], z[inside])
@@ -46,13 +46,13 @@ def camera_points(camera: Camera, xyz: Float64[np.ndarray, "N 3"]) -> SeenPoints
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """The points of every image.
+    """The points that every image sees.
 
     Args:
         xyz: The distinct finite originals, float64 [N, 3], scene units.
         point_idx: Rows of ``xyz``, image after image, int64 [T].
         start: Where each image begins in ``point_idx``, by its id.
-        count: How many each image has, by its id.
+        count: How many each image sees, by its id.
     """
 
     xyz: Float64[np.ndarray, "N 3"]
@@ -61,7 +61,7 @@ class Visibility:
     count: dict[int, int]
 
     def of(self, image: Image) -> Float64[np.ndarray, "M 3"]:
-        """What an image sees, world positions [M, 3]: by tracks, or else by projection."""
+        """The points an image sees, world positions [M, 3]: by tracks, or else by projection."""
         return np.asarray(self.xyz[self.rows_of(image)])
 
     def rows_of(self, image: Image) -> Int64[np.ndarray, " M"]:
@@ -74,7 +74,7 @@ class Visibility:
 
 
 def find_visibility(scene: Scene) -> Visibility:
-    """Gather the points of every image once, to be asked for image by image."""
+    """Compute the points of all images once, to be queried image by image."""
     usable = np.flatnonzero((scene.points.source == ORIGINAL) & scene.points.distinct)
     xyz = scene.points.xyz[usable].astype(np.float64)
     tracks = scene.tracks
@@ -86,7 +86,7 @@ def find_visibility(scene: Scene) -> Visibility:
     good = point_idx >= 0
     image_ids = tracks.image_ids[good]
     if len(image_ids) and image_ids.max() < 1 << 16:
-        image_ids = image_ids.astype(np.uint16)  # which is sorted by radix, ten times as fast
+        image_ids = image_ids.astype(np.uint16)  # sorted by radix, ten times as fast
     order = np.argsort(image_ids, kind="stable")
     ids, start, count = np.unique(image_ids[order], return_index=True, return_counts=True)
     return Visibility(
@@ -98,7 +98,7 @@ def find_visibility(scene: Scene) -> Visibility:
 
 
 def _in_front(xyz: Float64[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarray, " M"]:
-    """The rows of the points within the image that no other one close by hides."""
+    """The rows of the points within the image that no nearby point hides."""
     uv, z = camera.project(xyz)
     size = np.array([camera.width, camera.height])
     inside = np.flatnonzero((z > 0) & ((uv >= 0) & (uv < size)).all(axis=1))

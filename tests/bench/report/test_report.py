@@ -27,7 +27,7 @@ from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.cli import main
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.splat.pictures import beside_truth, write_picture
+from splatseed.splat.pictures import beside_photograph, write_picture
 from splatseed.synthetic import make_capture, write_capture
 
 from ..browser import CHROMIUM, chromium
@@ -254,7 +254,7 @@ def with_capture(bench, capture, **changes):
         for name in ("view0.png", "view1.png"):
             noise = 40 * rng.standard_normal(truth.shape)
             render = np.clip(truth + noise, 0, 255).astype(np.float32) / 255
-            write_picture(folder / name, beside_truth(truth, render))
+            write_picture(folder / name, beside_photograph(truth, render))
     return write_ledger(bench, found)
 
 

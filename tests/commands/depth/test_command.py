@@ -65,7 +65,7 @@ def test_a_blind_network_is_told_of(room, onnx_path, tmp_path, splatseed):
     words = ("depth", room, "--model", onnx_path, "--depth-kind", "inverse", *flags)
     run = splatseed(*words, "-o", tmp_path / "d")
     assert run.code == 0
-    assert "saw no depth" in run.out
+    assert "predicted no depth" in run.out
     assert "and 7 more" in run.out
 
 

@@ -85,8 +85,8 @@ def test_no_align_is_the_methods_flag(room, tmp_path, splatseed):
 WRONG = [
     ([], "--depth DIR"),
     (["--depth", "nowhere"], "a folder of depth maps at nowhere"),
-    (["--depth-kind", "ray"], "--depth DIR, whose maps"),
-    (["--depth-scale", "2"], "--depth DIR, whose maps"),
+    (["--depth-kind", "ray"], "--depth DIR, which"),
+    (["--depth-scale", "2"], "--depth DIR, which"),
     (["--depth", "ROOM", "--depth-scale", "0"], "above 0"),
     (["--depth", "ROOM", "--depth-kind", "zet"], "invalid choice"),
     (["--depth", "ROOM", "--depth.tolerance", "2"], "tolerance between 0 and 1"),

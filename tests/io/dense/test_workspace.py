@@ -270,7 +270,7 @@ def test_a_plain_folder_and_the_rest_beside_it(maps, room, tmp_path):
     ("spoil", "said"),
     [
         (lambda maps: maps[:0], "at least one depth map"),
-        (lambda maps: [maps[0], maps[0]], "one depth map an image"),
+        (lambda maps: [maps[0], maps[0]], "one depth map per image"),
         (lambda maps: [replace(maps[0], name="other.png")], "images of the scene"),
         (lambda maps: [replace(maps[0], sources=("other.png",))], "images of the scene"),
         (lambda maps: [replace(maps[0], sources=maps[0].sources * 3)], "at most 8 sources"),

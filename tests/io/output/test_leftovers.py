@@ -36,7 +36,7 @@ def test_a_leftover_is_removed_and_told_of(leftover, tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         _write(tmp_path)
     assert not leftover.exists()
-    assert caplog.messages == [f"Removed {leftover}, which a run left that was killed."]
+    assert caplog.messages == [f"Removed {leftover}, left by a run that was killed."]
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
@@ -75,7 +75,7 @@ def test_a_leftover_file_is_removed_and_told_of(tmp_path, caplog):
         _age(path)
     with caplog.at_level(logging.WARNING), atomic_file(tmp_path / "curve.csv") as partial:
         partial.write_text("1")
-    assert caplog.messages == [f"Removed {leftover}, which a run left that was killed."]
+    assert caplog.messages == [f"Removed {leftover}, left by a run that was killed."]
     assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "curve.csv", *mine])
 
 

@@ -159,7 +159,7 @@ def test_arrays_that_do_not_fit_are_left_aside_and_told_of(tmp_path, how):
 def test_files_that_are_none_of_ours_are_told_of(tmp_path, content):
     (tmp_path / SEEDS).write_bytes(content)
     assert (
-        "none of splatseed's"
+        "not splatseed's"
         in read_seeds(tmp_path, PointCloud(np.eye(3), np.zeros((3, 3), np.uint8))).warning
     )
 

@@ -1,1 +1,1 @@
-"""What the finished runs say: studies, statistics, gains, and the tables made of them."""
+"""The analysis of finished runs: studies, statistics, gains, and their tables."""

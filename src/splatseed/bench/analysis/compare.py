@@ -1,4 +1,4 @@
-"""Two benchmarks: what they were run with, what changed, and whether that is more than noise.
+"""Two benchmarks: their settings, what changed, and whether that is more than noise.
 
 Notation: the change of an arm on a scene is its mean PSNR in B less that in A, dB. Promise: runs of
 two ledgers are not paired, as a seed need not mean the same in another version: the noise of each
@@ -43,16 +43,16 @@ class Change:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is to be said of two ledgers.
+    """The comparison of two ledgers.
 
     Args:
         settings: Settings that differ, with A's value and B's.
-        changes: Of each arm on each scene that both have.
-        means: Of each arm over the scenes that both have.
-        only_a: Arms on scenes that A alone has.
+        changes: The change of each arm on each scene that both have.
+        means: The mean change of each arm over the scenes that both have.
+        only_a: Arms on scenes that only A has.
         only_b: Likewise for B.
         same_runs: Runs that are in both ledgers, with the same key and the same PSNR.
-        content: Scenes of one name whose files differ.
+        content: Scenes of the same name whose files differ.
     """
 
     settings: tuple[tuple[str, str, str], ...]
@@ -65,14 +65,14 @@ class Comparison:
 
 
 def compare(a: Sequence[RunRow], b: Sequence[RunRow]) -> Comparison | None:
-    """Compare two ledgers: of each, the set of runs with equal settings that fits best.
+    """Compare two ledgers: from each, the set of runs whose settings differ least.
 
     Args:
         a: The rows of the first.
         b: The rows of the second.
 
     Returns:
-        None where one of them has no finished run.
+        None if one of them has no finished run.
     """
     chosen = _closest(studies(a), studies(b))
     if chosen is None:
@@ -97,10 +97,7 @@ def compare(a: Sequence[RunRow], b: Sequence[RunRow]) -> Comparison | None:
 
 
 def _closest(a: Sequence[Study], b: Sequence[Study]) -> tuple[Study, Study] | None:
-    """The pair of studies with the fewest settings that differ.
-
-    Of equals, with the most in common.
-    """
+    """The pair of studies with the fewest differing settings; among equals, with most in common."""
     pairs = [(one, other) for one in a for other in b]
     return min(
         pairs,

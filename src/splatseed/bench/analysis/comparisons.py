@@ -1,8 +1,8 @@
 """Gain against ratio, gain against strategy, and gain at equal numbers of Gaussians.
 
 Notation: gains are those of ``splatseed.bench.analysis.gains``: mean over scenes, for these scenes
-alone. Promise: counts are equal where the runs' last numbers of Gaussians differ by 1% at most, in
-every pair; whether they are is looked up, not assumed from the strategy.
+alone. Promise: counts are equal if the runs' final numbers of Gaussians differ by at most 1% in
+every pair; this is checked, not assumed from the strategy.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ EQUAL = 0.01
 
 
 def ratio_table(study: Study) -> Table:
-    """Mean gain by method and strategy, a column a ratio.
+    """Mean gain by method and strategy, one column per ratio.
 
     Args:
         study: The study.
@@ -53,7 +53,7 @@ NOTE = (
 
 
 def strategy_table(study: Study) -> Table:
-    """Mean gain by variant, a column a strategy, with the baseline's own PSNR below.
+    """Mean gain by variant, one column per strategy, with the baseline's own PSNR below.
 
     Args:
         study: The study.

@@ -1,9 +1,9 @@
-"""How soon a run is as good as the baseline in the end.
+"""How soon a run becomes as good as the baseline's final result.
 
-Notation: a run *reaches* the target where its test PSNR first is at least the last PSNR of the
+Notation: a run *reaches* the target when its test PSNR first equals the final PSNR of the
 baseline's run on the same scene with the same repeat; between two tests of the curve the PSNR is
-taken as a straight line. Seconds are those of training, and of making the seeds. Promise: runs that
-never reach it are counted, not dropped silently: a mean over those that do would flatter.
+interpolated linearly. Seconds include training and making the seeds. Promise: runs that never reach
+it are counted, not silently dropped: a mean over the others would flatter.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ class Reached:
 
 @dataclass(frozen=True)
 class Speed:
-    """How soon a variant reaches the target, beside the baseline's own first time.
+    """How soon a variant reaches the target, and the baseline's own first time.
 
     Args:
         pairs: Pairs of runs that can be compared.
-        reached: Those whose variant reaches the target.
-        steps: Mean over scenes of the steps it takes, of those that reach it; None without any.
+        reached: Pairs whose variant reaches the target.
+        steps: Mean steps over scenes, of the runs that reach it; None if there are none.
         seconds: The same in seconds.
-        base_steps: What the baseline takes to its own last PSNR.
+        base_steps: The baseline's steps to its own final PSNR.
         base_seconds: The same in seconds.
-        log_steps: Mean difference of the logarithm of steps, where all reach; else None.
+        log_steps: Mean difference of the logarithm of steps, if all reach it; else None.
         log_seconds: The same for seconds.
     """
 
@@ -64,8 +64,7 @@ def reach(result: RunResult, target: float) -> Reached | None:
         target: PSNR in dB.
 
     Returns:
-        None where it never is. A run that is above at its first test has reached it there at the
-        latest.
+        None if it never is. A run above it at its first test has reached it there at the latest.
     """
     before: CurvePoint | None = None
     for point in result.curve:
@@ -80,12 +79,12 @@ def reach(result: RunResult, target: float) -> Reached | None:
 
 
 def _part(low: float, high: float, target: float) -> float:
-    """Which part of the way from ``low`` to ``high`` the target is at."""
+    """The fraction of the way from ``low`` to ``high`` at which the target lies."""
     return 1.0 if math.isinf(high) or not high > low else (target - low) / (high - low)
 
 
 def speed(study: Study, strategy: StrategyName, variant: Variant) -> Speed | None:
-    """How soon a variant is as good as the baseline in the end.
+    """How soon a variant is as good as the baseline's final result.
 
     Args:
         study: The study.
@@ -93,7 +92,7 @@ def speed(study: Study, strategy: StrategyName, variant: Variant) -> Speed | Non
         variant: The variant.
 
     Returns:
-        None where no pair of runs has curves.
+        None if no pair of runs has curves.
     """
     scenes = [_times(study, strategy, scene, variant) for scene in study.scenes_of(strategy)]
     scenes = [each for each in scenes if each]

@@ -1,7 +1,7 @@
-"""What every variant gives and costs on average: quality; and the paper's table 3 beside ours.
+"""Quality and cost of every variant on average; and the paper's table 3 beside ours.
 
 Promise: means are over runs within a scene first, then over the scenes that the variant and the
-baseline both have, so that a method is not charged for scenes that another was spared.
+baseline both have, so that a method is not charged for scenes that another skipped.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ COLUMNS = (
     _Column("model, MB", lambda r: r.model_bytes / 1e6, 1),
     _Column("render a view, ms", lambda r: 1e3 * r.scores.render_seconds, 1),
 )
-"""MB are of 1,000,000 bytes."""
+"""MB are 1,000,000 bytes."""
 
 QUALITY = (
     _Column("PSNR, dB", lambda r: r.psnr, 2),
@@ -72,10 +72,10 @@ def mean_of(
         study: The study.
         strategy: The strategy.
         variant: The variant; the baseline itself is taken on all its scenes.
-        measure: What to take of a result; NaN where it is not known.
+        measure: The value to take from a result; NaN if unknown.
 
     Returns:
-        None where nothing is known.
+        None if nothing is known.
     """
     means = []
     for scene in study.scenes_of(strategy):
@@ -87,7 +87,7 @@ def mean_of(
 
 
 def quality_table(study: Study, strategy: StrategyName) -> Table:
-    """PSNR, co-visible PSNR, SSIM and, where it was measured, LPIPS by variant.
+    """PSNR, co-visible PSNR, SSIM and, if measured, LPIPS by variant.
 
     Args:
         study: The study.

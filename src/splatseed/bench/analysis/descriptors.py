@@ -1,8 +1,8 @@
-"""What kind of scene it is, in a few numbers.
+"""A scene described by a few numbers.
 
 Notation: l1 >= l2 >= l3 are the variances of a point and its 16 nearest along their principal axes;
-h is a point's mean distance to its 6 nearest. Promise: all numbers are free of units, so that
-scenes compare; originals alone are described, never points that splatseed added; nothing is random.
+h is a point's mean distance to its 6 nearest. Promise: all numbers are dimensionless, so that
+scenes compare; only originals are described, never points that splatseed added; nothing is random.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ __all__ = ["DESCRIPTIONS", "Descriptors", "describe", "read_descriptors", "write
 
 NEIGHBORS = 16
 VIEWS = 24
-"""Views, evenly spaced, that gaps, empty area and texture are taken from."""
+"""Number of views, evenly spaced, for gaps, empty area and texture."""
 SIDE = 320
-"""Photographs are made this large along their longer side before their gradients are taken."""
+"""Longer side of photographs at which their gradients are measured."""
 BLOCK = 1 << 14
 SCHEMA = 1
 
@@ -52,7 +52,7 @@ DESCRIPTIONS = {
 
 @dataclass(frozen=True)
 class Descriptors:
-    """What kind of scene it is.
+    """The descriptors of a scene.
 
     Args:
         planarity: Mean of (l2 - l3) / l1, as Weinmann et al. (2015) define it.
@@ -181,9 +181,7 @@ def _energy(grey: Float32[np.ndarray, "H W"]) -> float:
 
 
 def read_descriptors(path: Path) -> dict[str, Descriptors]:
-    """What ``write_descriptors`` wrote, by the scenes' fingerprints.
-
-    Nothing where it cannot be used.
+    """The descriptors that ``write_descriptors`` stored, by fingerprint; empty if unusable.
 
     Args:
         path: The file.
@@ -203,7 +201,7 @@ def read_descriptors(path: Path) -> dict[str, Descriptors]:
 
 
 def write_descriptors(path: Path, found: Mapping[str, Descriptors]) -> None:
-    """Keep descriptors by the scenes' fingerprints, so that they need not be taken again.
+    """Store descriptors by the scenes' fingerprints, so that they need not be recomputed.
 
     Args:
         path: The file.

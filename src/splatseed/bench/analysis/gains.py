@@ -1,4 +1,4 @@
-"""What every variant gains over the cloud as it is, and how sure that is.
+"""What every variant gains over the original cloud, and how certain that is.
 
 Notation: a gain is PSNR of a variant less that of the baseline, dB, paired by scene and repeat.
 Promise: the p values of one strategy's gains are adjusted together: those on single scenes as one
@@ -39,7 +39,7 @@ class Gains:
     Args:
         strategy: The strategy.
         scenes: Scenes on which anything can be compared.
-        variants: Variants that can be compared on any scene.
+        variants: Variants that can be compared on some scene.
         on_scene: By scene and variant; absent where no repeat has both.
         on_these: By variant: the mean over its scenes, for these scenes alone.
         on_like: By variant: the same mean, for scenes like these.
@@ -53,14 +53,14 @@ class Gains:
     on_like: Mapping[Variant, Difference]
 
     def top(self, scene: str) -> Variant | None:
-        """The variant with the greatest gain on a scene, or the least loss; noise included."""
+        """The variant with the greatest gain, or the least loss, on a scene, ignoring noise."""
         means = {
             v: self.on_scene[scene, v].mean for v in self.variants if (scene, v) in self.on_scene
         }
         return max(means, key=lambda each: means[each], default=None)
 
     def best(self, scene: str) -> Variant | None:
-        """The variant that gains most on a scene, or None if none gains; noise included."""
+        """The variant that gains most on a scene, or None if none gains, ignoring noise."""
         top = self.top(scene)
         return top if top is not None and self.on_scene[scene, top].mean > 0 else None
 
@@ -74,14 +74,14 @@ class Gains:
 
 @dataclass(frozen=True)
 class MeanGains:
-    """Three mean gains over scenes, which are often mistaken for one another; dB.
+    """Three mean gains over scenes that are easily mistaken for one another; dB.
 
     Args:
-        over_all: Of all variants together: what a variant picked blindly gives.
+        over_all: Of all variants together: the gain of a variant picked blindly.
         best: The variant that gains most on average.
-        over_best: Its mean gain; a little flattering, as it was chosen by the scores that it is of.
-        per_scene: The best variant of each scene, chosen by the test views that it is scored on:
-            not a gain that anybody can have.
+        over_best: Its mean gain; slightly optimistic, as it was chosen by the same scores.
+        per_scene: The best variant of each scene, chosen by the test views it is scored on: not a
+            gain that anybody can have.
         num_scenes: Scenes in the means.
         num_variants: Variants in the means: those that every scene has.
     """
@@ -97,7 +97,7 @@ class MeanGains:
 def scores(
     study: Study, strategy: StrategyName, scene: str
 ) -> tuple[tuple[Variant, ...], Float64[np.ndarray, "A R"]]:
-    """PSNR in dB of a scene by arm and repeat, NaN where there is no run; the baseline first.
+    """PSNR in dB of a scene by arm and repeat, NaN if there is no run; the baseline first.
 
     Args:
         study: The study.
@@ -143,7 +143,7 @@ def _adjusted(family: Mapping[Key, Difference]) -> dict[Key, Difference]:
 
 
 def clear_best(study: Study, strategy: StrategyName, scene: str) -> bool:
-    """Whether a scene's best arm is better than each other one, the second too, beyond noise.
+    """Whether a scene's best arm is better than each other one, the second included, beyond noise.
 
     Args:
         study: The study.

@@ -1,10 +1,10 @@
 """Guidelines derived from the data: which kind of scene gains from which method.
 
-Notation: a *guideline* is about a descriptor and a method: scenes with more of the one gain more
-(or less) from the other. Promise: every guideline comes with its rank correlation, its p value,
-exact where scenes are few, adjusted after Holm over all that were looked at, and with how many
-scenes agree; none is called supported unless its adjusted p is at most 5%, and what the number of
-scenes can support at all is said.
+Notation: a *guideline* relates a descriptor and a method: scenes with more of the former gain more
+(or less) from the latter. Promise: every guideline comes with its rank correlation, its p value
+(exact if scenes are few, adjusted after Holm over all that were considered), and with how many
+scenes agree; none is called supported unless its adjusted p is at most 5%, and it is said what the
+number of scenes can support at all.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["FEWEST", "Guideline", "fewest_scenes", "guideline_table", "guideline
            "rank_correlation", "scene_table", "verdict", "winner_table"]  # fmt: skip
 
 EXACT = 8
-"""Up to so many scenes all orders are tried (40,320); beyond, t approximates well."""
+"""Up to this many scenes, all orders are enumerated (40,320); beyond, t approximates well."""
 FEWEST = 3
 """With two scenes every correlation is perfect."""
 
@@ -49,13 +49,13 @@ class Guideline:
     """Scenes with more of something gain more, or less, from a method.
 
     Args:
-        descriptor: Of what.
-        method: From which method; the mean over its variants.
+        descriptor: The descriptor.
+        method: The method; its gain is the mean over its variants.
         rho: Spearman's rank correlation over scenes.
         p: Its two-sided p value.
         adjusted: The same after Holm over all guidelines of the strategy.
-        agree: Scenes that are on the same side of both medians as the correlation says.
-        scenes: Scenes in all.
+        agree: Scenes that lie on the side of both medians that the correlation predicts.
+        scenes: Number of scenes.
     """
 
     descriptor: str
@@ -110,7 +110,7 @@ def _by_method(found: Gains) -> dict[str, dict[str, float]]:
 def _guideline(
     descriptor: str, method: str, gains: Mapping[str, float], described: Mapping[str, Descriptors]
 ) -> Guideline | None:
-    """What a descriptor says of a method; None for too few scenes, or where all are alike."""
+    """The guideline of a descriptor and a method; None for too few scenes or constant values."""
     pairs = [(getattr(described[s], descriptor), gains[s]) for s in gains if s in described]
     x, y = np.array([pair for pair in pairs if not math.isnan(pair[0])]).reshape(-1, 2).T
     if len(x) < FEWEST or len(set(x)) < 2 or len(set(y)) < 2:
@@ -148,9 +148,9 @@ def rank_correlation(
 
 
 def fewest_scenes(comparisons: int) -> int:
-    """With how many scenes a perfect rank correlation is the least that could be supported.
+    """The number of scenes from which on a perfect rank correlation can be supported at all.
 
-    Two of all orders are perfect, and Holm's first step asks for ``LEVEL`` over all comparisons.
+    Two of all orders are perfect, and Holm's first step requires ``LEVEL`` over all comparisons.
 
     Args:
         comparisons: Guidelines that are looked at.
@@ -162,7 +162,7 @@ def fewest_scenes(comparisons: int) -> int:
 
 
 def verdict(found: Sequence[Guideline]) -> str:
-    """What the data says, in a sentence or two.
+    """The conclusion, in a sentence or two.
 
     Args:
         found: All guidelines of a strategy.

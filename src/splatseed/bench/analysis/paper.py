@@ -1,9 +1,9 @@
-"""The paper's own numbers, for ours to stand beside.
+"""The paper's own numbers, for comparison with ours.
 
 Notation: a *dataset* is Mip-NeRF360 or Replica; an *entry* is a method and its ratio, ``("sfm",
-1.0)`` for the cloud as it is. Promise: the numbers are those of the paper's tables 1 to 3. They are
-of 30,000 steps and, for Mip-NeRF360, of photographs at a quarter (outdoors) or half (indoors) of
-their size; how far they would stray from one run to the next is not known.
+1.0)`` for the original cloud. Promise: the numbers are those of the paper's tables 1 to 3. They are
+from 30,000 steps and, for Mip-NeRF360, photographs at a quarter (outdoors) or half (indoors) of
+their size; their spread between runs is unknown.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class PaperCost:
 
 @dataclass(frozen=True)
 class PaperDataset:
-    """What the paper tells of a dataset.
+    """The paper's results on a dataset.
 
     Args:
         key: As in ``DATASETS``.
@@ -88,7 +88,7 @@ def paper_dataset(key: str) -> PaperDataset:
 
 
 def dataset_of(scene: str) -> PaperDataset | None:
-    """The dataset of the paper that has a scene of this name; None where neither has.
+    """The paper's dataset that has a scene of this name; None if neither has.
 
     Args:
         scene: The scene's name.

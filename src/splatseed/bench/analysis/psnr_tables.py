@@ -1,8 +1,8 @@
-"""The paper's tables 1 and 2 beside ours: PSNR of every scene and variant, and what it gains.
+"""The paper's tables 1 and 2 beside ours: PSNR and gain of every scene and variant.
 
-Notation: marks are as in ``MARKS``. Promise: our numbers carry their standard error over repeats,
-the paper's stand in a row of their own where the scene's name is one of its scenes; nothing is
-marked as best that could be noise.
+Notation: marks are as in ``MARKS``. Promise: our numbers carry their standard error over repeats;
+the paper's have a row of their own if the scene's name is one of its scenes; nothing is marked as
+best that could be noise.
 """
 
 from __future__ import annotations
@@ -153,9 +153,7 @@ def gain_cell(gain: Difference | None) -> Cell:
 
 
 def gain_table(study: Study, strategy: StrategyName) -> Table:
-    """What each variant gains: on each scene, on these scenes, on scenes like these.
-
-    The paper's gains stand beside ours.
+    """What each variant gains: on each scene, on these, on scenes like these, and in the paper.
 
     Args:
         study: The study.

@@ -1,4 +1,4 @@
-"""What a ledger's finished runs can be compared with: runs that differ in nothing but the seeds.
+"""Studies: sets of finished runs that differ only in their seeds and so can be compared.
 
 Notation: a *variant* is what makes the seeds (method, profile, ratio, parameters); a *study* holds
 runs whose settings are equal in all but the variant, the strategy, the scene and the repeat; a
@@ -36,7 +36,7 @@ class Variant:
         method: ``SFM``, or a key of ``splatseed.METHODS``.
         profile: "default" or "paper".
         ratio: Points in all, per original; 0 for any.
-        parameters: What differs from the profile, as words such as ``k=12``.
+        parameters: Differences from the profile, as words such as ``k=12``.
     """
 
     method: str
@@ -90,7 +90,7 @@ class Study:
         cells: By strategy, scene and variant.
         rows: The runs that the cells are made of, by scene.
         variant_of_key: The variant of each of these runs.
-        not_finite: Finished runs whose PSNR is infinite or no number.
+        not_finite: Finished runs whose PSNR is infinite or NaN.
     """
 
     settings: Mapping[str, object]
@@ -101,7 +101,7 @@ class Study:
 
     @cached_property
     def strategies(self) -> tuple[StrategyName, ...]:
-        """Those that there are runs of."""
+        """The strategies that have runs."""
         found = {strategy for strategy, _, _ in self.cells}
         return tuple(name for name in STRATEGIES if name in found)
 
@@ -202,7 +202,7 @@ def studies(rows: Iterable[RunRow]) -> tuple[Study, ...]:
     """The studies in a ledger's rows; the one with the most runs first.
 
     Scenes may differ in size; only where one scene was run at several ``data_factor`` are these
-    kept apart. Where a scene's name stands for different content, its label says which.
+    kept apart. If a scene's name stands for different content, its label says which.
 
     Args:
         rows: As the ledger has them; those not done are passed over.
@@ -216,7 +216,7 @@ def studies(rows: Iterable[RunRow]) -> tuple[Study, ...]:
 
 
 def _common(spec: RunSpec) -> dict[str, object]:
-    """What is the same for all runs of a study; their size may differ from scene to scene."""
+    """What all runs of a study share; their size may differ from scene to scene."""
     settings = {name: getattr(spec.training, name) for name in SHARED if name != "data_factor"}
     if spec.arm.budget:  # in Gaussians it may differ from scene to scene
         settings["cap_max"] = None
@@ -257,7 +257,7 @@ def _study(settings: Mapping[str, object], rows: Sequence[RunRow]) -> Study:
 
 
 def _scene_labels(rows: Sequence[RunRow]) -> dict[tuple[str, str], str]:
-    """What to call a scene of a name and digest."""
+    """Labels for scenes of a name and digest."""
     digests: dict[str, set[str]] = defaultdict(set)
     for row in rows:
         digests[row.spec.scene].add(row.spec.scene_digest)
@@ -269,7 +269,7 @@ def _scene_labels(rows: Sequence[RunRow]) -> dict[tuple[str, str], str]:
 
 
 def _depth_variants(rows: Sequence[RunRow]) -> dict[str, Variant]:
-    """The variant of each run's key; told apart by depth maps where a scene has several sets."""
+    """The variant of each run's key; distinguished by depth maps if a scene has several sets."""
     maps: dict[str, set[str]] = defaultdict(set)
     for row in rows:
         maps[row.spec.scene_digest].add(row.spec.depth_digest)

@@ -1,7 +1,7 @@
 """The answer in a few sentences: does upsampling help here, by which method, at what cost?
 
-Promise: a gain is called one only where it is more than noise after adjusting for the number of
-variants; where a single run was made of each, the sentences say that nothing is known of the noise.
+Promise: a gain is claimed only if it exceeds noise after adjusting for the number of variants; if
+there is a single run of each, the sentences say that the noise is unknown.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["decibels", "summary"]
 
 
 def summary(study: Study, strategy: StrategyName) -> tuple[str, ...]:
-    """What the runs under a strategy say, a sentence or two each.
+    """The conclusions on a strategy, a sentence or two each.
 
     Args:
         study: The study.
@@ -86,7 +86,7 @@ def _by_scene(found: Gains, best: Variant) -> str:
 
 
 def _elsewhere(found: Gains, best: Variant) -> str:
-    """Whether the gain can be expected of other scenes."""
+    """Whether the gain can be expected on other scenes."""
     like = found.on_like[best]
     if like.verdict == "unknown":
         return "One scene says nothing of others."
@@ -118,7 +118,7 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
 
 
 def _when_as_good(steps: Difference, seconds: Difference) -> str:
-    """How soon it is as good as the baseline becomes; NaN of a single pair is not sure."""
+    """How soon it reaches the baseline's final result; a single pair's NaN counts as unsure."""
     base = BASELINE.label
     if not any(each.p <= LEVEL for each in (steps, seconds)):
         return (

@@ -1,9 +1,8 @@
 """Tables as CSV, Markdown and LaTeX.
 
-Notation: a *cell* is words, or a number with its standard error, a mark and whether it is set bold.
-Promise: CSV has numbers in full, with columns of their own for standard errors and marks; Markdown
-and LaTeX have them rounded and with what their marks mean below; whatever names are in them is
-escaped.
+Notation: a *cell* is words, or a number with its standard error, a mark and whether it is bold.
+Promise: CSV has unrounded numbers, with separate columns for standard errors and marks; Markdown
+and LaTeX have rounded ones, with their marks explained below; names are escaped.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ LATEX = {
 
 @dataclass(frozen=True)
 class Cell:
-    """What stands in one place of a table.
+    """The content of one table cell.
 
     Args:
         value: The number; None where there are only words.
@@ -40,7 +39,7 @@ class Cell:
         text: The words, instead of a number or behind it.
         mark: A sign behind it, explained in the table's notes.
         bold: Whether it is the best of its row.
-        soft: Whether it is set back, as others' numbers are.
+        soft: Whether it is greyed out, as others' numbers are.
     """
 
     value: float | None = None
@@ -58,11 +57,11 @@ class Table:
     """A table.
 
     Args:
-        name: What its files are called.
+        name: Its file name without suffix.
         title: What it shows.
-        header: A name a column.
-        rows: As many cells each.
-        notes: What is to be known of it, a sentence or more each.
+        header: One name per column.
+        rows: The cells, as many per row.
+        notes: Explanations, a sentence or more each.
     """
 
     name: str

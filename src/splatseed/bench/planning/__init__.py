@@ -1,1 +1,1 @@
-"""Before a benchmark: its scenes and arms, the runs they make, how long those will take."""
+"""Before a benchmark: its scenes and arms, the runs they make, and how long those will take."""

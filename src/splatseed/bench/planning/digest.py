@@ -1,6 +1,6 @@
 """Fingerprints of what runs depend on: a scene's content, its photographs, its depth maps.
 
-Promise: a fingerprint depends on content alone, not on where files lie, when they were written, or
+Promise: a fingerprint depends on content alone, not on where files are, when they were written, or
 the order in which a system lists them; photographs count byte for byte, depth maps as they are
 read.
 """
@@ -95,7 +95,7 @@ def _update_camera(digest: hashlib.blake2b, image: Image) -> None:
 
 
 def _update(digest: hashlib.blake2b, arrays: Iterable[np.ndarray]) -> None:
-    """With shapes, so that two arrays are never taken for one."""
+    """Hashed with shapes, so that two arrays are never taken for one."""
     for array in arrays:
         digest.update(repr((array.shape, array.dtype.str)).encode())
         digest.update(array.tobytes())

@@ -1,11 +1,11 @@
-"""How long a benchmark will take, and how much disk: an estimate, which its own runs make better.
+"""How long a benchmark will take, and how much disk: an estimate that finished runs refine.
 
-Notation: a step of training takes about a + b G + c P seconds for G Gaussians and P pixels; a run
+Notation: a training step takes about a + b G + c P seconds for G Gaussians and P pixels; a run
 takes its steps, the making of its seeds, and what is *around* them: reading, tests, scores,
-pictures. A *factor* is how many times as long as the model says something took. Promise: before
-there are runs that tell, the numbers are those of one machine, so that the estimate can be off by
-several times; finished runs give each part its factors, by scene, strategy and method, and where
-one of these has not been run the others stand for it.
+pictures. A *factor* is the ratio of actual to modelled time. Promise: before there are finished
+runs, the numbers are those of one machine, and the estimate can be off by several times; finished
+runs give each part its factors, by scene, strategy and method, and if one of these has not been run
+the others stand in for it.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from splatseed.upsample import METHODS, chooses_number
 __all__ = ["Estimator"]
 
 TESTS = 21
-"""How often the test views are rendered: on the way, and at the end."""
+"""How often the test views are rendered: during training, and at the end."""
 RENDER_SHARE = 0.3
-"""Of a step's time, what rendering takes."""
+"""Fraction of a step's time that rendering takes."""
 LIKELY_RATIO = 3.0
 """Seeds to every original, of methods that look at photographs."""
 PICTURES = 3
 BYTES_A_PIXEL = 2.0
-"""Of a PNG of a photograph, its render and its error."""
+"""Bytes of a PNG of a photograph, its render and its error, per pixel."""
 SMALL_FILES = 60_000
 SECONDS_A_VIEW = 0.8
 """Of methods that compare photographs with each other."""
@@ -50,7 +50,7 @@ SWEEPS = 3
 
 @dataclass(frozen=True)
 class _Speed:
-    """Seconds of a step: a, b of each Gaussian, c of each pixel; and seconds around training."""
+    """Seconds per step: a, b per Gaussian, c per pixel; and seconds around training."""
 
     fixed: float
     per_gaussian: float
@@ -111,8 +111,8 @@ class Estimator:
     """Estimates for the runs of a benchmark.
 
     Args:
-        scenes: What is known of their scenes.
-        rows: What the ledger has.
+        scenes: Facts about the scenes.
+        rows: The ledger's rows.
         threads: Threads of each run; for the CPU.
     """
 
@@ -188,7 +188,7 @@ class Estimator:
         return found
 
     def is_twin(self, spec: RunSpec) -> bool:
-        """Whether a run will take over the training of one that begins with the same seeds."""
+        """Whether a run will reuse the training of one that begins with the same seeds."""
         most, arm = spec.most_seeds, spec.arm
         full = most is not None and self._scenes[spec.scene_digest].num_points >= most
         fills = not arm.ratio and arm.method in FILLING
@@ -199,7 +199,7 @@ class Estimator:
         return int(self._counts(spec)[0])
 
     def disk(self, spec: RunSpec, *, models: bool) -> float:
-        """Bytes that are kept of a run."""
+        """Bytes that are stored for a run."""
         pictures = PICTURES * 3 * BYTES_A_PIXEL * self._pixels(spec)
         model = self._counts(spec)[1] * _bytes_each(spec.settings) if models else 0.0
         return pictures + model + SMALL_FILES
@@ -293,7 +293,7 @@ FILLING = frozenset({SFM, *PHOTOGRAPHS, "linear", "triangle", "spline", "mls", "
                      "depth"})  # fmt: skip
 """Methods that add nothing where the originals fill the budget."""
 READING = 3.0
-"""Seconds of a run whose training is taken over, beside its seeds."""
+"""Seconds of a run whose training is reused, besides its seeds."""
 
 
 def _densification(spec: RunSpec) -> Densification:
@@ -351,7 +351,7 @@ def _seed_seconds(row: RunRow) -> float:
 
 
 def _seconds_around(row: RunRow) -> float:
-    """What a run took beside its steps and seeds; little if it was begun before and went on."""
+    """Seconds of a run besides its steps and seeds; little if it was resumed."""
     assert row.result is not None  # noqa: S101  (only finished runs are asked about)
     assert row.started is not None  # noqa: S101  (for mypy: it is known here)
     assert row.finished is not None  # noqa: S101  (for mypy: it is known here)

@@ -1,8 +1,8 @@
 """A plan: which scenes, which arms, how often, and how each run is trained.
 
-Notation: see ``records``. Promise: a plan that exists is valid; the runs of a plan come in an order
-in which all arms of all scenes have been run once before any is repeated, so that a benchmark which
-is stopped early still compares all of them.
+Notation: see ``records``. Promise: a plan that exists is valid; its runs are ordered so that all
+arms of all scenes have been run once before any is repeated, and a benchmark stopped early still
+compares all of them.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, conf
 __all__ = ["DEMO", "Plan", "PlannedScene", "budget_number", "plan_runs"]
 
 DEMO = "demo:"
-"""The path of the made-up room, which is made in the benchmark's folder when it is needed."""
+"""The path of the synthetic room, which is made in the benchmark's folder on demand."""
 DEPTH = "depth"
 RHO = "rho"
 LEAST_SIDE = 11
-"""Pixels of a photograph's side that SSIM's window needs."""
+"""Least side of a photograph in pixels, for SSIM's window."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class PlannedScene:
     """A scene of a plan.
 
     Args:
-        path: Where it lies; ``DEMO`` for the made-up room.
-        name: What it is called in tables; its folder's name when left empty.
-        images: The folder of photographs within it, such as ``images_4``; found when left empty.
+        path: Its folder; ``DEMO`` for the synthetic room.
+        name: Its name in tables; the folder's name when left empty.
+        images: The folder of photographs within it, such as ``images_4``; detected when left empty.
         depth: The folder of its depth maps; looked for in the scene when left out.
     """
 
@@ -48,7 +48,7 @@ class PlannedScene:
 
     @property
     def is_demo(self) -> bool:
-        """Whether it is the made-up room."""
+        """Whether it is the synthetic room."""
         return self.path == DEMO
 
     @property
@@ -59,7 +59,7 @@ class PlannedScene:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a benchmark is to run.
+    """What a benchmark should run.
 
     Raises:
         ParameterError: A value is out of its range, or given twice.
@@ -70,17 +70,17 @@ class Plan:
     methods: tuple[str, ...] = (SFM, "linear", "mls")
     """How new points are made; ``sfm`` for none, with which all others are compared."""
     ratios: tuple[float, ...] = (8.0,)
-    """Points in all, per original; none where budgets say how many there are."""
+    """Points in all, per original; empty if budgets determine the number."""
     budgets: tuple[str, ...] = ()
-    """Gaussians at the end, of every arm alike: numbers, or such as "0.25rho", per pixel of a
-    photograph at the size that is trained. Seeds are thinned to them, or to the share with which a
-    strategy begins that adds to what is there."""
+    """Gaussians at the end, the same for every arm: numbers, or such as "0.25rho", per pixel of a
+    photograph at training size. Seeds are thinned to them, or for strategies that add Gaussians to
+    the fraction they begin with."""
     strategies: tuple[StrategyName, ...] = ("default",)
     """Densification strategies."""
     profiles: tuple[Profile, ...] = ("default",)
     """Parameters of the methods: improved ones, and those of the paper's text."""
     repeats: int = 3
-    """How often each is run, with another seed each time."""
+    """Number of repeats, with another seed each time."""
     training: TrainSettings = field(default_factory=TrainSettings)
     """How each run is trained; strategy and seed are those of its arm and its repeat."""
     long_side: int | None = None
@@ -119,16 +119,16 @@ class Plan:
             configure(method, **self.parameters[method])
 
     def parameters_of(self, method: str) -> Mapping[str, Any]:
-        """What differs from the profile's; no method sees the photographs kept for the test."""
+        """Differences from the profile; no method sees the held-out test photographs."""
         looks = hasattr(METHODS[method], "hold_out")
         held = {"hold_out": self.training.test_every} if looks else {}
         return MappingProxyType({**held, **self.parameters.get(method, {})})
 
     def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:
-        """The arms of one strategy: of each budget, the original cloud first.
+        """The arms of one strategy: for each budget, the original cloud first.
 
-        A method whose profiles are one and the same has one arm, of the first of them; one that
-        makes as many seeds as the photographs need has no ratio.
+        A method whose profiles are identical has one arm, of the first profile; one that chooses
+        its number of seeds has no ratio.
         """
         arms = []
         for budget in self.budgets or ("",):
@@ -160,13 +160,13 @@ class Plan:
 def plan_runs(
     plan: Plan, scenes: Sequence[SceneFacts], backend: Backend, version: str
 ) -> list[RunSpec]:
-    """The runs of a plan, in the order in which they are to be run.
+    """The runs of a plan, in the order in which they should be run.
 
     Arms of the method depth are left out for scenes without depth maps.
 
     Args:
         plan: The plan.
-        scenes: What was found where its scenes lie.
+        scenes: Facts about its scenes.
         backend: Where they will be trained: not "auto".
         version: The package's.
     """
@@ -201,7 +201,7 @@ def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> Trai
 
 
 def budget_number(budget: str, pixels: float) -> int:
-    """Gaussians that a budget allows.
+    """The number of Gaussians that a budget allows.
 
     Args:
         budget: A number, or a string such as "0.25rho".
@@ -212,10 +212,10 @@ def budget_number(budget: str, pixels: float) -> int:
 
 
 def _budget(given: object) -> str:
-    """A budget as a plan has it, so that 20000 and "20000.0" are the same.
+    """A budget in the plan's form, so that 20000 and "20000.0" are the same.
 
     Raises:
-        ParameterError: It is none.
+        ParameterError: It is not a budget.
     """
     text = str(given).strip().lower()
     try:
@@ -263,7 +263,7 @@ def _check_distinct(name: str, given: Sequence[object]) -> None:
 
 
 def _check_text(scene: PlannedScene) -> None:
-    """A plan is a text file: names of files that are no text cannot stand in it."""
+    """A plan is a text file, which cannot hold file names that are not text."""
     try:
         f"{scene.path}{scene.name}{scene.images}{scene.depth}".encode()
     except UnicodeEncodeError:

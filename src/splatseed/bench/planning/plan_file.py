@@ -1,8 +1,7 @@
-"""Plans as TOML files: reading one with errors that name the key, and writing one that can be read.
+"""Plans as TOML files: reading with errors that name the key, and writing in readable form.
 
-Promise: what ``plan_text`` writes, ``read_plan`` reads back as the same plan; a key that is
-misspelt, or whose value is of another kind, is an error and never passed over. Paths in a file are
-relative to it.
+Promise: ``read_plan`` reads what ``plan_text`` writes back as the same plan; a misspelt key, or a
+value of the wrong kind, is an error and never ignored. Paths in a file are relative to it.
 """
 
 from __future__ import annotations
@@ -54,16 +53,16 @@ BUDGETS = _Kind(
     _all(lambda value: isinstance(value, str) or _is_number(value)),
 )
 WHOLE = _Kind("a whole number", lambda value: type(value) is int)
+NUMBER = _Kind("a number", _is_number)
 TRUTH = _Kind("true or false", lambda value: isinstance(value, bool))
 TABLE = _Kind("a table", lambda value: isinstance(value, dict))
 TABLES = _Kind("tables, each headed [[scenes]]", _all(dict))
 
 
 def _kind_of(default: object) -> _Kind:
-    """The kind of a training setting; the one that has no default is a number."""
-    if isinstance(default, bool):
-        return TRUTH
-    return TEXT if isinstance(default, str) else WHOLE
+    """The kind of a training setting; the one without a default is a whole number."""
+    kinds = {bool: TRUTH, str: TEXT, float: NUMBER}
+    return kinds.get(type(default), WHOLE)
 
 
 KINDS: Mapping[str, _Kind] = {
@@ -80,8 +79,7 @@ KINDS: Mapping[str, _Kind] = {
     SCENES: TABLES,
     PARAMETERS: TABLE,
 }
-"""What each key of a plan takes: there is one for each field of ``Plan``, but ``training`` is
-flat."""
+"""What each key of a plan takes: one per field of ``Plan``, except that ``training`` is flat."""
 
 
 def read_plan(path: Path) -> Plan:
@@ -114,7 +112,7 @@ def read_plan(path: Path) -> Plan:
 
 
 def plan_text(plan: Plan) -> str:
-    """A plan as TOML; its paths are made absolute, so that the text can be kept anywhere."""
+    """A plan as TOML, with absolute paths, so that the text can be kept anywhere."""
     lines = []
     for key in KINDS:
         value = getattr(plan.training if key in SHARED else plan, key)

@@ -1,9 +1,9 @@
-"""Plans made before: the paper's two data sets, and two that a laptop can run.
+"""Ready-made plans: the paper's two data sets, and two that a laptop can run.
 
 Notation: a preset's scenes are folders of one folder, the data set. Promise: scenes, folders of
-photographs, ratios and steps of the papers' presets are those of the paper's tables 1 and 2
-(docs/paper.md), and every eighth image is kept for the test; photographs are taken as the data set
-gives them, not made smaller anew. ``laptop`` compares arms at one number of Gaussians.
+photographs, ratios and steps of the paper's presets are those of its tables 1 and 2
+(docs/paper.md), and every eighth image is held out for testing; photographs are taken as the data
+set provides them, not downsampled anew. ``laptop`` compares arms at one number of Gaussians.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ PAPER_METHODS = (SFM, "linear", "triangle", "spline", "mls", "voronoi")
 
 
 def preset_plan(name: PresetName, data: Path | None) -> tuple[Plan, tuple[str, ...]]:
-    """A preset's plan for the scenes that are there.
+    """A preset's plan for the scenes that exist.
 
     Args:
-        name: Which.
-        data: The folder of the data set's scenes; not for ``quick``, which has the made-up room.
+        name: The preset.
+        data: The folder of the data set's scenes; not for ``quick``, which has the synthetic room.
 
     Returns:
-        The plan, and the names of scenes that are not there.
+        The plan, and the names of missing scenes.
 
     Raises:
-        ParameterError: The folder is not named, or named for ``quick``.
+        ParameterError: The folder is not given, or given for ``quick``.
         SceneNotFoundError: None of the scenes is in it.
     """
     if name == "quick":

@@ -1,9 +1,8 @@
-"""What a run of the benchmark is asked for, and what came of it.
+"""The specification of a run of the benchmark, and its result.
 
-Notation: an *arm* is everything about a run but its scene and its repeat: two runs are *paired*
-when those two are equal. Promise: ``RunSpec.key`` depends on all that determines the result and on
-nothing else (not on where the scene lies), so that a run that is in the ledger need never be
-repeated.
+Notation: an *arm* is everything about a run except its scene and its repeat: two runs are *paired*
+if those two are equal. Promise: ``RunSpec.key`` depends on everything that determines the result
+and on nothing else (not on where the scene is), so that a run in the ledger need never be repeated.
 """
 
 from __future__ import annotations
@@ -34,8 +33,7 @@ SFM = "sfm"
 """The method that leaves the cloud of Structure-from-Motion as it is; its ratio is 1."""
 
 ANY_RATIO = 0.0
-"""The ratio of methods that make as many seeds as the photographs need, and of all where a budget
-says how many there are."""
+"""The ratio of methods that choose their number of seeds, and of all if a budget determines it."""
 
 RunStatus = Literal["pending", "running", "done", "failed"]
 
@@ -43,15 +41,15 @@ DEFAULT = TrainSettings()
 SHARED = tuple(
     each.name for each in fields(TrainSettings) if each.name not in {"strategy", "seed", "seeding"}
 )
-"""Settings that all runs of a plan share; its arms and repeats decide the others."""
+"""Settings that all runs of a plan share; arms and repeats determine the others."""
 
 EARLY = {
     "max_steps", "data_factor", "test_every", "cap_max", "sh_degree", "backend", "opacity_reset",
 }  # fmt: skip
-"""Settings that every key tells, default or not: older ledgers' keys have them, and no others."""
+"""Settings that every key includes, default or not: older ledgers' keys have only these."""
 
 WHERE = {"scene_path", "depth_path", "images"}
-"""Fields of a specification that say where things lie, and nothing about what they are."""
+"""Fields of a specification that say where things are, not what they are."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +59,10 @@ class Arm:
     Args:
         method: ``SFM``, or a key of ``splatseed.METHODS``.
         profile: "default" or "paper".
-        ratio: Points in all, per original; ``ANY_RATIO`` where photographs or the budget say it.
+        ratio: Points in all, per original; ``ANY_RATIO`` if photographs or the budget decide.
         strategy: The densification strategy.
-        budget: Gaussians at the end, at most: a number, or a string such as "0.25rho", per pixel
-            of a photograph at the size that is trained; empty for no such bound.
+        budget: Most Gaussians at the end: a number, or a string such as "0.25rho", per pixel of a
+            photograph at training size; empty for no limit.
     """
 
     method: str
@@ -88,7 +86,7 @@ class Arm:
 
 @dataclass(frozen=True)
 class RunSpec:
-    """One run: everything that determines its result, and where its scene lies.
+    """One run: everything that determines its result, and where its scene is.
 
     Args:
         scene: The scene's name in tables.
@@ -96,7 +94,7 @@ class RunSpec:
         arm: How it is seeded and trained.
         parameters: The method's parameters that differ from its profile's.
         repeat: From 0; seeds both upsampling and training.
-        training: How it is trained; the arm says by which strategy, the repeat by which seed.
+        training: The settings; the arm gives the strategy, the repeat the seed.
         depth_digest: Fingerprint of the depth maps, for the method depth; empty without.
         version: The package's version.
         scene_path: Where the scene lies; not part of the key.
@@ -119,7 +117,7 @@ class RunSpec:
 
     @property
     def key(self) -> str:
-        """Fingerprint of what determines the result: 32 hexadecimal digits."""
+        """The fingerprint of everything that determines the result: 32 hexadecimal digits."""
         told = {k: v for k, v in self._flat().items() if k not in WHERE and self._is_told(k, v)}
         if not self.arm.budget:  # later than the ledgers of runs without
             del told["arm"]["budget"]
@@ -133,7 +131,7 @@ class RunSpec:
 
     @property
     def most_seeds(self) -> int | None:
-        """What seeds are thinned to under a budget; None without one."""
+        """The number that seeds are thinned to under a budget; None without one."""
         if not self.arm.budget or self.training.cap_max is None:
             return None
         share = SEEDS_SHARE.get(self.settings.densification, 1.0)
@@ -145,10 +143,7 @@ class RunSpec:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """What ``to_json`` wrote.
-
-        Settings that a ledger is too old to have are at their defaults.
-        """
+        """The inverse of ``to_json``; settings that an old ledger lacks have their defaults."""
         values = json.loads(text)
         training = TrainSettings(**{k: values.pop(k) for k in SHARED if k in values})
         return cls(**{**values, "arm": Arm(**values["arm"]), "training": training})
@@ -161,25 +156,25 @@ class RunSpec:
 
     @staticmethod
     def _is_told(name: str, value: object) -> bool:
-        """Whether a field is part of the key: later settings are not while they change nothing."""
+        """Whether a field is part of the key: newer settings are not while at their default."""
         return name not in SHARED or name in EARLY or value != getattr(DEFAULT, name)
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run gave.
+    """The result of a run.
 
     Args:
-        scores: Of the test views at the end.
-        curve: The test views on the way, in order of steps.
+        scores: Scores of the test views at the end.
+        curve: Scores of the test views during training, in order of steps.
         num_seeds: Points that training began with.
-        upsample_seconds: Wall time of making the seeds, thinning included; 0 for ``SFM`` as it is.
+        upsample_seconds: Wall time of making the seeds, thinning included; 0 for plain ``SFM``.
         train_seconds: Wall time of the training steps alone.
-        peak_bytes: Most memory the process held; None where the system does not tell.
+        peak_bytes: Peak memory of the process; None where the system does not tell.
         device: Where it was trained, in words.
-        peak_gpu_bytes: Most memory that PyTorch held on the GPU; None without one.
-        twin: The key of the run whose training this is, as it began with the same seeds; empty
-            where it was trained for itself.
+        peak_gpu_bytes: Peak memory of PyTorch on the GPU; None without one.
+        twin: The key of the run whose training was reused, as it began with the same seeds; empty
+            if this run was trained itself.
     """
 
     scores: EvalResult
@@ -219,7 +214,7 @@ class RunResult:
 
     @property
     def seconds(self) -> float:
-        """Of making the seeds and of training from them."""
+        """Seconds of making the seeds and training from them."""
         return self.upsample_seconds + self.train_seconds
 
     def to_json(self) -> str:
@@ -230,7 +225,7 @@ class RunResult:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """What ``to_json`` wrote, or that of a version that kept scores beside the rest."""
+        """The inverse of ``to_json``, also for versions that stored scores beside the rest."""
         values = json.loads(text)
         scores = EvalResult.from_dict(values.pop("scores", None) or _early_scores(values))
         curve = tuple(CurvePoint(**each) for each in values.pop("curve"))
@@ -247,16 +242,16 @@ def _early_scores(values: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class RunRow:
-    """A run as the ledger has it.
+    """A row of the ledger.
 
     Args:
-        spec: What was asked for.
-        status: How far it is.
-        result: What it gave; only when done.
+        spec: The run's specification.
+        status: Its status.
+        result: Its result; only when done.
         error: Why it failed; only when failed.
-        attempts: How often it was begun.
+        attempts: How often it was started.
         worker: Who has it or had it last: host and process.
-        started: When it was last begun, seconds since 1970; None before.
+        started: When it was last started, seconds since 1970; None before.
         finished: When it ended, likewise.
     """
 

@@ -1,8 +1,7 @@
-"""Scenes of a benchmark: opening one, and what is to be known of it before it is run.
+"""Scenes of a benchmark: opening one, and checking it before it is run.
 
-Promise: a scene is opened in one way wherever a benchmark does it; what would make every run on a
-scene fail (no photographs, lenses with distortion, depth that cannot be read) is found here, before
-any.
+Promise: a benchmark always opens a scene in the same way; whatever would make every run on a scene
+fail (no photographs, lenses with distortion, unreadable depth) is detected here, before any run.
 """
 
 from __future__ import annotations
@@ -26,16 +25,16 @@ __all__ = ["SceneFacts", "open_scene", "survey"]
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What was found where a scene lies.
+    """Facts about a scene.
 
     Args:
-        name: The scene's, in tables.
-        path: Where it lies, absolute.
+        name: The scene's name in tables.
+        path: Its folder, absolute.
         digest: Fingerprint of its points, cameras and photographs.
-        num_points: Distinct finite points: those that are trained from as they are.
-        num_images: Photographs.
-        pixels: Of the first of them, as its file is.
-        images: The folder of photographs within the scene's; empty for the one that is found.
+        num_points: Distinct finite points, which plain ``SFM`` trains from.
+        num_images: Number of photographs.
+        pixels: Pixels of the first photograph, as in its file.
+        images: The folder of photographs within the scene's; empty for the default one.
         depth_path: Where its depth maps lie, absolute; empty without.
         depth_digest: Their fingerprint; empty without.
         warnings: What is odd about it, one sentence each.
@@ -59,9 +58,9 @@ def open_scene(path: Path, *, images: str = "", depth: Path | None = None) -> Sc
     """A scene with its original points, as a run begins with it.
 
     Args:
-        path: Where it lies.
-        images: The folder of photographs within it; the one that is found when left out.
-        depth: The folder of its depth maps, if they are needed.
+        path: Its folder.
+        images: The folder of photographs within it; the default one when left out.
+        depth: The folder of its depth maps, if needed.
 
     Raises:
         SceneNotFoundError: There is no scene, or no such folder.
@@ -83,7 +82,7 @@ def survey(
     with_depth: bool = False,
     progress: Progress = silent,
 ) -> SceneFacts:
-    """Look at a scene, and at all files that a run on it reads.
+    """Check a scene and all files that a run on it reads.
 
     Args:
         path: Where it lies.

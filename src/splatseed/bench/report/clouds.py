@@ -1,7 +1,7 @@
 """Pictures of the seeds of each method, from one camera.
 
-Promise: seeds are made again exactly as the runs made them (the same scene, parameters and seed),
-and only while the scene's files are what they were; else a sentence says why there is no picture.
+Promise: seeds are recomputed exactly as in the runs (the same scene, parameters and seed), and only
+if the scene's files are unchanged; else a sentence says why there is no picture.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MOST = 10
 
 
 def seed_specs(study: Study, scene: str) -> dict[Variant, RunSpec]:
-    """A run of each variant of a scene, whose seeds are to be shown: that of the least repeat.
+    """A run of each variant of a scene whose seeds to show: the one with the lowest repeat.
 
     Args:
         study: The study.

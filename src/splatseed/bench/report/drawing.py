@@ -1,6 +1,6 @@
-"""What all figures share: sizes, panels, colours, legends, and their bytes.
+"""Shared by all figures: sizes, panels, colours, legends, and PNG bytes.
 
-Promise: the same data give the same bytes.
+Promise: equal data give equal bytes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ COLORS = {
     "stereo": "#1B7837",
     "auto": "#7B4FA3",
 }
-"""Colours that can be told apart without seeing red from green (Okabe and Ito)."""
+"""Colours that the colour-blind can tell apart (Okabe and Ito)."""
 OTHER = "#8C564B"
 MANY = 8
 """More curves than this in one picture cannot be told apart."""
@@ -49,7 +49,7 @@ def method_color(method: str) -> str:
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """An empty figure of so many inches."""
+    """An empty figure, its size in inches."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
     from matplotlib.figure import Figure  # noqa: PLC0415  (loads with its use)
 
@@ -59,7 +59,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def panels(count: int) -> tuple[Figure, list[Axes]]:
-    """A figure of so many panels, up to three a row."""
+    """A figure of ``count`` panels, up to three per row."""
     columns = min(count, 3)
     rows = -(-count // columns)
     figure = new_figure(max(3.6 * columns, 5.0), 2.9 * rows + 0.4)

@@ -39,14 +39,13 @@ __all__ = ["Plot", "curve_figure", "ratio_figure", "scene_figure", "shown_varian
            "strategy_figure"]  # fmt: skip
 
 MARKERS = {2.0: "v", 4.0: "s", 8.0: "o", 16.0: "^", 32.0: "D"}
-"""Marks by ratio; others have a cross."""
+"""Marks by ratio; other ratios have a cross."""
 LATE = 0.15
-"""Curves are shown from this share of the steps on: what is before is the same steep rise for
-all."""
+"""Curves are shown from this fraction of the steps on: before it, all rise equally steeply."""
 
 
 def shown_variants(variants: Sequence[Variant]) -> tuple[Variant, ...]:
-    """All variants, or where they are too many the highest ratio of each method and profile.
+    """All variants, or if they are too many the highest ratio of each method and profile.
 
     Args:
         variants: In order.
@@ -173,7 +172,7 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
 
 
 def _places(center: float, count: int) -> list[float]:
-    """So many places about a center, close enough to leave a gap to the next center's."""
+    """``count`` positions about a centre, close enough to leave a gap to the next centre's."""
     return [center + 0.8 * ((i + 0.5) / count - 0.5) for i in range(count)]
 
 
@@ -199,7 +198,7 @@ def _dot(
 
 
 def ratio_figure(study: Study) -> Plot | None:
-    """Mean gain over the ratio, a panel a strategy; None where there is but one ratio.
+    """Mean gain over the ratio, one panel per strategy; None if there is only one ratio.
 
     Args:
         study: The study.

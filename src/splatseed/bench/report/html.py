@@ -1,7 +1,7 @@
-"""The report's page: one file that needs no other, on a desk or on a phone, by day or by night.
+"""The report's page: one self-contained file, for desktop or phone, light or dark.
 
-Promise: every text is escaped; the page may load nothing from anywhere (its own policy forbids it),
-runs one script of a few lines, and without it still shows everything.
+Promise: every text is escaped; the page may load nothing (its own policy forbids it), runs one
+script of a few lines, and shows everything without it.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class Section:
     """A part of the page.
 
     Args:
-        key: What links to it are called.
+        key: The anchor that links point to.
         title: Its heading.
-        blocks: HTML, in order; a section without any is left out.
+        blocks: HTML, in order; a section without blocks is left out.
     """
 
     key: str
@@ -167,7 +167,7 @@ def folded(title: str, blocks: Sequence[str], *, is_open: bool) -> str:
 
 
 def slider(title: str, pictures: Mapping[str, bytes], shape: float) -> str:
-    """Pictures of one size laid over each other, with a slider between any two of them.
+    """Pictures of one size stacked on each other, with a slider between any two of them.
 
     Args:
         title: What they are of.

@@ -1,8 +1,8 @@
-"""What a report needs of the scenes themselves: descriptors, and pictures of the seeds.
+"""What a report needs from the scenes themselves: descriptors, and pictures of the seeds.
 
-Notation: what is kept lies in ``BENCH/descriptors.json`` and ``BENCH/figures``; ``clouds.json``
-there says which picture is of which seeds. Promise: a scene is opened only for what is not kept
-yet; one that is gone or has changed costs its pictures and not the report.
+Notation: cached results are in ``BENCH/descriptors.json`` and ``BENCH/figures``, whose
+``clouds.json`` says which seeds each picture shows. Promise: a scene is opened only for what is not
+cached; if it is gone or has changed, only its pictures are missing from the report.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ KEPT_DESCRIPTORS = "descriptors.json"
 
 @dataclass
 class Pictures:
-    """What was found out of a study's scenes.
+    """The pictures and descriptors of a study's scenes.
 
     Args:
         described: Descriptors by scene.
@@ -56,7 +56,7 @@ class Pictures:
 def scene_pictures(
     bench: Path, study: Study, *, from_scenes: bool = True, progress: Progress = silent
 ) -> Pictures:
-    """Descriptors and pictures of a study's scenes, kept ones or new.
+    """Descriptors and pictures of a study's scenes, cached or new.
 
     Args:
         bench: The benchmark's folder.

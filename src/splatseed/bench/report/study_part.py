@@ -1,6 +1,6 @@
-"""A study's part of the report: its tables, its figures, and where on the page they stand.
+"""A study's part of the report: its tables, its figures, and their place on the page.
 
-Promise: what stands on the page is what is written as a table or a figure, no more and no less.
+Promise: the page shows exactly the tables and figures that are written to files.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Test views: the photograph, what the baseline and the best variant make of it, and their errors.
+"""Test views: the photograph, renders of the baseline and the best variant, and their errors.
 
 Notation: runs keep a few test views as pictures, with photograph, render and error map in a row
-(see ``splatseed.splat.pictures``). Promise: both renders are of the same repeat; what is called
-best was chosen by mean gain on the scene, not by the view that is shown.
+(see ``splatseed.splat.pictures``). Promise: both renders are of the same repeat; the best variant
+is chosen by mean gain on the scene, not by the view that is shown.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from splatseed.train.settings import StrategyName
 __all__ = ["ComparedView", "compared_views", "jpeg"]
 
 VIEWS = 2
-"""Views shown of each scene and strategy; one where there are several strategies."""
+"""Views shown per scene and strategy; one if there are several strategies."""
 SIDE = 960
 QUALITY = 85
 
 
 class ComparedView(NamedTuple):
-    """A test view and what is made of it.
+    """A test view and its renders.
 
-    The pictures are JPEG by what they show, in an order in which neighbours are worth comparing.
+    Pictures are JPEG by name, ordered so that neighbours are worth comparing.
     """
 
     scene: str
@@ -123,7 +123,7 @@ def _apart(path: Path) -> list[UInt8[np.ndarray, "H W 3"]] | None:
 
 
 def jpeg(pixels: UInt8[np.ndarray, "H W 3"], side: int = SIDE) -> bytes:
-    """A picture as JPEG, made smaller where its longer side is over ``side``.
+    """A picture as JPEG, downsampled if its longer side exceeds ``side``.
 
     Args:
         pixels: The picture.

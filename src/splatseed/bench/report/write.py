@@ -1,9 +1,9 @@
 """The report of a benchmark: tables, figures, and a page that holds all of them.
 
 Notation: ``BENCH/report.html``, ``BENCH/tables/NAME.{csv,md,tex}``, ``BENCH/figures/NAME.png``.
-Promise: a report can be made at any time, of whatever is done by then, while runs go on; what is
-missing or has failed is listed; the page opens without a network; an earlier report is replaced as
-a whole.
+Promise: a report can be made at any time, from whatever is done so far, while runs continue; what
+is missing or has failed is listed; the page opens without a network; an earlier report is replaced
+as a whole.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ __all__ = ["REPORT", "Report", "write_report"]
 REPORT = "report.html"
 TABLES = "tables"
 KIND = "bench report"
-"""What the folders of tables and figures are marked as."""
+"""The kind recorded in the manifests of the folders of tables and figures."""
 PLAN = "plan.toml"
 CLOUD_SIDE = 1800
 
@@ -89,9 +89,8 @@ def write_report(bench: Path, *, from_scenes: bool = True, progress: Progress = 
 
     Args:
         bench: The folder.
-        from_scenes: Whether scenes may be opened, to describe them and to draw the seeds of each
-            method, which are made again for it; what an earlier report kept of that is used either
-            way.
+        from_scenes: Whether scenes may be opened to describe them and to recompute and draw each
+            method's seeds; results cached by an earlier report are used either way.
         progress: Told the stages.
 
     Raises:

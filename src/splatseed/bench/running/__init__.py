@@ -1,1 +1,1 @@
-"""While a benchmark runs: the ledger, the executors, one run from its seeds to what is kept."""
+"""While a benchmark runs: the ledger, the executors, and one run from its seeds to its result."""

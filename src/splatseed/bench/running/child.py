@@ -1,10 +1,10 @@
-"""A run in a process of its own, for an honest peak of memory and so that nothing can end the rest.
+"""A run in its own process, to measure its peak memory and so that its death ends nothing else.
 
 Notation: the process is started with the run as one line of JSON on its standard input, and answers
 with lines of JSON: ``{"stage": ..., "fraction": ...}`` on the way, ``{"status": ..., ...}`` at the
 end.
-Promise: it gets no Ctrl-C of the terminal's, but one SIGTERM from its parent when it shall stop; if
-its parent is gone, so is it.
+Promise: it does not receive the terminal's Ctrl-C, but one SIGTERM from its parent when it should
+stop; it ends with its parent.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ __all__ = ["Child", "Killed", "serve"]
 
 PROGRAM = "from splatseed.bench.running.child import serve; serve()"
 REPORT_SECONDS = 0.5
-"""Between two words on progress."""
+"""Seconds between progress messages."""
 LOG_WORDS = 40
-"""Of the last that a process said, how much is told."""
+"""Characters of the process's last output that are reported."""
 
 
 class Killed(Exception):  # noqa: N818  (it is what happened to it)
@@ -42,7 +42,7 @@ class Killed(Exception):  # noqa: N818  (it is what happened to it)
 
 @dataclass(frozen=True)
 class _Order:
-    """What the process is told."""
+    """The process's instructions."""
 
     spec: str
     work: str
@@ -58,7 +58,7 @@ class Child:
         work: The folder it works in.
         target: The folder for what is kept.
         options: What else to do.
-        environment: Variables that are set for it.
+        environment: Environment variables to set for it.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Child:
                 env=child_environment(environment),
                 text=True,
                 encoding="utf-8",
-                process_group=0,  # Ctrl-C comes to us alone
+                process_group=0,  # Ctrl-C reaches only us
             )
 
     def wait(self, progress: Progress) -> Outcome:
@@ -105,9 +105,9 @@ class Child:
                     outcome = _outcome(message)
                 else:
                     progress(message["stage"], message["fraction"])
-        except (BrokenPipeError, ValueError):  # it died before or while it spoke
+        except (BrokenPipeError, ValueError):  # it died before or during its message
             pass
-        except BaseException:  # we shall wait no longer
+        except BaseException:  # we stop waiting
             self.kill()
             raise
         finally:
@@ -129,9 +129,9 @@ class Child:
 
 
 def serve() -> None:
-    """Be the process: do the run that standard input names."""
+    """Be the process: execute the run given on standard input."""
     replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what libraries print belongs to the log
+    os.dup2(2, 1)  # what libraries print goes to the log
     order = _Order(**json.loads(sys.stdin.readline()))
     threading.Thread(target=_end_with_parent, daemon=True).start()
     outcome = run_job(
@@ -146,13 +146,13 @@ def serve() -> None:
 
 
 def _end_with_parent() -> None:
-    """The parent holds the other end of standard input, and says nothing more."""
+    """The parent holds the other end of standard input, and writes nothing more."""
     os.read(sys.stdin.fileno(), 1)  # not through the buffer, whose lock would be held at exit
     os._exit(1)
 
 
 def _reporter(replies: IO[str]) -> Progress:
-    """Progress that is passed on a few times a second."""
+    """Progress that is forwarded a few times per second."""
     last = ("", 0.0)
 
     def report(stage: str, fraction: float) -> None:
@@ -180,12 +180,12 @@ def _outcome(message: Mapping[str, Any]) -> Outcome:
 
 
 def _close(pipe: IO[str]) -> None:
-    with suppress(BrokenPipeError):  # what it was told last, it did not read
+    with suppress(BrokenPipeError):  # it did not read our last message
         pipe.close()
 
 
 def _cause(code: int, log: Path) -> str:
-    """How a process died, and the last it said."""
+    """How a process died, and its last output."""
     how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
     said = log.read_text("utf-8", "replace").split("\n")
     last = " ".join(" ".join(said).split()[-LOG_WORDS:]) if any(said) else ""

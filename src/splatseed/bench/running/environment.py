@@ -1,4 +1,4 @@
-"""What a benchmark was run with: machine, system, versions, and the words of the command."""
+"""The environment of a benchmark: machine, system, versions, and the command line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PACKAGES = ("splatseed", "torch", "gsplat", "torchmetrics", "numpy", "scipy", "n
 
 
 def describe_environment(words: Sequence[str]) -> dict[str, Any]:
-    """What is to be known of a call of the command, as plain values.
+    """The facts about a call of the command, as plain values.
 
     Args:
         words: What followed ``splatseed bench``.
@@ -37,7 +37,7 @@ def describe_environment(words: Sequence[str]) -> dict[str, Any]:
 
 
 def package_version(package: str) -> str:
-    """An installed package's version; empty for one that is not, or that is run from its source."""
+    """An installed package's version; empty if it is not installed or runs from its source."""
     try:
         return version(package)
     except PackageNotFoundError:

@@ -1,7 +1,7 @@
-"""What executors have in common: claiming runs, signs of life, and what comes of an outcome.
+"""Shared by executors: claiming runs, heartbeats, and handling outcomes.
 
-Promise: a run whose process is killed is tried once more, after all others, and then fails; an
-executor that stops hands every run back that is not done.
+Promise: a run whose process is killed is retried once, after all others, and then fails; an
+executor that stops hands back every run that is not done.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from splatseed.errors import OutputError
 __all__ = ["Executor"]
 
 TRIES = 2
-"""How often a run is begun whose process is killed, by one call of the command."""
+"""How often one call of the command starts a run whose process is killed."""
 
 
 class Executor:
@@ -53,7 +53,7 @@ class Executor:
         return spec
 
     def settle(self, spec: RunSpec, outcome: Outcome) -> None:
-        """Record what came of a run, and tell of it.
+        """Record the outcome of a run, and report it.
 
         Raises:
             OutputError: The ledger cannot be written.
@@ -69,7 +69,7 @@ class Executor:
             self.watcher.handed_back(spec, outcome.error or "stopped")
 
     def after_death(self, spec: RunSpec, how: str) -> Outcome:
-        """What comes of a run whose process died: memory may have been short for a while only."""
+        """The outcome of a run whose process died: memory may have been short only for a while."""
         if self.stopping.is_set():
             return Outcome("interrupted")
         self._deaths[spec.key] += 1
@@ -80,7 +80,7 @@ class Executor:
 
     @contextmanager
     def alive(self) -> Iterator[None]:
-        """Give signs of life while the block runs, so that no other process takes the runs."""
+        """Send heartbeats while the block runs, so that no other process takes the runs."""
         ended = threading.Event()
         pulse = threading.Thread(target=self._beat, args=(ended,), daemon=True)
         pulse.start()

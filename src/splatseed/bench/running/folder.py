@@ -1,4 +1,4 @@
-"""The folder of a benchmark: who may write there, and the made-up room in it.
+"""The folder of a benchmark: permission to write, and the synthetic room in it.
 
 Notation: ``BENCH`` holds ``ledger.sqlite``, ``plan.toml``, ``runs/`` with what is kept of each run,
 ``work/`` with runs that go on, and ``scenes/demo`` if a plan asks for it. Promise: a folder that is
@@ -28,7 +28,7 @@ DEMO_FACTS = SceneFacts(
     depth_digest="not made yet",
     long_side=400,
 )
-"""What is known of the made-up room before it is made; the number of points nearly."""
+"""Facts about the synthetic room before it is made; the number of points is approximate."""
 
 
 def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
@@ -40,7 +40,7 @@ def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
 
     Raises:
         OutputError: It is another's, or lies in a scene or around one.
-        SceneFormatError: Its ledger is none that this version knows.
+        SceneFormatError: Its ledger is not one that this version knows.
     """
     ledger = folder / LEDGER
     if ledger.is_file() and ledger.stat().st_size:  # else another process is about to write it
@@ -62,7 +62,7 @@ def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
 
 
 def make_bench_folder(folder: Path) -> None:
-    """Make the folder and mark it as a benchmark's, unless it is there.
+    """Make the folder and mark it as a benchmark's, unless it exists.
 
     Raises:
         OutputError: It cannot be written.
@@ -73,7 +73,7 @@ def make_bench_folder(folder: Path) -> None:
 
 
 def make_demo_scene(folder: Path) -> Path:
-    """The made-up room that ``splatseed demo`` makes, in a folder; made unless it is there.
+    """The synthetic room of ``splatseed demo``, in a folder; made unless it exists.
 
     Args:
         folder: Where to.

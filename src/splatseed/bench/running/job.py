@@ -1,8 +1,8 @@
 """One run of the benchmark, from its specification to its result.
 
-Promise: a run that was interrupted goes on from its checkpoint, if there is one, and else begins
-anew; a run on files other than those that were planned is an error; whatever goes wrong comes back
-as an ``Outcome`` and never as an exception, so that one bad run does not end the others.
+Promise: an interrupted run resumes from its checkpoint, if there is one, and else restarts; files
+that differ from the planned ones are an error; every failure is returned as an ``Outcome`` and
+never raised, so that one bad run does not end the others.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ COVISIBLE, DEPTHS = "covisible", "depths"
 
 @dataclass(frozen=True)
 class JobOptions:
-    """What is done beside what determines the result.
+    """Options that do not affect the result.
 
     Args:
         keep_models: Keep the trained Gaussians.
@@ -69,7 +69,7 @@ class Outcome:
     """How a run ended.
 
     Args:
-        status: Done; failed, for the reason in ``error``; or interrupted, to be taken up again.
+        status: Done; failed, for the reason in ``error``; or interrupted, to be resumed.
         result: What it gave, if it is done.
         error: One line, if it failed.
     """
@@ -86,10 +86,10 @@ def run_job(
     options: JobOptions | None = None,
     progress: Progress = silent,
 ) -> Outcome:
-    """Do a run, unless what is kept shows that it is done.
+    """Execute a run, unless the kept files show that it is done.
 
-    The first SIGINT or SIGTERM during training leaves a checkpoint; while results are written it is
-    not heeded, as that takes seconds.
+    The first SIGINT or SIGTERM during training leaves a checkpoint; while results are written,
+    which takes seconds, signals are ignored.
 
     Args:
         spec: The run.
@@ -116,7 +116,7 @@ def run_job(
 
 
 def _remove_leftovers(target: Path) -> None:
-    """Remove what an attempt left that was killed while it wrote; nobody else has this run now."""
+    """Remove what a killed attempt left behind; nobody else has this run now."""
     for partial in target.parent.glob(f".{target.name}.partial-*"):
         shutil.rmtree(partial, ignore_errors=True)
 
@@ -148,7 +148,7 @@ def _train(
 
 
 def _check_unchanged(scene: Scene, spec: RunSpec) -> None:
-    """Refuse a scene that is not as it was planned: changed since, or another on this node."""
+    """Refuse a scene that differs from the plan: changed since, or different on this node."""
     folder = scene.source.image_dir if scene.source else None
     same = folder is not None and scene_digest(scene, folder) == spec.scene_digest
     if same and spec.depth_digest and scene.depths is not None:
@@ -211,9 +211,9 @@ def _finish(
 
 
 def _covisible(spec: RunSpec, target: Path, views: Sequence[View], progress: Progress) -> Covisible:
-    """The pixels that two training views see: found once per scene, and kept beside the ledger.
+    """The pixels that two training views see: computed once per scene, stored beside the ledger.
 
-    The scene is opened anew for it, so that an arm's depth maps make no difference.
+    The scene is reopened for it, so that an arm's depth maps make no difference.
     """
     from splatseed.evaluate.covisible import (  # noqa: PLC0415  (PyTorch)
         find_covisible,
@@ -246,7 +246,7 @@ def _result(found: TrainingResult, run: TrainingRun, upsample_seconds: float) ->
 
 
 def _keep_error(target: Path, error: Exception) -> str:
-    """The error in one line; its traceback is kept if there is anywhere to keep it."""
+    """The error in one line; its traceback is stored if possible."""
     text = "".join(traceback.format_exception(error))
     try:
         write_kept(target, {ERROR: text.encode("utf-8", "backslashreplace")})

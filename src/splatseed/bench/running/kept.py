@@ -1,8 +1,8 @@
-"""What is kept of a run: numbers, the curve, a few pictures; and of a failed one, why.
+"""What is kept of a run: numbers, the curve, a few pictures; and for a failed one, the reason.
 
-Notation: ``BENCH/runs/KEY`` holds what is kept of the run KEY, ``BENCH/work/KEY`` what it works
-with while it goes on. Promise: the kept folder is there whole or not at all, and small: models are
-kept on request only.
+Notation: ``BENCH/runs/KEY`` holds what is kept of the run KEY, ``BENCH/work/KEY`` its working
+files. Promise: the kept folder appears whole or not at all, and is small: models are kept only on
+request.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def kept_files(work: Path, *, models: bool) -> dict[str, Path]:
 
 
 def write_kept(target: Path, files: Mapping[str, Path | bytes]) -> None:
-    """Make the folder of what is kept; what was kept of an earlier attempt is replaced.
+    """Make the folder of what is kept, replacing that of an earlier attempt.
 
     Args:
         target: The folder.

@@ -1,10 +1,10 @@
-"""The ledger: which runs there are, who has them, and what came of them, in one SQLite file.
+"""The ledger: all runs, who has them, and their results, in one SQLite file.
 
-Notation: a *worker* is a process that runs have been handed to; it gives a sign of life
-(*heartbeat*) every few seconds while it has any. Promise: a run is handed to one worker at a time,
-and is handed on only when its worker is gone; what is recorded as done stays so; whatever is killed
-at whatever moment, the file stays whole. SQLite's rollback journal is used, as its write-ahead log
-needs memory that the machines on a network file system do not share.
+Notation: a *worker* is a process that runs have been handed to; it sends a *heartbeat* every few
+seconds while it has any. Promise: a run is handed to one worker at a time, and to another only when
+its worker is gone; what is recorded as done stays so; whatever is killed at whatever moment, the
+file stays intact. SQLite's rollback journal is used, because its write-ahead log needs memory that
+machines on a network file system do not share.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ LEDGER = "ledger.sqlite"
 APPLICATION_ID = 0x73706C62
 """What SQLite's header says the file is: "splb"."""
 SCHEMA = 2
-"""To be raised when the tables change, or the fields of a run's specification or result; ledgers of
-earlier ones are read, and marked with this when they are written to."""
+"""Raise this when the tables change, or the fields of a run's specification or result; ledgers of
+earlier versions are read, and marked with this when they are written to."""
 BUSY_SECONDS = 60.0
 """How long to wait while another process writes."""
 
@@ -57,7 +57,7 @@ TABLES = (
 
 
 class Ledger:
-    """A ledger in a file; each call is one transaction, so that it can be used from any thread.
+    """A ledger in a file; each call is one transaction, so it can be used from any thread.
 
     Args:
         path: The file.
@@ -98,9 +98,9 @@ class Ledger:
         return ledger
 
     def add(self, specs: Iterable[RunSpec]) -> None:
-        """Enter runs that are not there yet, in the order in which they are to be run.
+        """Enter new runs, in the order in which they should be run.
 
-        Of those that are there, it is noted where their scenes lie now.
+        For known runs, the current paths of their scenes are updated.
 
         Raises:
             OutputError: The ledger cannot be written.
@@ -114,9 +114,9 @@ class Ledger:
             )
 
     def claim(self, worker: str, among: Collection[str] | None = None) -> RunSpec | None:
-        """Hand the next run that nobody has to a worker.
+        """Hand the next unclaimed run to a worker.
 
-        Runs that were begun less often come first, so that one which kills its worker comes last.
+        Runs that were started less often come first, so that one which kills its worker comes last.
 
         Args:
             worker: Who takes it, as ``worker_name`` says.
@@ -148,7 +148,7 @@ class Ledger:
         return None
 
     def heartbeat(self, worker: str) -> None:
-        """Give a worker's sign of life for all runs that it has.
+        """Record a worker's heartbeat for all of its runs.
 
         Raises:
             OutputError: The ledger cannot be written.
@@ -160,10 +160,10 @@ class Ledger:
             )
 
     def finish(self, key: str, result: RunResult) -> bool:
-        """Record what a run gave.
+        """Record the result of a run.
 
         Returns:
-            Whether it is recorded now; not, if the run was done already.
+            Whether it was recorded; not if the run was done already.
 
         Raises:
             OutputError: The ledger cannot be written.
@@ -177,7 +177,7 @@ class Ledger:
         return bool(changed.rowcount)
 
     def fail(self, key: str, worker: str, error: str) -> None:
-        """Record that a run which a worker has came to nothing.
+        """Record that a worker's run failed.
 
         Raises:
             OutputError: The ledger cannot be written.
@@ -185,7 +185,7 @@ class Ledger:
         self._end(key, worker, "failed", error)
 
     def release(self, key: str, worker: str) -> None:
-        """Hand a run back that a worker has, to be taken up again.
+        """Hand back a worker's run, to be resumed.
 
         Raises:
             OutputError: The ledger cannot be written.
@@ -236,7 +236,7 @@ class Ledger:
             ) from None
 
     def note_session(self, facts: Mapping[str, Any]) -> None:
-        """Keep what is to be known of a call of the command: its words, versions, machine.
+        """Record the facts about a call of the command: its words, versions, machine.
 
         Raises:
             OutputError: The ledger cannot be written.
@@ -246,7 +246,7 @@ class Ledger:
             db.execute("INSERT INTO sessions (started, facts) VALUES (?, ?)", values)
 
     def sessions(self) -> list[dict[str, Any]]:
-        """What ``note_session`` was told, oldest first, with ``started`` in seconds since 1970.
+        """The recorded calls, oldest first, with ``started`` in seconds since 1970.
 
         Raises:
             OutputError: The ledger cannot be read.
@@ -277,7 +277,7 @@ class Ledger:
             raise _foreign(self.path, str(error)) from error
 
     def _connect(self) -> sqlite3.Connection:
-        """A connection; one that may write where a killed writer's transaction must be undone."""
+        """A connection; one that may write if a killed writer's transaction must be undone."""
         journal = self.path.with_name(self.path.name + "-journal")
         undo = journal.is_file() and os.access(self.path, os.W_OK)
         mode = "rwc" if not self._read_only else "rw" if undo else "ro"

@@ -1,7 +1,7 @@
-"""The local executor: processes on this machine, some at a time.
+"""The local executor: processes on this machine, several at a time.
 
-Notation: a *slot* runs one process after the other; a machine's cores and GPUs are shared out among
-the slots. Promise: when the user stops, runs in training leave checkpoints; a second word stops at
+Notation: a *slot* runs one process after another; a machine's cores and GPUs are divided among the
+slots. Promise: when the user stops, runs in training leave checkpoints; a second signal stops at
 once.
 """
 
@@ -34,13 +34,13 @@ THREAD_VARIABLES = (
 
 
 class LocalExecutor(Executor):
-    """Runs what a ledger has to run, on this machine.
+    """Executes the runs of a ledger on this machine.
 
     Args:
         ledger: The ledger.
         bench: The benchmark's folder.
         environments: The variables of each slot's processes; one entry per slot.
-        options: What runs do beside.
+        options: Options of the runs.
         watcher: Told what happens.
     """
 
@@ -61,10 +61,10 @@ class LocalExecutor(Executor):
         self._errors: list[BaseException] = []
 
     def run(self, keys: Collection[str]) -> bool:
-        """Do those of the runs that nobody else has, until there are none or the user stops.
+        """Execute the given runs that nobody else has, until none are left or the user stops.
 
         Returns:
-            Whether it went to the end.
+            Whether it was completed.
 
         Raises:
             OutputError: The ledger or a folder cannot be written.
@@ -93,9 +93,9 @@ class LocalExecutor(Executor):
             time.sleep(POLL_SECONDS)
 
     def _stop(self) -> None:
-        """Ask all runs to stop, and begin no more."""
+        """Ask all runs to stop, and start no more."""
         with self._lock:
-            if self.stopping.is_set():  # a second word would stop them at once
+            if self.stopping.is_set():  # a second signal would stop them at once
                 return
             self.stopping.set()
             for child in self._children.values():
@@ -117,7 +117,7 @@ class LocalExecutor(Executor):
             self._stop()
 
     def _outcome(self, spec: RunSpec, environment: Mapping[str, str]) -> Outcome:
-        """What comes of a run in a process."""
+        """The outcome of a run in a process."""
         child = self._begin(spec, environment)
         if child is None:
             return Outcome("interrupted")
@@ -149,13 +149,13 @@ def cores() -> int:
 
 
 def slot_environment(threads: int, gpu: str = "") -> dict[str, str]:
-    """The variables by which a process knows its share of the machine.
+    """The variables that tell a process its share of the machine.
 
     Args:
         threads: Its threads.
         gpu: Its GPU, as ``CUDA_VISIBLE_DEVICES`` names it; empty to leave the choice to PyTorch.
     """
     environment = dict.fromkeys(THREAD_VARIABLES, str(threads))
-    # Idle threads of the one pool would take the cores from the other: see splatseed.cli.
+    # Idle threads of one pool would take the cores from the other: see splatseed.cli.
     environment["OMP_WAIT_POLICY"] = os.environ.get("OMP_WAIT_POLICY", "passive")
     return {**environment, "CUDA_VISIBLE_DEVICES": gpu} if gpu else environment

@@ -1,8 +1,8 @@
-"""Seeds that were made once for several runs: those of methods that look at photographs.
+"""Seeds that are made once for several runs: those of methods that use photographs.
 
 Budgets and strategies thin the same points, which took a minute or more to make. Notation:
-``BENCH/seeds/PRINT.npz`` holds points before they are thinned, and the seconds that they took.
-Promise: what is read is bit for bit what was written; a file that cannot be read counts for none.
+``BENCH/seeds/PRINT.npz`` holds points before thinning, and the seconds they took.
+Promise: points are read back bit for bit; an unreadable file is ignored.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ SEEDS = "seeds"
 
 
 def made_file(bench: Path, spec: RunSpec) -> Path:
-    """Where the points that a run's method makes are kept, before they are thinned.
+    """The file for the points that a run's method makes, before thinning.
 
     Args:
         bench: The benchmark's folder.
@@ -38,7 +38,7 @@ def made_file(bench: Path, spec: RunSpec) -> Path:
 
 
 def write_made(path: Path, cloud: PointCloud, seconds: float) -> None:
-    """Keep points and the seconds that they took.
+    """Store points and the seconds they took.
 
     Raises:
         OutputError: The file cannot be written.
@@ -51,7 +51,7 @@ def write_made(path: Path, cloud: PointCloud, seconds: float) -> None:
 
 
 def read_made(path: Path) -> tuple[PointCloud, float] | None:
-    """What ``write_made`` kept; None where there is nothing that can be read."""
+    """The points that ``write_made`` stored; None if nothing can be read."""
     try:
         with np.load(path, allow_pickle=False) as kept:
             arrays = {name: kept[name] for name in kept.files}

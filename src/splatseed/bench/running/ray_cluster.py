@@ -3,7 +3,7 @@
 Notation: the *driver* is the process that the user started; it alone writes the ledger and the
 folder of the benchmark. Promise: a run works in a temporary folder of its node and comes back as
 bytes, so that nodes need not share a disk with the driver; its scene must be at the same path on
-every node, and with the same content, which is checked. A run whose node is lost is begun again on
+every node, with the same content, which is checked. A run whose node is lost is restarted on
 another.
 """
 
@@ -37,17 +37,17 @@ from splatseed.requirements import require
 __all__ = ["Cluster", "RayExecutor", "Share", "ray_cluster", "run_on_node"]
 
 LOSSES = 3
-"""How often a run is begun anew whose node or worker was lost."""
+"""How often a run is restarted whose node or worker was lost."""
 POLL_SECONDS = 0.5
 GRACE_SECONDS = 10.0
-"""For tasks to end that are cancelled."""
+"""Seconds for cancelled tasks to end."""
 MOST_THREADS = 8
-"""Of a run, if the user does not say: with more, they wait for each other."""
+"""Default threads of a run: with more, they wait for each other."""
 
 
 @dataclass(frozen=True)
 class Share:
-    """What each run gets of a node.
+    """The resources of each run on a node.
 
     Args:
         threads: CPUs.
@@ -59,7 +59,7 @@ class Share:
 
 
 class Cluster:
-    """What the cluster that this process is connected to has, as of now."""
+    """The current resources of the cluster that this process is connected to."""
 
     @property
     def has_gpus(self) -> bool:
@@ -67,14 +67,14 @@ class Cluster:
         return any(gpus >= 1 for _, gpus in self._nodes())
 
     def share(self, threads: int | None, *, gpu: bool) -> Share:
-        """What each run gets, such that any node with CPUs (and GPUs) can do one.
+        """The resources of each run, such that every node with CPUs (and GPUs) can execute one.
 
         Args:
             threads: CPUs, if the user says so.
             gpu: Whether runs need a GPU.
 
         Raises:
-            ParameterError: No node has so much.
+            ParameterError: No node has enough.
         """
         nodes = [(cpus, gpus) for cpus, gpus in self._nodes() if cpus >= 1 and gpus >= gpu]
         fitting = min((int(cpus // max(gpus, 1)) for cpus, gpus in nodes), default=1)
@@ -105,18 +105,18 @@ class Cluster:
 
 @contextmanager
 def ray_cluster(address: str | None) -> Iterator[Cluster]:
-    """Be connected to a cluster while the block runs.
+    """Connect to a cluster while the block runs.
 
     Args:
-        address: Of the cluster, or "auto" on one of its nodes; None for one of this machine alone,
-            which is started for the purpose.
+        address: The cluster's address, or "auto" on one of its nodes; None to start one on this
+            machine.
 
     Raises:
         MissingDependencyError: Ray is absent.
         ParameterError: There is no such cluster, or it runs another version of Ray or Python.
     """
     require("ray")
-    # Ray tells its makers of each start otherwise; clusters that others started are theirs to set.
+    # Otherwise Ray reports usage on each start; clusters that others started keep their settings.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     import ray  # noqa: PLC0415  (an extra, and slow to import)
 
@@ -142,7 +142,7 @@ def ray_cluster(address: str | None) -> Iterator[Cluster]:
 
 @dataclass(frozen=True)
 class _Returned:
-    """What comes back from a node.
+    """What a node returns.
 
     Args:
         outcome: How the run ended.
@@ -156,15 +156,15 @@ class _Returned:
 
 
 class RayExecutor(Executor):
-    """Runs what a ledger has to run, on the cluster that this process is connected to.
+    """Executes the runs of a ledger on the cluster that this process is connected to.
 
     Args:
         ledger: The ledger.
         bench: The benchmark's folder.
-        share: What each run gets.
-        jobs: Most runs at a time; what fits, when left out.
-        options: What runs do beside.
-        watcher: Told what happens; not of how far a run is.
+        share: The resources of each run.
+        jobs: Most runs at a time; as many as fit, when left out.
+        options: Options of the runs.
+        watcher: Told what happens, except the progress of a run.
     """
 
     def __init__(
@@ -185,12 +185,12 @@ class RayExecutor(Executor):
         self._cluster = Cluster()
 
     def run(self, keys: Collection[str]) -> bool:
-        """Do those of the runs that nobody else has, until there are none or the user stops.
+        """Execute the given runs that nobody else has, until none are left or the user stops.
 
-        Runs that are stopped leave no checkpoint, as their folders are their nodes'.
+        Stopped runs leave no checkpoint, because their folders belong to their nodes.
 
         Returns:
-            Whether it went to the end.
+            Whether it was completed.
 
         Raises:
             OutputError: The ledger cannot be written.
@@ -217,7 +217,7 @@ class RayExecutor(Executor):
         return False
 
     def _fill(self, task: Any, flying: dict[Any, RunSpec], keys: Collection[str]) -> None:
-        """Begin as many runs as fit now; nodes may have come or gone."""
+        """Start as many runs as fit now; nodes may have come or gone."""
         most = self._jobs or max(self._cluster.capacity(self._share), 1)
         while len(flying) < most and (spec := self.claim(keys)) is not None:
             kept = read_result(kept_folder(self._bench, spec.key), spec.key)
@@ -228,7 +228,7 @@ class RayExecutor(Executor):
             flying[task.remote(*order)] = spec
 
     def _outcome(self, spec: RunSpec, reference: Any) -> Outcome:
-        """What came of a task; its files are written here."""
+        """The outcome of a task; its files are written here."""
         import ray  # noqa: PLC0415  (an extra, and slow to import)
 
         try:
@@ -251,13 +251,13 @@ class RayExecutor(Executor):
         return outcome
 
     def _cancel(self, flying: Mapping[Any, RunSpec]) -> None:
-        """Stop what is going on, and hand it back."""
+        """Cancel the running tasks, and hand their runs back."""
         import ray  # noqa: PLC0415  (an extra, and slow to import)
 
         if not flying:
             return
-        self.watcher.stopping("runs on the cluster begin anew next time")
-        for force in (False, True):  # a task that is asked first removes its temporary folder
+        self.watcher.stopping("runs on the cluster restart next time")
+        for force in (False, True):  # asked first, a task removes its temporary folder
             for reference in flying:
                 with suppress(ray.exceptions.RayError):
                     ray.cancel(reference, force=force)
@@ -267,11 +267,11 @@ class RayExecutor(Executor):
 
 
 def run_on_node(spec_json: str, options: Mapping[str, Any], threads: int) -> _Returned:
-    """Do a run on this node, in a process of its own, and return what is kept of it.
+    """Execute a run on this node, in its own process, and return what is kept of it.
 
     Args:
         spec_json: The run, as JSON.
-        options: What it does beside.
+        options: Its options.
         threads: Its threads.
     """
     spec = RunSpec.from_json(spec_json)
@@ -290,7 +290,7 @@ def run_on_node(spec_json: str, options: Mapping[str, Any], threads: int) -> _Re
 
 
 def _check_node(spec: RunSpec) -> None:
-    """Hold the node to what a run needs of it."""
+    """Check that the node meets a run's requirements."""
     host = socket.gethostname()
     here = package_version("splatseed")
     if here != spec.version:
@@ -308,7 +308,7 @@ def _check_node(spec: RunSpec) -> None:
 
 
 def _files(target: Path) -> dict[str, bytes]:
-    """The files of a folder but for its manifest, which is written anew."""
+    """The files of a folder except its manifest, which is written anew."""
     paths: Sequence[Path] = [path for path in target.rglob("*") if path.is_file()]
     found = {path.relative_to(target).as_posix(): path.read_bytes() for path in paths}
     return {name: content for name, content in found.items() if name != MANIFEST}

@@ -1,8 +1,8 @@
-"""The seeds of a run: what its method makes of its scene, and how long that takes.
+"""The seeds of a run: its method's points on its scene, and how long that takes.
 
 Promise: seeds are the points that ``splatseed upsample`` would write for the same scene, method,
-ratio, budget and seed: finite, and no two at one place. The time is that of upsampling and thinning
-alone, without the compilation of kernels, which happens once on a machine.
+ratio, budget and seed: finite and distinct. The time is that of upsampling and thinning, without
+the compilation of kernels, which happens once per machine.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from splatseed.upsample import Upsampler, chooses_number, configure
 __all__ = ["is_full", "make_seeds", "scene_of"]
 
 PLAIN = "linear"
-"""Any method does where no point is to be made."""
+"""The method used if no points are to be made; any would do."""
 
 
 def scene_of(spec: RunSpec) -> Scene:
@@ -46,13 +46,13 @@ def scene_of(spec: RunSpec) -> Scene:
 def make_seeds(
     scene: Scene, spec: RunSpec, progress: Progress = silent, bench: Path | None = None
 ) -> tuple[PointCloud, float]:
-    """The points that a run trains from, and the seconds that making new ones took.
+    """The points that a run trains from, and the seconds that new ones took.
 
     Args:
-        scene: As ``scene_of`` opens it.
+        scene: The scene as opened by ``scene_of``.
         spec: The run.
         progress: Told the stages of upsampling.
-        bench: The benchmark's folder, where points that several runs thin are kept; made anew
+        bench: The benchmark's folder, where points that several runs thin are stored; recomputed
             when left out. Their seconds count in each of these runs.
 
     Raises:
@@ -82,7 +82,7 @@ def is_full(scene: Scene, spec: RunSpec) -> bool:
 def _thinned(
     scene: Scene, method: Upsampler, spec: RunSpec, bench: Path, progress: Progress
 ) -> tuple[PointCloud, float]:
-    """The points that a method makes, new or kept, within the budget."""
+    """The points that a method makes, new or stored, within the budget."""
     kept = made_file(bench, spec)
     made = read_made(kept)
     with _compilation() as compiling:
@@ -105,9 +105,9 @@ def _num_original(scene: Scene) -> int:
 
 
 def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
-    """The method of a run, and how many points it is to make.
+    """The method of a run, and how many points it should make.
 
-    Under a budget, a method without a ratio fills what the originals leave of it.
+    Under a budget, a method without a ratio fills the room that the originals leave.
     """
     arm, most = spec.arm, spec.most_seeds
     if arm.method == SFM:
@@ -122,7 +122,7 @@ def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
 
 @contextmanager
 def _compilation() -> Iterator[list[float]]:
-    """A list that gets the seconds of each of Numba's compilations while the block runs."""
+    """A list that receives the seconds of each of Numba's compilations while the block runs."""
     spans: list[float] = []
     running: list[float] = []
 

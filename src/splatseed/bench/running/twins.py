@@ -1,10 +1,10 @@
-"""Runs that begin with the same seeds: the training of one is that of the other.
+"""Runs that begin with the same seeds: the training of one serves the other.
 
-Where a budget leaves no room for new points, every method comes down to the same thinned originals;
-on the CPU the same seeds and settings give the same bytes. Notation: ``BENCH/twins/PRINT`` names
-the run that was trained from the seeds and settings of that fingerprint. Promise: training is taken
-over from a run that is kept whole, and the result says from which; on a GPU, where bytes differ,
-never.
+If a budget leaves no room for new points, every method ends up with the same thinned originals; on
+the CPU the same seeds and settings give the same bytes. Notation: ``BENCH/twins/PRINT`` names the
+run that was trained from the seeds and settings of that fingerprint. Promise: training is reused
+only from a run whose files are complete, and the result says from which; never on a GPU, where
+bytes differ.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ TWINS = "twins"
 
 
 def fingerprint(spec: RunSpec, seeds: PointCloud) -> str:
-    """What a run's training depends on: 32 hexadecimal digits, or empty where bytes may differ.
+    """The fingerprint of a run's training: 32 hexadecimal digits, or empty if bytes may differ.
 
     Args:
         spec: The run.
-        seeds: What it begins with.
+        seeds: The points it begins with.
     """
     if spec.training.backend != "cpu":
         return ""
@@ -45,12 +45,12 @@ def fingerprint(spec: RunSpec, seeds: PointCloud) -> str:
 def find_twin(
     target: Path, mark: str, seconds: float, *, models: bool, lpips: bool
 ) -> tuple[RunResult, Mapping[str, bytes]] | None:
-    """The result and the kept files of a run with the same training; None where there is none.
+    """The result and files of a run with the same training; None if there is none.
 
     Args:
         target: The folder for what is kept of the run at hand.
         mark: Its ``fingerprint``.
-        seconds: What making its seeds took.
+        seconds: Seconds that making its seeds took.
         models: Whether the trained Gaussians must be among the files.
         lpips: Whether LPIPS must have been measured.
     """
@@ -72,7 +72,7 @@ def find_twin(
 
 
 def note_training(target: Path, mark: str) -> None:
-    """Remember whose training this was, for runs to come.
+    """Record whose training this was, for future runs.
 
     Raises:
         OutputError: It cannot be written.

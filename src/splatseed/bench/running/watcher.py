@@ -1,4 +1,4 @@
-"""Watcher: who is told what happens while a benchmark runs. This one listens to nothing."""
+"""Watcher: told what happens while a benchmark runs. This one ignores everything."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ __all__ = ["Watcher"]
 
 
 class Watcher:
-    """Told of runs by their executor; may be called from several threads at once."""
+    """Told about runs by their executor; may be called from several threads at once."""
 
     def begun(self, spec: RunSpec) -> None:
-        """A run has been begun."""
+        """A run has started."""
 
     def progress(self, spec: RunSpec, stage: str, fraction: float) -> None:
-        """So much of a stage of a run is done, 0 to 1."""
+        """A fraction, 0 to 1, of a stage of a run is done."""
 
     def done(self, spec: RunSpec, result: RunResult) -> None:
         """A run is done and recorded."""
@@ -23,7 +23,7 @@ class Watcher:
         """A run has failed."""
 
     def handed_back(self, spec: RunSpec, reason: str) -> None:
-        """A run has been stopped, and will be taken up again."""
+        """A run has been stopped, and will be resumed."""
 
     def stopping(self, words: str) -> None:
-        """The user asked to stop; the words say what becomes of the runs."""
+        """The user asked to stop; the words say what happens to the runs."""

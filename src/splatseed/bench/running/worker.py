@@ -1,9 +1,8 @@
-"""Workers: processes that have runs, and whether they are still there.
+"""Workers: processes that have runs, and whether they are still alive.
 
-Notation: a worker is named ``HOST:PID@SPACE``, where SPACE tells apart sets of process numbers:
-those of another boot, or of another container on the same host. Promise: a worker is held to be
-gone only if its process number is free where it ran, or if it gave no sign of life for
-``STALE_SECONDS``.
+Notation: a worker is named ``HOST:PID@SPACE``, where SPACE distinguishes sets of process numbers:
+those of another boot, or of another container on the same host. Promise: a worker counts as gone
+only if its process number is free where it ran, or if it sent no heartbeat for ``STALE_SECONDS``.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ __all__ = ["HEARTBEAT_SECONDS", "STALE_SECONDS", "is_gone", "worker_name"]
 
 HEARTBEAT_SECONDS = 10.0
 STALE_SECONDS = 180.0
-"""Many heartbeats: clocks of two machines differ, and a busy disk makes a heartbeat late."""
+"""Many heartbeats: clocks of two machines differ, and a busy disk delays heartbeats."""
 
 
 def worker_name() -> str:
@@ -26,11 +25,11 @@ def worker_name() -> str:
 
 
 def is_gone(worker: str, heartbeat: float | None, now: float) -> bool:
-    """Whether a worker is no longer there.
+    """Whether a worker is gone.
 
     Args:
-        worker: As ``worker_name`` said there.
-        heartbeat: Its last sign of life, seconds since 1970.
+        worker: Its name, as ``worker_name`` gave it.
+        heartbeat: Its last heartbeat, seconds since 1970.
         now: The time, likewise.
     """
     if heartbeat is None or now - heartbeat > STALE_SECONDS:
@@ -56,10 +55,7 @@ def _exists(process: int) -> bool:
 
 @cache
 def _space() -> str:
-    """Which set of process numbers this process's is one of.
-
-    Empty where the system does not tell.
-    """
+    """The set of process numbers that this one belongs to; empty if the system does not tell."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text("ascii")[:8]
         return f"{boot}-{Path('/proc/self/ns/pid').stat().st_ino}"

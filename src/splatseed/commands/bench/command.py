@@ -34,7 +34,7 @@ REPORTING = {"report": "run_report", "compare": "run_compare"}
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     if arguments and arguments[0] in REPORTING:
         reporting = import_module("splatseed.commands.bench.report")
         getattr(reporting, REPORTING[arguments[0]])(arguments[1:])
@@ -64,7 +64,7 @@ def _run(options: Options, asked: Asked, bench: Path, arguments: Sequence[str]) 
 
 
 def _check_fits(prepared: Prepared, machine: Machine) -> None:
-    """Refuse a plan with a run that the memory cannot hold, rather than have it killed."""
+    """Refuse a plan with a run that does not fit into memory, rather than have it killed."""
     estimator = Estimator(prepared.scenes, [], machine.threads)
     check_machine(machine, max(map(estimator.seeds, prepared.runs), default=0))
 
@@ -72,7 +72,7 @@ def _check_fits(prepared: Prepared, machine: Machine) -> None:
 def _run_all(
     bench: Path, prepared: Prepared, machine: Machine, ledger: Ledger, options: JobOptions
 ) -> bool:
-    """Do what is to be done; whether it went to the end."""
+    """Run everything that is left; returns whether it was completed."""
     rows = _rows(ledger, prepared)
     to_do = [row.spec for row in rows if row.status in {"pending", "running"}]
     estimator = Estimator(prepared.scenes, rows, machine.threads)
@@ -85,14 +85,14 @@ def _run_all(
 
 
 def _folders(plan: Plan) -> list[Path]:
-    """What is read, which the benchmark must lie apart from."""
+    """The folders that are read, which the benchmark must lie apart from."""
     return [Path(scene.path) for scene in plan.scenes if not scene.is_demo]
 
 
 def _job_options(plan: Plan) -> JobOptions:
-    """What runs do beside: LPIPS wherever its weights are found.
+    """Options of all runs: LPIPS is measured wherever its weights are available.
 
-    Where it is asked for, weights are missed now rather than in every run.
+    If LPIPS is requested, missing weights are reported now rather than in every run.
     """
     from splatseed.evaluate import load_lpips  # noqa: PLC0415  (PyTorch)
 
@@ -130,7 +130,7 @@ def _announce(
     rows: Sequence[RunRow],
     estimator: Estimator,
 ) -> None:
-    """Say what will be done, before it is done."""
+    """Print what will be done."""
     for note in prepared.notes:
         print_note(note)
     scenes = ", ".join(
@@ -142,7 +142,7 @@ def _announce(
 
 
 def _counts(rows: Sequence[RunRow]) -> str:
-    """How many runs there are, and how many of them are done."""
+    """The number of runs, and how many of them are done."""
     done, failed = (sum(row.status == status for row in rows) for status in ("done", "failed"))
     ended = f" ({done} done, {failed} failed, {len(rows) - done - failed} to do)"
     return f"{len(rows)} runs{ended if done or failed else ''}"
@@ -151,7 +151,7 @@ def _counts(rows: Sequence[RunRow]) -> str:
 def _estimates(
     plan: Plan, rows: Sequence[RunRow], machine: Machine, estimator: Estimator
 ) -> list[str]:
-    """Hours and disk for what is left, as sentences."""
+    """Hours and disk for the remaining runs, as sentences."""
     left = [row.spec for row in rows if row.status in {"pending", "running"}]
     if not left:
         return []
@@ -172,7 +172,7 @@ def _size(count: float) -> str:
 
 
 def _dry_run(options: Options, asked: Asked) -> None:
-    """Print the plan as TOML, and the rest as comments in it, so that all can be kept as one."""
+    """Print the plan as TOML, with everything else in comments, so that all can be saved as one."""
     with (
         open_machine(options, asked.plan.training.backend) as machine,
         stage_display() as clock,
@@ -194,7 +194,7 @@ def _dry_run(options: Options, asked: Asked) -> None:
 
 
 def _rows_if_there(options: Options, prepared: Prepared) -> list[RunRow]:
-    """The plan's runs, with what the ledger of the folder knows of them if there is one."""
+    """The plan's runs, with their status if the folder has a ledger."""
     known: dict[str, RunRow] = {}
     if options.output is not None and (options.output / LEDGER).is_file():
         ledger = Ledger.open(options.output / LEDGER, read_only=True)

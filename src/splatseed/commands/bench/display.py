@@ -1,4 +1,4 @@
-"""The display of a benchmark that runs: bars on stderr, one line per finished run on stdout."""
+"""The display of a running benchmark: bars on stderr, one line per finished run on stdout."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ MINUTE = 60.0
 
 
 class RunDisplay(Watcher):
-    """Shows how far a benchmark is; what it is told comes from several threads.
+    """Shows the progress of a benchmark; its methods are called from several threads.
 
     Args:
-        seconds: What each run that is to be done is expected to take, by its key.
-        done: How many runs of the benchmark are done already.
-        jobs: How many run at a time.
-        bar: Where to draw; None where there is no terminal.
+        seconds: Expected seconds of each remaining run, by its key.
+        done: Number of runs done already.
+        jobs: Number of runs at a time.
+        bar: Where to draw; None without a terminal.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class RunDisplay(Watcher):
             self._draw()
 
     def done(self, spec: RunSpec, result: RunResult) -> None:
-        """Say what a run gave."""
+        """Report the result of a run."""
         with self._lock:
             seconds = self._end(spec)
             expected, actual = self._pace
@@ -75,7 +75,7 @@ class RunDisplay(Watcher):
             )
 
     def failed(self, spec: RunSpec, error: str) -> None:
-        """Say why a run failed."""
+        """Report why a run failed."""
         with self._lock:
             self._end(spec)
             self._failed += 1
@@ -83,18 +83,18 @@ class RunDisplay(Watcher):
             self._say(f"{describe(spec)} failed: {error}")
 
     def handed_back(self, spec: RunSpec, reason: str) -> None:
-        """Say why a run is not done."""
+        """Report why a run is not done."""
         with self._lock:
             self._end(spec)
             self._ended -= 1
             self._say(f"{describe(spec)}: {reason}; to be taken up again", count=False)
 
     def stopping(self, words: str) -> None:
-        """Say what the user waits for."""
+        """Report what the user is waiting for."""
         ERR.print(f"stopping: {words}")
 
     def _end(self, spec: RunSpec) -> float:
-        """Take a run off the display; returns the seconds it took."""
+        """Remove a run from the display; returns the seconds it took."""
         self._ended += 1
         self._parts.pop(spec.key, None)
         task = self._tasks.pop(spec.key, None)
@@ -118,7 +118,7 @@ class RunDisplay(Watcher):
         self._bar.update(self._whole, completed=self._ended, description=label)
 
     def seconds_left(self) -> float:
-        """An estimate, made better by what runs have taken so far."""
+        """An estimate, refined by the time that runs have taken so far."""
         expected, actual = self._pace
         left = sum(self._expected.values())
         left -= sum(part * self._expected.get(key, 0.0) for key, part in self._parts.items())
@@ -130,9 +130,9 @@ def run_display(seconds: Mapping[str, float], done: int, jobs: int) -> Iterator[
     """A display while the block runs; bars only where stderr is a terminal.
 
     Args:
-        seconds: What each run that is to be done is expected to take, by its key.
-        done: How many runs of the benchmark are done already.
-        jobs: How many run at a time.
+        seconds: Expected seconds of each remaining run, by its key.
+        done: Number of runs done already.
+        jobs: Number of runs at a time.
     """
     if not ERR.is_terminal:
         yield RunDisplay(seconds, done, jobs)
@@ -152,7 +152,7 @@ def describe(spec: RunSpec) -> str:
 
 
 def spoken_time(seconds: float) -> str:
-    """A length of time in words, as roughly as an estimate deserves."""
+    """A duration in words, as roughly as an estimate deserves."""
     if seconds < 1.5 * MINUTE:
         return f"{seconds:.0f} s"
     if seconds < 90 * MINUTE:

@@ -29,14 +29,14 @@ Run: TypeAlias = Callable[[Ledger, Path, Collection[str], JobOptions, Watcher], 
 
 @dataclass(frozen=True)
 class Machine:
-    """Where runs go.
+    """Where runs are executed.
 
     Args:
-        name: What it is.
-        backend: What runs train on: not "auto".
-        jobs: How many at a time.
-        threads: Threads of each on the CPU.
-        run: Does those runs of a ledger that have one of these keys; whether it went to the end.
+        name: Its name.
+        backend: The backend of training: not "auto".
+        jobs: Number of runs at a time.
+        threads: Threads of each run on the CPU.
+        run: Executes the runs of a ledger with these keys; returns whether it was completed.
         is_local: Whether it is the machine that this process runs on.
     """
 
@@ -49,7 +49,7 @@ class Machine:
 
     @property
     def words(self) -> str:
-        """In words."""
+        """A description."""
         each = f"{self.threads} thread{'' if self.threads == 1 else 's'} each"
         on = "on a GPU" if self.backend == "cuda" else "on the CPU"
         return f"{self.name}, {self.jobs} at a time, {on}, {each}"
@@ -57,14 +57,14 @@ class Machine:
 
 @contextmanager
 def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
-    """What there is to run on, while the block runs.
+    """The machine to run on, while the block runs.
 
     Args:
-        options: What the user asks for.
-        backend: Of the plan.
+        options: The user's options.
+        backend: The plan's backend.
 
     Raises:
-        ParameterError: A GPU is asked for and there is none, or there is no such cluster.
+        ParameterError: A GPU is requested and there is none, or there is no such cluster.
         MissingDependencyError: PyTorch, gsplat or Ray is absent.
     """
     require("torch", "gsplat")
@@ -78,16 +78,16 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
 
 
 def check_machine(machine: Machine, seeds: int) -> None:
-    """Refuse runs that this machine's memory cannot hold.
+    """Refuse runs that do not fit into this machine's memory.
 
-    What nodes of a cluster hold is not known.
+    The memory of a cluster's nodes is unknown.
 
     Args:
-        machine: Where they shall run.
+        machine: Where they will run.
         seeds: Gaussians that the largest of them begins with.
 
     Raises:
-        ParameterError: So many at a time do not fit.
+        ParameterError: This many at a time do not fit.
     """
     if not machine.is_local or machine.backend != "cpu":
         return
@@ -137,7 +137,7 @@ def _gpus() -> list[str]:
 
 
 def _gpu_of(slot: int, gpus: Sequence[str]) -> str:
-    """The GPU of a slot; the choice is left to PyTorch where there is none."""
+    """The GPU of a slot; PyTorch chooses if there is none."""
     return gpus[slot % len(gpus)] if len(gpus) > 1 else ""
 
 

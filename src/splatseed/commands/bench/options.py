@@ -1,7 +1,7 @@
 """The options of ``splatseed bench``, and the plan that they make.
 
-Notation: an option that is not given leaves the plan as it is: that of a preset, of a file, of the
-folder to go on with, or the default one.
+Notation: an option that is not given leaves the plan unchanged: that of a preset, of a file, of the
+folder to resume, or the default one.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ DEFAULT = Plan()
 
 
 def _hint(default: str) -> Any:
-    """An option that is empty or None when it is not given, with what stands in for it."""
+    """An option that is empty or None when not given, with its default in words."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {default})")
 
 
@@ -50,7 +50,7 @@ def _listed(values: Sequence[object]) -> str:
 
 @dataclass(frozen=True)
 class PlanTraining(TrainSettings):
-    """What all runs of a plan share; the options --strategies and --repeats say the rest."""
+    """What all runs of a plan share; --strategies and --repeats determine the rest."""
 
     strategy: tyro.conf.Suppress[StrategyName] = "default"
     seed: tyro.conf.Suppress[int] = 0
@@ -70,48 +70,47 @@ class PlanTraining(TrainSettings):
 class Options:
     """Train from every method's seeds, several times each, on one machine or many, and compare.
 
-    Stop it when you like: the same command, or ``splatseed bench -o BENCH`` alone, goes on. Then
-    see ``splatseed bench report BENCH``, and ``splatseed bench compare A B`` for two benchmarks.
+    Stop it at any time: the same command, or ``splatseed bench -o BENCH`` alone, resumes. Then see
+    ``splatseed bench report BENCH``, and ``splatseed bench compare A B`` for two benchmarks.
     """
 
     output: Annotated[
         Path | None,
         tyro.conf.arg(aliases=["-o"], constructor=Path, metavar="DIR", help_behavior_hint=""),
     ] = None
-    """The folder of the benchmark, new or to go on with."""
+    """The folder of the benchmark, new or to be resumed."""
     scenes: Annotated[tuple[str, ...], _hint("the plan's")] = ()
-    """Scenes with photographs; demo: is a made-up room."""
+    """Scenes with photographs; demo: is a synthetic room."""
     methods: Annotated[tuple[str, ...], _hint(_listed(DEFAULT.methods))] = ()
-    """Methods of upsampling; sfm is the cloud as it is, with which the others are compared."""
+    """Upsampling methods; sfm is the original cloud, with which the others are compared."""
     ratios: Annotated[tuple[float, ...], _hint(_listed(DEFAULT.ratios))] = ()
     """Points in all, per original."""
     budgets: Annotated[tuple[str, ...], _hint("none")] = ()
     """Gaussians at the end, the same for every arm: numbers, or such as 0.25rho, per pixel of a
-    photograph at the size that is trained. Methods then fill the budget, unless --ratios are named
-    too."""
+    photograph at training size. Methods then fill the budget, unless --ratios are given too."""
     strategies: Annotated[tuple[StrategyName, ...], _hint(_listed(DEFAULT.strategies))] = ()
     """Densification strategies; -3dgs: in 3DGS's own conventions of rates and schedules."""
     profiles: Annotated[tuple[Profile, ...], _hint(_listed(DEFAULT.profiles))] = ()
-    """Improved parameters of the methods, and those of the paper's text."""
+    """Parameter sets of the methods: improved ones, and those of the paper's text."""
     repeats: Annotated[int | None, _one(int, f"{DEFAULT.repeats}")] = None
-    """How often, with another seed each time; error bars need at least 3."""
+    """Number of repeats, with another seed each time; error bars need at least 3."""
     training: Annotated[PlanTraining, tyro.conf.arg(name="")] = PlanTraining()
     """How each run is trained: its fields are options of their own."""
     long_side: Annotated[int | None, _one(int, "none")] = None
-    """Make photographs smaller by a whole factor, for each scene its own, until their longer side
-    has at most so many pixels; instead of --data-factor."""
+    """Downsample photographs by a whole factor, per scene, to at most this many pixels on their
+    longer side; instead of --data-factor."""
     depth: Annotated[tuple[Path, ...], _hint("the scene's")] = ()
     """For method depth: a folder of maps per scene, or one folder with a subfolder of each one's
     name."""
     preset: Annotated[PresetName | None, _hint("none")] = None
-    """A plan made before: the paper's data sets, laptop (four real scenes within an hour on two
-    cores), both with --data; or quick, on a made-up room."""
+    """A ready-made plan: the paper's data sets, laptop (four real scenes within an hour on two
+    cores), both with --data; or quick, on a synthetic room."""
     data: Annotated[Path | None, _one(Path, "none")] = None
     """The folder of a preset's scenes."""
     plan: Annotated[Path | None, _one(Path, "none")] = None
-    """A plan as --dry-run prints it; other options change it."""
+    """A plan as printed by --dry-run; other options change it."""
     dry_run: bool = False
-    """Print the plan, how many runs it is, and an estimate of hours and disk; run nothing."""
+    """Print the plan, the number of runs, and an estimate of hours and disk; run nothing."""
     executor: Literal["local", "ray"] = "local"
     """Processes on this machine, or tasks on a Ray cluster (extra cluster)."""
     jobs: Annotated[int | None, _one(int, "one per GPU, else 1; ray: what fits")] = None
@@ -121,12 +120,12 @@ class Options:
     address: Annotated[str | None, _one(str, "a cluster on this machine alone")] = None
     """The Ray cluster's, such as auto on its head node."""
     retry_failed: bool = False
-    """Run again what has failed."""
+    """Retry failed runs."""
     keep_models: bool = False
     """Keep trained models: some 236 bytes per Gaussian."""
     lpips: bool = False
-    """Refuse to run without LPIPS, which is measured wherever its weights are found (see splatseed
-    evaluate)."""
+    """Refuse to run without LPIPS, which is otherwise measured if its weights are available (see
+    splatseed evaluate)."""
 
 
 @dataclass(frozen=True)
@@ -135,8 +134,8 @@ class Asked:
 
     Args:
         plan: The plan.
-        missing: Scenes of a preset that are not there.
-        lenient: Whether a scene that is not fit to be run is passed over.
+        missing: Scenes of a preset that do not exist.
+        lenient: Whether unusable scenes are skipped.
     """
 
     plan: Plan
@@ -147,8 +146,8 @@ class Asked:
 def parse_plan(arguments: Sequence[str]) -> tuple[Options, Asked]:
     """The options of a command line, and the plan that they ask for.
 
-    The options are read twice: only the first reading says which plan there is to change, and only
-    with that plan's training as defaults does the second tell what the user wants otherwise.
+    The options are parsed twice: the first pass only determines which plan to change, and the
+    second, with that plan's training as defaults, what the user wants changed.
 
     Raises:
         ParameterError: Options contradict each other, or a value is out of its range.
@@ -223,7 +222,7 @@ def _changes(options: Options) -> dict[str, Any]:
 
 
 def _scenes(paths: Sequence[str]) -> tuple[PlannedScene, ...]:
-    """The scenes at some paths; folders of one name are told apart by those that they are in."""
+    """The scenes at some paths; folders of the same name are told apart by their parents."""
     scenes = [PlannedScene(path) for path in paths]
     count = Counter(scene.label for scene in scenes)
     return tuple(

@@ -1,4 +1,4 @@
-"""From a plan to its runs: looking at every scene before any is run."""
+"""From a plan to its runs: checking every scene before any is run."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Prepared:
     """A benchmark that can be run.
 
     Args:
-        plan: Its plan, with the scenes that are there.
-        scenes: What was found of them.
+        plan: Its plan, with the scenes that exist.
+        scenes: Facts about them.
         runs: Its runs, in order.
-        notes: What the user should know, one sentence each.
+        notes: Notes for the user, one sentence each.
     """
 
     plan: Plan
@@ -43,12 +43,12 @@ class Prepared:
 
 
 def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progress) -> Prepared:
-    """Look at all scenes of a plan, and list its runs.
+    """Check all scenes of a plan, and list its runs.
 
     Args:
-        asked: What the user asks for.
-        backend: Where runs are trained: not "auto".
-        made: Where a made-up scene is put; None to do with what is known of it, without making it.
+        asked: The user's request.
+        backend: The backend of training: not "auto".
+        made: Where to put a synthetic scene; None to use its known facts without making it.
         progress: Told how far this is.
 
     Raises:

@@ -1,4 +1,4 @@
-"""``splatseed bench report`` and ``splatseed bench compare``: what a benchmark has found."""
+"""``splatseed bench report`` and ``splatseed bench compare``: the results of a benchmark."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ __all__ = ["run_compare", "run_report"]
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Write report.html, tables and figures of a benchmark, as far as it has come."""
+    """Write report.html, tables and figures of a benchmark, as far as it has run."""
 
     bench: Annotated[Path, tyro.conf.Positional]
     """The folder of splatseed bench."""
     from_scenes: bool = True
-    """Open the scenes to describe them and to draw each method's points; else only what is kept."""
+    """Open the scenes to describe them and draw each method's points; else only cached results."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class CompareOptions:
 
 
 def run_report(arguments: list[str]) -> None:
-    """Do what the command line asks for.
+    """Run the verb with these arguments.
 
     Args:
         arguments: The words after ``splatseed bench report``.
@@ -91,7 +91,7 @@ def _print_report(bench: Path, report: Report) -> None:
 
 
 def run_compare(arguments: list[str]) -> None:
-    """Do what the command line asks for.
+    """Run the verb with these arguments.
 
     Args:
         arguments: The words after ``splatseed bench compare``.
@@ -130,7 +130,7 @@ def _print_table(table: Table) -> None:
 
 
 def _notes(found: Comparison, tables: Iterable[Table]) -> Iterable[str]:
-    """What else is to be known of the two."""
+    """Further notes on the two."""
     settings, changes, _ = tables
     if not settings.rows:
         yield "All settings are the same."

@@ -1,4 +1,4 @@
-"""What a benchmark says at its end: each arm so far, what failed, and what to run next."""
+"""The summary at the end of a benchmark: each arm so far, failures, and what to run next."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _arm_row(rows: Sequence[RunRow], baselines: dict[tuple[str, ...], float]) ->
 
 
 def _baselines(done: Sequence[RunRow]) -> dict[tuple[str, ...], float]:
-    """The PSNR of the original cloud, by what a run that is compared with it has in common."""
+    """The PSNR of the original cloud, by what paired runs have in common."""
     return {
         _pair(row): row.result.psnr for row in done if row.result and row.spec.arm.method == SFM
     }

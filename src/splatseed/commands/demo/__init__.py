@@ -1,4 +1,4 @@
-"""The verb ``demo``: the main job from end to end."""
+"""The verb ``demo``: the whole workflow, from capture to trained models."""
 
 from splatseed.commands.demo.command import Options, run
 

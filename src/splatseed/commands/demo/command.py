@@ -1,11 +1,10 @@
-"""``splatseed demo``: the main job from end to end, on a capture whose truth is known.
+"""``splatseed demo``: the whole workflow on a synthetic capture with known surfaces.
 
-It photographs a made-up room, finds points as Structure-from-Motion would, writes them as a COLMAP
-scene, reads that back, upsamples it and shows the result. Then it does so by every method, and
-measures how far the new points lie from the true surfaces and how well they cover them. Then, where
-PyTorch and gsplat are installed, it trains for a short while from the points as found and from the
-upsampled ones, and compares. What has to be compiled is compiled by a second process ahead of the
-first.
+It photographs a synthetic room, finds points as Structure-from-Motion would, writes them as a
+COLMAP scene, reads that back, upsamples it and shows the result. Then it does so by every method,
+and measures how far the new points lie from the true surfaces and how well they cover them. Then,
+if PyTorch and gsplat are installed, it trains briefly from the original points and from the
+upsampled ones, and compares. A second process compiles kernels ahead of the first.
 """
 
 from __future__ import annotations
@@ -46,13 +45,13 @@ class Options:
     ratio: float = 8.0
     """Points in all, as a multiple of the originals, for methods that interpolate."""
     views: int = 40
-    """Photographs of the made-up room."""
+    """Photographs of the synthetic room."""
     seed: int = 0
     """The same seed gives the same demo."""
     train_steps: int = 500
     """Training steps from each of two sets of seeds; 0 for no training."""
     training: Literal["now", "later", "only"] = "now"
-    """When to train: now, at the end; later, when PyTorch is being installed meanwhile; only, in a
+    """When to train: now, at the end; later, while PyTorch is being installed; only, in a
     demo folder that was made with later."""
     preview: bool = True
     """Write pictures."""
@@ -61,7 +60,7 @@ class Options:
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "demo", arguments)
     _check(options)
     with kernels_ahead(training=options.training != "only" and options.train_steps > 0) as ahead:
@@ -78,7 +77,7 @@ def run(arguments: list[str]) -> None:
 
 
 def _check(options: Options) -> None:
-    """Refuse what would fail after a minute's work."""
+    """Refuse early what would fail after a minute's work."""
     planned_size(1, options.ratio, None)
     if options.train_steps < 0:
         raise ParameterError(
@@ -91,7 +90,7 @@ def _check(options: Options) -> None:
 
 
 def _train(options: Options, ahead: KernelsAhead) -> bool:
-    """Train from both sets of seeds and compare, if what it takes is installed."""
+    """Train from both sets of seeds and compare, if the required packages are installed."""
     try:
         require("torch", "gsplat")
     except MissingDependencyError as error:
@@ -139,18 +138,18 @@ def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None
     print_pairs(
         "what this shows",
         [
-            ("fixed", "strategy grow, and the number of Gaussians that both end with"),
-            ("seconds", "of training, and of making the seeds; the last column is on the way,"),
-            ("", "before the mean that a run ends with"),
-            ("limits", "a made-up room, one run each, no error bars; in a long run growth makes"),
-            ("", "up for much of what seeds give"),
+            ("fixed", "the strategy, grow, and the final number of Gaussians"),
+            ("seconds", "of training and making the seeds; the last column is during training,"),
+            ("", "before the mean that a run ends with is taken"),
+            ("limits", "a synthetic room, one run each, no error bars; in long runs growth"),
+            ("", "makes up for much of what seeds give"),
             *pictures,
         ],
     )
 
 
 def _row(each: TrainedArm, least: float) -> tuple[str, ...]:
-    from splatseed.commands.demo.training import psnr_after, total_seconds  # noqa: PLC0415
+    from splatseed.commands.demo.training import psnr_after, total_seconds  # noqa: PLC0415  (loads with its use)
 
     scores, then = each.result.scores, psnr_after(least, each)
     return (

@@ -1,11 +1,11 @@
 """The demo's kernels, compiled by a second process while the first one makes photographs.
 
-Notation: a *part* is what is compiled at one go: what one method needs, or training. A part is
-*claimed* by the process that makes the file of its name, and only one can; ``PART.done`` says that
-it is compiled. The second process compiles by doing what the demo does, with a capture that is
-small; the first finds the machine code in Numba's cache. Promise: no part is compiled twice, nobody
-waits for a process that has ended, and results do not depend on it. It starts with the first
-compilation, so not where all is compiled.
+Notation: a *part* is compiled in one go: what one method needs, or what training needs. A part is
+*claimed* by the process that creates the file of its name, and only one can; ``PART.done`` says
+that it is compiled. The second process compiles by running the demo on a small capture; the first
+finds the machine code in Numba's cache. Promise: no part is compiled twice, nobody waits for a
+process that has ended, and results do not depend on it. It starts at the first compilation, so it
+does not start if everything is compiled already.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ __all__ = ["TRAINING", "KernelsAhead", "compile_parts", "kernels_ahead", "wait"]
 
 TRAINING = "training"
 PARTS = (SHOWN, "voronoi", "spline")
-"""What the second process compiles, in this order, and training as soon as it can after the first
-of them."""
+"""What the second process compiles, in this order; training as early as possible after the
+first."""
 SIZE = {"num_views": 8, "width": 96, "height": 72}
 POLL = 0.05
-"""Seconds between looks at what the other process has done."""
+"""Seconds between checks of the other process's progress."""
 PROGRAM = (
     "from splatseed.commands.demo.kernels import compile_parts as c; import sys; c(*sys.argv[1:])"
 )
@@ -44,7 +44,7 @@ def kernels_ahead(*, training: bool) -> Iterator[KernelsAhead]:
     """Have another process compile while the block runs, from the first compilation on.
 
     Args:
-        training: Whether it compiles what training needs, too, once PyTorch is installed.
+        training: Whether it also compiles what training needs, once PyTorch is installed.
     """
     with tempfile.TemporaryDirectory(prefix="splatseed-", ignore_cleanup_errors=True) as folder:
         ahead = KernelsAhead(Path(folder), (SHOWN, TRAINING, *PARTS[1:]) if training else PARTS)
@@ -59,8 +59,8 @@ class KernelsAhead:
     """The second process, as the first sees it.
 
     Args:
-        folder: Where both say what they compile.
-        parts: What it is to compile.
+        folder: Where both record what they compile.
+        parts: What it compiles.
     """
 
     def __init__(self, folder: Path, parts: Sequence[str]) -> None:
@@ -80,32 +80,32 @@ class KernelsAhead:
             )
 
     def wait_for(self, part: str) -> None:
-        """Return when the other process does not compile ``part``: it has, or it never will."""
+        """Return when the other process is not compiling ``part``: done, or never going to."""
         if self._process is None or _claim(self._folder, part):
             return
         while self._process.poll() is None and not _done(self._folder, part).exists():
             time.sleep(POLL)
 
     def last_first(self, methods: Sequence[str]) -> list[str]:
-        """Methods in the order in which the two processes are in each other's way the least."""
+        """The methods in an order in which the two processes conflict least."""
         return sorted(methods, key=lambda name: PARTS[::-1].index(name) + 1 if name in PARTS else 0)
 
     def stop(self) -> None:
-        """End the process, whatever it is at."""
+        """End the process, whatever it is doing."""
         if self._process is not None:
             self._process.terminate()
             self._process.wait()
 
 
 def wait(ahead: KernelsAhead, part: str, clock: StageClock) -> None:
-    """Wait for what the other process compiles just now, and count that as compilation."""
+    """Wait for what the other process is compiling, and count that as compilation."""
     clock.begin_compilation()
     ahead.wait_for(part)
     clock.end_compilation()
 
 
 def compile_parts(folder: str, *parts: str) -> None:
-    """Compile parts, by doing a small demo; the second process runs this.
+    """Compile parts by running a small demo; the second process runs this.
 
     Args:
         folder: Where parts are claimed.
@@ -118,19 +118,19 @@ def compile_parts(folder: str, *parts: str) -> None:
     waiting = list(parts)
     while waiting:
         part = next((each for each in waiting if each != TRAINING or _has_pytorch()), None)
-        if part is None:  # it may be being installed
+        if part is None:  # a package may still be installing
             time.sleep(10 * POLL)
             continue
         waiting.remove(part)
         if _claim(place, part):
-            with suppress(Exception):  # the demo itself will meet it, and say what it is
+            with suppress(Exception):  # the demo itself will hit and report it
                 _compile(part, scene)
             _done(place, part).touch()
 
 
 def _compile(part: str, path: Path) -> None:
-    from splatseed.io import find_depths, load_scene, write_scene  # noqa: PLC0415
-    from splatseed.preview import preview_pair  # noqa: PLC0415
+    from splatseed.io import find_depths, load_scene, write_scene  # noqa: PLC0415  (loads with its use)
+    from splatseed.preview import preview_pair  # noqa: PLC0415  (loads with its use)
 
     if part == TRAINING:
         _train(path)
@@ -144,15 +144,15 @@ def _compile(part: str, path: Path) -> None:
 
 
 def _train(scene: Path) -> None:
-    from splatseed.commands.demo.training import Arm, train_arm  # noqa: PLC0415
-    from splatseed.train.settings import TrainSettings  # noqa: PLC0415
+    from splatseed.commands.demo.training import Arm, train_arm  # noqa: PLC0415  (loads with its use)
+    from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
 
     arm = Arm("", scene, scene.with_name("run"))
     train_arm(arm, TrainSettings(strategy="grow", cap_max=2000, max_steps=4), StageClock())
 
 
 def _has_pytorch() -> bool:
-    """Whether training's packages are installed, each to the end."""
+    """Whether training's packages are completely installed."""
     invalidate_caches()
     try:
         for package in ("torch", "gsplat", "torchmetrics"):
@@ -163,7 +163,7 @@ def _has_pytorch() -> bool:
 
 
 def _claim(folder: Path, part: str) -> bool:
-    """Whether this process is the one that compiles ``part``."""
+    """Whether this process is the one to compile ``part``."""
     try:
         os.close(os.open(folder / part, os.O_CREAT | os.O_EXCL))
     except FileExistsError:

@@ -1,4 +1,4 @@
-"""How the demo calls a method; the process that compiles ahead of it must call it the same way."""
+"""How the demo calls a method; the process that compiles ahead must call it the same way."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["SHOWN", "TEST_EVERY", "upsample_by"]
 
 SHOWN = "auto"
 TEST_EVERY = 8
-"""Photographs kept for the test of what is trained: no method looks at them."""
+"""Photographs held out for testing: no method uses them."""
 
 
 def upsample_by(name: str, scene: Scene, ratio: float, seed: int) -> PointCloud:
@@ -18,9 +18,9 @@ def upsample_by(name: str, scene: Scene, ratio: float, seed: int) -> PointCloud:
 
     Args:
         name: A key of ``METHODS``.
-        scene: With photographs and depth maps.
-        ratio: Points in all over originals; methods that choose their number do not use it.
-        seed: Of the random numbers.
+        scene: A scene with photographs and depth maps.
+        ratio: Points in all over originals; ignored by methods that choose their number.
+        seed: Seed of the random numbers.
 
     Raises:
         SplatseedError: As ``upsample``.

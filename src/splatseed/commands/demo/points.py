@@ -1,7 +1,7 @@
 """The first half of the demo: a capture, its points by every method, their errors, and pictures.
 
-Promise: the default method's picture comes first, and its folder is then in place; what comes after
-is added to it, each file whole.
+Promise: the default method's picture comes first, when its folder is already in place; later files
+are added one by one, each whole.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ if TYPE_CHECKING:  # which imports this module
 __all__ = ["make_points"]
 
 SAMPLES = 20_000
-"""Places on the surfaces at which coverage is taken."""
+"""Samples of the surfaces at which coverage is measured."""
 FIRST_PICTURE = "preview.png"
 METHOD_PICTURES = ("preview_methods.png", "preview_errors.png")
 TABLE = "geometry.csv"
 
 
 def make_points(options: Options, ahead: KernelsAhead) -> None:
-    """Make the demo's folder, and say what is in it.
+    """Make the demo's folder, and report what is in it.
 
     Raises:
         SplatseedError: As ``output_folder``, ``make_capture`` and ``upsample``.
@@ -51,7 +51,7 @@ def make_points(options: Options, ahead: KernelsAhead) -> None:
 def _make_first(
     options: Options, clock: StageClock, ahead: KernelsAhead
 ) -> tuple[Capture, PointCloud]:
-    """The capture, its points as the default method adds to them, both as scenes, and a picture."""
+    """The capture, and its points upsampled by the default method, as scenes and a picture."""
     with (
         stage_display(clock),
         output_folder(options.output, kind="demo", overwrite=options.overwrite) as folder,
@@ -77,7 +77,7 @@ def _make_first(
     if options.preview:
         seconds = sum(clock.seconds().values())
         print_note(
-            f"the first picture is there after {seconds:.0f} s: {options.output / FIRST_PICTURE}"
+            f"the first picture is ready after {seconds:.0f} s: {options.output / FIRST_PICTURE}"
         )
     return capture, seeded
 
@@ -90,7 +90,7 @@ def _load(folder: Path) -> Scene:
 def _make_rest(
     options: Options, capture: Capture, seeded: PointCloud, clock: StageClock, ahead: KernelsAhead
 ) -> None:
-    """Every other method, the table and the pictures of all."""
+    """Every other method, the table and all pictures."""
     folder = options.output
     scene = _load(folder)
     add_files(folder, [TABLE, *METHOD_PICTURES])
@@ -126,7 +126,7 @@ def _upsample_all(
 def _measure_all(
     capture: Capture, scene: Scene, clouds: Mapping[str, PointCloud], clock: StageClock
 ) -> dict[str, GeometryScore]:
-    """Scores of the originals by themselves and of every method's new points."""
+    """Scores of the originals alone and of every method's new points."""
     clock("measure", 0.0)
     originals = scene.points.xyz
     h = spacing(originals)
@@ -156,7 +156,7 @@ def _write_pictures(
     clouds: Mapping[str, PointCloud],
     clock: StageClock,
 ) -> None:
-    """Every method, and every method's errors."""
+    """Pictures of every method, and of every method's errors."""
     clock("pictures", 0.0)
     methods, faults = (folder / name for name in METHOD_PICTURES)
     preview_methods(scene, clouds, methods)
@@ -176,7 +176,7 @@ def _summarise(
 ) -> None:
     print_table(
         f"{len(scene.points):,} points, {options.ratio:g}x where the method has a ratio; distances "
-        "in units of the originals' spacing, less is better",
+        "in units of the originals' spacing, lower is better",
         ("method", "error", "median", "95%", "coverage", "far"),
         [
             (

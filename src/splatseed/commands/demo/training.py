@@ -1,7 +1,7 @@
 """The demo's training: the same few steps from the SfM seeds and from the upsampled ones.
 
-Promise: the two runs differ in their seeds alone, and end with the same number of Gaussians; the
-seconds that seeds took are counted; the view that is shown is chosen before any is rendered.
+Promise: the two runs differ only in their seeds, and end with the same number of Gaussians; the
+time to make seeds is counted; the view that is shown is chosen before any is rendered.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ __all__ = ["Arm", "TrainedArm", "psnr_after", "total_seconds", "train_arm", "wri
 
 @dataclass(frozen=True)
 class Arm:
-    """One of the runs.
+    """One of the two runs.
 
     Args:
-        label: What its seeds are.
-        scene: The folder of the scene that holds them.
+        label: Names its seeds.
+        scene: The folder of the scene with the seeds.
         output: The folder of the run.
-        seconds: What making its seeds took.
+        seconds: Time it took to make the seeds.
     """
 
     label: str
@@ -44,18 +44,18 @@ class Arm:
 
 @dataclass(frozen=True, eq=False)
 class TrainedArm:
-    """A run that is done.
+    """A finished run.
 
     Args:
-        arm: Which.
-        result: What it gave, as its metrics.json holds it.
-        truth: The photograph of the view that is shown.
-        render: That view as rendered, 0 to 1.
+        arm: The arm.
+        result: The content of its metrics.json.
+        photograph: The photograph of the view that is shown.
+        render: The render of that view, 0 to 1.
     """
 
     arm: Arm
     result: TrainingResult
-    truth: UInt8[np.ndarray, "H W 3"]
+    photograph: UInt8[np.ndarray, "H W 3"]
     render: Float32[np.ndarray, "H W 3"]
 
 
@@ -63,7 +63,7 @@ def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedAr
     """Train from an arm's seeds, and score.
 
     Raises:
-        KeyboardInterrupt: The user does not want to wait; a checkpoint is there to go on with.
+        KeyboardInterrupt: The user interrupted; a checkpoint was saved for resuming.
         SplatseedError: As ``prepare_run``.
     """
     stage = f"train {arm.label}"
@@ -76,16 +76,16 @@ def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedAr
     result = run.finish(evaluate_views, clock)
     shown = run.trainer.test_views[len(run.trainer.test_views) // 2]
     render = np.asarray(run.trainer.render(shown).cpu().numpy(), np.float32)
-    return TrainedArm(arm, result, shown.image, render)
+    return TrainedArm(arm, result, shown.photograph, render)
 
 
 def total_seconds(each: TrainedArm) -> float:
-    """Of making the seeds and of training from them."""
+    """Seconds of making the seeds and training from them."""
     return each.arm.seconds + each.result.train_seconds
 
 
 def psnr_after(seconds: float, each: TrainedArm) -> float | None:
-    """The last test PSNR, in dB, of an arm within so many seconds in all; None before its first."""
+    """The last test PSNR, in dB, of an arm within ``seconds`` in all; None before its first."""
     known = [test.psnr for test in each.result.curve if each.arm.seconds + test.seconds <= seconds]
     return known[-1] if known else None
 
@@ -96,8 +96,8 @@ def write_comparison(arms: Sequence[TrainedArm], path: Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    truth = arms[0].truth
-    blank = np.full_like(truth, 255)
+    photograph = arms[0].photograph
+    blank = np.full_like(photograph, 255)
     renders = [
         Tile(
             f"{each.arm.label}: {each.result.scores.psnr:.2f} dB over all test views",
@@ -106,10 +106,10 @@ def write_comparison(arms: Sequence[TrainedArm], path: Path) -> None:
         for each in arms
     ]
     errors = [
-        Tile(f"error: black 0, bright {FULL_ERROR:g} or more", error_map(truth, each.render))
+        Tile(f"error: black 0, bright {FULL_ERROR:g} or more", error_map(photograph, each.render))
         for each in arms
     ]
-    tiles = [Tile("photograph, not trained on", truth), *renders, Tile("", blank), *errors]
+    tiles = [Tile("photograph, not trained on", photograph), *renders, Tile("", blank), *errors]
     write_grid(tiles, path, columns=1 + len(arms))
 
 

@@ -27,7 +27,7 @@ PACKAGES = ("splatseed", "transformers", "torch", "onnxruntime", "numpy", "pillo
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "depth", arguments)
     check_together(options)
     if options.stereo:
@@ -80,7 +80,7 @@ def _summarise(options: Options, network: DepthNetwork, report: DepthReport) -> 
         ("run by", network.device),
         ("predicts", f"{network.meaning.kind} ({network.meaning.reason})"),
         ("maps", f"{report.num_images:,} of {large if small == large else f'{small} to {large}'}"),
-        ("seconds", f"{report.seconds:.1f}, {each:.2f} an image"),
+        ("seconds", f"{report.seconds:.1f}, {each:.2f} per image"),
         ("output", str(report.path)),
     ]
     print_pairs("splatseed depth", rows)
@@ -88,7 +88,7 @@ def _summarise(options: Options, network: DepthNetwork, report: DepthReport) -> 
         shown = ", ".join(report.flat[:NAMES_SHOWN])
         more = len(report.flat) - NAMES_SHOWN
         print_note(
-            "the network saw no depth (one value all over, or none) in: "
+            "the network predicted no depth (a constant map, or none) for:  "
             + shown
             + (f" and {more} more" if more > 0 else "")
         )

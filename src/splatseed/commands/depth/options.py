@@ -1,6 +1,6 @@
 """The options of ``splatseed depth``, and which of them go together.
 
-Promise: an option that would have no effect is refused, not passed over.
+Promise: an option that would have no effect is refused, not ignored.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Channels = tuple[float, float, float]
 
 
 def _number(default: str) -> Any:
-    """How an optional number shows in the help."""
+    """How an optional number appears in the help."""
     return tyro.conf.arg(constructor=int, metavar="INT", help_behavior_hint=f"(default: {default})")
 
 
@@ -38,39 +38,39 @@ class Options:
     scene: Annotated[Path, tyro.conf.Positional]
     """A scene with photographs."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The folder of maps to write: one float32 .npy an image."""
+    """The folder of maps to write: one float32 .npy per image."""
     model: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(or --stereo)")] = None
     """A folder in transformers' format, an id that Hugging Face's cache holds, or an .onnx file."""
     stereo: bool = False
     """Match the photographs with each other instead: no network, on the CPU; normals and confidence
     too."""
     colmap: bool = False
-    """With --stereo: write a COLMAP dense workspace, which colmap stereo_fusion makes a cloud
-    of."""
+    """With --stereo: write a COLMAP dense workspace, which colmap stereo_fusion turns into a
+    cloud."""
     grid: Annotated[int | None, _number("4")] = None
-    """With --stereo: a pixel of the map for every block of GRID x GRID of the photograph's."""
+    """With --stereo: one pixel of the map per block of GRID x GRID pixels of the photograph."""
     seed: Annotated[int | None, _number("0")] = None
     """With --stereo: the same seed gives the same bytes."""
     preview: bool = False
     """With --stereo: also write preview_maps.png, some photographs beside their maps."""
     batch: int = 1
-    """Photographs that the network sees at once: more is faster on a GPU, and takes more memory."""
+    """Photographs per run of the network: more is faster on a GPU, and takes more memory."""
     device: DeviceName = "auto"
-    """Where to run; auto takes a GPU if there is one that can be used."""
+    """Where to run; auto takes a usable GPU if there is one."""
     max_size: Annotated[int | None, _number("1600; 800 with --stereo")] = None
     """Photographs with a longer side are reduced to this many pixels, and so are their maps."""
     depth_kind: Annotated[
-        DepthKind | None, tyro.conf.arg(help_behavior_hint="(default: what config.json tells)")
+        DepthKind | None, tyro.conf.arg(help_behavior_hint="(default: what config.json says)")
     ] = None
     """What the network predicts: planar depth, distance along the ray, or inverse depth."""
     input_size: Annotated[int | None, _number("as beside the file, else 518")] = None
-    """Of an .onnx file that leaves it open: what the sides are scaled to, in pixels."""
+    """For an .onnx file that leaves it open: size in pixels to which the sides are scaled."""
     input_multiple: Annotated[int | None, _number("as beside the file, else 14")] = None
-    """Of such a file: what the sides are then rounded to a multiple of."""
+    """For such a file: the sides are then rounded to a multiple of this."""
     mean: Annotated[Channels | None, _BESIDE] = None
-    """Of an .onnx file: taken away from red, green and blue in 0..1."""
+    """For an .onnx file: subtracted from red, green and blue in 0..1."""
     std: Annotated[Channels | None, _BESIDE] = None
-    """Of an .onnx file: what red, green and blue are divided by then."""
+    """For an .onnx file: divides red, green and blue after that."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
 
@@ -83,7 +83,7 @@ _OF_STEREO = ("colmap", "grid", "seed", "preview")
 
 
 def check_together(options: Options) -> None:
-    """Check that the options name one source of depth, and none that only the other has.
+    """Check that the options name one source of depth, and none that belongs to the other.
 
     Raises:
         ParameterError: They do not.
@@ -104,7 +104,7 @@ def check_together(options: Options) -> None:
 
 
 def _given(options: Options, names: tuple[str, ...]) -> list[str]:
-    """Which of the options are not as they are by default."""
+    """Which of the options differ from their defaults."""
     return [
         field.name
         for field in fields(options)

@@ -32,12 +32,12 @@ NAMES_SHOWN = 5
 PICTURE = "preview_maps.png"
 PACKAGES = ("splatseed", "numba", "numpy", "pillow", "scipy")
 MIN_PIXELS = 3
-"""What COLMAP is told to want of a fused point. Its own 5 suit maps that nothing has confirmed yet;
-a pixel of ours has been, and few views see the borders."""
+"""Photographs that must confirm a point fused by COLMAP. Its default of 5 suits unconfirmed maps;
+our pixels are confirmed already, and few views see the borders."""
 
 
 def run_stereo(options: Options) -> None:
-    """Do what the options ask for."""
+    """Run stereo with these options."""
     start = time.perf_counter()
     with stage_display() as clock:
         clock("read", 0.0)
@@ -59,7 +59,7 @@ def run_stereo(options: Options) -> None:
 
 
 def provenance(options: Options, packages: Sequence[str]) -> dict[str, object]:
-    """How maps came about, for ``splatseed.json``."""
+    """How maps were made, for ``splatseed.json``."""
     versions = {"python": platform.python_version()}
     for package in packages:
         try:
@@ -123,8 +123,8 @@ def _summarise(
         print_note(f"no other view confirms any pixel of: {shown}")
     if bent and not options.colmap:
         print_note(
-            "the cameras have lens distortion, and these maps are of the photographs without it: "
-            "--colmap writes both, as a scene to go on with"
+            "the cameras have lens distortion, and these maps belong to the undistorted "
+            "photographs: --colmap writes both, as a scene to continue with"
         )
     print_commands("next", _next(options, report, bent=bent))
 
@@ -137,7 +137,7 @@ def _sizes(maps: Sequence[StereoMap]) -> str:
 
 
 def _next(options: Options, report: DenseReport, *, bent: bool) -> list[tuple[str, str]]:
-    # The workspace is a scene itself, without distortion.
+    # The workspace is itself a scene, without distortion.
     shown = report.path if options.colmap else options.scene
     scene, maps = (quoted(path) for path in (shown, report.path))
     look = ("look", f"splatseed info {scene} --depth {maps} --picture depth.png")

@@ -31,7 +31,7 @@ def print_json(
     alignments: Mapping[str, Alignment] | None,
     problems: Sequence[str],
 ) -> None:
-    """Print what ``info`` found."""
+    """Print the facts that ``info`` shows."""
     train, test = scene.split()
     source = scene.source
     facts = {
@@ -56,7 +56,7 @@ def print_json(
 
 
 def _known(value: Any) -> Any:
-    """The value with null for what is no finite number."""
+    """The value, with null for numbers that are not finite."""
     if isinstance(value, Mapping):
         return {str(key): _known(each) for key, each in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""``splatseed info``: what is in a scene, and what is wrong with it."""
+"""``splatseed info``: the contents of a scene, and its problems."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ KINDS_SHOWN = 3
 
 
 def _path(metavar: str) -> Any:
-    """How an optional path shows in the help."""
+    """How an optional path appears in the help."""
     return tyro.conf.arg(constructor=Path, metavar=metavar, help_behavior_hint="")
 
 
 def _default(stands_in: str) -> Any:
-    """How an option that may be left out shows in the help: with what stands in for it."""
+    """How an optional option appears in the help: with its default in words."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
 
 
@@ -56,7 +56,7 @@ class Options:
     scene: Annotated[Path, tyro.conf.Positional]
     """A COLMAP scene folder, a folder with transforms.json, an RGB-D capture, or a .ply."""
     depth: Annotated[Path | None, _path("DIR")] = None
-    """Also hold a folder of depth maps, in any layout of docs/formats.md, against the SfM
+    """Also compare a folder of depth maps, in any layout of docs/formats.md, with the SfM
     points."""
     depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
     """What their values are: planar depth, distance along the ray, or inverse depth."""
@@ -75,13 +75,13 @@ class Options:
     max_steps: int = FULL_RUN
     """Steps that you plan to train; the advice depends on them."""
     list_all: Annotated[bool, tyro.conf.arg(name="all")] = False
-    """List the depth of all images, not of the worst alone."""
+    """List the depth of all images, not only of the worst."""
     json: bool = False
     """Print one JSON object instead, for scripts."""
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "info", arguments)
     with stage_display() as clock:
         clock("read", 0.0)
@@ -111,14 +111,14 @@ def run(arguments: list[str]) -> None:
 
 
 def _read(options: Options) -> Scene:
-    """The scene, with the depth maps that the user names, or else its own."""
+    """The scene, with the depth maps that the user names, else with its own."""
     scene = load_scene(options.scene, require_points=False)
     if options.depth is not None:
         maps = find_depths(scene, options.depth, kind=options.depth_kind, scale=options.depth_scale)
         return scene.replace(depths=maps)
     if options.depth_kind is not None or options.depth_scale is not None or options.picture:
         raise ParameterError(
-            "--depth DIR, whose maps --depth-kind, --depth-scale and --picture speak of",
+            "--depth DIR, which --depth-kind, --depth-scale and --picture refer to",
             found="none",
             fix="Name the folder.",
         )
@@ -126,14 +126,14 @@ def _read(options: Options) -> Scene:
 
 
 def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, Alignment] | None:
-    """How each map fits the SfM points, drawn if so asked; None where no maps were named."""
+    """How each map fits the SfM points, drawn if requested; None if no maps were named."""
     if options.depth is None:
         return None
     from splatseed.depth import align  # noqa: PLC0415  (loads Numba)
 
     alignments = align(scene, progress=clock)
     if options.picture is not None:
-        from splatseed.commands.info.depth_picture import write_depth_picture  # noqa: PLC0415
+        from splatseed.commands.info.depth_picture import write_depth_picture  # noqa: PLC0415  (loads with its use)
 
         clock("draw picture", 0.0)
         write_depth_picture(scene, alignments, options.picture)
@@ -141,7 +141,7 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
 
 
 def _next_command(options: Options, scene: Scene) -> str:
-    """What to run on the scene: points can be upsampled once there are some."""
+    """The next command for the scene: points can be upsampled once there are some."""
     scene_dir = quoted(options.scene)
     if options.depth is not None and len(scene.points):
         maps = quoted(options.depth)
@@ -160,7 +160,7 @@ def _source_rows(scene: Scene) -> list[tuple[str, str]]:
     sizes = Counter(f"{c.model} {c.width}x{c.height}" for c in scene.intrinsics)
     cameras = [f"{count:,} {kind}" for kind, count in sizes.most_common(KINDS_SHOWN)]
     if len(sizes) > KINDS_SHOWN:
-        cameras.append(f"{len(sizes) - KINDS_SHOWN:,} kinds more")
+        cameras.append(f"{len(sizes) - KINDS_SHOWN:,} more kinds")
     train, test = scene.split()
     by = f", by its {scene.listed.origin}" if scene.listed else ""
     images = f"{len(scene.images):,} ({len(train):,} to train, {len(test):,} to test{by})"

@@ -1,7 +1,7 @@
-"""What ``splatseed info --depth`` says of a scene's depth maps, in words and numbers.
+"""What ``splatseed info --depth`` reports about a scene's depth maps, in words and numbers.
 
-Promise: images are listed worst first: those left out, then by residual; all of them only if asked
-for.
+Promise: images are listed worst first: those left out, then by residual; all of them only on
+request.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ ROWS = 12
 def print_depth(
     title: str, scene: Scene, alignments: Mapping[str, Alignment], *, list_all: bool
 ) -> None:
-    """Print a summary, a table of images, and why those left out are left out.
+    """Print a summary, a table of images, and why some were left out.
 
     Args:
-        title: What stands above the summary.
+        title: Heading of the summary.
         scene: A scene with depth maps.
-        alignments: Of its images, by name.
+        alignments: The alignments of its images, by name.
         list_all: Whether to list every image.
     """
     example = _example(scene)
@@ -74,15 +74,15 @@ def _summary(
 
 
 def _spread(values: Iterable[float], style: str) -> str:
-    found = np.array([value for value in values if not math.isnan(value)])
-    if not found.size:
+    known = np.array([value for value in values if not math.isnan(value)])
+    if not known.size:
         return "unknown"
-    low, median, high = np.percentile(found, [5, 50, 95])
+    low, median, high = np.percentile(known, [5, 50, 95])
     return f"median {median:{style}}, 5/95% {low:{style}} {high:{style}}"
 
 
 def _badness(name: str, alignment: Alignment) -> tuple[bool, float, str]:
-    """What to sort by: left out first, then the largest residual."""
+    """Sort key: images left out first, then the largest residuals."""
     residual = -math.inf if math.isnan(alignment.residual) else -alignment.residual
     return alignment.rejected is None, residual, name
 

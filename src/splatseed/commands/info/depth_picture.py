@@ -1,9 +1,9 @@
-"""A picture of depth beside photographs, and of how well it agrees with the SfM points.
+"""A picture of depth beside photographs, and of its agreement with the SfM points.
 
 Notation: a row is one image: its photograph, its depth (near is yellow, far is violet, unknown is
-grey; logarithmic, so that both near and far are told apart), and its SfM points on the photograph,
-coloured by |depth of the map / depth of the point - 1|. Promise: the images shown are a typical
-one, the best and the worst aligned ones, and one that was left out, where there are such.
+grey; on a logarithmic scale), and its SfM points on the photograph, coloured by |depth of the map /
+depth of the point - 1|. Promise: it shows a typical image, the best and the worst aligned, and one
+that was left out, if there are such.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = ["write_depth_picture"]
 SIDE = 480
 """The longer side of a tile, in pixels."""
 LIMIT = 0.1
-"""Relative errors from here on have the last colour."""
+"""Relative errors from this value on have the last colour."""
 RADIUS = 2.5
 
 
@@ -39,7 +39,7 @@ def write_depth_picture(scene: Scene, alignments: Mapping[str, Alignment], path:
 
     Args:
         scene: A scene with depth maps.
-        alignments: Of its images, by name; at least one.
+        alignments: The alignments of its images, by name; at least one.
         path: The PNG to write.
 
     Raises:
@@ -55,7 +55,7 @@ def write_depth_picture(scene: Scene, alignments: Mapping[str, Alignment], path:
 
 
 def _chosen(alignments: Mapping[str, Alignment]) -> dict[str, str]:
-    """Names of images to show, and what each stands for."""
+    """Names of images to show, and why each was chosen."""
     used = sorted(
         (name for name, a in alignments.items() if a.rejected is None),
         key=lambda name: (np.nan_to_num(alignments[name].residual), name),
@@ -104,7 +104,7 @@ def _shortened(label: str, length: int = 46) -> str:
 def _depth_colors(
     depth: DepthMap, camera: Camera, alignment: Alignment
 ) -> tuple[UInt8[np.ndarray, "H W 3"], str]:
-    """The map in colours, and what its range is."""
+    """The map in colours, and its range in words."""
     aligned = np.isfinite(alignment.scale)
     if depth.kind == "inverse" and not aligned:
         nearness, words = depth.values, "depth, not aligned"
@@ -129,7 +129,7 @@ def _points(
     alignment: Alignment,
     xyz: Float64[np.ndarray, "M 3"],
 ) -> tuple[UInt8[np.ndarray, "H W 3"], int]:
-    """SfM points on the paled photograph, the largest errors on top, and how many there are."""
+    """SfM points on the faded photograph, the largest errors on top, and their number."""
     grey = np.repeat(photograph.mean(axis=2, keepdims=True), 3, axis=2)
     canvas = PilImage.fromarray(np.uint8((grey + 255) / 2))
     if not np.isfinite(alignment.scale):
@@ -146,7 +146,7 @@ def _points(
 def _errors(
     z_map: Float64[np.ndarray, "H W"], camera: Camera, xyz: Float64[np.ndarray, "M 3"]
 ) -> tuple[Float64[np.ndarray, "K 2"], Float64[np.ndarray, " K"]]:
-    """Where points that see depth are, in pixels of the map, and their relative errors."""
+    """Positions of points that see depth, in pixels of the map, and their relative errors."""
     uv, z = camera.project(xyz)
     inside = (z > 0) & ((uv >= 0) & (uv < [camera.width, camera.height])).all(axis=1)
     uv, z = uv[inside], z[inside]

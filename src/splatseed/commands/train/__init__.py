@@ -1,4 +1,4 @@
-"""The verb ``train``: a scene and its seeds to trained Gaussians."""
+"""The verb ``train``: from a scene and its seeds to trained Gaussians."""
 
 from splatseed.commands.train.command import Options, run
 

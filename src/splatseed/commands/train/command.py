@@ -1,4 +1,4 @@
-"""``splatseed train``: a scene and its seeds to trained Gaussians."""
+"""``splatseed train``: from a scene and its seeds to trained Gaussians."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ __all__ = ["bar_columns", "run"]
 BAR_WIDTH = 12
 DEFAULT = TrainSettings()
 BEST: StrategyName = "auto"
-"""The strategy where none is named."""
+"""The default strategy."""
 BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
 
 
@@ -66,37 +66,37 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The folder of the run."""
     training: Annotated[TrainSettings, tyro.conf.arg(name="")] = BEST_SETTINGS
-    """How to train: its fields are options of their own."""
+    """The settings; its fields are options of their own."""
     budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
-    """--cap-max as upsample has it: a number, or Gaussians per pixel of a photograph at its
-    training size, such as 0.25rho."""
+    """--cap-max as in upsample: a number, or Gaussians per pixel of a photograph at training size,
+    such as 0.25rho."""
     seeds: Annotated[
         Seeding | None,
         tyro.conf.arg(
             help_behavior_hint="(default: auto, for points that splatseed has not added to)"
         ),
     ] = None
-    """Begin with what method auto makes of the scene, looking at the training photographs alone, or
-    with the scene's points as they are."""
+    """Start from the points that method auto makes of the training photographs, or from the scene's
+    points as they are."""
     resume: bool = False
-    """Go on with the run in the output folder, with its own settings."""
+    """Resume the run in the output folder, with its own settings."""
     tensorboard: bool = False
     """Also write a log for TensorBoard."""
     view: bool = False
-    """Watch it learn in the browser, pause it, stop it and keep what there is (extra view)."""
+    """Watch training in the browser; pause it, or stop early and keep the result (extra view)."""
     view_port: int = 8080
-    """The port of this machine that the browser is served at; 0 for any that is free."""
+    """Port of this machine to serve the browser; 0 for any free one."""
     config: Annotated[
         Path | None, tyro.conf.arg(constructor=Path, metavar="FILE", help_behavior_hint="")
     ] = None
-    """A .toml with these options, or the config.json of a run; what the command line says wins."""
+    """A .toml with these options, or a run's config.json; the command line takes precedence."""
     overwrite: bool = False
     """Replace an earlier run in the output folder."""
 
     @property
     def settings(self) -> TrainSettings:
-        """Those of the options that say how to train."""
-        # A run that goes on says itself what it began with.
+        """The options that make up the training settings."""
+        # A resumed run knows its own settings.
         goes_on = self.resume and RunFolder(self.output).is_run
         seeding = self.seeds or (DEFAULT.seeding if goes_on else "auto")
         named = self.training.strategy
@@ -105,7 +105,7 @@ class Options:
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     if any(word.partition("=")[0] == "--config" for word in arguments):
         arguments = with_config(arguments, known_options(Options))
     options = parse_options(Options, "train", arguments)
@@ -150,7 +150,7 @@ def _prepare(
 def _within_budget(
     options: Options, settings: TrainSettings, scene: Scene, note: Callable[[str], None]
 ) -> TrainSettings:
-    """The settings, with the number of Gaussians that the budget is in this scene as their cap."""
+    """The settings, with the cap that the budget amounts to in this scene."""
     if options.budget is not None and settings.cap_max is not None:
         raise ParameterError("--budget or --cap-max", found="both", fix="Leave one out.")
     chosen = settings.strategy == BEST and settings.cap_max is None
@@ -168,7 +168,7 @@ def _within_budget(
 
 
 def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None:
-    """Say what will be done, before it is done."""
+    """Print what will be done."""
     for note in notes:
         print_note(note)
     settings, views = training.settings, training.trainer.train_views
@@ -183,14 +183,14 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
 
 
 def _strategy(settings: TrainSettings) -> str:
-    """Its name, and what it is where that depends on the run."""
+    """The strategy's name, and what ``auto`` chose."""
     chosen = settings.strategy == BEST
     return f"{BEST} ({settings.densification})" if chosen else settings.strategy
 
 
 @contextmanager
 def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
-    """A function that shows the steps done; nothing is drawn when stderr is not a terminal."""
+    """A function that shows the steps done; draws nothing when stderr is not a terminal."""
     if not ERR.is_terminal:
         yield lambda _: None
         return
@@ -205,10 +205,7 @@ def _training_bar(training: TrainingRun) -> Iterator[Callable[[int], None]]:
 
 
 def bar_columns() -> tuple[ProgressColumn, ...]:
-    """Steps and the time left whole.
-
-    What else there is to say fills the rest, cut where it ends.
-    """
+    """Steps and remaining time in full; the rest of the line is cut off where it ends."""
 
     def whole() -> Column:
         return Column(no_wrap=True, overflow="ignore")
@@ -230,7 +227,7 @@ def _line(training: TrainingRun, steps_per_second: float | None) -> str:
     tested = next((r.test_psnr for r in reversed(records) if r.test_psnr is not None), None)
     test = "" if tested is None else f", test {tested:.2f}"
     speed = "" if steps_per_second is None else f"  {steps_per_second:.1f} steps/s"
-    # The most important first: a narrow terminal cuts the end off.
+    # Most important first: a narrow terminal cuts off the end.
     return (
         f"PSNR {last.train_psnr:.2f}{test} dB  {last.num_gaussians:,} Gaussians{speed}"
         f"  loss {last.loss:.4f}"
@@ -248,14 +245,14 @@ def _finish(training: TrainingRun, clock: StageClock) -> TrainingResult:
 def _say_how_to_go_on(options: Options, training: TrainingRun) -> None:
     scene, output = quoted(options.scene), quoted(options.output)
     ERR.print(
-        f"\ninterrupted after step {training.state.step:,}; saved. Go on with:\n"
+        f"\ninterrupted after step {training.state.step:,}; saved. Continue with:\n"
         f"  splatseed train {scene} -o {output} --resume",
         soft_wrap=True,
     )
 
 
 def _summarise(options: Options, result: TrainingResult) -> None:
-    """The closing table and the commands to go on with."""
+    """Print the final table and the commands to run next."""
     scores, seconds = result.scores, result.train_seconds
     psnr = f"{scores.psnr:.2f} dB" if math.isfinite(scores.psnr) else "infinite"
     print_pairs(
@@ -271,8 +268,8 @@ def _summarise(options: Options, result: TrainingResult) -> None:
     )
     if held := result.held_by_memory_at:
         print_note(
-            f"memory held the run at {held:,} Gaussians; on another machine it may end otherwise. "
-            f"Pass --cap-max {held} to have the same everywhere."
+            f"memory held the run at {held:,} Gaussians; results may differ on another machine. "
+            f"Pass --cap-max {held} for the same result everywhere."
         )
     output = quoted(options.output)
     print_commands("next", [("score again, with LPIPS", f"splatseed evaluate {output}")])

@@ -1,7 +1,7 @@
 """``splatseed train --config``: options from a file, a .toml or the config.json of a run.
 
-Promise: what the command line says wins; a key that is no option is an error, not passed over, but
-for what a run notes of itself.
+Promise: the command line takes precedence; a key that is not an option is an error, not ignored,
+except for what a run records about itself.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from splatseed.literal import did_you_mean
 __all__ = ["with_config"]
 
 NOTES = {"splatseed", "points", "device", "versions"}
-"""What config.json says beside settings."""
+"""What config.json records besides settings."""
 RENAMED = {"seeding": "seeds"}
-"""Settings that the command line calls otherwise."""
+"""Settings whose options have other names."""
 
 
 def with_config(words: Sequence[str], known: Sequence[str]) -> list[str]:
@@ -28,10 +28,10 @@ def with_config(words: Sequence[str], known: Sequence[str]) -> list[str]:
 
     Args:
         words: The words after the verb.
-        known: All options, such as ``--max-steps``; of a switch both forms.
+        known: All options, such as ``--max-steps``; both forms of a switch.
 
     Raises:
-        ParameterError: A key is no option, ``--config`` has no file, or the scene is named nowhere.
+        ParameterError: A key is not an option, ``--config`` has no file, or no scene is named.
         SceneNotFoundError: There is no such file.
         SceneFormatError: It cannot be read.
     """
@@ -107,7 +107,7 @@ def _words(path: Path, name: str, value: Any) -> list[str]:
 
 
 def _has_scene(words: Sequence[str], known: Sequence[str]) -> bool:
-    """Whether a word stands by itself, no option and no option's value."""
+    """Whether some word is neither an option nor an option's value."""
     value_follows = False
     for word in words:
         if value_follows:

@@ -1,4 +1,4 @@
-"""``splatseed train --view``: a run that browsers can look at while it learns."""
+"""``splatseed train --view``: a run that browsers can watch while it trains."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ HOST = "127.0.0.1"
 
 @dataclass(frozen=True)
 class Watch:
-    """Who looks on, if anybody may."""
+    """The browsers that watch, if any may."""
 
     viewer: TrainingViewer | None = None
 
     @property
     def kept(self) -> bool:
-        """Whether somebody stopped the run, to keep it as it is."""
+        """Whether a browser stopped the run early, to keep its result."""
         return self.viewer is not None and self.viewer.kept
 
     def also(self, show: Callable[[int], None]) -> Callable[[int], None]:
-        """A function that shows the steps done here, and to whoever looks on."""
+        """A function that shows the steps done here, and in the browsers."""
         viewer = self.viewer
         if viewer is None:
             return show
@@ -46,7 +46,7 @@ class Watch:
 
 
 def view_port(port: int) -> int:
-    """The port to serve at, found free before any work is done.
+    """The port to serve on, checked to be free before any work is done.
 
     Raises:
         MissingDependencyError: viser is absent.

@@ -1,4 +1,4 @@
-"""The verb ``upsample``: read, add points, write, and say what was done."""
+"""The verb ``upsample``: read, add points, write, and report."""
 
 from splatseed.commands.upsample.command import Options, run
 

@@ -49,7 +49,7 @@ HELP_ALL = "--help-all"
 
 
 def _number(kind: type, default: str) -> Any:
-    """How an optional number shows in the help: as a number, with what stands in for it."""
+    """How an optional number appears in the help: as a number, with its default in words."""
     return tyro.conf.arg(
         constructor=kind,
         metavar=kind.__name__.upper(),
@@ -68,14 +68,14 @@ def _cover() -> Any:
 
 
 def _budget() -> Any:
-    """How a budget shows in the help."""
+    """How a budget appears in the help."""
     return tyro.conf.arg(
-        constructor=str, metavar="N|Xrho", help_behavior_hint="(default: as many as there are)"
+        constructor=str, metavar="N|Xrho", help_behavior_hint="(default: no limit)"
     )
 
 
 def _default(stands_in: str) -> Any:
-    """How an optional choice shows in the help: with what stands in for it."""
+    """How an optional choice appears in the help: with its default in words."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
 
 
@@ -95,7 +95,7 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     method: str = DEFAULT_METHOD
-    """How new points are made; the flags of each method are below. auto looks at the
+    """The method that makes new points; the flags of each are below. auto uses the
     photographs."""
     ratio: Annotated[float | None, _number(float, "4, unless --num-points is given")] = None
     """Points in all, as a multiple of the originals, for methods that interpolate."""
@@ -104,11 +104,10 @@ class Options:
     budget: Annotated[str | None, _budget()] = None
     """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph."""
     cover_cell: Annotated[int | None, _cover()] = None
-    """Give each part of the photographs, of so many pixels a side, that no point falls in a
-    seed."""
+    """Side in pixels of the parts of the photographs that get a seed if no point falls in."""
     verify: bool = False
-    """Hold interpolated points against the photographs: slide them onto surfaces, drop what fits
-    none."""
+    """Check interpolated points against the photographs: slide them onto surfaces, drop those that
+    fit none."""
     seed: int = 0
     """The same seed gives the same bytes."""
     profile: Profile = "default"
@@ -120,7 +119,7 @@ class Options:
     depth_scale: Annotated[float | None, _number(float, "what the folder says")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
     align: bool = True
-    """For --method depth: --no-align takes metric depth and poses as they are
+    """For --method depth: --no-align takes metric depth and poses as given
     (--depth.no-align)."""
     preview: bool = False
     """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's
@@ -128,7 +127,7 @@ class Options:
     gaussians: Annotated[
         Path | None, tyro.conf.arg(constructor=Path, help_behavior_hint="(default: none)")
     ] = None
-    """Also write the Gaussians to begin training with, a 3DGS .ply, for trainers that start from
+    """Also write the initial Gaussians of training, as a 3DGS .ply, for trainers that start from
     one."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write; auto keeps the input's."""
@@ -139,13 +138,13 @@ class Options:
 
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
-    """The options, and every method with its parameters, from the command line's words."""
+    """The options, and every method with its parameters, from the words of the command line."""
     if {"-h", "--help"} & set(arguments):
         _help(arguments)
     arguments = ["--help" if word == HELP_ALL else word for word in arguments]
     options = _parse_with({name: configure(name) for name in METHODS}, arguments)
     if options.profile == "paper":
-        # The profile sets the defaults of other flags, so it must be known before they are read.
+        # The profile sets the defaults of other flags, so it is parsed first.
         options = _parse_with({name: configure(name, "paper") for name in METHODS}, arguments)
     methods = {name: getattr(options, name) for name in METHODS}
     if not options.align:
@@ -154,13 +153,13 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
 
 
 def _help(arguments: list[str]) -> None:
-    """Show the common options, those of the method that is named too, and how to see all."""
+    """Show the common options, those of the named method, and how to see all."""
     named = [name for name in METHODS if name in arguments or f"--method={name}" in arguments]
     with suppress(SystemExit):
         _parse_with({name: configure(name) for name in named}, ["--help"])
     OUT.print(
         f"\nsplatseed upsample {HELP_ALL} shows the flags of all methods,"
-        " --method mls --help those of one."
+        " --method mls --help those of one method."
     )
     raise SystemExit(0)
 
@@ -182,7 +181,7 @@ def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     if _asks_what_to_do(arguments):
         run_advice(arguments)
         return
@@ -197,7 +196,7 @@ def run(arguments: list[str]) -> None:
         clock("read", 0.0)
         scene = _read(options, methods[options.method])
         if options.gaussians is not None:
-            photographed(scene)  # raises without any: their sizes are bounded by what views show
+            photographed(scene)  # raises without photographs: views bound the Gaussians' sizes
         options = _settle(options, scene, notes)
         method = methods[options.method]
         total = _planned(options, method, len(scene.points))
@@ -205,19 +204,19 @@ def run(arguments: list[str]) -> None:
     with stage_display(clock):
         seeds = _make(options, scene, method, total, clock, notes)
         clock("check", 0.0)
-        found = _check(scene, seeds, method)
+        checks = _check(scene, seeds, method)
         clock("write", 0.0)
         report = _write(options, scene.replace(points=seeds), method)
         if options.gaussians is not None:
             write_start(options.gaussians, scene.replace(points=seeds), method, clock)
-            notes.append(f"The Gaussians to begin with are in {visible(options.gaussians)}.")
+            notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
         if options.preview:
             write_previews(
                 scene, seeds, total, methods, options.method, options.seed, options.output, clock
             )
             write_map_preview(scene, method, options.seed, options.output, clock)
         seconds = clock.seconds()
-    summarise(scene, seeds, report, seconds, found, options.output, options.preview)
+    summarise(scene, seeds, report, seconds, checks, options.output, options.preview)
     for sentence in notes:
         print_note(sentence)
 
@@ -229,7 +228,7 @@ def _asks_what_to_do(arguments: Sequence[str]) -> bool:
 
 
 def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
-    """The options with the method that is taken: the default needs photographs."""
+    """The options with the method that will be used: the default needs photographs."""
     if options.method != DEFAULT_METHOD:
         return options
     method = method_for(scene, options.method, notes.append)
@@ -237,7 +236,7 @@ def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
 
 
 def _planned(options: Options, method: Upsampler, count: int) -> int | None:
-    """Points in all; None where the photographs say how many."""
+    """Points in all; None if the photographs determine the number."""
     new = number_of_new(method, options.method, count, options.ratio, options.num_points)
     return None if new is None else count + new
 
@@ -258,15 +257,15 @@ def _make(
 
 
 def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, float]:
-    """How far off the points are, or how much of the pictures they cover."""
-    found = {}
+    """How far off the points are, or how much of the photographs they cover."""
+    checks = {}
     new = seeds.xyz[seeds.source != ORIGINAL]
     if len(scene.points) and not chooses_number(method):
-        found["far"] = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
+        checks["far"] = far_share(scene.points.xyz, new, rng=np.random.default_rng(0))
     if scene.images:
-        found["before"] = share_covered(scene, scene.points)
-        found["after"] = share_covered(scene, seeds)
-    return found
+        checks["before"] = share_covered(scene, scene.points)
+        checks["after"] = share_covered(scene, seeds)
+    return checks
 
 
 def _read(options: Options, method: Upsampler) -> Scene:
@@ -280,7 +279,7 @@ def _read(options: Options, method: Upsampler) -> Scene:
         return scene.replace(depths=maps)
     if options.depth_kind is not None or options.depth_scale is not None:
         raise ParameterError(
-            "--depth DIR, whose maps --depth-kind and --depth-scale speak of",
+            "--depth DIR, which --depth-kind and --depth-scale refer to",
             found="none",
             fix="Name the folder.",
         )
@@ -290,11 +289,11 @@ def _read(options: Options, method: Upsampler) -> Scene:
 def _announce(
     options: Options, scene: Scene, method: Upsampler, total: int | None, idle: Sequence[str]
 ) -> None:
-    """Say what will be done, before it is done, and which flags have no part in it."""
+    """Print what will be done, and which flags have no effect."""
     for warning in scene.warnings:
         print_note(warning)
     for name in idle:
-        print_note(f"The flags of {name} change nothing with --method {options.method}.")
+        print_note(f"The flags of {name} have no effect with --method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
     parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]  # a method is a dataclass
     number = "as many as the photographs need" if total is None else f"{total:,} points"
@@ -307,8 +306,8 @@ def _announce(
 
 
 def _idle(options: Options, methods: dict[str, Upsampler]) -> list[str]:
-    """Methods whose flags were changed though they are not used."""
-    if options.preview:  # draws them all
+    """Methods whose flags were changed although they are not used."""
+    if options.preview:  # previews draw all methods
         return []
     plain = {name: configure(name, options.profile) for name in methods}
     changed = {name for name in methods if methods[name] != plain[name]}
@@ -329,7 +328,7 @@ def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
 
 
 def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
-    """What made the output, for ``splatseed.json``."""
+    """How the output was made, for ``splatseed.json``."""
     return {
         "command": "upsample",
         "method": options.method,

@@ -1,4 +1,4 @@
-"""What ``splatseed upsample`` says and draws at its end."""
+"""What ``splatseed upsample`` prints and draws at its end."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PICTURES = (
     MAPS,
 )
 PHOTOGRAPHS_SHOWN = 4
-"""Those whose cells and maps are drawn."""
+"""Methods whose cells and maps are drawn."""
 
 
 def write_previews(
@@ -44,15 +44,15 @@ def write_previews(
     folder: Path,
     clock: StageClock,
 ) -> None:
-    """Before and after, every method; with photographs, seeds by origin and covered cells.
+    """Draw before and after, and every method; with photographs, origins and covered cells too.
 
     Args:
-        scene: With the originals that were used.
-        seeds: What was written.
+        scene: The scene, with the originals that were used.
+        seeds: The points that were written.
         total: Points in all, for methods that take a number; None for their default.
-        methods: All, with their parameters.
+        methods: All methods, with their parameters.
         method: The one that made ``seeds``.
-        seed: As was used.
+        seed: The seed that was used.
         folder: Where the pictures go.
         clock: Told the stages.
     """
@@ -68,7 +68,7 @@ def write_previews(
             clouds[name] = seeds
             continue
         number = None if chooses_number(methods[name]) else total
-        # Too few points for one of the methods, or depth that does not fit: show the others.
+        # Too few points for a method, or depth that does not fit: show the others.
         with suppress(PointCloudError, SceneFormatError):
             clouds[name] = upsample(
                 scene, methods[name], num_points=number, seed=seed, progress=clock
@@ -94,7 +94,7 @@ def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
     clouds = [cloud.xyz[cloud.finite] for cloud in (scene.points, seeds)]
     before, after = (covered_cells(views, xyz, CELL) for xyz in clouds)
     shown = [
-        CoveredView(view.name, view.image, CELL, old, new)
+        CoveredView(view.name, view.photograph, CELL, old, new)
         for view, old, new in zip(views, before, after, strict=True)
     ]
     preview_cells(shown, path)
@@ -103,12 +103,12 @@ def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
 def write_map_preview(
     scene: Scene, method: Upsampler, seed: int, folder: Path, clock: StageClock
 ) -> None:
-    """What stereo found of some photographs, if the method begins with it.
+    """Draw stereo's maps of some photographs, if the method begins with stereo.
 
     Args:
-        scene: As the method got it.
-        method: The one that was used.
-        seed: As was used.
+        scene: The scene as the method got it.
+        method: The method that was used.
+        seed: The seed that was used.
         folder: Where the picture goes.
         clock: Told the stages.
     """
@@ -116,8 +116,8 @@ def write_map_preview(
 
     if isinstance(method, Stereo):
         shown = _some_of(photographed(scene, method.hold_out))
-        # Found again, of the few that are shown: to keep the maps of all would take as much memory
-        # as the views.
+        # Recomputed for the few that are shown: keeping all maps would take as much memory as the
+        # views.
         maps = method.maps(scene, shown, seed, clock)
         clock("preview", 0.9)
         preview_maps(scene, maps, folder / MAPS)
@@ -135,32 +135,32 @@ def summarise(
     seeds: PointCloud,
     report: WriteReport,
     seconds: Mapping[str, float],
-    found: Mapping[str, float],
+    checks: Mapping[str, float],
     output: Path,
     pictures: bool,
 ) -> None:
-    """The closing table and the commands to go on with.
+    """Print the final table and the commands to run next.
 
     Args:
-        scene: As it was read.
-        seeds: What was written.
-        report: What writing says.
-        seconds: By stage.
-        found: ``far``, the share of new points far from any original; ``before`` and ``after``, the
-            share of the pictures that the points cover.
-        output: Where it went.
+        scene: The scene as it was read.
+        seeds: The points that were written.
+        report: The report of writing.
+        seconds: Seconds by stage.
+        checks: ``far``, the share of new points far from any original; ``before`` and ``after``,
+            the share of the photographs that the points cover.
+        output: The scene folder.
         pictures: Whether previews were drawn.
     """
     rows = [
         ("points in", f"{len(scene.points):,}"),
         ("points out", f"{report.num_points:,} ({_origins(seeds)})"),
-        *_findings(found),
+        *_findings(checks),
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(output)),
     ]
     if (output / "images").is_symlink():
         where = (output / "images").resolve()
-        rows.append(("images", f"linked, not copied: {where}; --copy-images to take OUT elsewhere"))
+        rows.append(("images", f"linked, not copied: {where}; --copy-images to move OUT elsewhere"))
     if report.dropped_nonfinite + report.dropped_duplicates:
         left_out = (
             f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate"
@@ -181,20 +181,20 @@ def summarise(
 
 
 def _origins(seeds: PointCloud) -> str:
-    """How many points are of which origin."""
+    """How many points have which origin."""
     codes, counts = np.unique(seeds.source, return_counts=True)
     return ", ".join(
         f"{count:,} {origin_name(int(code))}" for code, count in zip(codes, counts, strict=True)
     )
 
 
-def _findings(found: Mapping[str, float]) -> list[tuple[str, str]]:
+def _findings(checks: Mapping[str, float]) -> list[tuple[str, str]]:
     rows = []
-    if "far" in found:
+    if "far" in checks:
         rows.append(
-            ("far from any original", f"{found['far']:.2%} of the new points, over 3 spacings")
+            ("far from any original", f"{checks['far']:.2%} of the new points, over 3 spacings")
         )
-    if "after" in found:
-        share = f"{found['after']:.1%} of the pictures have a point in each 8 x 8 pixels"
-        rows.append(("covered", f"{share}; {found['before']:.1%} before"))
+    if "after" in checks:
+        share = f"{checks['after']:.1%} of the 8 x 8 pixel cells of the photographs have a point"
+        rows.append(("covered", f"{share}; {checks['before']:.1%} before"))
     return rows

@@ -1,4 +1,4 @@
-"""``splatseed upsample --gaussians``: the first Gaussians, for trainers that take a 3DGS .ply."""
+"""``splatseed upsample --gaussians``: initial Gaussians, for trainers that take a 3DGS .ply."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ __all__ = ["check_start", "write_start"]
 
 
 def check_start(path: Path, output: Path, *, overwrite: bool) -> None:
-    """Refuse a name for the first Gaussians that cannot be had, before any work is done.
+    """Refuse an unusable name for the initial Gaussians before any work is done.
 
     Args:
         path: The .ply.
         output: The scene folder that is written beside it.
-        overwrite: Whether a file that is there may be replaced.
+        overwrite: Whether an existing file may be replaced.
 
     Raises:
         ParameterError: It is not named .ply.
@@ -33,8 +33,8 @@ def check_start(path: Path, output: Path, *, overwrite: bool) -> None:
     target, folder = path.resolve(), output.resolve()
     if folder == target or folder in target.parents:
         raise OutputError(
-            "first Gaussians outside of the scene that is written",
-            found=f"{path} in {output}, where some trainers take any .ply for the points",
+            "a file outside the scene that is written, for the initial Gaussians",
+            found=f"{path} in {output}, where some trainers read any .ply as points",
             fix="Name a file beside the folder.",
         )
     if path.exists() and not overwrite:
@@ -44,16 +44,16 @@ def check_start(path: Path, output: Path, *, overwrite: bool) -> None:
 
 
 def write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress) -> None:
-    """Write the Gaussians that training from a scene's points would begin with.
+    """Write the Gaussians that training from a scene's points would start with.
 
     Args:
         path: The .ply.
-        scene: With the seeds as its points, in whose world the Gaussians are.
-        method: What made them; photographs that it held out are not looked at.
+        scene: The scene with the seeds as its points; the Gaussians are in its world.
+        method: The method that made them; photographs that it held out are not used.
         progress: Told how far it is.
 
     Raises:
-        SceneNotFoundError: The scene has no photographs, which say how large a Gaussian may be.
+        SceneNotFoundError: The scene has no photographs, which bound the size of a Gaussian.
         OutputError: The file cannot be written.
     """
     images = photographed(scene, getattr(method, "hold_out", 0))

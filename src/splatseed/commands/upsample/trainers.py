@@ -11,7 +11,7 @@ __all__ = ["training_commands"]
 
 
 def training_commands(path: Path, written_format: SceneFormat) -> list[tuple[str, str]]:
-    """(trainer, command) for every trainer that reads the scene at ``path`` as it is.
+    """(trainer, command) for every trainer that reads the scene at ``path`` unchanged.
 
     Args:
         path: The scene folder that was written.

@@ -172,7 +172,7 @@ def _split_points(
 
 
 def _track_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " N+1"]:
-    """Offsets into the track elements, from those of the records."""
+    """Offsets into the track elements, from the offsets of the records."""
     heads = np.arange(len(starts)) * _POINT.itemsize
     return np.asarray((starts - starts[0] - heads) // _OBSERVATION.itemsize)
 

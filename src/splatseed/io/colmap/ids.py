@@ -1,9 +1,9 @@
-"""Contiguous point ids for a COLMAP model that is written again.
+"""Contiguous point ids for rewriting a COLMAP model.
 
 Notation: a *feature* is one observation slot of an image; all features of all images in a row are
-numbered by *slot*. A track element (image id, feature index) and a feature's point id say the same
-thing twice. Promise: in the result both say it alike, every id is 1..N in the cloud's order, and a
-model that was like that already comes out unchanged. No loop over points or features.
+numbered by *slot*. A track element (image id, feature index) and a feature's point id state the
+same fact twice. Promise: in the result the two agree, ids are 1..N in the cloud's order, and a
+model that satisfied this already comes out unchanged. No loop over points or features.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ class Renumbered:
     """The tracks and images of a scene under the new ids of its points.
 
     Args:
-        tracks: Of the originals; None if the scene has none.
-        images: With the features' point ids renewed.
+        tracks: The originals' tracks; None if the scene has none.
+        images: The images, with the features' point ids renewed.
         num_broken: References between points and features that were removed because one side
             did not confirm them.
     """
@@ -38,7 +38,7 @@ class Renumbered:
 
 
 def without_points(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Scene:
-    """The scene with some of its points alone; features of the others belong to no point.
+    """The scene with some points removed; their features then belong to no point.
 
     Args:
         scene: Its tracks belong to the first ``len(scene.tracks)`` points.

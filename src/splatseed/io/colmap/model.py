@@ -1,4 +1,4 @@
-"""What the binary and the text form of a COLMAP model have in common.
+"""Shared by the binary and the text form of a COLMAP model.
 
 Notation: ``where`` is the place an error names, "file, record" or "file, line". Promise: every
 record either becomes one of our types with its values checked, or raises ``SceneFormatError`` that

@@ -1,7 +1,7 @@
 """A scene from a COLMAP model: where its files are, and what they hold.
 
 Notation: a *model* is a folder with cameras, images and points3D, each as ``.bin`` or ``.txt``;
-``points3D.ply`` stands in for missing points. Promise: ``.bin`` goes before ``.txt``; a model
+``points3D.ply`` stands in for missing points. Promise: ``.bin`` is preferred to ``.txt``; a model
 without images still gives its cloud and cameras.
 """
 
@@ -35,7 +35,7 @@ _IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
 
 
 def find_model(*folders: Path) -> Path | None:
-    """The first of some folders that holds a model."""
+    """The first of the given folders that holds a model."""
     return next((folder for folder in folders if _is_model(folder)), None)
 
 
@@ -50,7 +50,7 @@ def _model_file(model_dir: Path, name: str) -> Path | None:
 
 
 def scene_root(model_dir: Path) -> Path:
-    """The scene's folder: the model's, less ``sparse/0`` or ``sparse``, and ``colmap`` above."""
+    """The scene's folder: the model's without ``sparse/0`` or ``sparse``, or ``colmap`` above."""
     parts = model_dir.absolute().parts
     levels = 1 if parts[-1] == "sparse" else 2 if parts[-2:-1] == ("sparse",) else 0
     if not levels:
@@ -61,7 +61,7 @@ def scene_root(model_dir: Path) -> Path:
 
 
 def read_colmap_scene(model_dir: Path) -> Scene:
-    """The scene of a model, with its images, its points and what a user should know of them."""
+    """The scene of a model: its images, its points, and warnings for the user."""
     root = scene_root(model_dir)
     intrinsics, images = read_model_cameras(model_dir)
     points, tracks, points_path = read_model_points(model_dir)
@@ -104,7 +104,7 @@ def read_model_cameras(
 
 
 def read_model_points(model_dir: Path) -> tuple[PointCloud, Tracks | None, Path]:
-    """The points of a model, their tracks where they have any, and the file they are in."""
+    """The points of a model, their tracks if any, and the file they came from."""
     path = _model_file(model_dir, "points3D")
     if path is None:
         return empty_cloud(), None, model_dir / "points3D.bin"
@@ -124,7 +124,7 @@ def empty_cloud() -> PointCloud:
 
 
 def _find_image_dir(root: Path, images: Sequence[Image]) -> Path | None:
-    """The first known folder that holds the first image, else the first that is there."""
+    """The first known folder that holds the first image, else the first that exists."""
     folders = [root / name for name in _IMAGE_DIRS if (root / name).is_dir()]
     first = images[0].name if images else ""
     holding = (folder for folder in (*folders, root) if first and (folder / first).is_file())

@@ -4,8 +4,8 @@ Notation: ``rows`` are the fields of the data lines, ``numbers`` their line numb
 that begin with ``#`` and blank ones are skipped, except that the line after an image's is always
 its features and may be blank. Promise: what one reads is what the binary form of the same model
 gives, to the last bit; a malformed file raises a single error that names the file and the line.
-Python loops over lines are the price of the format. The text form is read, never written: trainers
-load the binary one.
+Python loops over lines are the price of the format. The text form is read but never written:
+trainers load the binary one.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ def _flat(
     try:
         return np.array([field for column in columns for field in column], dtype)
     except (ValueError, OverflowError):
-        # Only a file that is refused anyway pays for finding its first bad line.
+        # Only a file that is refused anyway pays for locating its first bad line.
         i = next(i for i, column in enumerate(columns) if not _converts(column, dtype))
         raise _bad(path, numbers[i], expected, columns[i]) from None
 
@@ -220,5 +220,5 @@ def _data_rows(path: Path) -> tuple[list[int], list[list[str]]]:
 
 def _bad(path: Path, number: int, expected: str, row: list[str]) -> SceneFormatError:
     fields = " ".join(row)
-    found = repr(fields if len(fields) <= 80 else f"{fields[:77]}...") if row else "an empty line"
-    return SceneFormatError(f"{expected} in {path}, line {number}", found=found, fix=EXPORT_AGAIN)
+    line = repr(fields if len(fields) <= 80 else f"{fields[:77]}...") if row else "an empty line"
+    return SceneFormatError(f"{expected} in {path}, line {number}", found=line, fix=EXPORT_AGAIN)

@@ -1,4 +1,4 @@
-"""Stereo's depth maps and normals in files: a COLMAP dense workspace, a plain folder."""
+"""Writing stereo's depth and normal maps: a COLMAP dense workspace, or a plain folder."""
 
 from splatseed.io.dense.maps import DenseMap
 from splatseed.io.dense.plain import write_dense_maps

@@ -1,8 +1,8 @@
-"""DenseMap: what a map must have to be written, and its depth along the rays of another pixel grid.
+"""DenseMap: what a map needs to be written, and its depth along the rays of another pixel grid.
 
 Notation: ``K`` [3, 3] maps rays r = (x, y, 1) to pixels; a map's own pixel (column, row) has its
-centre at (column + 0.5, row + 0.5). Promise: a pixel is moved along the plane that its normal
-spans, never mixed with its neighbours, so that no depth between two surfaces is made up.
+centre at (column + 0.5, row + 0.5). Promise: a pixel is moved along the plane given by its normal
+and never mixed with its neighbours, so that no depth between two surfaces is invented.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from splatseed.scene import Image
 __all__ = ["MAX_SOURCES", "DenseMap", "check_map", "depth_along", "scaled_K"]
 
 MAX_SOURCES = 8
-"""``agreeing`` has one bit for each."""
+"""``agreeing`` has one bit per source."""
 _MAX_CHANGE = 1.25
-"""A plane seen so flatly that its depth changes by more within the move is left out."""
+"""Planes seen at so grazing an angle that depth changes by more than this factor are left out."""
 _SAME_POSE = 1e-6
 
 
@@ -31,12 +31,12 @@ class DenseMap(Protocol):
 
     @property
     def name(self) -> str:
-        """Of the image."""
+        """The image's name."""
         ...
 
     @property
     def camera(self) -> Camera:
-        """In pixels of this map."""
+        """The camera, in pixels of this map."""
         ...
 
     @property
@@ -51,12 +51,12 @@ class DenseMap(Protocol):
 
     @property
     def confidence(self) -> Float32[np.ndarray, "H W"]:
-        """0 to 1; 0 where depth is NaN."""
+        """Confidence, 0 to 1; 0 where depth is NaN."""
         ...
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of the views it was compared with."""
+        """Names of the views that it was compared with."""
         ...
 
     @property
@@ -66,10 +66,10 @@ class DenseMap(Protocol):
 
 
 def check_map(dense: DenseMap, images: Mapping[str, Image]) -> None:
-    """Check that a map belongs to an image of the scene, and its arrays to each other.
+    """Check that a map belongs to an image of the scene, and that its arrays match.
 
     Raises:
-        ParameterError: They do not.
+        ParameterError: One of these fails.
     """
     names = (dense.name, *dense.sources)
     if unknown := [name for name in names if name not in images]:
@@ -95,20 +95,20 @@ def scaled_K(camera: Camera, width: int, height: int) -> Float64[np.ndarray, "3 
 def depth_along(
     dense: DenseMap, K: Float64[np.ndarray, "3 3"], at: float
 ) -> Float32[np.ndarray, "H W"]:
-    """The depth of each pixel's plane along another ray close by; NaN where unknown.
+    """The depth of each pixel's plane along another ray nearby; NaN where unknown.
 
     Args:
         dense: The map.
         K: Maps the other rays to their grid, [3, 3].
-        at: Pixel (column, row) asks for the ray through (column + at, row + at) of that grid. 0.5
-            is a pixel's centre; COLMAP's dense stereo looks along 0.
+        at: Pixel (column, row) gets the depth along the ray through (column + at, row + at) of that
+            grid. 0.5 is a pixel's centre; COLMAP's dense stereo uses 0.
     """
     own = _toward_plane(dense, dense.camera.K, 0.5)
     other = _toward_plane(dense, K, at)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = own / other  # n . (d r) = n . (d' r'), so d' = d (n . r) / (n . r')
         near = (ratio < _MAX_CHANGE) & (ratio > 1 / _MAX_CHANGE)
-    ratio = np.where(near, ratio, np.where(np.isfinite(own), np.nan, 1.0))  # no normal: as it is
+    ratio = np.where(near, ratio, np.where(np.isfinite(own), np.nan, 1.0))  # no normal: unchanged
     return np.asarray(dense.depth * ratio, np.float32)
 
 

@@ -1,4 +1,4 @@
-"""OverlapPoints: points of the maps, with tracks, for a model that has none.
+"""OverlapPoints: points sampled from the maps, with tracks, for a model that has none.
 
 Notation: a point's track names the image whose pixel it is and the sources that confirm it.
 Promise: at most ``PER_MAP`` points per image, evenly over its pixels; which ones depends on the map
@@ -22,20 +22,20 @@ from splatseed.scene import Image, Observations, Tracks
 __all__ = ["PER_MAP", "OverlapPoints"]
 
 PER_MAP = 200
-"""Enough to tell views that overlap much from those that do little."""
+"""Enough to tell which views overlap much and which little."""
 _GREY = 128
 _UNKNOWN_ERROR = -1.0
 
 
 class OverlapPoints:
-    """Collects points while maps pass."""
+    """Collects points as maps pass by."""
 
     def __init__(self) -> None:
         self._xyz: list[np.ndarray] = []
         self._views: list[tuple[str, ...]] = []
 
     def add(self, dense: DenseMap) -> None:
-        """Take points of one map, from pixels that some source confirms."""
+        """Take points of one map, from pixels confirmed by at least one source."""
         rows, columns = np.nonzero(np.isfinite(dense.depth) & (dense.agreeing > 0))
         chosen = np.linspace(0, len(rows) - 1, min(PER_MAP, len(rows))).astype(np.intp)
         rows, columns = rows[chosen], columns[chosen]

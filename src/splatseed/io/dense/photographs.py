@@ -1,8 +1,8 @@
-"""The photographs of a COLMAP dense workspace: as they are, or undistorted.
+"""The photographs of a COLMAP dense workspace: unchanged or undistorted.
 
 Notation: the pinhole camera of an undistorted photograph has the lens's own focal length, centre
-and size. Promise: photographs are linked, or copied, and never written to; undistorted ones keep
-their names and kinds of file.
+and size. Promise: photographs are linked or copied, and never written to; undistorted ones keep
+their names and file types.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ Undistort: TypeAlias = Callable[
     [UInt8[np.ndarray, "H W 3"], Intrinsics, Float64[np.ndarray, "3 3"]],
     tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]],
 ]
-"""``splatseed.views.undistortion.undistort``, or what does the same: pixels, lens and matrix to
-pixels and which of them are known."""
+"""``splatseed.views.undistortion.undistort`` or an equivalent: takes pixels, lens and matrix, and
+returns pixels and which of them are known."""
 
 _ASPECT_SLACK = 0.02
 _QUALITY: dict[str, Any] = {"quality": 95, "subsampling": 0}
-"""Of JPEGs that are written: the pixels were JPEG's once before."""
+"""Quality of JPEGs that are written: their pixels come from JPEGs already."""
 
 
 def check_image(image: Image, folder: Path, *, undistorts: bool) -> tuple[int, int]:
-    """Check that a photograph can be brought, and return its width and height.
+    """Check that a photograph can be used, and return its width and height.
 
     Raises:
         SceneNotFoundError: It is missing.
@@ -86,12 +86,12 @@ def _check_lens(image: Image, *, undistorts: bool) -> None:
 def bring_photographs(
     scene: Scene, folder: Path, undistort: Undistort | None, progress: Progress, *, copy: bool
 ) -> list[str]:
-    """Fill ``images`` in a folder; returns what was made, as paths inside the folder.
+    """Fill ``images`` in a folder; returns the paths of what was made, inside the folder.
 
     Args:
         scene: Of checked images.
         folder: The workspace.
-        undistort: What takes the distortion out; None where there is none.
+        undistort: Removes lens distortion; None if there is none.
         progress: Told how many are undistorted.
         copy: Whether to copy rather than link.
     """

@@ -1,9 +1,9 @@
-"""A plain folder of stereo's maps, as ``--method depth`` reads them.
+"""A plain folder of stereo maps, as ``--method depth`` reads them.
 
 Notation: for the image ``a/b.jpg`` there are ``a/b.jpg.npy``, its planar depth, and
 ``a/b.jpg.stereo.npz`` with the rest: ``normal``, ``confidence``, ``agreeing``, ``sources`` and
 ``K``.
-Promise: readers of depth maps take the first and never see the second.
+Promise: readers of depth maps take the first file and ignore the second.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ def write_dense_maps(
 ) -> DenseReport:
     """Write a folder of depth maps of kind "z"; ``splatseed.io.find_depths`` reads them.
 
-    Args:
-        scene: Whose images.
-        maps: Of some of its images, in any order and of any size; taken one by one.
+        scene: The scene of the maps.
+        maps: The maps of some of its images, in any order and of any size; consumed one by one.
+        path: The folder to make.
         path: The folder to make.
         overwrite: Whether an earlier output of splatseed may be replaced.
         provenance: How the maps came about, for ``splatseed.json``.

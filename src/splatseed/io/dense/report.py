@@ -1,6 +1,6 @@
-"""DenseReport: what was written of some maps, counted as they pass.
+"""DenseReport: statistics of the written maps, counted as they pass.
 
-Promise: counting costs one look at each map and keeps none of them.
+Promise: counting looks at each map once and keeps none of them.
 """
 
 from __future__ import annotations
@@ -56,6 +56,6 @@ class DenseCount:
         self._empty += [] if known else [dense.name]
 
     def report(self, path: Path) -> DenseReport:
-        """All that was counted."""
+        """The counts so far."""
         counts = (len(self.names), self._pixels, self._known)
         return DenseReport(path, *counts, tuple(sorted(self._empty)))

@@ -1,8 +1,8 @@
 """The sparse model of a COLMAP dense workspace: pinhole cameras in the photographs' own pixels.
 
 Notation: COLMAP numbers images by their place in the model, here ascending by image id. Promise:
-the points are the originals with their tracks; where there are no tracks, points of the maps stand
-in, because COLMAP learns from tracks alone which images overlap.
+the points are the originals with their tracks; where there are no tracks, points from the maps
+stand in, because COLMAP learns only from tracks which images overlap.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class SparseModel:
         colmap_binary.write_points3d(folder / "points3D.bin", points, tracked.tracks)
 
     def _originals(self) -> tuple[PointCloud, Renumbered]:
-        """The finite, distinct points that have tracks; points that were added have none."""
+        """The finite, distinct points with tracks; added points have none."""
         num_tracked = len(self.scene.tracks or ())
         points = self.scene.points.select(slice(0, num_tracked))
         scene = clean_scene(replace(self.scene, points=points, images=self.images))
@@ -82,15 +82,15 @@ class SparseModel:
 
 
 def photograph_model(scene: Scene, sizes: Mapping[str, Size]) -> SparseModel:
-    """The cameras and images of a scene in pixels of the photographs as they are.
+    """The cameras and images of a scene, in pixels of the photographs as they are on disk.
 
-    A camera record may be larger than the photographs (a folder of reduced copies); COLMAP takes
-    colours at the record's pixels, so that the two must agree.
+    A camera record may be larger than its photographs (a folder of reduced copies); COLMAP samples
+    colours at the record's pixels, so the two must agree.
 
     Args:
-        scene: Of a camera with distortion, the pinhole one is written that its undistorted
-            photographs have.
-        sizes: Of each photograph, by its name.
+        scene: The scene; a camera with distortion becomes the pinhole camera of its undistorted
+            photographs.
+        sizes: Width and height of each photograph, by name.
     """
     cameras: dict[tuple[int, Size], Intrinsics] = {}
     images = []
@@ -119,9 +119,9 @@ def _in_pixels_of(image: Image, record: Intrinsics) -> Image:
 
 
 def _straightened(lens: Intrinsics, uv: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 2"]:
-    """Where an undistorted photograph has the features of a lens.
+    """The features of a lens in the undistorted photograph.
 
-    As they are where none of its rays leads.
+    A feature that no ray of the lens reaches stays where it is.
     """
     straight = rays_through(lens, uv) * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
     return np.where(np.isnan(straight), uv, straight)

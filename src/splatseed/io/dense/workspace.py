@@ -1,10 +1,10 @@
-"""A COLMAP dense workspace, as its ``stereo_fusion`` takes it, from maps of our own.
+"""A COLMAP dense workspace from our own maps, as its ``stereo_fusion`` takes it.
 
 Notation: ``images/``, ``sparse/`` and ``stereo/`` as COLMAP's image_undistorter lays them out.
-COLMAP places pixel (column, row) of a map at (column, row) of its camera where everyone else, and
-its own sparse model, has (column + 0.5, row + 0.5). Promise: depths are those along COLMAP's rays,
-so that fused points lie where the scene has them, whatever the size of the maps; the folder appears
-whole or not at all.
+COLMAP places pixel (column, row) of a map at (column, row) of its camera, whereas everyone else,
+its own sparse model included, has (column + 0.5, row + 0.5). Promise: depths are those along
+COLMAP's rays, so fused points lie where the scene has them, whatever the size of the maps; the
+folder appears whole or not at all.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.errors import ParameterError
 from splatseed.io.dense.colmap_files import write_consistency_graph, write_map
 from splatseed.io.dense.maps import DenseMap, check_map, depth_along, scaled_K
 from splatseed.io.dense.overlap import OverlapPoints
@@ -24,6 +24,7 @@ from splatseed.io.dense.report import DenseCount, DenseReport
 from splatseed.io.dense.sparse_model import Size, SparseModel, photograph_model
 from splatseed.io.output.layouts import write_json
 from splatseed.io.output.staging import MANIFEST, output_folder
+from splatseed.io.photograph import photograph_folder
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 
@@ -32,7 +33,7 @@ __all__ = ["check_dense_scene", "write_dense_workspace"]
 _KINDS = ("photometric", "geometric")
 """COLMAP's two passes; stereo_fusion reads the second unless told otherwise."""
 _CORNER = 0.0
-"""Where COLMAP's dense stereo has a pixel's centre."""
+"""The offset of a pixel's centre in COLMAP's dense stereo."""
 
 
 def write_dense_workspace(
@@ -53,14 +54,14 @@ def write_dense_workspace(
 
     Args:
         scene: A scene with photographs.
-        maps: Of some of its images, in any order and of any size; taken one by one.
+        maps: Maps of some of its images, in any order and of any size; taken one by one.
         path: The folder to make.
         overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the photographs instead of linking them.
-        undistort: What takes the distortion of a lens out of a photograph, such as
-            ``splatseed.views.undistortion.undistort``. The workspace gets what it makes, and
-            pinhole cameras of the same matrix; maps are of these. Without it, distorted cameras are
-            refused.
+        undistort: Removes lens distortion from a photograph, such as
+            ``splatseed.views.undistortion.undistort``. The workspace then holds the undistorted
+            photographs and pinhole cameras of the same matrix, which the maps belong to. Without
+            it, distorted cameras are refused.
         provenance: How the maps came about, for ``splatseed.json``.
         progress: Told how many maps are written.
 
@@ -70,8 +71,8 @@ def write_dense_workspace(
     Raises:
         ParameterError: There is no map, or one does not belong to the scene.
         SceneNotFoundError: The scene has no photographs, or one is missing.
-        SceneFormatError: A camera has distortion that nothing takes out, or a photograph has not
-            its shape.
+        SceneFormatError: A camera has distortion that is not removed, or a photograph differs from
+            its camera in aspect ratio.
         OutputError: The folder is taken or cannot be written, or an image's name leads out of it.
     """
     model = photograph_model(scene, check_dense_scene(scene, undistorts=undistort is not None))
@@ -101,28 +102,23 @@ def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Si
 
     Args:
         scene: The scene.
-        undistorts: Whether distortion will be taken out.
+        undistorts: Whether distortion will be removed.
 
     Returns:
         Width and height of each photograph, by its name.
 
     Raises:
         SceneNotFoundError: It has no photographs, or one is missing.
-        SceneFormatError: A camera has distortion that stays, or a photograph is not of its shape.
+        SceneFormatError: A camera has distortion that stays, or a photograph differs from it in
+            aspect ratio.
         OutputError: An image's name leads out of its folder.
     """
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None or not scene.images:
-        raise SceneNotFoundError(
-            "a scene with photographs",
-            found="no images" if folder else "no folder of images",
-            fix="Name a scene with cameras, and put its photographs into a folder named images.",
-        )
+    folder = photograph_folder(scene)
     return {image.name: check_image(image, folder, undistorts=undistorts) for image in scene.images}
 
 
 def _inputs(scene: Scene) -> tuple[Path, ...]:
-    """What was read, which the output must stay apart from."""
+    """The files that were read, which the output must stay apart from."""
     source = scene.source
     if source is None:
         return ()
@@ -144,7 +140,7 @@ class _Stereo:
         check_map(dense, self._images)
         if dense.name in self._sources:
             raise ParameterError(
-                "one depth map an image", found=f"two for {dense.name}", fix="Leave one out."
+                "one depth map per image", found=f"two for {dense.name}", fix="Leave one out."
             )
         self._sources[dense.name] = dense.sources
         height, width = dense.depth.shape
@@ -163,7 +159,7 @@ class _Stereo:
         np.save(centred, depth_along(dense, K, 0.5), allow_pickle=False)
 
     def write_lists(self) -> None:
-        """Write which images to match with which, and which to fuse, ordered as in the model."""
+        """Write which images to match with which, and which to fuse, in the model's order."""
         names = [name for name in self._images if name in self._sources]
         matches = [f"{name}\n{_matches(self._sources[name])}\n" for name in names]
         (self._folder / "patch-match.cfg").write_text("".join(matches), encoding="utf-8")

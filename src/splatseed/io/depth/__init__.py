@@ -1,1 +1,1 @@
-"""Depth maps in files: every format that is read, and folders of them."""
+"""Depth maps in files: every readable format, and folders of maps."""

@@ -1,4 +1,4 @@
-"""Depth maps that are kept as arrays: NumPy's ``.npy`` and ``.npz``, ``.pfm``, COLMAP's ``.bin``.
+"""Depth maps stored as arrays: NumPy's ``.npy`` and ``.npz``, ``.pfm``, COLMAP's ``.bin``.
 
 Notation: a stored map is H x W numbers, top row first, still in the file's own units. Promise: a
 header is checked against the bytes that follow before anything is allocated for it, no pickle is
@@ -36,9 +36,9 @@ __all__ = [
 ]
 
 KINDS: tuple[DepthKind, ...] = get_args(DepthKind)
-"""What a value can be."""
+"""NumPy kinds of real numbers."""
 MAX_PIXELS = 2**28
-"""The largest map that is believed: a header that promises more is damaged or hostile."""
+"""The largest plausible map: a header that promises more is damaged or hostile."""
 
 _NPY_HEADERS = {
     (1, 0): npy_format.read_array_header_1_0,
@@ -50,9 +50,9 @@ _NPY_FAILURES = (
 )
 _ZIP_FAILURES = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
 _MOST_INFLATED = 100
-"""How many times larger than in its archive a map can be: measured values hardly shrink."""
+"""How many times larger than in its archive a map can be: measured values hardly compress."""
 _SMALL = 1 << 26
-"""Bytes that do no harm, however little they are in the archive: a map can be of one value."""
+"""Maps of up to this many bytes are harmless at any compression: a map can be constant."""
 _NPZ_KEYS = ("depth", "arr_0")
 _PFM_HEADER = re.compile(rb"(P[fF])\s+(\d{1,9})\s+(\d{1,9})\s+([-+.\deE]{1,32})[ \t]*\r?\n")
 _BIN_HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
@@ -60,11 +60,11 @@ _FLOAT = np.dtype("<f4")
 
 
 class StoredDepth(NamedTuple):
-    """A map as its file has it.
+    """A map as stored in its file.
 
     Args:
         values: Real numbers [H, W].
-        kind: What the file says that they are; None where it does not.
+        kind: What the values are, if the file says so; else None.
     """
 
     values: np.ndarray
@@ -192,7 +192,7 @@ def _parse_npy(path: Path, data: bytes) -> np.ndarray:
 
 
 def _as_map(path: Path, array: np.ndarray) -> np.ndarray:
-    """Without an axis of length 1 before [1, H, W] or after [H, W, 1]; checked."""
+    """The map without an axis of length 1 before [1, H, W] or after [H, W, 1]; checked."""
     if array.ndim == 3 and 1 in (array.shape[0], array.shape[2]):
         array = array[0] if array.shape[0] == 1 else array[..., 0]
     check_stored(path, array.shape, array.dtype)
@@ -200,7 +200,7 @@ def _as_map(path: Path, array: np.ndarray) -> np.ndarray:
 
 
 def _wanted(path: Path, names: set[str]) -> str:
-    """Which of an archive's arrays is the map."""
+    """The name of the map among an archive's arrays."""
     wanted = [key for key in _NPZ_KEYS if key in names] or sorted(names)
     if not wanted or (wanted[0] not in _NPZ_KEYS and len(names) > 1):
         refuse(path, "one array, or one named depth", ", ".join(sorted(names)[:5]) or "none")
@@ -208,20 +208,20 @@ def _wanted(path: Path, names: set[str]) -> str:
 
 
 def _member(path: Path, archive: zipfile.ZipFile, name: str) -> bytes:
-    """A ``.npy`` file of an archive, unless it says that it is absurdly larger than it is there."""
+    """A ``.npy`` file in an archive, refused if it claims to be absurdly larger than stored."""
     info = archive.getinfo(f"{name}.npy")
     most = max(_SMALL, _MOST_INFLATED * info.compress_size)
     if info.file_size > min(most, 8 * MAX_PIXELS):
-        found = f"{info.compress_size:,} bytes that would become {info.file_size:,}"
-        refuse(path, "no more values than an archive of its size holds", found)
+        sizes = f"{info.compress_size:,} bytes that would become {info.file_size:,}"
+        refuse(path, "no more values than an archive of its size holds", sizes)
     return archive.read(info)
 
 
 def _kind_of(path: Path, data: bytes | None) -> DepthKind | None:
     if data is None:
         return None
-    found = _parse_npy(path, data)
-    kind = str(found.reshape(-1)[0])
-    if found.dtype.kind != "U" or kind not in KINDS:
+    stored = _parse_npy(path, data)
+    kind = str(stored.reshape(-1)[0])
+    if stored.dtype.kind != "U" or kind not in KINDS:
         refuse(path, f"a kind of {', '.join(KINDS)}", repr(kind))
     return kind

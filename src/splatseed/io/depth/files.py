@@ -1,8 +1,8 @@
-"""DepthFiles: the depth maps of a scene, one file per image, read when asked for.
+"""DepthFiles: the depth maps of a scene, one file per image, read on demand.
 
-Notation: ``scale`` is stored units per unit of the scene, by which a file's numbers are divided.
-Promise: a map is float32 with NaN wherever nothing is known; reading keeps nothing in memory and is
-safe from several threads at once.
+Notation: ``scale`` is stored units per scene unit, by which a file's numbers are divided.
+Promise: a map is float32 with NaN where unknown; nothing stays in memory, and reading is safe from
+several threads at once.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from splatseed.io.depth.pictures import read_exr, read_picture
 __all__ = ["INTEGER_SCALE", "NOTHING_HIT", "SUFFIXES", "DepthFiles"]
 
 INTEGER_SCALE = 1000.0
-"""Stored units per scene unit of integers whose scale nobody tells: millimetres in metres."""
+"""Default scale of integer maps: millimetres in a scene in metres."""
 NOTHING_HIT = 1e9
-"""From here on a distance is a renderer's word for "nothing hit"; Blender writes 1e10."""
+"""From this distance on, a value means that a renderer's ray hit nothing; Blender writes 1e10."""
 
 _SATURATED = 65535
 _READERS: dict[str, Callable[[Path], StoredDepth]] = {
@@ -45,7 +45,7 @@ _READERS: dict[str, Callable[[Path], StoredDepth]] = {
     ".png": read_picture,
 }
 SUFFIXES = tuple(_READERS)
-"""Suffixes of files that can be read. A PNG comes last: beside exact numbers it is their
+"""Suffixes of readable files. PNG comes last: beside a file of exact numbers it is their
 picture."""
 
 
@@ -57,7 +57,7 @@ class DepthFiles:
         paths: The file of each image that has one, by the image's name.
         kind: What the values are; None: what the file itself says, else planar z.
         scale: Stored units per scene unit; None: 1000 for integers, 1 for floats.
-        lens: What moves the values to the pixels of undistorted photographs; None: they are there.
+        lens: Moves the values to the pixels of undistorted photographs; None: no need to.
     """
 
     paths: Mapping[str, Path]
@@ -80,9 +80,9 @@ class DepthFiles:
     def read(self, name: str) -> DepthMap:
         """The map of an image; safe to call from several threads.
 
-        NaN stands where nothing is known: the file has NaN, an infinity or 1e9 and more; 0 or less
-        (of inverse depth only integer zeros, since a network may predict 0 for what is far); or
-        65535 in 16 bits, where the sensor's range ended.
+        NaN stands where nothing is known: the file has NaN, an infinity, or 1e9 and more; 0 or less
+        (for inverse depth only integer zeros, since a network may predict 0 for far pixels); or
+        65535 in 16 bits, the end of the sensor's range.
 
         Raises:
             SceneNotFoundError: The image has no file, or it is gone.

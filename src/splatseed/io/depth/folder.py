@@ -1,8 +1,8 @@
-"""Folders of depth maps: the description that tells what they hold, and writing one.
+"""Folders of depth maps: reading the description of their contents, and writing a folder.
 
 Notation: ``depths.json`` beside the maps holds ``{"kind": "z" | "ray" | "inverse", "scale": S}``,
-both optional: what the values are, and stored units per scene unit. Promise: a folder that is
-written appears whole or not at all, with one float32 ``.npy`` an image, named as the image is.
+both optional: what the values are, and stored units per scene unit. Promise: a folder appears whole
+or not at all, with one float32 ``.npy`` per image, named after the image.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ __all__ = [
 CAMERA_FILE = "cam_params.json"
 """The camera of an RGB-D capture, and the scale of its maps, in its folder or the one above."""
 DESCRIPTION = "depths.json"
-"""The file beside depth maps that says what they hold."""
+"""The file beside depth maps that describes them."""
 
 
 class DepthDescription(NamedTuple):
-    """What a folder says of its maps.
+    """What a folder says about its maps.
 
     Args:
         kind: What the values are; None: not said.
@@ -82,7 +82,7 @@ def write_description(
         folder: Where the maps are.
         kind: What the values are.
         scale: Stored units per scene unit.
-        more: How they came about; for people, not read.
+        more: How they were made; for people, never read back.
 
     Raises:
         OSError: It cannot be written.
@@ -103,14 +103,14 @@ def read_capture_scale(path: Path) -> float | None:
 
 
 def safe_parts(name: str) -> tuple[str, ...]:
-    """The folders and the file of an image's name, without ways out of a folder."""
+    """The folders and the file name of an image, without parts that lead out of a folder."""
     pure = PurePosixPath(name)
     return tuple(part for part in pure.parts if part not in {"..", pure.anchor})
 
 
 @dataclass(frozen=True)
 class DepthWriter:
-    """Writes the maps of a folder that is being made.
+    """Writes the maps of a folder in the making.
 
     Args:
         folder: Where to.
@@ -126,7 +126,7 @@ class DepthWriter:
             values: NaN where nothing is known.
 
         Raises:
-            OutputError: Two images have names that differ only in ways out of the folder.
+            OutputError: Two image names become the same once parts that lead out are dropped.
         """
         path = self.folder.joinpath(*safe_parts(f"{name}.npy"))
         check_stored(path, values.shape, values.dtype)
@@ -136,7 +136,7 @@ class DepthWriter:
                 np.save(file, np.ascontiguousarray(values, np.float32))
         except FileExistsError:
             raise OutputError(
-                "one depth map an image", found=f"two for {name}", fix="Rename the image."
+                "one depth map per image", found=f"two for {name}", fix="Rename the image."
             ) from None
 
 
@@ -152,14 +152,14 @@ def depth_folder(
     """A folder of depth maps that appears at ``path`` when the block ends without an error.
 
     Args:
-        path: Where the maps are to be.
+        path: Where the maps should be.
         kind: What their values are.
         overwrite: Whether a folder that splatseed wrote may be replaced.
         protect: Inputs that the folder must lie apart from.
-        provenance: How the maps came about, for ``splatseed.json``.
+        provenance: How the maps were made, for ``splatseed.json``.
 
     Yields:
-        What writes them.
+        The writer of the maps.
 
     Raises:
         OutputError: ``path`` is taken or protected, or writing failed.
@@ -174,12 +174,12 @@ def _read_object(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_bytes(path).decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        found = f"{type(error).__name__}: {error}"
+        wrong = f"{type(error).__name__}: {error}"
     else:
         if isinstance(content, dict):
             return content
-        found = type(content).__name__
-    raise SceneFormatError(f"{path} to hold a JSON object", found=found, fix="Write it again.")
+        wrong = type(content).__name__
+    raise SceneFormatError(f"{path} to hold a JSON object", found=wrong, fix="Write it again.")
 
 
 def _positive(path: Path, scale: object) -> float:

@@ -1,9 +1,9 @@
-"""Depth maps of a distorted lens, brought to the pixels of undistorted photographs.
+"""Depth maps of a distorted lens, resampled to the pixels of undistorted photographs.
 
 Notation: ``lens`` is the camera that took the maps, in one of COLMAP's models; the photographs were
 undistorted to pinhole cameras at the same place. Promise: planar depth belongs to the ray and not
 to the pixel, so values are moved, never changed; a pixel takes the nearest value, so that no depth
-between two surfaces is made up, and NaN where the lens did not look.
+between two surfaces is invented, and NaN where the lens did not look.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Undistortion:
     cameras: Mapping[str, Intrinsics]
 
     def apply(self, name: str, values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "h w"]:
-        """The map in the pixels of one photograph, of that one's size.
+        """The map in the pixels of one photograph, at that photograph's size.
 
         Args:
             name: The photograph.

@@ -1,11 +1,10 @@
-"""Depth maps that belong to images by their names.
+"""Matching depth maps to images by name.
 
 Notation: a *stem* is a map's path without suffix, relative to the folder. For the image ``a/b.jpg``
 the stems are tried in this order: ``a/b.jpg``, ``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's
 dense stereo), ``a/b``, ``a/b_depth``, ``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM) and
 ``a/X.depth`` for ``a/X.color.png`` (7-Scenes); for each, the suffixes in the order of ``SUFFIXES``.
-Promise: which file is taken depends on names alone, never on the order in which a system lists
-them.
+Promise: the choice depends on names only, never on the order in which a system lists files.
 """
 
 from __future__ import annotations
@@ -29,15 +28,13 @@ from splatseed.scene import Scene
 __all__ = ["match_by_name"]
 
 _FOLDERS = ("", "stereo/depth_maps", "depth_maps", "results", "depths", "depth")
-"""Where maps lie in the folder that was named; the first with a map of any image."""
+"""Subfolders searched for maps; the first with a map of any image is used."""
 _FRAME = re.compile(r"frame(\d+)", re.IGNORECASE)
 _CAPTURED = re.compile(r"depth(\d+)", re.IGNORECASE)
 
 
 def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
-    """The depth maps in a folder whose names are those of a scene's images.
-
-    None where there is none.
+    """The depth maps in a folder whose names match a scene's images; None if there are none.
 
     Raises:
         SceneFormatError: Two images share a map, or the folder's description is damaged.
@@ -51,14 +48,14 @@ def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
 def _match(scene: Scene, folder: Path) -> dict[str, Path]:
     """The map of each image in one folder.
 
-    Images' names may begin with folders that the maps' do not: as many are left out as it takes to
-    find any map.
+    Image names may begin with folders that map names lack: as many as needed to match any map are
+    dropped.
     """
     parts = {image.name: safe_parts(image.name) for image in scene.images}
     listing = _Listing(folder, _image_files(scene))
     for drop in range(max(map(len, parts.values()), default=0)):
-        found = {name: listing.map_of(each[drop:]) for name, each in sorted(parts.items())}
-        present = {name: path for name, path in found.items() if path is not None}
+        maps = {name: listing.map_of(each[drop:]) for name, each in sorted(parts.items())}
+        present = {name: path for name, path in maps.items() if path is not None}
         if present:
             _check_unshared(present)
             return present
@@ -66,7 +63,7 @@ def _match(scene: Scene, folder: Path) -> dict[str, Path]:
 
 
 def _image_files(scene: Scene) -> frozenset[Path]:
-    """The photographs themselves, which are no depth maps even if they lie where those do."""
+    """The photographs themselves, which are not depth maps even if they lie in the same folder."""
     folder = scene.source.image_dir if scene.source else None
     if folder is None:
         return frozenset()
@@ -76,7 +73,7 @@ def _image_files(scene: Scene) -> frozenset[Path]:
 
 
 class _Listing:
-    """The depth maps of a folder, each subfolder listed once, when first asked for."""
+    """The depth maps of a folder; each subfolder is listed once, on demand."""
 
     def __init__(self, root: Path, taken: frozenset[Path]) -> None:
         self._root = root
@@ -94,7 +91,7 @@ class _Listing:
         return next((files[key] for key in keys if key in files), None)
 
     def _list(self, folder: Path) -> dict[str, Path]:
-        """The files of a subfolder by their names, suffix in lower case, numbers also unpadded."""
+        """The files of a subfolder by name, suffixes in lower case, numbers also unpadded."""
         files: dict[str, Path] = {}
         if not folder.is_dir():
             return files
@@ -109,7 +106,7 @@ class _Listing:
 
 
 def _stems(file_name: str) -> Iterator[str]:
-    """The stems that a map of this image may have, the first to be preferred."""
+    """The stems that a map of this image may have, in order of preference."""
     stem = PurePosixPath(file_name).stem
     yield from (file_name, f"{file_name}.geometric", f"{file_name}.photometric")
     yield from (stem, f"{stem}_depth")
@@ -119,9 +116,9 @@ def _stems(file_name: str) -> Iterator[str]:
         yield f"{stem.removesuffix('.color')}.depth"
 
 
-def _check_unshared(found: dict[str, Path]) -> None:
+def _check_unshared(maps: dict[str, Path]) -> None:
     owners: dict[Path, str] = {}
-    for name, path in found.items():
+    for name, path in maps.items():
         other = owners.setdefault(path, name)
         if other != name:
             raise SceneFormatError(
@@ -132,7 +129,7 @@ def _check_unshared(found: dict[str, Path]) -> None:
 
 
 def _describe(folder: Path, example: Path) -> DepthDescription:
-    """What the folder says of its maps: ``depths.json``, or the camera file of a capture."""
+    """What the folder says about its maps: ``depths.json``, or the camera file of a capture."""
     if (folder / DESCRIPTION).is_file():
         return read_description(folder / DESCRIPTION)
     if _CAPTURED.fullmatch(example.stem) and example.suffix.lower() == ".png":

@@ -1,8 +1,8 @@
-"""Depth maps that are kept as pictures: PNG and TIFF through Pillow, OpenEXR through its package.
+"""Depth maps stored as pictures: PNG and TIFF through Pillow, OpenEXR through its package.
 
-Notation: as in ``depth_arrays``, a stored map is H x W numbers in the file's own units. Promise:
-only pictures of one channel are taken for depth, never the first channel of a colour picture; a
-damaged file is a ``SceneFormatError`` that names it.
+Notation: as in ``arrays``, a stored map is H x W numbers in the file's own units. Promise:
+only one-channel pictures count as depth, never the first channel of a colour picture; a damaged
+file is a ``SceneFormatError`` that names it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _PILLOW_FAILURES = (
 _GREY = {"L", "I", "F", "I;16", "I;16B", "I;16L", "I;16N"}
 _EXR_FAILURES = (RuntimeError, OSError, ValueError, TypeError, KeyError)
 _EXR_CHANNELS = ("Z", "depth", "Depth", "D", "Y", "V", "R")
-"""Where renderers put depth, first match first; R if it stands for grey, with G and B beside it."""
+"""Where renderers put depth, first match first; R only if it is grey, without G and B beside it."""
 
 
 def read_picture(path: Path) -> StoredDepth:
@@ -66,7 +66,7 @@ def read_exr(path: Path) -> StoredDepth:
     """
     require("OpenEXR")
     openexr = importlib.import_module("OpenEXR")
-    read_bytes(path)  # whether it can be read; the package's own words for that are few
+    read_bytes(path)  # check that it can be read; the package's own message says little
     try:
         with openexr.File(str(path), header_only=True) as file:
             _check_windows(path, file.header())

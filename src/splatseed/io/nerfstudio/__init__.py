@@ -1,1 +1,1 @@
-"""Cameras in ``transforms.json``, as nerfstudio, instant-ngp and Blender's data sets have them."""
+"""Cameras in ``transforms.json``, as in the data sets of nerfstudio, instant-ngp and Blender."""

@@ -1,4 +1,4 @@
-"""A scene in two files: ``transforms_train.json`` and ``transforms_test.json``, as of Blender.
+"""A scene in two files, ``transforms_train.json`` and ``transforms_test.json``, as Blender's sets.
 
 Promise: both become one scene, whose images are named with their folders (``train/r_0.png``), and
 whose split is that of the files. Images that only ``transforms_val.json`` has are left out.
@@ -27,7 +27,7 @@ def is_blender(folder: Path) -> bool:
 
 
 def read_blender(folder: Path) -> Scene:
-    """Read both files, and the points that lie in their space; the cloud may be empty.
+    """Read both files, and the points in their space; the cloud may be empty.
 
     Raises:
         SceneNotFoundError: A file is missing.

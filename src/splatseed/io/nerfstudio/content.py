@@ -93,7 +93,7 @@ def kept_json(transforms: Transforms, names: Collection[str]) -> dict[str, Any]:
 def _kept_lists(
     content: Mapping[str, Any], dropped: Iterable[Mapping[str, Any]], root: Path
 ) -> dict[str, list[str]]:
-    """The lists of file names by which nerfstudio splits; it fails over one that is no frame's."""
+    """The file lists of nerfstudio's split, which fails over names that no frame has."""
     gone = {os.path.normpath(str(frame["file_path"])) for frame in dropped}
     return {
         key: [
@@ -107,7 +107,7 @@ def _kept_lists(
 
 
 def frame_paths(frames: Iterable[Mapping[str, Any]]) -> list[str]:
-    """All paths, relative to the file, that the frames name."""
+    """All paths in the frames, relative to the file."""
     paths = (frame.get(key) for frame in frames for key in _PATH_KEYS)
     return [path for path in paths if isinstance(path, str) and not Path(path).is_absolute()]
 

@@ -2,8 +2,7 @@
 
 Notation: the *transforms' space* is the world of the file's poses. Promise: points come from the
 file that the JSON names, else from a PLY known to lie in that space, else from a COLMAP model whose
-cameras prove how it is brought there: by a known turn of the axes, or by a similarity that fits
-them.
+cameras determine the map into that space: a known rotation of the axes, or a fitted similarity.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply
 _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """What nerfstudio applied to a COLMAP model before it wrote ``applied_transform``."""
 _FEWEST_FITTED = 4
-"""Of three camera centres a similarity says nothing: it fits any three nearly as well."""
+"""Three camera centres do not suffice for a similarity: it fits any three nearly as well."""
 _POSE_TOLERANCE = 1e-2  # of the cameras' extent, between transforms.json and its COLMAP model
 
 
@@ -65,7 +64,7 @@ def read_transforms_scene(path: Path) -> Scene:
 
 
 def find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
-    """The cloud, the file it came from, and what to tell of it."""
+    """The cloud, the file it came from, and notes for the user."""
     root, notes = transforms.path.parent, []
     named = transforms.json.get("ply_file_path")
     names = [name for name in (named, *_POINT_FILES) if isinstance(name, str)]

@@ -48,13 +48,13 @@ class Transforms:
 
     Args:
         path: The file.
-        json: Its content as it is.
+        json: Its content, unchanged.
         images: The posed images, in the file's order; OpenCV axes, the transforms' space.
-        intrinsics: The different cameras among the frames, ids from 1.
+        intrinsics: The distinct cameras of the frames, ids from 1.
         image_dir: The folder that holds all images (``images`` as a rule); names are relative
             to it.
         applied_transform: float64 [3, 4], None if the file has none.
-        warnings: What could not be taken over, one sentence each.
+        warnings: What could not be converted, one sentence each.
     """
 
     path: Path
@@ -98,7 +98,7 @@ def apply_transform(
     transform: Float64[np.ndarray, "3 4"], xyz: np.ndarray
 ) -> Float64[np.ndarray, "N 3"]:
     """Points [N, 3] taken through an affine map [3, 4], float64."""
-    with np.errstate(invalid="ignore"):  # infinite points stay not finite
+    with np.errstate(invalid="ignore"):  # infinite points stay infinite or NaN
         return np.asarray(np.asarray(xyz, np.float64) @ transform[:, :3].T + transform[:, 3])
 
 
@@ -117,8 +117,8 @@ def _parse(path: Path) -> dict[str, Any]:
 def _frames(path: Path, meta: Mapping[str, Any]) -> list[dict[str, Any]]:
     frames = meta.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
-        found = "none" if not frames else "something else"
-        raise SceneFormatError(f"{path} to have a list of frames", found=found, fix=_FIX)
+        other = "none" if not frames else "something else"
+        raise SceneFormatError(f"{path} to have a list of frames", found=other, fix=_FIX)
     return frames
 
 
@@ -171,8 +171,8 @@ def _number(where: str, values: Mapping[str, Any], key: str, default: float | No
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        found = "none" if value is None else repr(value)
-        raise SceneFormatError(f"a number {key} in {where}", found=found, fix=_FIX)
+        other = "none" if value is None else repr(value)
+        raise SceneFormatError(f"a number {key} in {where}", found=other, fix=_FIX)
     return number
 
 
@@ -223,7 +223,7 @@ def _focal_length(
 
 
 def _lens(where: str, values: Mapping[str, Any]) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's model and distortion parameters; k4 of a perspective lens has no place in it."""
+    """COLMAP's model and distortion parameters; COLMAP has no k4 of a perspective lens."""
     model = str(values.get("camera_model", "OPENCV"))
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
     if model == "OPENCV_FISHEYE" or values.get("is_fisheye") is True:
@@ -276,7 +276,7 @@ def _pose(where: str, value: Any) -> tuple[Float64[np.ndarray, " 4"], Float64[np
         raise SceneFormatError(
             f"a rotation and translation as transform_matrix in {where}",
             found="a scaled, sheared or mirrored one",
-            fix="Take the scale out of the poses (and of the points).",
+            fix="Remove the scale from the poses (and from the points).",
         )
     return quat_from_rotation(rotation), -rotation @ world_from_cam[:, 3]
 

@@ -1,1 +1,1 @@
-"""Output that trainers load: its layouts, what we add, and how it is written whole."""
+"""Output that trainers load: its layouts, our additions, and writing it whole or not at all."""

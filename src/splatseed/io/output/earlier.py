@@ -1,9 +1,9 @@
-"""Scenes that splatseed wrote: which points are originals, and what is known of them.
+"""Scenes that splatseed wrote: which points are originals, and what is known about the others.
 
-Point files have no place for a point's origin, but ``splatseed.json`` beside them says how many of
-the points, the first ones, were in the input, and ``seeds.npz`` what made each of the others. New
+Point files have no field for a point's origin, but ``splatseed.json`` beside them says how many of
+the first points were in the input, and ``seeds.npz`` which method made each of the others. New
 points must never be taken for originals: upsampling an output again starts from its originals and
-replaces what was made from them. Where no point at all is an original, all count as such.
+replaces the points made from them. If no point at all is an original, all count as such.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ __all__ = ["recall_seeds"]
 
 
 def recall_seeds(scene: Scene) -> Scene:
-    """The scene with what its ``seeds.npz`` and its manifest say of its points, where they fit."""
+    """The scene with the attributes from ``seeds.npz`` and its manifest, if they match."""
     if scene.source is None or not len(scene.points):
         return scene
     known = read_seeds(scene.source.root, scene.points)
     source = known.points.source if known.has_source else _by_manifest(scene)
     points = known.points.replace(source=source if (source == ORIGINAL).any() else None)
     notes = tuple(filter(None, (known.warning, _added_note(points))))
-    # Tracks belong to the points that come first, and a new point has none.
+    # Tracks belong to the first points, and a new point has none.
     first_new = int(np.append(points.source != ORIGINAL, True).argmax())
     tracks = None if scene.tracks is None else _first(scene.tracks, first_new)
     return replace(scene, points=points, tracks=tracks, warnings=(*scene.warnings, *notes))
 
 
 def _by_manifest(scene: Scene) -> UInt8[np.ndarray, " N"]:
-    """The origin of each point by the number of originals in the manifest."""
+    """The origin of each point, from the number of originals in the manifest."""
     root = scene.source.root if scene.source else Path()
     total = len(scene.points)
     source = np.full(total, GENERATED, np.uint8)
@@ -47,18 +47,18 @@ def _by_manifest(scene: Scene) -> UInt8[np.ndarray, " N"]:
 
 
 def _added_note(points: PointCloud) -> str:
-    """What the user should know of points that are not originals; nothing if there are none."""
+    """A note for the user about points that are not originals; empty if all are."""
     added = len(points) - points.num_original
     if not added:
         return ""
     return (
-        f"{added:,} of the points were added by splatseed to {points.num_original:,} originals;"
+        f"splatseed added {added:,} of the points to {points.num_original:,} originals;"
         " upsampling again would replace them."
     )
 
 
 def _num_original(manifest: Path, total: int) -> int:
-    """How many of ``total`` points are originals; all unless a manifest of this cloud says so."""
+    """How many of ``total`` points are originals; all unless a manifest for this cloud says so."""
     try:
         facts = json.loads(manifest.read_text(encoding="utf-8"))
         num_points, num_original = facts["num_points"], facts["num_original"]

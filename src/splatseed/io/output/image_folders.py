@@ -1,4 +1,4 @@
-"""Bringing a scene's image folders into an output.
+"""Linking or copying a scene's image folders into an output.
 
 Notation: ``folders`` maps a path inside the output to the folder or file it stands for. Promise:
 the photographs are linked, or copied where links are not wanted or not possible; the source is
@@ -22,11 +22,11 @@ __all__ = ["bring", "frame_folders", "image_folders"]
 _SIBLINGS = tuple(
     f"{kind}{scale}" for kind in ("images", "masks", "depths") for scale in ("", "_2", "_4", "_8")
 )
-"""Folders by which trainers find pictures, at the resolutions they ask for."""
+"""Folders in which trainers look for photographs, by the resolution they ask for."""
 
 
 def image_folders(scene: Scene) -> dict[str, Path]:
-    """What stands for ``images/`` and its siblings in a scene folder.
+    """The source of ``images/`` and its siblings in a scene folder.
 
     Images that lie in the scene's own root, between other files, are linked by their first folder
     (or one by one).
@@ -47,12 +47,12 @@ def image_folders(scene: Scene) -> dict[str, Path]:
 
 
 def frame_folders(root: Path, file_paths: Iterable[str]) -> dict[str, Path]:
-    """What makes the relative paths of a ``transforms.json`` resolve: their first folders."""
+    """The first folders of a ``transforms.json``'s relative paths, so that these resolve."""
     return {**_siblings(root), **{first: root / first for first in _first_folders(file_paths)}}
 
 
 def bring(folders: Mapping[str, Path], output: Path, *, copy: bool) -> list[str]:
-    """Link or copy ``folders`` into ``output``; what does not exist is left out.
+    """Link or copy ``folders`` into ``output``; missing ones are left out.
 
     Returns:
         The paths inside ``output`` that were made.
@@ -81,7 +81,7 @@ def _siblings(root: Path) -> dict[str, Path]:
 
 
 def _goal(source: Path, link: Path, around: Path) -> Path:
-    """The target of a link: relative if output and source lie side by side, to move together."""
+    """The target of a link: relative if output and source are siblings, to move together."""
     if around not in source.parents or around == Path(around.anchor):
         return source
     return Path(os.path.relpath(source, link.parent.resolve()))
@@ -114,7 +114,7 @@ def _copy_file(source: Path, target: Path) -> None:
 
 
 def _above(folder: Path, top: Path) -> list[Path]:
-    """The folders between ``folder`` and ``top``, this one included."""
+    """The folders from ``folder`` up to ``top``, both included."""
     return [each for each in folder.parents if each == top or top in each.parents]
 
 

@@ -1,7 +1,7 @@
 """The two sets of files that trainers look for: COLMAP's, and nerfstudio's ``transforms.json``.
 
 Promise: every point file in a layout holds the scene's points in their order, ``seeds.npz`` too;
-COLMAP's root holds no PLY, for Brush takes any it finds there. Writers write straight into
+COLMAP's root holds no PLY, because Brush loads any it finds there. Writers write straight into
 ``folder`` and let ``OSError`` pass.
 """
 
@@ -79,7 +79,7 @@ def write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, P
 
 
 def _in_nerfstudio_space(points: PointCloud) -> PointCloud:
-    """The points, and their normals, as nerfstudio turns those of a COLMAP model."""
+    """The points and their normals, rotated as nerfstudio rotates those of a COLMAP model."""
     xyz = apply_transform(NERFSTUDIO_FROM_COLMAP, points.xyz).astype(np.float32)
     if points.normals is None:
         return points.replace(xyz=xyz)
@@ -96,7 +96,7 @@ def write_json(path: Path, content: Mapping[str, object]) -> None:
 
 
 def _all_cameras(scene: Scene) -> tuple[Intrinsics, ...]:
-    """The file's camera records, and those that only images know (in scenes made in memory)."""
+    """The file's camera records, and those that only images have (in scenes made in memory)."""
     cameras = {camera.camera_id: camera for camera in scene.intrinsics}
     for image in scene.images:
         cameras.setdefault(image.intrinsics.camera_id, image.intrinsics)
@@ -132,7 +132,7 @@ def _write_lists(scene: Scene, folder: Path) -> None:
 
 
 def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
-    """The model's rigs and frames if they hold for the output too, else a note why not."""
+    """The model's rigs and frames if they are valid for the output, else a note saying why not."""
     there = [f"{name}.bin" for name in _RIG_FILES if (model_dir / f"{name}.bin").is_file()]
     if there and _has_all_images(scene, model_dir):
         return there, []
@@ -146,7 +146,7 @@ def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
 
 
 def _has_all_images(scene: Scene, model_dir: Path) -> bool:
-    """Whether the scene still has the very images of its model."""
+    """Whether the scene still has exactly the images of its model."""
     _, images = read_model_cameras(model_dir)
     return {(im.image_id, im.name) for im in images} == {
         (im.image_id, im.name) for im in scene.images
@@ -157,7 +157,7 @@ def _model_notes(scene: Scene, model: Renumbered) -> list[str]:
     notes = []
     if model.num_broken:
         notes.append(
-            f"{model.num_broken} references between features and points were taken out: the other"
+            f"{model.num_broken} references between features and points were removed: the other"
             " side did not confirm them."
         )
     if not scene.images:

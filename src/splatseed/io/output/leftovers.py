@@ -1,7 +1,7 @@
-"""What killed processes leave behind: hidden partial outputs, found again and removed.
+"""Removing what killed processes leave behind: hidden partial outputs.
 
-Promise: what a process still writes to is never removed, as it holds a lock on it; where the system
-has no such locks nothing is.
+Promise: what a process is still writing to is never removed, because the process holds a lock on
+it; on systems without such locks nothing is removed.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from pathlib import Path
 __all__ = ["held", "remove_leftovers", "remove_tree"]
 
 _SETTLED = 5.0
-"""Seconds after which a partial that nobody holds is a leftover: it is held right after it is
-made."""
+"""Seconds after which a partial that nobody holds counts as a leftover: it is locked right after
+it is made."""
 _LOG = logging.getLogger(__name__)
 
 
 @contextmanager
 def held(partial: Path) -> Iterator[Callable[[], None]]:
-    """While the block runs, a partial can be held as being written to.
+    """While the block runs, a partial can be marked as being written to.
 
     Args:
         partial: The file or folder.
 
     Yields:
-        What holds it, to be called once it is there.
+        A function that marks it, to be called once the partial exists.
     """
     locks: list[int] = []
     try:
@@ -42,10 +42,7 @@ def held(partial: Path) -> Iterator[Callable[[], None]]:
 
 
 def remove_leftovers(target: Path) -> None:
-    """Remove the partials that processes left which were killed while they wrote ``target``.
-
-    Log it.
-    """
+    """Remove, and log, the partials of processes that were killed while they wrote ``target``."""
     start = re.escape(f".{target.name}.partial-") + "[0-9a-f]{8}"
     folder, file = re.compile(start), re.compile(start + re.escape(target.suffix))
     with suppress(OSError):
@@ -65,7 +62,7 @@ def _remove_unless_held(leftover: Path) -> None:
         for lock in _lock(leftover):
             try:
                 remove_tree(leftover) if leftover.is_dir() else leftover.unlink()
-                _LOG.warning("Removed %s, which a run left that was killed.", leftover)
+                _LOG.warning("Removed %s, left by a run that was killed.", leftover)
             finally:
                 os.close(lock)
 
@@ -73,7 +70,7 @@ def _remove_unless_held(leftover: Path) -> None:
 def _lock(path: Path) -> list[int]:
     """A descriptor that locks a file or folder until it is closed.
 
-    None if another process does, or none can.
+    None if another process holds the lock, or the system has none.
     """
     try:
         import fcntl  # noqa: PLC0415  (not on Windows)
@@ -89,11 +86,11 @@ def _lock(path: Path) -> list[int]:
 
 
 def remove_tree(folder: Path) -> None:
-    """Remove a folder of our own, also where folders in it are read-only."""
+    """Remove one of our own folders, even if folders in it are read-only."""
     folder.chmod(0o700)
     for parent, names, _ in os.walk(folder):
         for name in names:
             child = Path(parent, name)
-            if not child.is_symlink():  # its target is the user's
+            if not child.is_symlink():  # a link's target is the user's
                 child.chmod(0o700)
     shutil.rmtree(folder)

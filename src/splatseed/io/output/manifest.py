@@ -1,10 +1,9 @@
 """``splatseed.json``: which folder may be replaced, and which of its files are ours.
 
 Notation: ``command`` says what wrote a folder, its *kind*; ``files`` lists the paths inside it with
-forward slashes. An entry may name a folder that is an output of its own: then that one's manifest
-says what is ours in there. Promise: a folder may be replaced only by its own kind, and only if
-nothing lies in it that is not listed; a manifest that is missing, damaged or has no list allows
-nothing.
+forward slashes. An entry may name a folder that is itself an output: then that folder's manifest
+lists our files there. Promise: a folder may be replaced only by its own kind, and only if it holds
+nothing unlisted; a manifest that is missing, damaged or without a list allows nothing.
 """
 
 from __future__ import annotations
@@ -21,25 +20,25 @@ __all__ = ["MANIFEST", "add_files", "kind_of", "seal", "unlisted_files", "why_ke
 MANIFEST = "splatseed.json"
 """The file that marks a folder as written by splatseed: only such a folder is ever replaced."""
 
-_PICTURES = tuple(  # made after the manifest
+_PICTURES = tuple(  # written after the manifest
     f"preview{which}.png" for which in ("", "_methods", "_maps", "_cells", "_origins")
 )
 _SMALLER = re.compile(r"images_[248]/(.+)")
-"""nerfstudio's smaller copies of the photographs, under their names: it makes them again."""
+"""nerfstudio's smaller copies of the photographs, under their names: it can recreate them."""
 _NOBODYS = re.compile(
-    r"(.*/)?(\.DS_Store|Thumbs\.db"  # made by looking at the folder
-    r"|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+|/.*)?"  # what a killed process of ours left
-    r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs: it makes them again
+    r"(.*/)?(\.DS_Store|Thumbs\.db"  # made by file browsers
+    r"|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+|/.*)?"  # left by a killed process of ours
+    r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs: it can recreate them
     re.IGNORECASE,
 )
 
 
 def seal(folder: Path, kind: str) -> None:
-    """Mark a finished output with its kind and with the list of all that is in it now.
+    """Mark a finished output with its kind and a list of everything in it now.
 
     Args:
-        folder: The output; what its manifest says already is kept.
-        kind: What writes it.
+        folder: The output; existing entries of its manifest are kept.
+        kind: What wrote it.
 
     Raises:
         OSError: The folder cannot be read or written.
@@ -53,8 +52,8 @@ def add_files(folder: Path, names: Iterable[str]) -> None:
 
     Args:
         folder: An output with a manifest.
-        names: Paths inside it, also of files that are yet to be written. Of a folder all files are
-            meant that are in it now; if it is an output of its own, or not there yet, its own list.
+        names: Paths inside it, including files yet to be written. A folder stands for all files in
+            it now; if it is itself an output, or does not exist yet, for its own list.
 
     Raises:
         OSError: The manifest cannot be written.
@@ -65,13 +64,13 @@ def add_files(folder: Path, names: Iterable[str]) -> None:
 
 
 def kind_of(folder: Path) -> str | None:
-    """What wrote a folder; None if it does not say."""
+    """What wrote a folder; None if unknown."""
     kind = _read(folder).get("command")
     return kind if isinstance(kind, str) else None
 
 
 def why_kept(folder: Path, kind: str) -> tuple[str, str] | None:
-    """Why a full folder may not be replaced, and what the user can do; None if it may be.
+    """Why a non-empty folder may not be replaced, and what the user can do; None if it may.
 
     Args:
         folder: The folder.
@@ -81,20 +80,20 @@ def why_kept(folder: Path, kind: str) -> tuple[str, str] | None:
         OSError: The folder cannot be read.
     """
     if not (folder / MANIFEST).is_file():
-        found = f"files that splatseed did not write (no {MANIFEST})"
-        return found, "Choose another folder, or empty this one yourself."
+        kept = f"files that splatseed did not write (no {MANIFEST})"
+        return kept, "Choose another folder, or empty this one yourself."
     manifest = _read(folder)
     if manifest.get("command", kind) != kind:
-        found = f"what splatseed {manifest['command']} wrote, not {kind}"
-        return found, "Choose another folder, or remove this one yourself."
+        kept = f"what splatseed {manifest['command']} wrote, not {kind}"
+        return kept, "Choose another folder, or remove this one yourself."
     if "command" not in manifest or not isinstance(manifest.get("files"), list):
-        found = f"a folder whose {MANIFEST} does not say what splatseed wrote there"
-        return found, "Choose another folder, or empty this one yourself."
+        kept = f"a folder whose {MANIFEST} does not say what splatseed wrote there"
+        return kept, "Choose another folder, or empty this one yourself."
     if names := unlisted_files(folder):
         more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
         some = f"{', '.join(names[:3])}{more}"
-        found = f"an earlier output with files that splatseed did not write: {some}"
-        return found, "Move them elsewhere, or choose another name."
+        kept = f"an earlier output with files that splatseed did not write: {some}"
+        return kept, "Move them elsewhere, or choose another name."
     return None
 
 
@@ -105,9 +104,9 @@ def unlisted_files(folder: Path) -> list[str]:
         OSError: The folder cannot be read.
     """
     ours = {*_files(_read(folder)), MANIFEST, *_PICTURES}
-    found = _files_outside(folder, ours)
+    unlisted = _files_outside(folder, ours)
     return sorted(
-        name for name in found if not (_NOBODYS.fullmatch(name) or _is_smaller(folder, name))
+        name for name in unlisted if not (_NOBODYS.fullmatch(name) or _is_smaller(folder, name))
     )
 
 
@@ -150,7 +149,7 @@ def _files_outside(folder: Path, ours: set[str], prefix: str = "") -> Iterator[s
             if not entry.is_dir(follow_symlinks=False):
                 if name not in ours:
                     yield name
-            elif name in ours:  # an output of its own
+            elif name in ours:  # itself an output
                 yield from (f"{name}/{each}" for each in unlisted_files(folder / name))
             else:
                 yield from _files_outside(folder, ours, name + "/")

@@ -1,9 +1,9 @@
-"""``seeds.npz``: what is known of an output's points that point files have no place for.
+"""``seeds.npz``: attributes of an output's points that point files have no field for.
 
 Notation: N points, in the order of the point files; ``source`` uint8 [N], ``normals`` float16 [N,
-3], ``sizes`` float32 [N] and ``confidence`` float16 [N], in the scene's world, each there if it is
-known of any point; ``digest`` is the fingerprint of the positions that they belong to. Promise: the
-file has the same bytes for the same cloud; one of other points, or damaged, is told of and not
+3], ``sizes`` float32 [N] and ``confidence`` float16 [N], in the scene's world, each present if
+known for any point; ``digest`` is the fingerprint of the positions they belong to. Promise: equal
+clouds give equal bytes; a file that is damaged or belongs to other points is reported and not
 used; no pickle is loaded, and nothing is allocated on the word of a header.
 """
 
@@ -30,7 +30,7 @@ SEEDS = "seeds.npz"
 
 _STORED: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {
     "source": ((), np.dtype("u1")),
-    # Half precision turns a normal by 0.03 degrees at most; sizes have no bounded range.
+    # Half precision rotates a normal by 0.03 degrees at most; sizes have no bounded range.
     **{
         name: (shape, np.dtype("<f4" if name == "sizes" else "<f2"))
         for name, shape in ATTRIBUTES.items()
@@ -47,12 +47,12 @@ _FAILURES = (
 
 
 class KnownOfSeeds(NamedTuple):
-    """What a file says of a cloud's points.
+    """What a file says about a cloud's points.
 
     Args:
-        points: The cloud with the attributes of the file, and its ``source`` where it has one.
+        points: The cloud with the attributes in the file, and its ``source`` if it has one.
         has_source: Whether it has one.
-        warning: Why the file was left aside; empty where it was not.
+        warning: Why the file was ignored; empty if it was not.
     """
 
     points: PointCloud
@@ -64,8 +64,8 @@ def write_seeds(folder: Path, points: PointCloud) -> None:
     """Write the file into an output, if there is anything to write.
 
     Args:
-        folder: Of the output.
-        points: As the point files have them.
+        folder: The output.
+        points: The cloud, in the order of the point files.
 
     Raises:
         OSError: It cannot be written.
@@ -78,11 +78,11 @@ def write_seeds(folder: Path, points: PointCloud) -> None:
 
 
 def read_seeds(folder: Path, points: PointCloud) -> KnownOfSeeds:
-    """What the file in a folder says of points that were read from there; all unchanged without it.
+    """What the file in a folder says about the points read from there; unchanged without a file.
 
     Args:
         folder: The scene's root.
-        points: As the point files have them.
+        points: The cloud, in the order of the point files.
     """
     path = folder / SEEDS
     try:
@@ -91,17 +91,17 @@ def read_seeds(folder: Path, points: PointCloud) -> KnownOfSeeds:
         with zipfile.ZipFile(path) as archive:
             digest = _member(archive, "digest", (_DIGEST_BYTES,), np.dtype("u1"))
             if digest.tobytes() != _digest(points.xyz):
-                told = f"{SEEDS} was left aside: it belongs to other points than are in the scene."
+                told = f"{SEEDS} was ignored: it belongs to other points than the scene's."
                 return KnownOfSeeds(points, warning=told)
             arrays = _members(archive, len(points))
         return KnownOfSeeds(points.replace(**arrays), "source" in arrays)
     except _FAILURES as error:
-        told = f"{SEEDS} was left aside: it is damaged, or none of splatseed's"
+        told = f"{SEEDS} was ignored: it is damaged, or not splatseed's"
         return KnownOfSeeds(points, warning=f"{told} ({type(error).__name__}).")
 
 
 def _known(points: PointCloud) -> dict[str, np.ndarray]:
-    """Arrays of which any point has more than the other files say, as they are stored."""
+    """Arrays with more information than the other files hold, as they are stored."""
     arrays: dict[str, np.ndarray] = {}
     if not np.isin(points.source, (ORIGINAL, GENERATED)).all():
         arrays["source"] = points.source
@@ -110,13 +110,13 @@ def _known(points: PointCloud) -> dict[str, np.ndarray]:
 
 
 def _digest(xyz: Float32[np.ndarray, "N 3"]) -> bytes:
-    """A fingerprint of positions, the same for both zeros and for any byte order."""
+    """A fingerprint of positions, equal for both zeros and for any byte order."""
     rows = np.ascontiguousarray(xyz + np.float32(0.0), "<f4")  # adding turns -0.0 into 0.0
     return hashlib.blake2b(rows.tobytes(), digest_size=_DIGEST_BYTES).digest()
 
 
 def _members(archive: zipfile.ZipFile, num_points: int) -> dict[str, np.ndarray]:
-    """The arrays of an archive that are ours, as a cloud has them."""
+    """Our arrays in an archive, as a cloud has them."""
     there = {name.removesuffix(".npy") for name in archive.namelist()}
     arrays = {
         name: _member(archive, name, (num_points, *shape), dtype)

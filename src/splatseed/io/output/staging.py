@@ -1,11 +1,11 @@
-"""Output that is there whole or not at all.
+"""Output that appears whole or not at all.
 
-Notation: the *target* is what the user named, the *partial* a hidden sibling ``.NAME.partial-XXXX``
-that is written first and renamed to the target at the end; a *leftover* is the partial of a process
-that was killed, which the next one for the same target removes. Promise: whatever interrupts the
-writing (an error, a full disk, Ctrl-C), the partial is removed and an older output is still there
-unharmed; an ``OSError`` becomes an ``OutputError`` that says what to do, and what cannot be removed
-is named.
+Notation: the *target* is what the user named; the *partial* is a hidden sibling
+``.NAME.partial-XXXX`` that is written first and renamed to the target at the end; a *leftover* is
+the partial of a process that was killed, which the next one for the same target removes. Promise:
+whatever interrupts writing (an error, a full disk, Ctrl-C), the partial is removed and an older
+output stays unharmed; an ``OSError`` becomes an ``OutputError`` that says what to do, and what
+cannot be removed is named.
 """
 
 from __future__ import annotations
@@ -40,17 +40,16 @@ def output_folder(
 ) -> Iterator[Path]:
     """A folder to write into that appears at ``path`` when the block ends without an error.
 
-    Missing parents are made. An empty folder at ``path`` is used up; a full one is replaced only
-    with ``overwrite``, and only if its ``splatseed.json`` says that the same kind wrote it and
-    lists all that is in it. That of the new one is written at the end, with what the block has put
-    there.
+    Missing parents are made. An empty folder at ``path`` is used; a full one is replaced only with
+    ``overwrite``, and only if its ``splatseed.json`` says that the same kind wrote it and lists
+    everything in it. The new folder's own manifest is written at the end.
 
     Args:
-        path: Where the output is to be.
-        kind: What writes it, a verb of the command line if it has one.
+        path: Where the output should be.
+        kind: What writes it: the verb of the command line, if any.
         overwrite: Whether an earlier output of this kind may be replaced.
-        protect: Files and folders that are read: the output may be neither one of them, nor inside
-            one, nor around one.
+        protect: Files and folders that are read: the output may not be, lie inside or contain any
+            of them.
 
     Yields:
         The partial folder, empty.
@@ -92,10 +91,10 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """A file to write to; it appears at ``path`` when the block ends without an error.
 
     Its name keeps the suffix, by which image writers choose the format. Missing parents are made,
-    and a file that is there is replaced.
+    and an existing file is replaced.
 
     Args:
-        path: Where the file is to be.
+        path: Where the file should be.
 
     Yields:
         The name of the partial file, which is empty.
@@ -105,8 +104,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     target = _resolved(path)
     if target.exists() and not target.is_file():  # a device would be replaced by a file
-        found = "a folder" if target.is_dir() else "a device or a pipe"
-        raise OutputError(f"a file name at {target}", found=found, fix="Choose another name.")
+        other = "a folder" if target.is_dir() else "a device or a pipe"
+        raise OutputError(f"a file name at {target}", found=other, fix="Choose another name.")
     partial = _partial_name(target, target.suffix)
     remove_leftovers(target)
     with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
@@ -136,10 +135,10 @@ def _partial_name(target: Path, suffix: str = "") -> Path:
 
 
 def check_apart(path: Path, protect: Sequence[Path]) -> None:
-    """Refuse an output that is one of ``protect``, lies inside one, or around one.
+    """Refuse an output that is one of ``protect``, lies inside one, or contains one.
 
     Raises:
-        OutputError: It is, or does.
+        OutputError: It is one of them, lies inside one, or contains one.
     """
     target = _resolved(path)
     for source in (_resolved(kept) for kept in protect):
@@ -152,7 +151,7 @@ def check_apart(path: Path, protect: Sequence[Path]) -> None:
     here = Path.cwd()
     if target == here or target in here.parents:
         raise OutputError(
-            "an output folder that can be put in place whole",
+            "an output folder that can be renamed into place",
             found=f"{target}, which holds the working directory",
             fix="Name a new folder.",
         )
@@ -171,13 +170,13 @@ def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
         if kept is None and not overwrite:
             kept = "an earlier output", "Pass --overwrite to replace it, or choose another name."
     if kept is not None:
-        found, fix = kept
-        raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
+        there, fix = kept
+        raise OutputError(f"no folder, or an empty one, at {target}", found=there, fix=fix)
 
 
 @contextmanager
 def _parents(folder: Path) -> Iterator[None]:
-    """Make ``folder`` and its parents; take those made away again on an error."""
+    """Make ``folder`` and its parents; remove the new ones again on an error."""
     missing = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -190,7 +189,7 @@ def _parents(folder: Path) -> Iterator[None]:
 
 
 def _put_in_place(partial: Path, target: Path, kind: str) -> None:
-    """Rename ``partial`` to ``target``; what was there steps aside and comes back on failure."""
+    """Rename ``partial`` to ``target``; an older output steps aside, and returns on failure."""
     if not target.exists():
         partial.rename(target)
         return
@@ -219,7 +218,7 @@ def _restore(old: Path, target: Path) -> None:
 
 
 def _discard(old: Path, target: Path, kind: str) -> None:
-    """Remove the earlier output, now that the new one is in its place."""
+    """Remove the earlier output, now that the new one is in place."""
     try:
         kept = why_kept(old, kind) if any(old.iterdir()) else None
         if kept is not None:  # somebody wrote there while we worked

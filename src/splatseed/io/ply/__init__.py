@@ -1,1 +1,1 @@
-"""PLY files: points, and what of trained Gaussians is recognised without being read."""
+"""PLY files: points, and recognising trained Gaussians without reading them."""

@@ -1,6 +1,6 @@
-"""Formats of trained Gaussians alone, so that errors can say that a file is a model and no scene.
+"""File formats of trained Gaussians, so that errors can say that a file is a model, not a scene.
 
-Promise: only a file's name and, of a PLY, its header are looked at.
+Promise: only a file's name and, for a PLY, its header are looked at.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ _PACKED = "Gaussians compressed as PlayCanvas's .compressed.ply"
 
 
 def refuse_foreign(path: Path) -> None:
-    """Refuse a file whose name is that of a known format of models.
+    """Refuse a file whose name is that of a known model format.
 
     Raises:
-        SceneFormatError: It is.
+        SceneFormatError: It is one.
     """
-    found = _FORMATS.get(path.suffix.lower())
-    if found is not None and path.is_file():
-        raise _foreign(path, found)
+    kind = _FORMATS.get(path.suffix.lower())
+    if kind is not None and path.is_file():
+        raise _foreign(path, kind)
 
 
 def refuse_packed(path: Path, properties: Collection[str]) -> None:
@@ -37,7 +37,7 @@ def refuse_packed(path: Path, properties: Collection[str]) -> None:
 
     Args:
         path: The file.
-        properties: Those of its vertices.
+        properties: The properties of its vertices.
 
     Raises:
         SceneFormatError: They are.
@@ -46,10 +46,10 @@ def refuse_packed(path: Path, properties: Collection[str]) -> None:
         raise _foreign(path, _PACKED)
 
 
-def _foreign(path: Path, found: str) -> SceneFormatError:
+def _foreign(path: Path, kind: str) -> SceneFormatError:
     return SceneFormatError(
         f"{path} to be a scene, or a .ply of points",
-        found=f"{found}: a trained model",
+        found=f"{kind}: a trained model",
         fix="Score it with splatseed evaluate MODEL --scene SCENE, look at it with splatseed view "
         "MODEL; a .ply of it, by splatseed export MODEL -o OUT.ply, is read as points too.",
     )

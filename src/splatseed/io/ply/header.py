@@ -1,9 +1,9 @@
 """The header of a PLY file: which elements it holds and how their rows are laid out.
 
 Notation: an element is a table of rows; a property is a column, a scalar or a list with
-its length in front. Types are NumPy codes without byte order ("f4"). Promise: a header that is
-returned has known types, unique property names and counts of zero or more; whether so many rows are
-in the file is for the reader of the body to check.
+its length in front. Types are NumPy codes without byte order ("f4"). Promise: a returned header
+has known types, unique property names and counts of zero or more; the reader of the body must
+check that the file holds that many rows.
 """
 
 from __future__ import annotations
@@ -68,10 +68,10 @@ class Header(NamedTuple):
     """What a PLY file promises to hold."""
 
     byte_order: str
-    """NumPy's character for it; empty for an ascii body."""
+    """NumPy's byte-order character; empty for an ascii body."""
     elements: tuple[Element, ...]
     size: int
-    """Bytes of the header: where the body begins."""
+    """Length of the header in bytes: the offset of the body."""
 
 
 def parse_header(path: Path, data: bytes) -> Header:
@@ -105,12 +105,12 @@ class _Line(NamedTuple):
 
     def error(self, expected: str) -> SceneFormatError:
         where = f"the header of {self.path}, line {self.number}"
-        found = repr(" ".join(self.words)[:80])
-        return SceneFormatError(f"{expected} in {where}", found=found, fix=EXPORT_PLY_AGAIN)
+        words = repr(" ".join(self.words)[:80])
+        return SceneFormatError(f"{expected} in {where}", found=words, fix=EXPORT_PLY_AGAIN)
 
 
 def _lines(path: Path, header: bytes) -> list[_Line]:
-    """The lines after the first that say something; comments may be in any encoding."""
+    """The non-empty lines after the first; comments may be in any encoding."""
     text = header.decode("latin-1").split("\n")
     lines = [_Line(path, number, line.split()) for number, line in enumerate(text, start=1)]
     return [ln for ln in lines[1:] if ln.words and ln.words[0] not in {"comment", "obj_info"}]

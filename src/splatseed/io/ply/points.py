@@ -1,4 +1,4 @@
-"""Point clouds in PLY files: any that has x, y, z in; the form that every 3DGS loader takes out.
+"""Point clouds in PLY files: reads any with x, y, z; writes the form that every 3DGS loader takes.
 
 Notation: ``columns`` maps a vertex property to its values [N] in its own type; SH0 is the constant
 of the spherical harmonic of degree 0. Promise: ascii and both binary forms give the same cloud;
@@ -92,9 +92,9 @@ def _vertex_element(path: Path, header: Header) -> Element:
     refuse_packed(path, [prop.name for prop in vertex.properties] if vertex else ())
     if vertex is None or not _wanted_dtypes(vertex).keys() >= set(_XYZ):
         names = ", ".join(prop.name for prop in vertex.properties) if vertex else ""
-        found = f"properties {names[:200] or '(none)'}" if vertex else "no element vertex"
+        there = f"properties {names[:200] or '(none)'}" if vertex else "no element vertex"
         raise SceneFormatError(
-            f"{path} to have vertices with scalar x, y, z", found=found, fix=EXPORT_PLY_AGAIN
+            f"{path} to have vertices with scalar x, y, z", found=there, fix=EXPORT_PLY_AGAIN
         )
     return vertex
 
@@ -145,7 +145,7 @@ def _equal_rows(reader: ByteReader, element: Element, byte_order: str) -> np.nda
 
 
 def _row_dtype(reader: ByteReader, element: Element, byte_order: str) -> np.dtype[Any]:
-    """The layout of the row at the reader's place, which stays where it is."""
+    """The layout of the row at the reader's position, which does not move."""
     start = reader.offset
     fields: list[tuple[Any, ...]] = []
     for prop in element.properties:

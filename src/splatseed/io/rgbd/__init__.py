@@ -1,1 +1,1 @@
-"""Captures of cameras with a depth sensor, in the layouts of Replica and TUM."""
+"""Captures of RGB-D cameras, in the layouts of Replica and TUM."""

@@ -1,4 +1,4 @@
-"""What the layouts of RGB-D captures have in common: a camera file, and images of its size.
+"""Shared by the RGB-D layouts: the camera file, and images of its size.
 
 Promise: every failure names the file and is one of ``splatseed.errors``.
 """
@@ -56,7 +56,7 @@ def check_size(path: Path, intrinsics: Intrinsics) -> None:
     """Check that an image can be read and has the size of its camera; only its header is opened.
 
     Raises:
-        SceneFormatError: It cannot, or has not.
+        SceneFormatError: It cannot be read, or has another size.
     """
     from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 

@@ -39,14 +39,14 @@ _RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
 def load_rgbd(path: Path) -> Scene:
     """Read the images, poses and depth maps of an RGB-D capture; it has no points.
 
-    Frames whose pose is not finite (tracking was lost) are left out and told of in ``warnings``.
+    Frames whose pose is not finite (tracking was lost) are left out and reported in ``warnings``.
 
     Args:
         path: The folder that holds ``traj.txt`` and ``results/``.
 
     Returns:
-        A scene with posed images, one PINHOLE camera, an empty cloud, and in ``depths`` the maps
-        that there are (planar z, divided by ``scale`` of ``cam_params.json``).
+        A scene with posed images, one PINHOLE camera, an empty cloud, and in ``depths`` the
+        existing maps (planar z, divided by ``scale`` of ``cam_params.json``).
 
     Raises:
         SceneNotFoundError: ``traj.txt``, ``cam_params.json`` or the frames are missing.
@@ -95,7 +95,7 @@ def _find_frames(folder: Path) -> list[Path]:
 
 
 def _read_trajectory(path: Path) -> Float64[np.ndarray, "N 4 4"]:
-    """The poses ``world_from_cam`` of every line, float64 [N, 4, 4], NaN where so written."""
+    """The poses ``world_from_cam`` of all lines, float64 [N, 4, 4]; NaN is kept."""
     lines = [
         (number, line)
         for number, line in enumerate(read_text(path).splitlines(), 1)

@@ -5,7 +5,7 @@ A folder holds ``rgb.txt`` and ``depth.txt`` (``time path`` a line, times in sec
 metres) and the images, in ``rgb/`` and ``depth/``; depth PNGs hold planar z times 5000. Lines that
 begin with # are comments.
 
-Notation: what is taken at different times belongs together if the times are within 0.02 s, the
+Notation: measurements at different times belong together if the times are within 0.02 s, the
 benchmark's own tolerance. Promise: every image returned exists, has its camera's size and a pose.
 """
 
@@ -55,10 +55,10 @@ def load_tum(path: Path) -> Scene:
     """Read the images, poses and depth maps of a TUM RGB-D capture; it has no points.
 
     The camera is that of ``cam_params.json`` (here or one folder up, as in NICE-SLAM's layout),
-    else the published one of the series that the folder's name tells (freiburg1, 2 or 3), else
-    ROS's default with a warning. A pose is interpolated between the records before and after the
-    image where both are near, else it is the nearest record's. Images without a pose or a file are
-    left out with a warning.
+    else the published one of the series in the folder's name (freiburg1, 2 or 3), else ROS's
+    default, with a warning. A pose is interpolated between the records before and after the image
+    if both are near, else it is the nearest record's. Images without a pose or a file are left out
+    with a warning.
 
     Args:
         path: The folder that holds ``rgb.txt`` and ``groundtruth.txt``.
@@ -103,7 +103,7 @@ def load_tum(path: Path) -> Scene:
 
 
 def find_tum_depths(scene: Scene, root: Path) -> DepthFiles | None:
-    """The maps nearest in time to images of a scene that was made from a capture.
+    """The maps nearest in time to the images of a scene that was made from a capture.
 
     Where the capture's lens is distorted and the scene's photographs are not the capture's own, as
     ``splatseed sfm`` and COLMAP undistort them, the maps are undistorted likewise.
@@ -161,7 +161,7 @@ def _intrinsics(published: tuple[float, ...]) -> Intrinsics:
 def _undistortion(
     scene: Scene, lens: Intrinsics, originals: dict[str, Path]
 ) -> Undistortion | None:
-    """What takes maps to the scene's photographs, unless those are the capture's own."""
+    """Moves maps to the scene's photographs; None if those are the capture's own."""
     posed = {image.name: image.intrinsics for image in scene.images if image.name in originals}
     if lens.is_pinhole or not all(camera.is_pinhole for camera in posed.values()):
         return None
@@ -193,7 +193,7 @@ def _image(
 
 
 def _common_folder(names: Sequence[str]) -> PurePosixPath:
-    """The folder that all images lie in, which their names leave out."""
+    """The folder that all images lie in, which their names omit."""
     folders = {PurePosixPath(name).parent for name in names}
     return folders.pop() if len(folders) == 1 else PurePosixPath()
 

@@ -1,4 +1,4 @@
-"""The lists of a TUM RGB-D capture, and what belongs together by time.
+"""The lists of a TUM RGB-D capture, and matching them by time.
 
 Notation: times are seconds, sorted; ``quats`` are unit wxyz of ``world_from_cam`` (the files have
 xyzw).
@@ -21,13 +21,13 @@ from splatseed.io.rgbd.capture import read_text
 __all__ = ["TOLERANCE", "Track", "nearest_in_time", "poses_at", "read_list", "read_track"]
 
 TOLERANCE = 0.02
-"""Seconds by which an image, its depth and its pose may be apart: the benchmark's own."""
+"""Seconds by which an image, its depth and its pose may differ: the benchmark's own."""
 
 _NORM_SLACK = 0.01  # of a quaternion, which is written with four digits
 
 
 class Track(NamedTuple):
-    """Where the camera was.
+    """The camera's trajectory.
 
     Args:
         times: Seconds, float64 [M], sorted.
@@ -82,7 +82,7 @@ def read_track(path: Path) -> Track:
 def nearest_in_time(
     times: Float64[np.ndarray, " M"], wanted: Float64[np.ndarray, " N"]
 ) -> Int64[np.ndarray, " N"]:
-    """Which of the sorted ``times`` is nearest to each wanted one; -1 beyond the tolerance."""
+    """Index of the sorted ``times`` nearest to each wanted one; -1 beyond the tolerance."""
     if not len(times):
         return np.full(len(wanted), -1, np.int64)
     before, after = _around(times, wanted)
@@ -94,7 +94,7 @@ def nearest_in_time(
 def poses_at(
     track: Track, times: Float64[np.ndarray, " N"]
 ) -> tuple[Float64[np.ndarray, "N 4"], Float64[np.ndarray, "N 3"], Bool[np.ndarray, " N"]]:
-    """Quaternions [N, 4] and centres [N, 3] at some times, and which are known [N].
+    """Quaternions [N, 4] and centres [N, 3] at given times, and which are known [N].
 
     Between two records that are near enough a pose is interpolated, else it is the nearest one's.
     """
@@ -109,7 +109,7 @@ def poses_at(
     share = np.where(between, share, nearest == after)[:, None]
     start, end = track.quats[before], track.quats[after]
     end = end * np.where((start * end).sum(axis=1) < 0, -1, 1)[:, None]  # the shorter way round
-    quats = (1 - share) * start + share * end  # over hundredths of a second as good as slerp
+    quats = (1 - share) * start + share * end  # as good as slerp over hundredths of a second
     centers = (1 - share) * track.centers[before] + share * track.centers[after]
     return quats / np.linalg.norm(quats, axis=1, keepdims=True), centers, nearest >= 0
 
@@ -124,15 +124,15 @@ def _around(
 
 
 def _lines(path: Path, words: int) -> Iterator[tuple[str, list[str]]]:
-    """The place and the words of each record."""
+    """The location and the words of each record."""
     for number, line in enumerate(read_text(path).splitlines(), 1):
-        found = line.split()
-        if not found or found[0].startswith("#"):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
             continue
         where = f"{path} line {number}"
-        if len(found) != words:
-            raise _bad(where, f"{words} words", f"{len(found)}")
-        yield where, found
+        if len(fields) != words:
+            raise _bad(where, f"{words} words", f"{len(fields)}")
+        yield where, fields
 
 
 def _numbers(where: str, words: list[str]) -> list[float]:

@@ -1,1 +1,1 @@
-"""What a run leaves on disk: its settings, its curve, its folder."""
+"""What a run writes to disk: its settings, its curve, its folder."""

@@ -1,6 +1,6 @@
-"""config.json: what a run was asked to do, by which it is continued and evaluated.
+"""config.json: the settings of a run, for resuming and evaluating it.
 
-Promise: a run is never continued with other settings or other seeds than it began with.
+Promise: a run is never resumed with other settings or other seeds than it began with.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from splatseed.train.settings import TrainSettings
 __all__ = ["check_same_seeds", "make_config", "resumed_settings"]
 
 WHERE = {"backend"}
-"""Settings that may change when a run goes on."""
+"""Settings that may change when a run is resumed."""
 OPTIONS = {"seeding": "seeds"}
-"""What the command line calls a setting, where that is not its name."""
+"""Command-line names of settings, where they differ."""
 
 
 def make_config(
     scene: Scene, seeds: PointCloud, settings: TrainSettings, device: torch.device
 ) -> dict[str, Any]:
-    """What is written to config.json."""
+    """The content of config.json."""
     return {
         "splatseed": _version("splatseed"),
         "scene": str(scene.source.root.resolve()) if scene.source else None,
@@ -48,17 +48,17 @@ def make_config(
 
 
 def resumed_settings(begun: Mapping[str, Any] | None, asked: TrainSettings) -> TrainSettings:
-    """The settings of a run that goes on; those asked for if there is none.
+    """The settings of a resumed run; those asked for if there is none.
 
     Args:
         begun: The run's config.
-        asked: What the user says now: a setting left at its default follows the run.
+        asked: The user's settings: one left at its default follows the run.
 
     Raises:
         ParameterError: A setting is neither the run's nor the default.
-        SceneFormatError: The config has none of a run's settings.
+        SceneFormatError: The config has no settings of a run.
 
-    A setting that the run's version did not have yet is as that version trained: at its default.
+    A setting that did not exist in the run's version has its default, as the run was trained.
     """
     if begun is None:
         return asked
@@ -74,14 +74,25 @@ def resumed_settings(begun: Mapping[str, Any] | None, asked: TrainSettings) -> T
         then = begun.get(field.name, getattr(default, field.name))
         if field.name in WHERE or now == then:
             continue
+        _check_kind(field.name, then, getattr(default, field.name))
         if now != getattr(default, field.name):
             raise _differs(field.name, then, now)
         changes[field.name] = then
     return dataclasses.replace(asked, **changes)
 
 
+def _check_kind(name: str, then: object, default: object) -> None:
+    """Refuse a setting of another type, which comparisons would fail over."""
+    if isinstance(default, int) and not isinstance(then, int):
+        raise SceneFormatError(
+            f"{name} in the config.json of the run to be a number",
+            found=repr(then)[:80],
+            fix="Start again with --overwrite.",
+        )
+
+
 def check_same_seeds(path: Path, begun: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Refuse to go on from other points.
+    """Refuse to resume from other points.
 
     Raises:
         ParameterError: The scene's points are not those that the run began with.
@@ -102,9 +113,9 @@ def _points_path(scene: Scene) -> str | None:
 def _differs(name: str, then: object, now: object) -> ParameterError:
     option = OPTIONS.get(name, name.replace("_", "-"))
     return ParameterError(
-        f"--{option} {then}, with which the run began",
+        f"--{option} {then}, as when the run began",
         found=f"{now}",
-        fix="Leave the option out to go on, or start again with --overwrite.",
+        fix="Leave the option out to resume, or start again with --overwrite.",
     )
 
 

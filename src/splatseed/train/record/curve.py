@@ -1,7 +1,7 @@
 """The curve of a run: loss, PSNR and number of Gaussians, as a table and as a picture.
 
-Notation: a record is taken every so many steps; its loss is the mean since the record before.
-Promise: both files appear whole or not at all, so that a run can be looked at while it goes on.
+Notation: records are taken at regular steps; a record's loss is the mean since the one before.
+Promise: both files appear whole or not at all, so that a run can be watched while it trains.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ __all__ = ["Record", "write_curve_csv", "write_curve_png"]
 
 
 class Record(NamedTuple):
-    """How far a run was."""
+    """The progress of a run."""
 
     step: int
     """Steps done."""
     seconds: float
-    """Spent training, without reading, scoring and writing."""
+    """Seconds of training, without reading, scoring and writing."""
     loss: float
     """Mean since the last record."""
     train_psnr: float
-    """Of the last photograph shown, dB."""
+    """PSNR of the last training photograph, dB."""
     test_psnr: float | None
-    """Mean over the test views, dB; None where it was not taken."""
+    """Mean over the test views, dB; None if not evaluated."""
     num_gaussians: int
     test_ssim: float | None = None
     """Mean over the test views; None where it was not taken."""

@@ -1,4 +1,4 @@
-"""The folder of a run: what lies where, and who may write there.
+"""The folder of a run: its files, and permission to write.
 
 Promise: a folder that splatseed did not write is never touched; an earlier run is replaced only on
 request, and not before the new one is ready to start.
@@ -22,7 +22,7 @@ __all__ = ["RunFolder", "write_json"]
 
 
 KIND = "train"
-"""What a run's folder is marked as."""
+"""The kind recorded in a run folder's manifest."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class RunFolder:
 
     @property
     def checkpoint(self) -> Path:
-        """What an unfinished run goes on from."""
+        """The state from which an unfinished run is resumed."""
         return self.path / "checkpoint.pt"
 
     @property
     def metrics(self) -> Path:
-        """The scores, as JSON; there once the run has finished."""
+        """The scores, as JSON; written once the run has finished."""
         return self.path / "metrics.json"
 
     @property
@@ -67,7 +67,7 @@ class RunFolder:
 
     @property
     def renders(self) -> Path:
-        """Test views beside the truth."""
+        """Test views beside their photographs."""
         return self.path / "renders"
 
     @property
@@ -88,7 +88,7 @@ class RunFolder:
         """
         if resume and self.metrics.is_file():
             raise OutputError(
-                f"an unfinished run to go on with at {self.path}",
+                f"an unfinished run to resume at {self.path}",
                 found="a finished one",
                 fix="See its metrics.json, or pass --overwrite to train again.",
             )
@@ -100,11 +100,11 @@ class RunFolder:
             raise OutputError(
                 f"no folder, or an empty one, at {self.path}",
                 found="an earlier run",
-                fix="Pass --resume to go on with it, --overwrite to replace it, or choose another.",
+                fix="Pass --resume to continue it, --overwrite to replace it, or choose another.",
             )
 
     def begin(self, config: Mapping[str, object]) -> None:
-        """Make the folder, empty but for the config; what ``check`` let pass is removed.
+        """Make the folder, empty but for the config; removes what ``check`` allowed to replace.
 
         Raises:
             OutputError: It cannot be written.
@@ -118,7 +118,7 @@ class RunFolder:
                 found=error.strerror or type(error).__name__,
                 fix="Remove it yourself, or choose another folder.",
             ) from None
-        # The mark first: a run that is cut off here can be replaced.
+        # The mark first: a run that is interrupted here can be replaced.
         files = [self.config, self.checkpoint, self.metrics, self.gaussians]
         files += [self.curve_csv, self.curve_png, self.path / MANIFEST]
         mark = {"command": KIND, "version": config["splatseed"]}
@@ -127,10 +127,10 @@ class RunFolder:
 
     @contextmanager
     def results(self) -> Iterator[RunFolder]:
-        """Where to write results: all are moved into this folder once whole, the metrics last.
+        """Where to write results: all are moved into this folder once complete, the metrics last.
 
         Raises:
-            OutputError: They cannot be put in place.
+            OutputError: They cannot be moved into place.
         """
         staged = RunFolder(self.path / f".results.partial-{secrets.token_hex(4)}")
         try:
@@ -179,7 +179,7 @@ class RunFolder:
 
 
 def _move(path: Path, target: Path) -> None:
-    """Rename a file or folder, in the place of an earlier one."""
+    """Rename a file or folder, replacing an earlier one."""
     if target.is_dir() and not target.is_symlink():
         shutil.rmtree(target)
     path.replace(target)

@@ -15,7 +15,7 @@ class Board:
 
     Args:
         path: The folder of the log.
-        step: Where the run goes on; what an interrupted run logged beyond it is dropped.
+        step: Where the run resumes; entries of an interrupted run beyond it are dropped.
 
     Raises:
         MissingDependencyError: TensorBoard is not installed.

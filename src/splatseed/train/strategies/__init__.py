@@ -2,7 +2,7 @@
 
 | file | role |
 | --- | --- |
-| ``base`` | what every strategy can do |
+| ``base`` | the interface of all strategies |
 | ``densification`` | gsplat's strategies, held to a cap and to the memory |
 | ``growing``, ``contributions`` | splatseed's own: a budget, spent where renders are wrong |
 | ``choice`` | the strategy that settings name |

@@ -1,4 +1,4 @@
-"""What every strategy can do."""
+"""The interface of all strategies."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ __all__ = ["Strategy"]
 
 
 class Strategy(ABC):
-    """What changes the number of Gaussians.
+    """Changes the number of Gaussians.
 
     Attributes:
-        state: What it remembers from step to step: all that a checkpoint must hold of it.
+        state: What it remembers from step to step, for checkpoints.
         capacity: How many Gaussians it may make; None if it makes none.
     """
 
@@ -28,24 +28,24 @@ class Strategy(ABC):
         self.capacity = capacity
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""] | None:  # noqa: ARG002  (the interface's name)
-        """What is added to the loss; nothing by default."""
+        """A term to add to the loss; none by default."""
         return None
 
-    def before(  # noqa: B027  (most have nothing to do there)
+    def before(  # noqa: B027  (most need nothing)
         self, params: Parameters, optimizers: Optimizers, step: int, info: Any
     ) -> None:
-        """To be called ahead of the backward pass; nothing by default."""
+        """Called before the backward pass; does nothing by default."""
 
     def observe(  # noqa: B027  (likewise)
         self,
         params: Parameters,
         view: View,
         render: Float[Tensor, "H W 3"],
-        truth: Float[Tensor, "H W 3"],
+        photograph: Float[Tensor, "H W 3"],
         step: int,
     ) -> None:
-        """To be called behind the optimisers, with what the step has shown; nothing by default."""
+        """Called after the optimisers, with the result of the step; does nothing by default."""
 
     @abstractmethod
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        """To be called behind ``observe``; may replace parameters and their moments."""
+        """Called after ``observe``; may replace parameters and their moments."""

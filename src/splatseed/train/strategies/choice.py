@@ -22,12 +22,12 @@ def make_strategy(
     device: torch.device | None = None,
     depths: Mapping[str, Float[Tensor, "h w"]] = NOWHERE,
 ) -> Strategy:
-    """The strategy that the settings name, on their schedule.
+    """The strategy named by the settings, on their schedule.
 
     Args:
         settings: How to train.
-        device: Whose memory bounds the number of Gaussians; the CPU's by default.
-        depths: What is known of the training views' depth; see ``Growing``.
+        device: The device whose memory limits the number of Gaussians; the CPU by default.
+        depths: Known depths of the training views; see ``Growing``.
     """
     capacity = Capacity(settings.cap, device or torch.device("cpu"))
     match settings.densification:

@@ -1,9 +1,9 @@
-"""How much of a photograph each Gaussian paints, and how wrong the pixels are that it paints.
+"""How much each Gaussian contributes to a photograph, and how wrong its pixels are.
 
 Notation: w_ip is the weight of Gaussian i in pixel p, its alpha times the transmittance in front of
 it, so that pixel p is sum_i w_ip c_i. Any rasteriser gives sums of weights as a gradient: of sum_p
-f_p sum_i w_ip c_i with respect to c_i. Promise: the Gaussians are left as they are, and so are
-their gradients.
+f_p sum_i w_ip c_i with respect to c_i. Promise: the Gaussians and their gradients are left
+unchanged.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ def contributions(
 
     Args:
         params: The parameter dict, in the frame of the view's camera.
-        view: Whose camera is used.
-        error: e, of each pixel.
+        view: The view whose camera is used.
+        error: The error e of each pixel.
 
     Returns:
         Pixels and errors; 0 where the view does not see a Gaussian.

@@ -1,10 +1,10 @@
 """gsplat's strategies behind one small interface.
 
-Notation: ``info`` is the rasteriser's; ``before`` runs ahead of the backward pass, ``after`` behind
-the optimisers. Promise: what runs are subclasses of gsplat's strategies, on both backends, which
-hold growth to a cap and to the memory, and MCMC's growth and noise to splatseed's conventions;
-``state`` is all that a checkpoint must hold of them. gsplat 1.5.3 never resets opacities (it writes
-``step % reset_every == 0 & step > 0``, which is always false), so that is an option here.
+Notation: ``info`` is the rasteriser's; ``before`` runs before the backward pass, ``after`` after
+the optimisers. Promise: both backends run subclasses of gsplat's strategies, which hold growth to a
+cap and to the memory, and MCMC's growth and noise to splatseed's conventions; ``state`` is all that
+a checkpoint must hold. gsplat 1.5.3 never resets opacities (it writes ``step % reset_every == 0 &
+step > 0``, which is always false), so resetting is an option here.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ __all__ = ["Capped", "Default", "Fixed", "Mcmc"]
 
 
 class Fixed(Strategy):
-    """The seeds as they are: neither more nor fewer."""
+    """The seeds only: Gaussians are neither added nor removed."""
 
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
         """Change nothing."""
 
 
 class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
-    """gsplat's strategy, but that only the largest image gradients that there is room for grow.
+    """gsplat's strategy, but only as many Gaussians grow as there is room, largest gradients first.
 
-    On the CPU its running sums are kept in another way, equal up to rounding.
+    On the CPU its running sums are computed differently, equal up to rounding.
     """
 
     capacity: Capacity
@@ -66,7 +66,7 @@ class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
             self.grow_grad2d = wanted
 
     def _threshold(self, params: Parameters, state: Any) -> float:
-        """A gradient that at most as many exceed as there is room: each one adds one Gaussian."""
+        """A gradient exceeded by at most as many Gaussians as there is room: each adds one."""
         count, gradients = len(params["means"]), state["grad2d"] / state["count"].clamp_min(1)
         wanted = int((gradients > self.grow_grad2d).sum())
         room = self.capacity.limit(count, count + wanted) - count
@@ -78,10 +78,10 @@ class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
 
 
 def _add_gradients(state: Any, info: Any) -> None:
-    """Count each Gaussian that is seen, and add up the lengths of the gradients of its 2D mean.
+    """Count each visible Gaussian, and add up the lengths of the gradients of its 2D mean.
 
-    gsplat lists the Gaussians that are seen, gathers their gradients and reduces rows of two, which
-    takes several times as long as adding zeros for the others.
+    gsplat lists the visible Gaussians, gathers their gradients and reduces rows of two, which takes
+    several times as long as adding zeros for the others.
     """
     radii, half_cameras = info["radii"], info["n_cameras"] / 2.0
     seen = (radii[..., 0] > 0) & (radii[..., 1] > 0)
@@ -110,12 +110,12 @@ class Default(Strategy):
         self.state = self.inner.initialize_state()
 
     def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        """Have the image gradients kept."""
+        """Keep the image gradients."""
         self.inner.step_pre_backward(params, optimizers, self.state, step, info)
 
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        """Clone, split, prune, and where asked for reset opacities."""
-        # gsplat takes one number, or hands on one of each Gaussian like the rest of its state.
+        """Clone, split, prune, and reset opacities if enabled."""
+        # gsplat takes one number here, or one per Gaussian like the rest of its state.
         self.state["scene_scale"] = yardsticks(params) if NEAR_DEPTHS in params else SCENE_SCALE
         self.inner.step_post_backward(params, optimizers, self.state, step, info)
         if self._resets_at(step):
@@ -128,11 +128,11 @@ class Default(Strategy):
 
 @dataclass
 class _Bounded(MCMCStrategy):
-    """gsplat's strategy, but that it may grow faster, and never beyond the memory.
+    """gsplat's strategy, but it may grow faster, and never beyond the memory.
 
     gsplat moves positions by a covariance times noise. A covariance is an area and a displacement a
     length, so it is divided by the near depth: the noise of a Gaussian of given size in the
-    pictures is then the same in the pictures wherever it stands.
+    photographs is then the same there wherever the Gaussian is.
     """
 
     capacity: Capacity | None = None
@@ -140,7 +140,7 @@ class _Bounded(MCMCStrategy):
     noise: float = 0.0
 
     def set_noise(self, params: Parameters) -> None:
-        """To be called before each step, and where the number of Gaussians changes."""
+        """Called before each step, and whenever the number of Gaussians changes."""
         if NEAR_DEPTHS in params:
             self.noise_lr = self.noise / yardsticks(params)[:, None]
 
@@ -155,7 +155,7 @@ class _Bounded(MCMCStrategy):
 
 
 class Mcmc(Strategy):
-    """3DGS as MCMC: move the faint to where there is more to show, add up to a cap, add noise."""
+    """3DGS as MCMC: relocate the faint to where more is needed, grow up to a cap, add noise."""
 
     def __init__(self, settings: TrainSettings, capacity: Capacity) -> None:
         super().__init__(capacity)
@@ -172,16 +172,16 @@ class Mcmc(Strategy):
         self.state = self.inner.initialize_state()
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""]:
-        """Mean opacity and mean size, weighed."""
+        """Mean opacity and mean size, weighted."""
         opacities, sizes = torch.sigmoid(params["opacities"]), torch.exp(params["scales"])
         if NEAR_DEPTHS in params:
             sizes = sizes / yardsticks(params)[:, None]
         return self.schedule.penalty * (opacities.mean() + sizes.mean())
 
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        """Relocate, add, and shake."""
+        """Relocate, add, and perturb."""
         self.inner.set_noise(params)
-        # 3DGS's rate of positions, however fast they move here: noise must not move them more.
+        # 3DGS's rate of positions, however fast they move here: the noise must not grow with it.
         lr = LEARNING_RATES["means"] * self.schedule.decay("means", step)
         unit = 1.0 if NEAR_DEPTHS in params else SCENE_SCALE
         self.inner.step_post_backward(params, optimizers, self.state, step, info, lr=lr * unit)

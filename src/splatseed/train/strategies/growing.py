@@ -1,13 +1,13 @@
-"""Strategy ``grow``: a fixed budget, spent where the photographs are still wrong.
+"""Strategy ``grow``: a fixed budget, spent where renders are still wrong.
 
-Notation: of each Gaussian, over the views looked at since the last round: *pixels* c = sum w,
+Notation: for each Gaussian, over the views looked at since the last round: *pixels* c = sum w,
 *error* E = sum w e with e the absolute error of a pixel (see ``contributions``), and *most pixels*,
-c in the one view where it is largest. Half of what is added comes from splitting Gaussians that
-paint wrong pixels, half is new, on wrong pixels whose depth is known (see ``placing``). Promise:
-the number of Gaussians never exceeds the budget; which ones grow depends on the views and the seed
-alone. The idea of growing by the error that a Gaussian paints is that of S. Rota Bulo et al.,
-"Revising Densification in Gaussian Splatting" (2024); what is taken away, when, and by what the
-error is divided were chosen on held-out training views: see benchmarks/README.md.
+c in the one view where it is largest. A quarter of the added Gaussians come from splitting those
+that contribute to wrong pixels; the others are new, on wrong pixels whose depth is known (see
+``placing``). Promise: the number of Gaussians never exceeds the budget; which ones grow depends
+only on the views and the seed. Growing by the error that a Gaussian contributes to follows S. Rota
+Bulo et al., "Revising Densification in Gaussian Splatting" (2024); what is removed, when, and the
+normalisation of the error were chosen on held-out training views: see benchmarks/README.md.
 """
 
 from __future__ import annotations
@@ -30,35 +30,35 @@ from splatseed.train.strategies.contributions import contributions
 from splatseed.train.strategies.placing import add_candidates, draw_candidates, join_candidates
 from splatseed.views.view import View
 
-__all__ = ["NOWHERE", "Growing"]
+__all__ = ["NOWHERE", "PLACED", "Growing"]
 
 LOOK_EVERY = 2
-"""Steps from one look at contributions to the next: a look costs half a step."""
+"""Steps between looks at contributions: a look costs half a step."""
 FAINT = 0.005
-"""Opacity below which a Gaussian goes, as in 3DGS."""
+"""Opacity below which a Gaussian is removed, as in 3DGS."""
 LEAST_PIXELS, LEAST_PART = 0.5, 0.1
-"""A Gaussian goes that paints less than this of a pixel, and less than this part of what Gaussians
-paint on average, in every view that shows it: where there are more Gaussians than pixels, all paint
-little."""
+"""A Gaussian is removed if, in every view that shows it, it contributes less than this much of a
+pixel, and less than this fraction of the average contribution: where there are more Gaussians than
+pixels, all contribute little."""
 RECYCLED = 0.1
-"""Part of a full budget that is taken from those with the fewest pixels, and spent again, a
-round."""
+"""Fraction of a full budget that each round takes from the Gaussians with the fewest pixels, and
+spends again."""
 FULL = 0.95
-"""From this part of the budget on it counts as full."""
+"""Fraction of the budget from which on it counts as full."""
 FULL_AT = 0.35
-"""Part of the run by which the budget is spent."""
+"""Fraction of the run by which the budget is spent."""
 FASTEST = 0.5
-"""Gaussians that are added in a round at most, as a part of those there are."""
-PLACED = 0.5
-"""Part of what is added in a round that goes to wrong pixels of known depth."""
+"""Most Gaussians added in a round, as a fraction of the existing ones."""
+PLACED = 0.75
+"""Fraction of the added Gaussians that goes to wrong pixels of known depth."""
 NOWHERE: Mapping[str, Tensor] = MappingProxyType({})
 """No view's depth is known."""
 LEAST_VIEWS = 2
-"""Looks that must have shown a Gaussian before it is taken away for what it paints."""
+"""Looks that must have shown a Gaussian before it is removed for its contribution."""
 
 
 class Growing(Strategy):
-    """Take away what paints little, split what paints wrong pixels, within a budget.
+    """Remove Gaussians that contribute little, split those with wrong pixels, within a budget.
 
     Args:
         settings: How to train.
@@ -84,13 +84,13 @@ class Growing(Strategy):
         params: Parameters,
         view: View,
         render: Float[Tensor, "H W 3"],
-        truth: Float[Tensor, "H W 3"],
+        photograph: Float[Tensor, "H W 3"],
         step: int,
     ) -> None:
-        """Add what this view says of each Gaussian to the sums."""
+        """Add this view's measurements of each Gaussian to the sums."""
         if step % LOOK_EVERY or step > self.schedule.refine_stop:
             return
-        error = (render.detach() - truth).abs().mean(dim=-1)
+        error = (render.detach() - photograph).abs().mean(dim=-1)
         pixels, errors = contributions(params, view, error)
         sums = self._sums(params)
         sums["errors"] += errors
@@ -99,7 +99,7 @@ class Growing(Strategy):
         torch.maximum(sums["most_pixels"], pixels, out=sums["most_pixels"])
         if view.name in self.depths:
             drawn = draw_candidates(
-                view, self.depths[view.name], error, truth, self._drawn_each(len(pixels), step)
+                view, self.depths[view.name], error, photograph, self._drawn_each(len(pixels), step)
             )
             self.state["candidates"] = join_candidates(self.state.get("candidates"), drawn)
 
@@ -108,9 +108,9 @@ class Growing(Strategy):
         params: Parameters,
         optimizers: Optimizers,
         step: int,
-        info: Any,  # noqa: ARG002  (gsplat's own need it)
+        info: Any,  # noqa: ARG002  (gsplat's own strategies need it)
     ) -> None:
-        """At the end of a round, change the Gaussians and begin the next."""
+        """At the end of a round, change the Gaussians and begin the next round."""
         schedule = self.schedule
         if (
             not schedule.refine_start <= step <= schedule.refine_stop
@@ -139,7 +139,7 @@ class Growing(Strategy):
         return self.state
 
     def _needless(self, params: Parameters) -> Bool[Tensor, " N"]:
-        """Which Gaussians go: the faint, the too large, and those that paint least."""
+        """Which Gaussians are removed: faint, too large, or with the least contribution."""
         sums, count = self._sums(params), len(params["means"])
         sizes = torch.exp(params["scales"].detach()).amax(dim=-1) / yardsticks(params)
         shown = sums["views"] >= LEAST_VIEWS
@@ -155,14 +155,14 @@ class Growing(Strategy):
         return needless
 
     def _split(self, params: Parameters, optimizers: Optimizers, wanted: int) -> None:
-        """Split where E / sqrt(c) is largest: E alone favours the large, E / c the accidental."""
+        """Split where E / sqrt(c) is largest: E alone favours large ones, E / c chance."""
         sums = self._sums(params)
         scores = sums["errors"] / sums["pixels"].clamp_min(1e-6).sqrt()
         number = min(wanted, int((scores > 0).sum()))
         if number > 0:
             chosen = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
             chosen[torch.topk(scores, number).indices] = True
-            # The opacity of both halves together is that of the whole.
+            # Both halves together are as opaque as the whole.
             split(params, optimizers, {}, chosen, revised_opacity=True)
 
     def _drawn_each(self, count: int, step: int) -> int:
@@ -187,5 +187,5 @@ class Growing(Strategy):
 
 
 def _least(most_pixels: Float[Tensor, " M"]) -> float:
-    """The fewest pixels that are worth a Gaussian, where those that are shown paint so many."""
+    """The fewest pixels that are worth a Gaussian, given those of the Gaussians shown."""
     return min(LEAST_PIXELS, LEAST_PART * float(most_pixels.mean())) if len(most_pixels) else 0.0

@@ -1,9 +1,9 @@
 """New Gaussians on wrong pixels, at the depth that stereo knows there.
 
-Notation: of a pixel p, e its absolute error and d its planar depth, training units. A *candidate*
-is such a pixel, drawn as a place for a Gaussian. Promise: candidates lie on pixels whose depth is
-known and whose error is not 0, and which ones depends on PyTorch's generator alone. Splitting adds
-only beside what is there; a leaf, a rod, or a piece of wall that no seed stands on is reached so.
+Notation: for a pixel p, e is its absolute error and d its planar depth in training units. A
+*candidate* is a pixel drawn as a place for a Gaussian. Promise: candidates lie on pixels with known
+depth and nonzero error, and depend on PyTorch's generator only. Splitting only adds beside existing
+Gaussians; this reaches a leaf, a rod, or a piece of wall without a seed.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from splatseed.views.view import View
 __all__ = ["Candidates", "add_candidates", "draw_candidates", "join_candidates"]
 
 Candidates = Mapping[str, Tensor]
-"""``means`` [M, 3], ``colors`` [M, 3] as the photograph has them, 0 to 1, ``depths`` [M], and
-``sizes`` [M], standard deviations: training units."""
-OPACITY = 0.3
-"""Of a new Gaussian: enough to show, and it can be lost again."""
+"""``means`` [M, 3], ``colors`` [M, 3] from the photograph, 0 to 1, ``depths`` [M], and ``sizes``
+[M], standard deviations: training units."""
+OPACITY = 0.6
+"""Opacity of a new Gaussian. It stands on a surface; a fainter one takes the rest of the run to
+show."""
 SIZE = 1.0
-"""Standard deviation of a new Gaussian, in pixels of the view that it is drawn in."""
+"""Standard deviation of a new Gaussian, in pixels of its view."""
 
 
 def draw_candidates(
@@ -37,20 +38,20 @@ def draw_candidates(
     photograph: Float[Tensor, "H W 3"],
     count: int,
 ) -> Candidates:
-    """Draw pixels with a probability of e^2, where the depth is known.
+    """Draw pixels of known depth with probability proportional to e^2.
 
     Args:
-        view: Whose pixels, in the training frame.
-        depth: d, 0 where unknown; of any size, over all of the picture.
-        error: e.
-        photograph: What new Gaussians are coloured by, 0 to 1.
-        count: At most so many; a pixel that is drawn twice counts once.
+        view: The view, in the training frame.
+        depth: d, 0 where unknown; of any size, covering the whole photograph.
+        error: The error e.
+        photograph: Colours of new Gaussians, 0 to 1.
+        count: The most candidates; a pixel drawn twice counts once.
     """
     height, width = error.shape
     rows = torch.arange(height, device=depth.device) * depth.shape[0] // height
     columns = torch.arange(width, device=depth.device) * depth.shape[1] // width
     d = depth[rows[:, None], columns].flatten()
-    # In float64: the sum over a large photograph must still grow with its last pixels.
+    # In float64, so that the sum over a large photograph still grows with its last pixels.
     worth = torch.where(d > 0, error.flatten() ** 2, 0.0).double().cumsum(0)
     drawn = torch.rand(count, dtype=torch.float64, device=worth.device) * worth[-1]
     pixels = torch.unique(torch.searchsorted(worth, drawn, right=True))
@@ -86,10 +87,10 @@ def join_candidates(first: Candidates | None, second: Candidates) -> Candidates:
 def add_candidates(
     params: Parameters, optimizers: Optimizers, candidates: Candidates, count: int
 ) -> int:
-    """Make Gaussians of ``count`` candidates, drawn evenly; balls of one colour.
+    """Turn ``count`` candidates, drawn uniformly, into round Gaussians of one colour.
 
     Returns:
-        How many were made: fewer where there are not so many candidates, or Gaussians.
+        How many were made: fewer if there are not enough candidates or Gaussians.
     """
     number = len(params["means"])
     count = min(count, len(candidates["depths"]), number)
@@ -98,7 +99,8 @@ def add_candidates(
     device = params["means"].device
     some = torch.randperm(len(candidates["depths"]), device=device)[:count]
     chosen = {name: values.to(device)[some] for name, values in candidates.items()}
-    # Copies of any others have the right shapes, and moments of 0; then they get their own values.
+    # Copies of arbitrary ones have the right shapes and zero moments; then they get their own
+    # values.
     copied = torch.zeros(number, dtype=torch.bool, device=device)
     copied[:count] = True
     duplicate(params, optimizers, {}, copied)

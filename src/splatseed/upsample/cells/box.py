@@ -1,8 +1,8 @@
-"""The paper's Voronoi cells: of the originals and the corners of an enlarged bounding box.
+"""The paper's Voronoi cells: those of the originals and the corners of an enlarged bounding box.
 
-The eight corners of the bounding box enlarged by 10% are added as sites so that the cells of the
+The eight corners of the bounding box, enlarged by 10%, are added as sites so that the cells of the
 originals are bounded. Most of the volume then lies in the cells of a few outer points and reaches
-far outside the scene; ``docs/paper.md`` measures it. Kept to reproduce the paper, not to be used.
+far outside the scene; ``docs/paper.md`` measures it. For reproducing the paper only.
 
 The cells come from Qhull's Delaunay tetrahedra, whose circumcentres are the Voronoi vertices. A
 cell's volume is the signed sum, over the tetrahedra at its site i and the ways to pick an edge ij
@@ -94,7 +94,7 @@ def _count_once(
 
 
 @inline
-def _circumcenters(sites, tetrahedra):  # type: ignore[no-untyped-def]
+def _circumcenters(sites, tetrahedra):  # type: ignore[no-untyped-def]  # Numba's types
     """Circumcentre of every tetrahedron [T, 3], NaN where it is too flat to have one."""
     vertex = np.empty((len(tetrahedra), 3))
     for t in range(len(tetrahedra)):
@@ -104,7 +104,7 @@ def _circumcenters(sites, tetrahedra):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _cells(sites, tetrahedra, vertex, once):  # type: ignore[no-untyped-def]
+def _cells(sites, tetrahedra, vertex, once):  # type: ignore[no-untyped-def]  # Numba's types
     """Centre, radius and volume of every site's cell, in one serial (so deterministic) pass."""
     n = len(sites)
     center, count = np.zeros((n, 3)), np.zeros(n)
@@ -126,15 +126,15 @@ def _cells(sites, tetrahedra, vertex, once):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _cross(a, b):  # type: ignore[no-untyped-def]
+def _cross(a, b):  # type: ignore[no-untyped-def]  # Numba's types
     return np.array(
         (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
     )
 
 
 @inline
-def _circumcenter(sites, corners, out):  # type: ignore[no-untyped-def]
-    """Write a tetrahedron's circumcentre; return whether it has one."""
+def _circumcenter(sites, corners, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Write a tetrahedron's circumcentre; return whether it exists."""
     a = sites[corners[1]] - sites[corners[0]]
     b = sites[corners[2]] - sites[corners[0]]
     c = sites[corners[3]] - sites[corners[0]]
@@ -149,7 +149,7 @@ def _circumcenter(sites, corners, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _face_center(a, b):  # type: ignore[no-untyped-def]
+def _face_center(a, b):  # type: ignore[no-untyped-def]  # Numba's types
     """Circumcentre of the triangle 0, a, b."""
     normal = _cross(a, b)
     aa, bb = np.sum(a * a), np.sum(b * b)
@@ -157,8 +157,8 @@ def _face_center(a, b):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _add_volumes(sites, corners, vertex, volume):  # type: ignore[no-untyped-def]
-    """Add one tetrahedron's share to the cells of its four corners."""
+def _add_volumes(sites, corners, vertex, volume):  # type: ignore[no-untyped-def]  # Numba's types
+    """Add one tetrahedron's volume to the cells of its four corners."""
     for i in range(4):
         origin = sites[corners[i]]
         for j in range(4):

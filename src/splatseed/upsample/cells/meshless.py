@@ -27,13 +27,13 @@ MAX_NEIGHBORS = 58
 MAX_PLANES = 6 + MAX_NEIGHBORS
 MAX_VERTICES = 2 * MAX_PLANES  # 2 F - 4 on a simple polytope of F faces
 COINCIDENT = 1e-12
-"""Cuts shallower than this share of the cube are left out: they only make slivers."""
+"""Cuts shallower than this fraction of the cube are skipped: they only make slivers."""
 
 
 class Cells(NamedTuple):
     """Cells of n sites, all relative to the site.
 
-    ``center`` and ``radius`` describe the cell with its vertices drawn in to the clamping distance.
+    ``center`` and ``radius`` describe the cell with its vertices clamped to the clamping distance.
     """
 
     center: Float64[np.ndarray, "n 3"]
@@ -43,7 +43,7 @@ class Cells(NamedTuple):
     volume: Float64[np.ndarray, " n"]
     """Volume of the cell within its cube, [n]."""
     closed: Bool[np.ndarray, " n"]
-    """Whether the cell is the true Voronoi cell: no cube face is left and the security radius was
+    """Whether the cell is the true Voronoi cell: no cube face is left, and the security radius was
     passed, [n]."""
 
 
@@ -71,11 +71,11 @@ def build_cells(
 
 
 @kernel
-def _build(xyz, idx, distance, frames, first, last, center, radius, volume, closed):  # type: ignore[no-untyped-def]
+def _build(xyz, idx, distance, frames, first, last, center, radius, volume, closed):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(first, last):
         normal, offset = np.empty((MAX_PLANES, 3)), np.empty(MAX_PLANES)
         triple, vertex = np.empty((MAX_VERTICES, 3), np.int16), np.empty((MAX_VERTICES, 3))
-        twin = np.empty((MAX_PLANES, MAX_PLANES), np.int16)  # an edge is set before it is read
+        twin = np.empty((MAX_PLANES, MAX_PLANES), np.int16)  # entries are set before they are read
         reach = 0.5 * distance[i, -1]
         count = _cube(frames[i], reach, normal, offset, triple, vertex, twin)
         count, complete = _cut_all(
@@ -87,7 +87,7 @@ def _build(xyz, idx, distance, frames, first, last, center, radius, volume, clos
 
 
 @inline
-def _cube(frame, reach, normal, offset, triple, vertex, twin):  # type: ignore[no-untyped-def]
+def _cube(frame, reach, normal, offset, triple, vertex, twin):  # type: ignore[no-untyped-def]  # Numba's types
     """Planes +u -u +v -v +n -n and the eight corners; returns the number of vertices."""
     for face in range(6):
         for axis in range(3):
@@ -104,13 +104,13 @@ def _cube(frame, reach, normal, offset, triple, vertex, twin):  # type: ignore[n
 
 
 @inline
-def _set(triple, twin, v, a, b, c):  # type: ignore[no-untyped-def]
+def _set(triple, twin, v, a, b, c):  # type: ignore[no-untyped-def]  # Numba's types
     triple[v, 0], triple[v, 1], triple[v, 2] = a, b, c
     twin[a, b], twin[b, c], twin[c, a] = v, v, v
 
 
 @inline
-def _cut_all(xyz, i, rows, distance, normal, offset, triple, vertex, twin, count):  # type: ignore[no-untyped-def]
+def _cut_all(xyz, i, rows, distance, normal, offset, triple, vertex, twin, count):  # type: ignore[no-untyped-def]  # Numba's types
     """Cut by the bisectors; returns the number of vertices and whether the cell is complete."""
     signed = np.empty(MAX_VERTICES)
     fresh, place = np.empty((MAX_VERTICES, 2), np.int16), np.empty((MAX_VERTICES, 3))
@@ -130,7 +130,7 @@ def _cut_all(xyz, i, rows, distance, normal, offset, triple, vertex, twin, count
 
 
 @inline
-def _farthest_squared(vertex, count):  # type: ignore[no-untyped-def]
+def _farthest_squared(vertex, count):  # type: ignore[no-untyped-def]  # Numba's types
     farthest = 0.0
     for v in range(count):
         farthest = max(farthest, vertex[v, 0] ** 2 + vertex[v, 1] ** 2 + vertex[v, 2] ** 2)
@@ -138,7 +138,7 @@ def _farthest_squared(vertex, count):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _measure(normal, offset, vertex, count, signed):  # type: ignore[no-untyped-def]
+def _measure(normal, offset, vertex, count, signed):  # type: ignore[no-untyped-def]  # Numba's types
     """Signed distances of the vertices beyond a plane; returns the largest."""
     largest = -np.inf
     for v in range(count):
@@ -150,7 +150,7 @@ def _measure(normal, offset, vertex, count, signed):  # type: ignore[no-untyped-
 
 
 @inline
-def _cut(plane, triple, vertex, twin, count, signed, fresh, place):  # type: ignore[no-untyped-def]
+def _cut(plane, triple, vertex, twin, count, signed, fresh, place):  # type: ignore[no-untyped-def]  # Numba's types
     """Replace the vertices beyond ``plane`` by those on it; returns the number of vertices.
 
     Every directed edge (a, b) from a removed vertex to a kept one gives the new vertex
@@ -183,7 +183,7 @@ def _cut(plane, triple, vertex, twin, count, signed, fresh, place):  # type: ign
 
 
 @inline
-def _drop_removed(triple, vertex, twin, count, signed):  # type: ignore[no-untyped-def]
+def _drop_removed(triple, vertex, twin, count, signed):  # type: ignore[no-untyped-def]  # Numba's types
     """Move the kept vertices to the front."""
     kept = 0
     for v in range(count):
@@ -195,7 +195,7 @@ def _drop_removed(triple, vertex, twin, count, signed):  # type: ignore[no-untyp
 
 
 @inline
-def _volume(normal, offset, triple, vertex, twin, count):  # type: ignore[no-untyped-def]
+def _volume(normal, offset, triple, vertex, twin, count):  # type: ignore[no-untyped-def]  # Numba's types
     """Sum over faces a of offset_a area_a / 3, the areas from their directed edges."""
     total = 0.0
     for v in range(count):
@@ -210,8 +210,8 @@ def _volume(normal, offset, triple, vertex, twin, count):  # type: ignore[no-unt
 
 
 @inline
-def _clamp(vertex, count, reach, center):  # type: ignore[no-untyped-def]
-    """Draw vertices in to ``reach``; fill their mean; return the largest distance from it."""
+def _clamp(vertex, count, reach, center):  # type: ignore[no-untyped-def]  # Numba's types
+    """Clamp vertices to ``reach``; fill their mean; return the largest distance from it."""
     center[:] = 0.0
     for v in range(count):
         length = math.sqrt(vertex[v, 0] ** 2 + vertex[v, 1] ** 2 + vertex[v, 2] ** 2)

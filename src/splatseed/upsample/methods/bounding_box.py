@@ -1,4 +1,4 @@
-"""Random points in the bounding box (the paper's ablation): what position alone is worth.
+"""Random points in the bounding box (the paper's ablation): the baseline of random positions.
 
 xyz uniform in the axis-aligned bounding box of the originals, rgb drawn from the originals.
 """
@@ -39,7 +39,7 @@ class BoundingBox:
         low, high = cloud.xyz.min(axis=0), cloud.xyz.max(axis=0)
         progress("random", 0.0)
         xyz = rng.random((num_new, 3), dtype=np.float32)
-        for start in range(0, num_new, BLOCK):  # float64 for the sum, without a float64 cloud
+        for start in range(0, num_new, BLOCK):  # sums in float64 without a whole float64 cloud
             part = xyz[start : start + BLOCK]
             part[...] = low + cloud.center + part * (high - low)
         by_rank = np.empty_like(cloud.rgb)

@@ -1,9 +1,9 @@
-"""Depth-guided lifting (paper, eqs. 7-9): pixels become points where a map says how far they are.
+"""Depth-guided lifting (paper, eqs. 7-9): pixels with known depth become points.
 
 P = c + z v, with c the camera's centre, v the ray through the pixel's centre and z its depth,
-scaled to the scene by the SfM points of the image. The work is done in ``splatseed.depth``; here
-are the method's parameters and their limits. Promise: every new point is the centre of a pixel of a
-map, at its depth.
+scaled to the scene by the SfM points of the image. ``splatseed.depth`` does the work; here are the
+method's parameters and their limits. Promise: every new point is the centre of a map's pixel, at
+its depth.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAX_VIEWS = 255
 
 @dataclass(frozen=True)
 class Depth(Settings):
-    """Pixels lifted by depth maps (eqs. 7-9), which fills what has no texture."""
+    """Pixels lifted by depth maps (eqs. 7-9), which also fills untextured areas."""
 
     name: ClassVar[str] = "depth"
 
@@ -54,7 +54,7 @@ class Depth(Settings):
 
     @property
     def traits(self) -> Traits:
-        """Maps in scene units need no originals to be aligned with."""
+        """Maps in scene units need no originals for alignment."""
         return Traits(frozenset({"points", "depth"} if self.align else {"depth"}))
 
     @classmethod

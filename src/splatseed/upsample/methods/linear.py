@@ -59,8 +59,8 @@ class Linear(NearestMethod):
 
 
 @kernel
-def _blend(xyz, rgb, center, idx, start, count, alpha, out_xyz, out_rgb):  # type: ignore[no-untyped-def]
-    """P = a P1 + (1 - a) P2 and the same for colours, for all outputs of all rows."""
+def _blend(xyz, rgb, center, idx, start, count, alpha, out_xyz, out_rgb):  # type: ignore[no-untyped-def]  # Numba's types
+    """P = a P1 + (1 - a) P2 and the same for colours, for all new points of all rows."""
     for i in parallel_range(len(xyz)):
         j = idx[i, 0]
         for m in range(start[i], start[i] + count[i]):

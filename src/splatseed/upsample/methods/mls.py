@@ -1,10 +1,10 @@
 """Moving least squares (paper, eqs. 4-5): a weighted quadratic height field at every base point.
 
 Minimise sum_j w_j (q(u_j, v_j) - z_j)^2 over q of degree 2, with w_j = 1 / max(d_j, d_1 / 2):
-inverse to the distance from the base point, held finite at the base itself. Coordinates are scaled
-by the distance of the k-th neighbour, and a ridge of 1e-6 times the mean diagonal settles what
-collinear or too few neighbours leave open. A position drawn on the patch is moved along the normal
-onto q.
+inverse to the distance from the base point, bounded at the base itself. Coordinates are scaled
+by the distance of the k-th neighbour, and a ridge of 1e-6 times the mean diagonal resolves what
+collinear or too few neighbours leave undetermined. A position drawn on the patch is moved along the
+normal onto q.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class Mls(PatchMethod):
     def heights(
         self, patches: Patches, first: int, last: int, out: Float32[np.ndarray, " M"]
     ) -> None:
-        """Fit rows ``first:last`` and write q(u, v) of all their outputs into ``out`` [M]."""
+        """Fit rows ``first:last`` and write q(u, v) of all their new points into ``out`` [M]."""
         _heights(
             patches.cloud.xyz, patches.neighbors.idx, patches.neighbors.distance, patches.frames,
             patches.bases.start, patches.bases.count, patches.uv, first, last, out,
@@ -62,8 +62,8 @@ class Mls(PatchMethod):
 
 
 @kernel
-def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  # type: ignore[no-untyped-def]
-    """Heights of all outputs of rows ``first:last``."""
+def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Heights of all new points of rows ``first:last``."""
     for i in parallel_range(first, last):
         if count[i] > 0:
             scale = distance[i, -1]
@@ -75,8 +75,8 @@ def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  #
 
 
 @inline
-def _fit(xyz, i, rows, distance, frame):  # type: ignore[no-untyped-def]
-    """Coefficients of 1, u, v, u^2, uv, v^2, in units of the k-th distance."""
+def _fit(xyz, i, rows, distance, frame):  # type: ignore[no-untyped-def]  # Numba's types
+    """Coefficients of 1, u, v, u^2, uv, v^2, with lengths in units of the k-th distance."""
     normal, rhs = np.zeros((TERMS, TERMS)), np.zeros(TERMS)
     term = np.empty(TERMS)
     scale = 1.0 / distance[-1]
@@ -102,7 +102,7 @@ def _fit(xyz, i, rows, distance, frame):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _solve(normal, rhs):  # type: ignore[no-untyped-def]
+def _solve(normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
     """Solve the ridge-regularised normal equations in place, by Cholesky on the lower triangle."""
     trace = 0.0
     for a in range(TERMS):

@@ -34,9 +34,9 @@ __all__ = ["Spline"]
 
 COEFFICIENTS = CONTROL * CONTROL
 BAND = 3 * CONTROL + 3
-"""Two basis functions that meet lie at most this far apart in the flat order."""
+"""Bandwidth: two overlapping basis functions are at most this far apart in the flat order."""
 RIDGE = 1e-9
-"""Settles control values that no data and, for a plane, no penalty holds."""
+"""Ridge for control values that no data and, for a plane, no penalty determines."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Spline(PatchMethod):
     def heights(
         self, patches: Patches, first: int, last: int, out: Float32[np.ndarray, " M"]
     ) -> None:
-        """Fit rows ``first:last`` and write S(u, v) of all their outputs into ``out`` [M]."""
+        """Fit rows ``first:last`` and write S(u, v) of all their new points into ``out`` [M]."""
         if self.basis == "bicubic":
             from splatseed.upsample.surfaces.spline_bicubic import bicubic_heights  # noqa: PLC0415  (LAPACK)
 
@@ -102,14 +102,14 @@ class Spline(PatchMethod):
 def fit(
     basis: PatchBasis, count: np.ndarray, smoothing: Float64[np.ndarray, " rows"]
 ) -> Float64[np.ndarray, "rows 36"]:
-    """Control values of every row that makes outputs (``count`` > 0), [rows, 36]; else 0."""
+    """Control values of every row with new points (``count`` > 0), [rows, 36]; else 0."""
     coefficients = np.zeros((len(basis.z), COEFFICIENTS))
     _fit(basis.weight, basis.cell, basis.z, count, smoothing, penalty(), coefficients)
     return coefficients
 
 
 @kernel
-def _fit(weight, cell, z, count, smoothing, roughness, coefficients):  # type: ignore[no-untyped-def]
+def _fit(weight, cell, z, count, smoothing, roughness, coefficients):  # type: ignore[no-untyped-def]  # Numba's types
     for row in parallel_range(len(z)):
         if count[row] > 0:
             normal = np.empty((COEFFICIENTS, COEFFICIENTS))
@@ -122,7 +122,7 @@ def _fit(weight, cell, z, count, smoothing, roughness, coefficients):  # type: i
 
 
 @inline
-def _accumulate(weight, cell, z, normal, rhs):  # type: ignore[no-untyped-def]
+def _accumulate(weight, cell, z, normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
     """Add B'B (upper triangle) and B'z; every data point touches 4 x 4 control values."""
     product = np.empty((4, 4))
     for j in range(z.size):
@@ -143,8 +143,8 @@ def _accumulate(weight, cell, z, normal, rhs):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _solve(normal, rhs):  # type: ignore[no-untyped-def]
-    """Solve in place with the banded Cholesky factor U'U; whole rows are updated, to vectorise."""
+def _solve(normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
+    """Solve in place by a banded Cholesky factor U'U; whole rows are updated, to vectorise."""
     n = rhs.size
     for a in range(n):
         end = min(n, a + BAND + 1)

@@ -63,8 +63,8 @@ class Triangle(NearestMethod):
 
 
 @kernel
-def _blend(xyz, rgb, center, idx, start, count, draws, out_xyz, out_rgb):  # type: ignore[no-untyped-def]
-    """The barycentric mix of positions and of colours, for all outputs of all rows."""
+def _blend(xyz, rgb, center, idx, start, count, draws, out_xyz, out_rgb):  # type: ignore[no-untyped-def]  # Numba's types
+    """P = b0 P1 + b1 P2 + b2 P3 and the same for colours, for all new points of all rows."""
     for i in parallel_range(len(xyz)):
         p, q = idx[i, 0], idx[i, 1]
         for m in range(start[i], start[i] + count[i]):

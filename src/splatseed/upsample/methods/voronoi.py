@@ -1,13 +1,13 @@
-"""Voronoi upsampling (paper, eq. 6): new points where the originals leave room.
+"""Voronoi upsampling (paper, eq. 6): new points where originals are sparse.
 
 A cell is drawn with probability proportional to its volume, and the point is uniform in the ball
 (c_i, r_i / 2) about the cell's centre; its colour comes from the 5 nearest originals.
 
-Default: cells are clamped to half the distance of the 25th neighbour (``voronoi_cells``), and the
-draw is by the volume relative to the median of the neighbours', capped at 8: otherwise all new
+Default: cells are clamped to half the distance of the 25th neighbour (``cells.meshless``), and the
+probability is the volume relative to the median of the neighbours', capped at 8: otherwise all new
 points go to the sparse background, most of them outside the scene.
 Paper: SciPy's Voronoi cells of the originals and the corners of the bounding box enlarged by 10%,
-drawn by volume (``voronoi_box``).
+drawn by volume (``cells.box``).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Voronoi(NearestMethod):
     """Cells clamped to their neighbourhood, or Qhull's in the enlarged bounding box (paper:
     box)."""
     ball: float = 0.5
-    """Radius of the ball that takes new points, as a share of the cell's radius (paper: 0.5)."""
+    """Radius of the ball for new points, as a fraction of the cell's radius (paper: 0.5)."""
     color_k: int = 5
     """Nearest originals that colour a new point (paper: 5)."""
     max_weight: float = 8.0
@@ -123,7 +123,7 @@ def _relative(
 
 
 @kernel
-def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]
+def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(len(volume)):
         around = np.sort(volume[idx[i]])
         median = 0.5 * (around[(around.size - 1) // 2] + around[around.size // 2])
@@ -131,11 +131,8 @@ def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _place(xyz, site_center, center, radius, frames, start, count, out):  # type: ignore[no-untyped-def]
-    """Uniform in each cell's ball, in place of the draws in ``out``.
-
-    Directions turn with frames.
-    """
+def _place(xyz, site_center, center, radius, frames, start, count, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Uniform in each cell's ball, replacing the draws in ``out``; directions turn with frames."""
     for i in parallel_range(len(xyz)):
         for m in range(start[i], start[i] + count[i]):
             r = radius[i] * np.float64(out[m, 0]) ** (1.0 / 3.0)

@@ -1,1 +1,1 @@
-"""Height fields over neighbourhoods: frames, patches, where to sample, splines."""
+"""Height fields over neighbourhoods: frames, patches, placement, splines."""

@@ -2,7 +2,7 @@
 
 Notation: ``frames[i]`` [3, 3] has rows e_u, e_v (the tangent plane, widest axis first) and e_n (the
 normal), right-handed. Promise: axes and signs follow from the neighbourhood's shape alone, so they
-turn with the cloud; a neighbourhood on a line is reported, as its tangent plane is arbitrary.
+rotate with the cloud; a collinear neighbourhood is reported, as its tangent plane is arbitrary.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from splatseed.kernels.jit import inline, kernel, parallel_range
 __all__ = ["coordinate", "local_frames", "world_frames"]
 
 COLLINEAR = 1e-9
-"""Ratio of the two largest variances below which a neighbourhood counts as a line."""
+"""Ratio of the two largest variances below which a neighbourhood counts as collinear."""
 
 
 def world_frames(
     n: int,
 ) -> tuple[Float64[np.ndarray, "n 3 3"], Bool[np.ndarray, " n"]]:
-    """The world's axes for each of ``n`` rows, [n, 3, 3], none of them on a line."""
+    """The world's axes for each of ``n`` rows, [n, 3, 3], none of them collinear."""
     return np.ascontiguousarray(np.broadcast_to(np.eye(3), (n, 3, 3))), np.zeros(n, bool)
 
 
@@ -37,7 +37,7 @@ def local_frames(
         idx: Neighbour rows, int32 [n, k].
 
     Returns:
-        Frames [n, 3, 3] with rows e_u, e_v, e_n, and which rows lie on a line, bool [n].
+        Frames [n, 3, 3] with rows e_u, e_v, e_n, and which rows are collinear, bool [n].
     """
     frames, collinear = np.empty((len(xyz), 3, 3)), np.empty(len(xyz), bool)
     _frames(xyz, idx, frames, collinear, COLLINEAR)
@@ -45,7 +45,7 @@ def local_frames(
 
 
 @kernel
-def _frames(xyz, idx, frames, collinear, tolerance):  # type: ignore[no-untyped-def]
+def _frames(xyz, idx, frames, collinear, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(len(xyz)):
         covariance = _covariance(xyz, i, idx[i])
         collinear[i] = _principal_axes(covariance, frames[i]) < tolerance
@@ -53,7 +53,7 @@ def _frames(xyz, idx, frames, collinear, tolerance):  # type: ignore[no-untyped-
 
 
 @inline
-def coordinate(xyz, i, j, axis_vector):  # type: ignore[no-untyped-def]
+def coordinate(xyz, i, j, axis_vector):  # type: ignore[no-untyped-def]  # Numba's types
     """Coordinate of row j along a unit vector, relative to row i."""
     return (
         (xyz[j, 0] - xyz[i, 0]) * axis_vector[0]
@@ -63,7 +63,7 @@ def coordinate(xyz, i, j, axis_vector):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _covariance(xyz, i, rows):  # type: ignore[no-untyped-def]
+def _covariance(xyz, i, rows):  # type: ignore[no-untyped-def]  # Numba's types
     """Covariance of row i and its neighbours, scaled to a trace of 1: (xx, xy, xz, yy, yz, zz)."""
     mx = my = mz = 0.0
     for j in rows:
@@ -86,7 +86,7 @@ def _covariance(xyz, i, rows):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]
+def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]  # Numba's types
     """Fill ``frame`` with e_u, e_v, e_n; return the middle variance over the largest.
 
     The eigenvalue that lies farthest from the others gives a well-conditioned first axis; the
@@ -116,14 +116,14 @@ def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _set_rows(frame, first, second, third):  # type: ignore[no-untyped-def]
-    # One by one: assigning a tuple to a row compiles 5 s of Numba's own checks and messages.
+def _set_rows(frame, first, second, third):  # type: ignore[no-untyped-def]  # Numba's types
+    # One by one: assigning a tuple to a row makes Numba compile 5 s of its own checks and messages.
     for axis in range(3):
         frame[0, axis], frame[1, axis], frame[2, axis] = first[axis], second[axis], third[axis]
 
 
 @inline
-def _null_vector(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
+def _null_vector(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]  # Numba's types
     """Unit null vector of a symmetric matrix of rank 2: the longest cross product of its rows."""
     x0, y0, z0 = xy * yz - xz * yy, xz * xy - xx * yz, xx * yy - xy * xy
     x1, y1, z1 = xy * zz - xz * yz, xz * xz - xx * zz, xx * yz - xy * xz
@@ -144,7 +144,7 @@ def _null_vector(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _plane_axes(covariance, wx, wy, wz):  # type: ignore[no-untyped-def]
+def _plane_axes(covariance, wx, wy, wz):  # type: ignore[no-untyped-def]  # Numba's types
     """Principal axes in the plane orthogonal to w: (major, minor, variance along major)."""
     xx, xy, xz, yy, yz, zz = covariance
     if abs(wx) > abs(wy):
@@ -177,7 +177,7 @@ def _plane_axes(covariance, wx, wy, wz):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _fix_signs(xyz, i, rows, frame):  # type: ignore[no-untyped-def]
+def _fix_signs(xyz, i, rows, frame):  # type: ignore[no-untyped-def]  # Numba's types
     """Point e_u and e_v to the neighbour farthest along each; e_n makes the frame right-handed."""
     far_u = far_v = 0.0
     for j in rows:

@@ -1,4 +1,4 @@
-"""The steps of a method that fits a height field: frames, places, heights, colours."""
+"""The steps of a method that fits a height field: frames, placement, heights, colours."""
 
 from __future__ import annotations
 
@@ -34,11 +34,12 @@ class PatchMethod(NearestMethod, ABC):
     frame: Literal["local", "world"] = "local"
     """Axes of the fit: the neighbourhood's principal axes, or the world's (paper: world)."""
     placement: Literal["disc", "triangle", "box"] = "disc"
-    """Where: a disc (covers best), a triangle of neighbours (most exact), a box (paper: box)."""
+    """Where points are placed: a disc (best coverage), a triangle of neighbours (most exact), a
+    box (paper: box)."""
     disc_radius: float = 1.5
     """Radius of the disc in units of the base point's spacing."""
     clamp: float | None = 0.25
-    """How far a height may leave the neighbours' range, as a share of it (paper: no limit)."""
+    """How far a height may leave the neighbours' range, as a fraction of it (paper: no limit)."""
 
     min_points: ClassVar[int] = 4
     name: ClassVar[str]
@@ -55,7 +56,7 @@ class PatchMethod(NearestMethod, ABC):
     def heights(
         self, patches: Patches, first: int, last: int, out: Float32[np.ndarray, " M"]
     ) -> None:
-        """Fit rows ``first:last`` and write S(u, v) of all their outputs into ``out`` [M]."""
+        """Fit rows ``first:last`` and write S(u, v) of all their new points into ``out`` [M]."""
 
     def __call__(
         self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
@@ -75,7 +76,7 @@ class PatchMethod(NearestMethod, ABC):
     def _place(
         self, cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, rng: np.random.Generator
     ) -> Patches:
-        """Stand a patch on every row and choose where its new points go."""
+        """Put a patch on every row and choose where its new points go."""
         if self.frame == "local":
             frames, collinear = local_frames(cloud.xyz, neighbors.idx)
         else:

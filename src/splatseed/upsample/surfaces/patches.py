@@ -1,4 +1,4 @@
-"""Height-field patches: the data that surface-fitting methods share, and the way back to 3D.
+"""Height-field patches: the data that surface-fitting methods share, and the map back to 3D.
 
 Around a base point p with k neighbours stands a frame (e_u, e_v, e_n), the rows of ``frames[i]``.
 A surface is a height z = S(u, v) over the plane through p, and the new point at (u, v) is
@@ -26,10 +26,10 @@ class Patches:
     Args:
         cloud: The prepared originals, n rows.
         neighbors: The k neighbours of each row.
-        bases: Which outputs each row makes, M in all.
+        bases: The new points of each row, M in all.
         frames: Axes of each patch as rows e_u, e_v, e_n, float64 [n, 3, 3].
-        collinear: Rows whose neighbourhood is a line, bool [n].
-        uv: Where each new point stands on its patch, float32 [M, 2], scene units.
+        collinear: Rows with a collinear neighbourhood, bool [n].
+        uv: Position of each new point on its patch, float32 [M, 2], scene units.
     """
 
     cloud: PreparedCloud
@@ -48,8 +48,8 @@ def lift(
     Args:
         patches: The patches.
         height: S(u, v) of every new point, float32 [M].
-        clamp: Heights are held within the neighbours' range, widened on both sides by this share
-            of it; None leaves them as they are.
+        clamp: Heights are clamped to the neighbours' range, widened on both sides by this fraction
+            of it; None leaves them unchanged.
     """
     cloud, bases = patches.cloud, patches.bases
     out = np.empty((bases.total, 3), np.float32)
@@ -62,8 +62,8 @@ def lift(
 
 
 @kernel
-def _lift(xyz, center, idx, frames, start, count, uv, height, margin, out):  # type: ignore[no-untyped-def]
-    """Compute p + u e_u + v e_v + clamp(z) e_n for all outputs of all rows."""
+def _lift(xyz, center, idx, frames, start, count, uv, height, margin, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Compute p + u e_u + v e_v + clamp(z) e_n for all new points of all rows."""
     for i in parallel_range(len(xyz)):
         if count[i] > 0:
             e_u, e_v, e_n = frames[i, 0], frames[i, 1], frames[i, 2]
@@ -78,7 +78,7 @@ def _lift(xyz, center, idx, frames, start, count, uv, height, margin, out):  # t
 
 
 @inline
-def _height_range(xyz, i, rows, e_n):  # type: ignore[no-untyped-def]
+def _height_range(xyz, i, rows, e_n):  # type: ignore[no-untyped-def]  # Numba's types
     """Lowest and highest of the neighbours and the base (at 0) along the normal."""
     low = high = 0.0
     for j in rows:

@@ -1,7 +1,7 @@
-"""Where on its patch a new point stands: the (u, v) that a height is then computed for.
+"""The position (u, v) of a new point on its patch, at which the height is then computed.
 
 Each function takes M uniform draws and returns uv, float32 [M, 2], in scene units relative to the
-base point. On a neighbourhood that is a line, v is 0: its tangent plane is arbitrary.
+base point. On a collinear neighbourhood v is 0, since its tangent plane is arbitrary.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ def place_in_box(
 
 
 @kernel
-def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def]
+def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def]  # Numba's types
     """Polar coordinates with a square-root radius, in place of the draws in ``uv``."""
-    turn = np.float32(2.0 * math.pi)  # float32 throughout: its sine and cosine are twice as fast
+    turn = np.float32(2.0 * math.pi)  # float32 sine and cosine are twice as fast
     for i in parallel_range(len(radius)):
         reach_u = np.float32(radius[i])
         reach_v = np.float32(0.0) if collinear[i] else reach_u
@@ -75,7 +75,7 @@ def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-untyped-def]
+def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-untyped-def]  # Numba's types
     """The square-root map on the triangle of the base and a random pair of its neighbours."""
     pairs = idx.shape[1] * (idx.shape[1] - 1) // 2
     for i in parallel_range(len(xyz)):
@@ -92,7 +92,7 @@ def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-unt
 
 
 @kernel
-def _box(xyz, idx, frames, start, count, uv):  # type: ignore[no-untyped-def]
+def _box(xyz, idx, frames, start, count, uv):  # type: ignore[no-untyped-def]  # Numba's types
     """Stretch the draws in ``uv`` over the neighbourhood's bounding box."""
     for i in parallel_range(len(xyz)):
         for axis in range(2):

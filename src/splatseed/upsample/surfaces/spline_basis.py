@@ -24,7 +24,7 @@ __all__ = ["CONTROL", "PatchBasis", "evaluate", "patch_basis", "penalty"]
 CONTROL = 6
 HEIGHT_UNIT = 1.5
 LINE = 1e-6
-"""Least extent along v, as a share of the k-th distance: a line has none."""
+"""Least extent along v, as a fraction of the k-th distance: a collinear patch has none."""
 
 
 def penalty() -> Float64[np.ndarray, "36 36"]:
@@ -52,7 +52,7 @@ class PatchBasis(NamedTuple):
 
 
 def patch_basis(patches: Patches, first: int, last: int) -> PatchBasis:
-    """The basis at the data points of rows ``first:last``; rows without outputs are left empty."""
+    """The basis at the data points of rows ``first:last``; rows without new points stay empty."""
     rows, m = last - first, patches.neighbors.k + 1
     basis = PatchBasis(
         np.zeros((rows, m, 2, 4)), np.zeros((rows, m, 2), np.int8), np.zeros((rows, m)),
@@ -73,9 +73,9 @@ def evaluate(
     last: int,
     out: Float32[np.ndarray, " M"],
 ) -> None:
-    """Write S(u, v), in scene units, of all outputs of rows ``first:last`` into ``out``.
+    """Write S(u, v), in scene units, of all new points of rows ``first:last`` into ``out``.
 
-    Places outside the domain get the height of the nearest place in it.
+    Positions outside the domain get the height of the nearest position in it.
     """
     _evaluate(
         patches.bases.start, patches.bases.count, patches.uv, coefficients, scale, first, last, out
@@ -83,7 +83,7 @@ def evaluate(
 
 
 @kernel
-def _patch_basis(xyz, idx, distance, frames, count, first, last, weight, cell, z, scale):  # type: ignore[no-untyped-def]
+def _patch_basis(xyz, idx, distance, frames, count, first, last, weight, cell, z, scale):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(first, last):
         if count[i] > 0:
             row = i - first
@@ -98,7 +98,7 @@ def _patch_basis(xyz, idx, distance, frames, count, first, last, weight, cell, z
 
 
 @inline
-def _local_points(xyz, i, rows, frame, reach, scale):  # type: ignore[no-untyped-def]
+def _local_points(xyz, i, rows, frame, reach, scale):  # type: ignore[no-untyped-def]  # Numba's types
     """Scaled (u, v, z) of the neighbours and, last, the base [k + 1, 3]; fills the scales."""
     k = rows.size
     points = np.zeros((k + 1, 3))
@@ -116,7 +116,7 @@ def _local_points(xyz, i, rows, frame, reach, scale):  # type: ignore[no-untyped
 
 
 @inline
-def _weights(t):  # type: ignore[no-untyped-def]
+def _weights(t):  # type: ignore[no-untyped-def]  # Numba's types
     """First control index and the four uniform cubic B-splines at t in [-1, 1]."""
     x = (t + 1.0) * 0.5 * (CONTROL - 3)
     cell = min(max(int(x), 0), CONTROL - 4)
@@ -132,7 +132,7 @@ def _weights(t):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _evaluate(start, count, uv, coefficients, scale, first, last, out):  # type: ignore[no-untyped-def]
+def _evaluate(start, count, uv, coefficients, scale, first, last, out):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(first, last):
         c, unit = coefficients[i - first], scale[i - first]
         for m in range(start[i], start[i] + count[i]):

@@ -23,7 +23,7 @@ TERMS = (DEGREE + 1) * (DEGREE + 1)
 def bicubic_heights(
     patches: Patches, first: int, last: int, out: Float32[np.ndarray, " M"]
 ) -> None:
-    """Write the polynomial's height at all outputs of rows ``first:last`` into ``out`` [M]."""
+    """Write the polynomial's height at all new points of rows ``first:last`` into ``out`` [M]."""
     _heights(
         patches.cloud.xyz, patches.neighbors.idx, patches.neighbors.distance, patches.frames,
         patches.bases.start, patches.bases.count, patches.uv, first, last, out,
@@ -31,7 +31,7 @@ def bicubic_heights(
 
 
 @kernel
-def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  # type: ignore[no-untyped-def]
+def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  # type: ignore[no-untyped-def]  # Numba's types
     for i in parallel_range(first, last):
         if count[i] > 0:
             reach = distance[i, -1]
@@ -47,7 +47,7 @@ def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  #
 
 
 @inline
-def _design(xyz, i, rows, frame, reach):  # type: ignore[no-untyped-def]
+def _design(xyz, i, rows, frame, reach):  # type: ignore[no-untyped-def]  # Numba's types
     """Design matrix [k + 1, 16] and heights [k + 1] of the neighbours and the base."""
     design, z = np.empty((rows.size + 1, TERMS)), np.zeros(rows.size + 1)
     for j in range(rows.size + 1):
@@ -63,7 +63,7 @@ def _design(xyz, i, rows, frame, reach):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _terms(u, v, out):  # type: ignore[no-untyped-def]
+def _terms(u, v, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Products of Chebyshev polynomials T0..T3 of u and v, better conditioned than powers."""
     tu = (1.0, u, 2.0 * u * u - 1.0, u * (4.0 * u * u - 3.0))
     tv = (1.0, v, 2.0 * v * v - 1.0, v * (4.0 * v * v - 3.0))

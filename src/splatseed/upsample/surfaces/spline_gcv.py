@@ -19,7 +19,7 @@ from splatseed.upsample.surfaces.spline_basis import CONTROL, PatchBasis, penalt
 __all__ = ["LAMBDAS", "cross_validate"]
 
 LAMBDAS = np.logspace(-3.0, 2.0, 11)
-"""The candidates: from nearly interpolating to nearly a plane."""
+"""The candidates: from near interpolation to near a plane."""
 COEFFICIENTS = CONTROL * CONTROL
 FREE = 3
 """Dimension of the planes."""
@@ -34,7 +34,7 @@ def cross_validate(basis: PatchBasis, count: np.ndarray) -> Float64[np.ndarray, 
 
 
 @kernel
-def _choose(weight, cell, z, count, inverse, candidates, chosen):  # type: ignore[no-untyped-def]
+def _choose(weight, cell, z, count, inverse, candidates, chosen):  # type: ignore[no-untyped-def]  # Numba's types
     for row in parallel_range(len(z)):
         if count[row] > 0:
             gram = _gram(weight[row], cell[row], inverse)
@@ -50,7 +50,7 @@ def _choose(weight, cell, z, count, inverse, candidates, chosen):  # type: ignor
 
 
 @inline
-def _gram(weight, cell, inverse):  # type: ignore[no-untyped-def]
+def _gram(weight, cell, inverse):  # type: ignore[no-untyped-def]  # Numba's types
     """K = B P^+ B' for one patch, [m, m]."""
     m = len(weight)
     half, gram = np.zeros(COEFFICIENTS), np.empty((m, m))
@@ -75,7 +75,7 @@ def _gram(weight, cell, inverse):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _planes(weight, cell):  # type: ignore[no-untyped-def]
+def _planes(weight, cell):  # type: ignore[no-untyped-def]  # Numba's types
     """X = [1, u, v] at the data points (u and v up to scale and shift), [m, 3]."""
     planes = np.ones((len(weight), FREE))
     for j in range(len(weight)):
@@ -86,7 +86,7 @@ def _planes(weight, cell):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _remove_planes(planes, gram, y):  # type: ignore[no-untyped-def]
+def _remove_planes(planes, gram, y):  # type: ignore[no-untyped-def]  # Numba's types
     """Rotate by the Householder QR of X, so that rows and columns 3.. are orthogonal to it."""
     m = len(y)
     v = np.empty(m)
@@ -106,7 +106,7 @@ def _remove_planes(planes, gram, y):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _reflect_rows(matrix, v, first, squared):  # type: ignore[no-untyped-def]
+def _reflect_rows(matrix, v, first, squared):  # type: ignore[no-untyped-def]  # Numba's types
     """Set matrix <- (I - 2 v v' / v'v) matrix, v being 0 before ``first``."""
     total = np.zeros(matrix.shape[1])
     for j in range(first, len(matrix)):
@@ -119,14 +119,14 @@ def _reflect_rows(matrix, v, first, squared):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _reflect_columns(matrix, v, first, squared):  # type: ignore[no-untyped-def]
+def _reflect_columns(matrix, v, first, squared):  # type: ignore[no-untyped-def]  # Numba's types
     """Set matrix <- matrix (I - 2 v v' / v'v), v being 0 before ``first``."""
     for j in range(len(matrix)):
         _reflect_vector(matrix[j], v, first, squared)
 
 
 @inline
-def _reflect_vector(y, v, first, squared):  # type: ignore[no-untyped-def]
+def _reflect_vector(y, v, first, squared):  # type: ignore[no-untyped-def]  # Numba's types
     total = 0.0
     for j in range(first, y.size):
         total += v[j] * y[j]
@@ -136,7 +136,7 @@ def _reflect_vector(y, v, first, squared):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _tridiagonalise(matrix, y):  # type: ignore[no-untyped-def]
+def _tridiagonalise(matrix, y):  # type: ignore[no-untyped-def]  # Numba's types
     """Diagonal [n] and off-diagonal [n - 1] of an orthogonally similar matrix; y turns along."""
     n = y.size
     diagonal, beside = np.empty(n), np.zeros(max(n - 1, 0))
@@ -161,7 +161,7 @@ def _tridiagonalise(matrix, y):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _similar(matrix, v, p, first, squared):  # type: ignore[no-untyped-def]
+def _similar(matrix, v, p, first, squared):  # type: ignore[no-untyped-def]  # Numba's types
     """The symmetric rank-2 update of a Householder similarity on rows and columns ``first``.."""
     n = v.size
     p[first:] = 0.0
@@ -180,8 +180,8 @@ def _similar(matrix, v, p, first, squared):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _score(diagonal, beside, y, smoothing):  # type: ignore[no-untyped-def]
-    """|lambda (T + lambda)^-1 y|^2 / (lambda tr (T + lambda)^-1)^2: GCV but for its constant m.
+def _score(diagonal, beside, y, smoothing):  # type: ignore[no-untyped-def]  # Numba's types
+    """|lambda (T + lambda)^-1 y|^2 / (lambda tr (T + lambda)^-1)^2: GCV without its constant m.
 
     The forward pivots f and backward pivots b of a tridiagonal matrix give both its solution and
     the diagonal of its inverse, 1 / (f_i + b_i - d_i).

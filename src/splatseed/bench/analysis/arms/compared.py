@@ -1,10 +1,10 @@
-"""Arms of any seeds and any strategy beside one baseline: at equal numbers and at equal seconds.
+"""Arms of any seeds and strategy against one baseline: at equal numbers and at equal seconds.
 
 Notation: an *arm* is a variant (how seeds are made) with a strategy; the *baseline* is the scene's
 own points with strategy ``default``. Differences are arm less baseline, paired by scene and repeat;
-repeats are averaged within a scene. Seconds are those of making the seeds and of training. Between
-two tests of a curve scores are taken as a straight line over seconds. Promise: an arm is compared
-over the scenes that both have; where a curve ends before a time, its last score stands for it.
+repeats are averaged within a scene. Seconds include making the seeds and training. Between two
+tests of a curve scores are interpolated linearly over seconds. Promise: an arm is compared over the
+scenes that both have; if a curve ends before a time, its last score stands for it.
 """
 
 from __future__ import annotations
@@ -41,26 +41,26 @@ class Arm(NamedTuple):
 
 @dataclass(frozen=True)
 class Compared:
-    """An arm beside the baseline.
+    """An arm compared with the baseline.
 
     Args:
         arm: The arm.
         scenes: The scenes that both have.
         runs: Pairs of runs behind the differences.
-        psnr: Its mean PSNR in dB over scenes, and so on for the other scores; None where one is
-            not known on some of the scenes.
+        psnr: Its mean PSNR in dB over scenes; likewise the other scores; None if unknown on some
+            of the scenes.
         gain: Difference of PSNR, dB.
         covisible_gain: The same over co-visible pixels.
         ssim_gain: Difference of SSIM.
         lpips_gain: Difference of LPIPS; below 0 is better.
-        gain_in_time: PSNR at the seconds at which the baseline ends, less that of the baseline at
-            its end, dB.
-        reached: Pairs whose arm reaches the baseline's last PSNR.
-        sooner: Mean logarithm of seconds to the baseline's last PSNR, over those that the baseline
-            takes in all; None unless all reach it.
-        num_gaussians: At the end, mean.
-        seeding: Seconds, mean.
-        training: Seconds, mean.
+        gain_in_time: PSNR at the seconds at which the baseline ends, less the baseline's final
+            PSNR, dB.
+        reached: Pairs whose arm reaches the baseline's final PSNR.
+        sooner: Mean logarithm of seconds to the baseline's final PSNR, relative to the baseline's
+            total; None unless all reach it.
+        num_gaussians: Mean number at the end.
+        seeding: Mean seconds.
+        training: Mean seconds.
     """
 
     arm: Arm
@@ -83,7 +83,7 @@ class Compared:
 
 
 def baseline_of(study: Study) -> Arm | None:
-    """The scene's own points with ``default``, or with the first strategy that they have."""
+    """The scene's own points with ``default``, or with the first strategy they were run with."""
     known = [s for s in study.strategies if any(study.cell(s, x, BASELINE) for x in study.scenes)]
     if not known:
         return None
@@ -91,7 +91,7 @@ def baseline_of(study: Study) -> Arm | None:
 
 
 def compared_arms(study: Study) -> tuple[Compared, ...]:
-    """Every arm beside the baseline, the one with the highest mean gain first.
+    """Every arm compared with the baseline, the one with the highest mean gain first.
 
     The p values of each kind of difference are adjusted together over the arms.
 
@@ -146,7 +146,7 @@ def _pairs(base: Runs, own: Runs) -> list[Pair]:
 
 
 def _mean(scenes: Sequence[Sequence[RunResult]], measure: Measure) -> float | None:
-    """Mean over scenes of the means over repeats; None where it is not known of all."""
+    """Mean over scenes of the means over repeats; None unless known for all."""
     values = [[measure(result) for result in runs] for runs in scenes]
     known = [[v for v in each if v is not None] for each in values]
     return fmean(map(fmean, known)) if all(known) else None
@@ -168,7 +168,7 @@ def _over(scenes: Sequence[Sequence[float]]) -> Difference:
 
 
 def psnr_at(result: RunResult, seconds: float) -> float | None:
-    """A run's test PSNR when so many seconds have gone by since it began to make seeds, dB.
+    """A run's test PSNR ``seconds`` after it began to make seeds, dB.
 
     Args:
         result: The run.
@@ -189,7 +189,7 @@ def psnr_at(result: RunResult, seconds: float) -> float | None:
 
 
 def _in_time(scenes: Sequence[Sequence[Pair]]) -> Difference | None:
-    """What the arm is ahead by when the baseline ends; None where an arm has no test by then."""
+    """The arm's lead when the baseline ends; None if an arm has no test by then."""
     found = []
     for pairs in scenes:
         at = [(base.psnr, psnr_at(own, base.seconds)) for base, own in pairs]
@@ -201,14 +201,14 @@ def _in_time(scenes: Sequence[Sequence[Pair]]) -> Difference | None:
 
 
 def _times(scenes: Sequence[Sequence[Pair]]) -> list[list[tuple[float, float | None]]]:
-    """The baseline's seconds in all, and the arm's to the baseline's last PSNR, by scene."""
+    """The baseline's total seconds, and the arm's to the baseline's final PSNR, by scene."""
     return [
         [(base.seconds, _seconds_to(own, base.psnr)) for base, own in pairs] for pairs in scenes
     ]
 
 
 def _seconds_to(own: RunResult, target: float) -> float | None:
-    """When a run is as good as that; also where the baseline is the run itself."""
+    """When a run reaches that PSNR, even if the run is the baseline itself."""
     reached = reach(own, target)
     if reached is not None:
         return reached.seconds
@@ -225,7 +225,7 @@ def _sooner(scenes: Sequence[Sequence[tuple[float, float | None]]]) -> Differenc
 
 
 def _with_adjusted(found: Sequence[Compared], base: Arm) -> list[Compared]:
-    """The differences with their p values adjusted over all arms but the baseline itself."""
+    """The differences with their p values adjusted over all arms except the baseline itself."""
     others = [each for each in found if each.arm != base]
     kinds = ("gain", "covisible_gain", "ssim_gain", "lpips_gain", "gain_in_time", "sooner")
     columns = {kind: adjusted([getattr(each, kind) for each in others]) for kind in kinds}

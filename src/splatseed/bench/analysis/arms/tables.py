@@ -1,4 +1,4 @@
-"""Tables of arms at equal numbers of Gaussians and at equal seconds, and what they say in words.
+"""Tables of arms at equal numbers of Gaussians and at equal seconds, with conclusions in words.
 
 Notation and promise: see ``splatseed.bench.analysis.arms.compared``.
 """
@@ -159,7 +159,7 @@ def _share_of_time(sooner: Difference | None) -> Cell:
 
 
 def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
-    """What the arms say, in sentences for a reader who has not seen the tables.
+    """The conclusions on the arms, for a reader who has not seen the tables.
 
     Args:
         study: The study.

@@ -1,0 +1,38 @@
+"""The PyTorch device that a user's choice stands for.
+
+Promise: a requested GPU is used or an error, never silently replaced; PyTorch is imported only when
+a device is picked.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from splatseed.errors import ParameterError
+
+if TYPE_CHECKING:  # PyTorch may be absent, and takes a while to load
+    import torch
+
+__all__ = ["pick_torch_device"]
+
+
+def pick_torch_device(choice: Literal["auto", "cpu", "cuda"], option: str) -> torch.device:
+    """The device of a choice; ``auto`` takes a GPU if PyTorch sees one.
+
+    Args:
+        choice: What the user says.
+        option: The option by which it was said, for errors.
+
+    Raises:
+        ParameterError: CUDA is requested and there is none.
+    """
+    import torch  # noqa: PLC0415  (see the promise)
+
+    seen = torch.cuda.is_available()
+    if choice == "cuda" and not seen:
+        raise ParameterError(
+            f"a GPU for {option} cuda",
+            found="none that PyTorch sees",
+            fix=f"Pass {option} cpu, or install PyTorch's CUDA build.",
+        )
+    return torch.device("cuda" if seen and choice != "cpu" else "cpu")
