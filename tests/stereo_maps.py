@@ -1,4 +1,4 @@
-"""Stereo maps with true depth and normals, ray-cast from the made-up room."""
+"""Stereo maps with true depth and normals, ray-cast from the synthetic room."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from splatseed.train.record.config import make_config, resumed_settings
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.settings import TrainSettings
 
-NEWER = ("seed_sizes", "seed_normals", "seed_colors", "seeding")
+NEWER = ("placing", "seed_sizes", "seed_normals", "seed_colors", "seeding")
 """Settings that version 0.1.0 did not have."""
 STEPS = 3
 

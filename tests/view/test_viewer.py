@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import socket
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from splatseed.cli import main
 from splatseed.errors import ParameterError
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.frame import TrainingFrame
-from splatseed.view import pictures
+from splatseed.view import pictures, session as session_module
 from splatseed.view.canvas import canvas_view, fitted_fov, laid_onto, stage_pose
 from splatseed.view.pictures import Entry
 from splatseed.view.shown import open_shown
@@ -134,6 +135,34 @@ def _camera_in_sight(session):
         if depth > 0 and 50 < u / depth < 350 and 160 < v / depth < 550:
             found.append((depth, image, handle, (u / depth, v / depth)))
     return min(found, key=lambda each: each[0])[1:]
+
+
+@needs_browser
+def test_a_browser_gets_as_many_points_as_it_draws_quickly(room, tmp_path, monkeypatch):
+    monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
+    port = free_port("127.0.0.1", 0)
+    served = Viewer([open_shown(room)], "127.0.0.1", port)
+    total = len(served.entries[0].shown.scene.points)
+    with served_page(tmp_path, f"http://127.0.0.1:{port}") as page:
+        session = _session(served)
+        assert waits_for(lambda: session._legend.content.endswith(f"{total:,}</div></div>"))
+        assert waits_for(lambda: f"original: {total:,}" in text(page))
+        monkeypatch.setattr(session, "_seconds_of_a_picture", lambda points: 100.0 * points)
+        session._fill_stage()  # as when another entry is chosen
+        assert waits_for(lambda: f"original: {total:,} (" in text(page))
+        assert len(session._clouds["original"].xyz) <= 100
+        # One that does not answer is left with the points that it has, shown.
+        session._seconds_of_a_picture = partial(_unanswered, session)
+        with pytest.raises(TimeoutError):
+            session._affordable_points()
+        assert all(node.visible for node in session._nodes.values())
+    served.stop()
+
+
+def _unanswered(session, points):
+    for node in session._nodes.values():
+        node.visible = points
+    raise TimeoutError
 
 
 @needs_browser

@@ -57,15 +57,15 @@ def _number(kind: type, default: str) -> Any:
 class Options:
     """Find the best seeds and strategy for a scene by short runs on it, at one number of Gaussians.
 
-    Test views are never looked at: every 8th of the other views is held out to choose by. Many
-    arms are trained a little, the best of them longer. Stop it when you like: the same command goes
-    on.
+    Test views are never looked at: every 8th of the other views is held out for choosing. Many
+    arms are trained briefly, the best of them for longer. Stop it when you like: the same command
+    resumes.
     """
 
     scene: Annotated[Path, tyro.conf.Positional]
     """The scene, with photographs."""
     minutes: float = 30.0
-    """How long to take, about."""
+    """Approximate time to take."""
     output: Annotated[
         Path | None,
         tyro.conf.arg(
@@ -77,12 +77,11 @@ class Options:
     ] = None
     """The folder of its runs."""
     budget: str = "0.25rho"
-    """Gaussians at the end: a number, or per pixel of a photograph at the size that is trained."""
+    """Gaussians at the end: a number, or per pixel of a photograph at the training size."""
     max_steps: int = 7000
-    """Steps that you plan to train; the last runs have no more than that."""
+    """Steps that you plan to train; no run takes more."""
     long_side: int = 400
-    """Make photographs smaller by a whole factor until their longer side has at most so many
-    pixels."""
+    """Reduce photographs by a whole factor until their longer side has at most this many pixels."""
     methods: tuple[str, ...] = METHODS
     """Seeds to try."""
     strategies: tuple[StrategyName, ...] = STRATEGIES
@@ -97,7 +96,7 @@ class Options:
 
 @dataclass(frozen=True)
 class _Study:
-    """A scene that is tuned: what all its rungs have in common."""
+    """A scene under tuning: everything that its rungs share."""
 
     options: Options
     folder: Path
@@ -106,7 +105,7 @@ class _Study:
     ledger: Ledger
 
     def specs(self, rung: Rung, arms: Collection[Arm] | None = None) -> list[RunSpec]:
-        """The runs of a rung: of these arms, or of all."""
+        """The runs of a rung, for these arms or for all."""
         options = self.options
         plan = Plan(
             scenes=(PlannedScene(self.facts.path, self.facts.name),),
@@ -123,17 +122,17 @@ class _Study:
         return [spec for spec in runs if arms is None or spec.arm in arms]
 
     def results(self, specs: Sequence[RunSpec]) -> dict[Arm, dict[int, RunResult]]:
-        """What is done of some runs, by arm and repeat."""
+        """Results of the finished ones among some runs, by arm and repeat."""
         keys = {spec.key for spec in specs}
-        found: dict[Arm, dict[int, RunResult]] = defaultdict(dict)
+        results: dict[Arm, dict[int, RunResult]] = defaultdict(dict)
         for row in self.ledger.rows():
             if row.spec.key in keys and row.result and math.isfinite(row.result.psnr):
-                found[row.spec.arm][row.spec.repeat] = row.result
-        return dict(found)
+                results[row.spec.arm][row.spec.repeat] = row.result
+        return dict(results)
 
 
 def run(arguments: list[str]) -> None:
-    """Do what the command line asks for."""
+    """Run the verb with these arguments."""
     options = parse_options(Options, "tune", arguments)
     _check(options)
     folder = options.output or Path(f"tune_{options.scene.resolve().name}")
@@ -216,7 +215,7 @@ def _estimator(study: _Study) -> Estimator:
 
 
 def _seconds(study: _Study, rung: Rung, estimator: Estimator) -> float:
-    """What a rung takes, if its arms are like the mean of all."""
+    """Seconds of a rung, if its arms take the mean time of all."""
     specs = study.specs(rung)
     share = rung.arms / len({spec.arm for spec in specs})
     return share * sum(estimator.of_all(specs).values()) / study.machine.jobs
@@ -241,7 +240,7 @@ def _announce(study: _Study, rungs: Sequence[Rung]) -> None:
 
 
 def _climb(study: _Study, rungs: Sequence[Rung]) -> bool:
-    """Do the rungs one after the other; whether it went to the end."""
+    """Run the rungs in order; whether all were finished."""
     arms: Collection[Arm] | None = None
     for i, rung in enumerate(rungs):
         specs = study.specs(rung, arms)
@@ -254,7 +253,7 @@ def _climb(study: _Study, rungs: Sequence[Rung]) -> bool:
 
 
 def _do(study: _Study, specs: Sequence[RunSpec]) -> bool:
-    """Do what is not done yet of some runs."""
+    """Do the unfinished ones among some runs."""
     study.ledger.add(specs)
     keys = frozenset(spec.key for spec in specs)
     done = {row.spec.key for row in study.ledger.rows() if row.status in {"done", "failed"}}
@@ -268,7 +267,7 @@ def _do(study: _Study, specs: Sequence[RunSpec]) -> bool:
 
 
 def _report(study: _Study, rungs: Sequence[Rung]) -> None:
-    """What the longest runs that are done say, and the command that follows from it."""
+    """Print the verdict of the longest finished runs, and the command that follows from it."""
     said = _verdict(study, rungs)
     if said is None:
         print_note("Nothing can be said yet: the same command goes on.")
@@ -281,10 +280,10 @@ def _report(study: _Study, rungs: Sequence[Rung]) -> None:
 
 
 def _verdict(study: _Study, rungs: Sequence[Rung]) -> Verdict | None:
-    """What the highest rung with two arms and more says."""
+    """The verdict of the highest rung with two or more finished arms."""
     for rung in reversed(rungs):
-        found = study.results(study.specs(rung))
-        said = verdict(found, rung.steps)
+        results = study.results(study.specs(rung))
+        said = verdict(results, rung.steps)
         if said is not None:
             return said
     return None
@@ -302,7 +301,7 @@ def _sentence(said: Verdict) -> str:
 
 
 def _commands(study: _Study, said: Verdict) -> list[tuple[str, str]]:
-    """The winner's commands, for the whole scene and the steps that are planned."""
+    """The winner's commands, for the whole scene and the planned steps."""
     options, arm = study.options, said.winner
     spec = next(each for each in study.specs(Rung(said.steps, 0, 1)) if each.arm == arm)
     spec = dataclasses.replace(

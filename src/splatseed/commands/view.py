@@ -47,7 +47,7 @@ class Options:
     port: int = 8080
     """The port to listen on; 0 for any free one."""
     max_points: int = 5_000_000
-    """The most points that the browser draws; choose fewer for one without a GPU."""
+    """The most points that the browser gets to draw; one without a GPU gets 300,000."""
     browser: bool = False
     """Open this machine's browser."""
     backend: Backend = "auto"

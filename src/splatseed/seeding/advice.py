@@ -1,13 +1,13 @@
-"""Advice: what to do with a scene's points before training, from what is measured in seconds.
+"""Advice: what to do with a scene's points before training, from measurements made in seconds.
 
-Notation: *room* is how many seeds training can begin with under its budget, per point that the
-scene has. Promise: ``advise`` is a function of what was measured and of the plan, without files or
-chance, so that it can be held against a benchmark's ledger (``bench.analysis.advice_score``); it
-may say that nothing is to be done.
+Notation: *room* is the number of seeds with which training can begin under its budget, per point
+of the scene. Promise: ``advise`` depends only on the measurements and the plan, not on files or
+chance, so that it can be tested against a benchmark's ledger (``bench.analysis.arms.advice``); it
+may advise against any change.
 
-What the rules stand on, on validation views at 1,500 steps (benchmarks/README.md): where
-Structure-from-Motion left room (fern, fox) ``auto`` gave 0 to 0.5 dB with densification and 1.1 to
-1.5 dB without; where its points alone filled the budget (bonsai, treehill) whatever was added cost
+The rules rest on validation views at 1,500 steps (benchmarks/README.md): where
+Structure-from-Motion left room (fern, fox), ``auto`` gained 0 to 0.5 dB with densification and 1.1
+to 1.5 dB without; where its points alone filled the budget (bonsai, treehill), adding points cost
 up to 0.4 dB.
 """
 
@@ -37,33 +37,33 @@ Layout: TypeAlias = Literal["facing one way", "around something", "through a pla
 AS_IT_IS = "sfm"
 """The advice to leave the points as they are."""
 ROOM = 1.3
-"""Room from which on new points are worth making."""
+"""Least room at which new points are worth making."""
 LOW_AGREEMENT = 0.15
-"""Share of pixels with confirmed depth below which stereo finds little."""
+"""Below this share of pixels with confirmed depth, stereo finds little."""
 FEW_EMPTY = 0.05
-"""Share of the pictures without points below which there is nothing to cover."""
+"""Below this share of empty cells in the photographs, there is nothing to cover."""
 SAME_WAY = 0.95
-"""Length of the mean of the viewing directions, from which on cameras face one way."""
+"""Least length of the mean viewing direction at which cameras face one way."""
 INWARD = 0.7
-"""Share of cameras that look towards the point nearest to all optical axes, in an orbit."""
+"""Least share of cameras that look towards the point nearest to all optical axes in an orbit."""
 VIEWS_LOOKED_AT = 2
 SIDE_LOOKED_AT = 400
-"""Pixels of the longer side at which stereo is tried: a few seconds a view with its neighbours."""
+"""Longer side, in pixels, at which stereo is tried: a few seconds per view."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What is known of a scene.
+    """Measurements of a scene.
 
     Args:
         num_points: Distinct points.
         num_images: Images with a pose.
-        pixels: Of one photograph.
-        empty: Share of the pictures, in cells, that no point falls in, 0 to 1; None if not known.
-        layout: How its cameras stand; None for fewer than three.
-        photographs: Whether they are there.
-        depth_maps: Whether each photograph has one.
-        agreement: Share of pixels whose depth by stereo other views confirm; None if not tried.
+        pixels: Pixels of one photograph.
+        empty: Share of the photographs' cells in which no point is seen, 0 to 1; None if unknown.
+        layout: Layout of its cameras; None for fewer than three.
+        photographs: Whether they exist.
+        depth_maps: Whether each photograph has a depth map.
+        agreement: Share of pixels whose stereo depth other views confirm; None if not tried.
     """
 
     num_points: int
@@ -86,8 +86,8 @@ class Advice:
     """What to do, and why.
 
     Args:
-        method: How to make new points, or ``AS_IT_IS``.
-        reasons: One sentence each.
+        method: The method for new points, or ``AS_IT_IS``.
+        reasons: A sentence each.
     """
 
     method: str
@@ -101,20 +101,20 @@ class Advice:
         return f"add points by method {self.method}"
 
 
-def advise(found: Measured, most_seeds: int, *, room: float = ROOM) -> Advice:
+def advise(measured: Measured, most_seeds: int, *, room: float = ROOM) -> Advice:
     """What to do with a scene's points.
 
     Args:
-        found: What is known of the scene.
-        most_seeds: Seeds that training can begin with under its budget.
-        room: From how much room on new points are worth making; fitted by whoever scores this.
+        measured: Measurements of the scene.
+        most_seeds: Most seeds with which training can begin under its budget.
+        room: Least room at which new points are worth making; scoring fits it.
     """
-    if not found.num_points:
+    if not measured.num_points:
         return Advice("auto", ("There are no points to begin with.",))
-    if not found.photographs:
+    if not measured.photographs:
         return Advice("mls", ("There are no photographs to look at, so points are interpolated.",))
-    has = most_seeds / found.num_points
-    per_pixel = f"{found.num_points:,} points, {found.points_per_pixel:.2f} per pixel"
+    has = most_seeds / measured.num_points
+    per_pixel = f"{measured.num_points:,} points, {measured.points_per_pixel:.2f} per pixel"
     if has < room:
         full = (
             f"It has {per_pixel}; training begins with {most_seeds:,} at most, so there is no "
@@ -122,25 +122,27 @@ def advise(found: Measured, most_seeds: int, *, room: float = ROOM) -> Advice:
         )
         return Advice(AS_IT_IS, (full,))
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
-    if found.depth_maps:
+    if measured.depth_maps:
         return Advice("depth", (*reasons, "Its depth maps say where the surfaces are."))
-    if found.empty is not None:
-        reasons.append(f"No point falls in {found.empty:.0%} of the pictures.")
-    if found.agreement is not None:
-        reasons.append(f"Stereo finds a confirmed depth for {found.agreement:.0%} of the pixels.")
-    little = found.agreement is not None and found.agreement < LOW_AGREEMENT
-    if little and found.empty is not None and found.empty < FEW_EMPTY:
+    if measured.empty is not None:
+        reasons.append(f"No point falls in {measured.empty:.0%} of the pictures.")
+    if measured.agreement is not None:
+        reasons.append(
+            f"Stereo finds a confirmed depth for {measured.agreement:.0%} of the pixels."
+        )
+    little = measured.agreement is not None and measured.agreement < LOW_AGREEMENT
+    if little and measured.empty is not None and measured.empty < FEW_EMPTY:
         return Advice(AS_IT_IS, (*reasons, "That is too little to add to what there is."))
     return Advice("auto", tuple(reasons))
 
 
 def measure(scene: Scene, empty: float | None = None, pixels: float | None = None) -> Measured:
-    """What is known of a scene without looking at its photographs.
+    """Measure a scene without looking at its photographs.
 
     Args:
         scene: The scene.
-        empty: Share of the pictures without points, if it is known.
-        pixels: Of a photograph at the size that is trained; the median camera's when left out.
+        empty: Share of the photographs' cells without points, if known.
+        pixels: Pixels of a photograph at the training size; the median camera's by default.
     """
     points = scene.points.originals
     sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
@@ -156,7 +158,7 @@ def measure(scene: Scene, empty: float | None = None, pixels: float | None = Non
 
 
 def camera_layout(scene: Scene) -> Layout | None:
-    """How a scene's cameras stand; None for fewer than three."""
+    """The layout of a scene's cameras; None for fewer than three."""
     if len(scene.images) < 3:
         return None
     world_from_cam = [np.linalg.inv(image.camera.cam_from_world) for image in scene.images]
@@ -175,12 +177,12 @@ def camera_layout(scene: Scene) -> Layout | None:
 
 
 def stereo_agreement(scene: Scene, seed: int = 0, progress: Progress = silent) -> float:
-    """The share of the pixels of a few views whose depth by stereo other views confirm, 0 to 1.
+    """The share of pixels in a few views whose stereo depth other views confirm, 0 to 1.
 
     Args:
         scene: With photographs.
         seed: The same seed gives the same bytes.
-        progress: Told how far it is.
+        progress: Told how much is done.
 
     Raises:
         SceneNotFoundError: There are no photographs.

@@ -39,18 +39,18 @@ def known_depths(
     note: Callable[[str], None] = lambda _: None,
     progress: Progress = silent,
 ) -> Mapping[str, Float[Tensor, "h w"]]:
-    """Depth maps of the training views by name; none if the settings have no use for them.
+    """Depth maps of the training views by name; none if the settings do not use them.
 
     Args:
         scene: A scene with photographs.
         frame: The training frame.
-        settings: Whose strategy, seed and test views count.
-        device: Where the maps are wanted.
-        stereo: What seeding found already.
-        kept: A file that holds what was found for the same photographs and seed, or is to hold it
+        settings: Strategy, seed and test views are taken from here.
+        device: Device of the maps.
+        stereo: Maps that seeding has made already.
+        kept: A file with the maps of the same photographs and seed, or a path at which to keep them
             for the next run.
-        note: Told what was found.
-        progress: Told how far it is.
+        note: Told the share of known depth.
+        progress: Told how much is done.
 
     Raises:
         SceneFormatError: A photograph cannot be used.
@@ -84,10 +84,10 @@ def known_depths(
 
 
 def seconds_of(kept: Path | None, took: float) -> float:
-    """What finding the maps of a file took when they were found, or else what reading took.
+    """Seconds it took to make a file's maps, or, without a file, the seconds given.
 
     Args:
-        kept: The file, if there is to be one.
+        kept: The file, if any.
         took: Seconds of this call.
     """
     if kept is None:
@@ -100,7 +100,7 @@ def seconds_of(kept: Path | None, took: float) -> float:
 
 
 def _read(kept: Path | None) -> dict[str, Float32[np.ndarray, "h w"]] | None:
-    """Depth by name; None where nothing is kept that can be read."""
+    """Depth by name; None without a readable file."""
     if kept is None:
         return None
     try:

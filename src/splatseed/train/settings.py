@@ -99,7 +99,13 @@ class TrainSettings:
     left alone."""
 
     def __post_init__(self) -> None:
-        for name, kind in (("backend", Backend), ("placing", Placing), ("seeding", Seeding)):
+        choices = (
+            ("strategy", StrategyName),
+            ("backend", Backend),
+            ("placing", Placing),
+            ("seeding", Seeding),
+        )
+        for name, kind in choices:
             known = get_args(kind)
             self._require(name, getattr(self, name) in known, f"one of {', '.join(known)}")
         for name, least in (("max_steps", 1), ("data_factor", 1), ("seed", 0), ("test_every", 2)):

@@ -16,7 +16,7 @@ import numpy as np
 from splatseed.errors import SplatseedError
 from splatseed.literal import visible
 from splatseed.preview.photographs import photograph_at
-from splatseed.scene import Image
+from splatseed.scene import Image, Scene
 from splatseed.view.canvas import canvas_view, fitted_fov, stage_pose
 from splatseed.view.frames import split_picture
 from splatseed.view.live import FrameLoop
@@ -27,10 +27,15 @@ from splatseed.views.view import View
 __all__ = ["MOST_POINTS", "Session"]
 
 MOST_PIXELS = 1_600_000
-"""Longest side of a full picture; on larger canvases it is stretched."""
+"""The most pixels of a full picture; on larger canvases it is stretched."""
 THUMBNAIL = 96
 MOST_POINTS = 5_000_000
-"""Points sent to a browser; larger clouds are thinned evenly."""
+"""The most points sent to a browser, if it is quick enough; larger clouds are thinned evenly."""
+FIRST_POINTS, ENOUGH_MORE = 300_000, 1.5
+"""Points sent at once, and how many times as many are worth sending again."""
+PATIENCE, MOST_PATIENCE = 0.3, 30.0
+"""Seconds that the points of a picture may take (without a GPU a million take some seconds), and
+the longest wait for an answer."""
 FLIGHT_SECONDS, FLIGHT_STEPS = 0.5, 15
 _LOG = logging.getLogger(__name__)
 ARRIVED = 1e-3
@@ -155,17 +160,54 @@ class Session:
             every = self._entry.shown.test_every
             self._cameras = add_cameras(self._client.scene, scene, frame, self._fly, every)
             self._go.options = ("-", *(image.name for image, _ in self._cameras))
-        clouds = clouds_of(scene.points, frame, self._most_points)
+        self._send_points(scene, min(self._most_points, FIRST_POINTS))
+        with self._origin_folder:
+            for name in self._nodes:
+                self._origins[name] = self._client.gui.add_checkbox(name, initial_value=True)
+                self._origins[name].on_update(lambda _: self._restyle())
+        self._restyle()
+        threading.Thread(target=self._fill_in, daemon=True).start()
+
+    def _send_points(self, scene: Scene, most: int) -> None:
+        """Have the browser draw so many of the points at most, in place of those it has."""
+        clouds = clouds_of(scene.points, self._entry.frame, most)
         if clouds:
             self._clouds = {cloud.name: cloud for cloud in clouds}
-            self._base_size = point_size(clouds, scene.images, frame)
+            self._base_size = point_size(clouds, scene.images, self._entry.frame)
             self._nodes = add_clouds(self._client.scene, clouds, self._base_size)
-            with self._origin_folder:
-                for name in self._nodes:
-                    self._origins[name] = self._client.gui.add_checkbox(name, initial_value=True)
-                    self._origins[name].on_update(lambda _: self._restyle())
-        self._restyle()
-        threading.Thread(target=self._add_thumbnails, daemon=True).start()
+
+    def _fill_in(self) -> None:
+        """What can wait: the photographs, and the points that the browser is quick enough for."""
+        self._add_thumbnails()
+        scene, nodes = self._entry.shown.scene, self._nodes
+        if scene is None or min(self._most_points, len(scene.points)) <= FIRST_POINTS:
+            return
+        try:
+            wanted = min(self._most_points, self._affordable_points())
+        except Exception:  # noqa: BLE001  (the browser went away, or hides its page)
+            return
+        if wanted > ENOUGH_MORE * FIRST_POINTS and nodes is self._nodes and not self._closed:
+            self._send_points(scene, wanted)
+            self._restyle()
+
+    def _affordable_points(self) -> int:
+        """How many points the browser draws in reasonable time, by how long those it has take."""
+        try:
+            without, with_points = (self._seconds_of_a_picture(points=on) for on in (False, True))
+        finally:  # it may not have answered
+            self._restyle()
+        return round(FIRST_POINTS * PATIENCE / max(with_points - without, 1e-3))
+
+    def _seconds_of_a_picture(self, *, points: bool) -> float:
+        """How long the browser takes to draw a small picture and to send it."""
+        for node in self._nodes.values():
+            node.visible = points
+        seconds = 0.0
+        for _ in range(2):  # the first may come before it has heard of the switch
+            start = time.perf_counter()
+            self._client.get_render(48, 64, transport_format="jpeg", timeout=MOST_PATIENCE)
+            seconds = time.perf_counter() - start
+        return seconds
 
     def _restyle(self) -> None:
         """Style points and cameras as the switches say."""

@@ -13,7 +13,7 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.bench.planning.estimate import Estimator
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene, plan_runs
-from splatseed.bench.planning.plan_file import KINDS, plan_text, read_plan
+from splatseed.bench.planning.plan_file import KINDS, _kind_of, plan_text, read_plan
 from splatseed.bench.planning.presets import preset_plan
 from splatseed.bench.planning.records import SFM, SHARED, Arm
 from splatseed.bench.planning.scenes import SceneFacts, survey
@@ -266,6 +266,18 @@ def test_a_plan_with_budgets_survives_its_file(tmp_path):
 def test_budgets_out_of_range_are_refused(wrong):
     with pytest.raises(ParameterError):
         Plan(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("default", "words"),
+    [(0.5, "a number"), (3, "a whole number"), (False, "true or false"), ("auto", "text")],
+)
+def test_a_setting_of_any_type_has_its_kind(default, words):
+    """So that a new setting of training is declared once, whatever its type."""
+    kind = _kind_of(default)
+    assert kind.words == words
+    assert kind.fits(default)
+    assert not kind.fits([])
 
 
 def test_a_laptop_has_four_scenes_at_one_number_of_gaussians(tmp_path):

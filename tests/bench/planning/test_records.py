@@ -82,7 +82,7 @@ def test_so_is_every_setting_of_training(change):
 def test_an_older_ledger_keeps_its_keys():
     """Its runs have fewer settings, and must not be run again for that."""
     old = json.loads(SPEC.to_json())
-    for later in ("seed_sizes", "seed_normals", "seed_colors"):
+    for later in ("placing", "seed_sizes", "seed_normals", "seed_colors"):
         del old[later]
     assert RunSpec.from_json(json.dumps(old)) == SPEC
     where = {"scene_path", "depth_path", "images"}

@@ -1,10 +1,10 @@
 """Successive halving: many arms in short runs, the best of them in longer ones.
 
-Notation: a *rung* trains some arms for a number of steps; the best go on to the next, which has
-twice the steps. The *baseline* (the scene's own points with ``default``) is in every rung. Promise:
-arms are ranked by validation views alone; what is said at the end rests on the last rung that is
-done, paired by view and repeat (Jamieson and Talwalkar 2016; here every rung trains anew, as a
-run's schedule depends on its length).
+Notation: a *rung* trains some arms for a number of steps; the best go on to the next rung, which
+has twice the steps. The *baseline* (the scene's own points with ``default``) is in every rung.
+Promise: arms are ranked by validation views only; the verdict rests on the last finished rung,
+paired by view and repeat. After Jamieson and Talwalkar (2016), but every rung trains from the
+start, as a run's schedule depends on its length.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from splatseed.bench.planning.records import SFM, Arm, RunResult
 __all__ = ["BASELINE", "Rung", "Verdict", "best_arms", "is_baseline", "plan_rungs", "verdict"]
 
 BASELINE = (SFM, "default")
-"""Method and strategy that all else is compared with."""
+"""Method and strategy of the baseline."""
 KEPT = (1.0, 1 / 3, 1 / 6)
-"""Shares of the arms in each rung; the last repeats its runs."""
+"""Share of the arms in each rung; the last rung repeats its runs."""
 LAST_REPEATS = 2
 LEAST_STEPS = 100
 Results = Mapping[Arm, Mapping[int, RunResult]]
@@ -36,9 +36,9 @@ class Rung:
     """A rung.
 
     Args:
-        steps: Of each run.
-        arms: How many arms it has, the baseline among them.
-        repeats: Runs of each.
+        steps: Steps of each run.
+        arms: Number of arms, with the baseline.
+        repeats: Runs of each arm.
     """
 
     steps: int
@@ -48,14 +48,13 @@ class Rung:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the last rung says.
+    """The verdict of the last rung.
 
     Args:
         winner: The arm with the highest mean PSNR.
-        gain: Its PSNR less the baseline's, dB: mean over validation views, with its error over
-            them.
-        steps: Of the runs it rests on.
-        views: Validation views.
+        gain: Its PSNR minus the baseline's, dB: mean and standard error over validation views.
+        steps: Steps of its runs.
+        views: Number of validation views.
         repeats: Runs of each arm.
         ranking: All arms of that rung with their mean PSNR in dB, the best first.
     """
@@ -69,23 +68,23 @@ class Verdict:
 
 
 def is_baseline(arm: Arm) -> bool:
-    """Whether an arm is what all others are compared with."""
+    """Whether an arm is the baseline."""
     return (arm.method, arm.strategy) == BASELINE
 
 
 def plan_rungs(
     num_arms: int, seconds: float, most_steps: int, cost: Callable[[Sequence[Rung]], float]
 ) -> tuple[Rung, ...]:
-    """Rungs that fit a time, as long as they can be.
+    """The longest rungs that fit into a time.
 
     Args:
-        num_arms: Arms in all.
+        num_arms: Number of arms.
         seconds: The time.
-        most_steps: Steps of the last rung, at most.
-        cost: Seconds that some rungs take.
+        most_steps: Most steps of the last rung.
+        cost: Estimates the seconds of some rungs.
 
     Returns:
-        At least the shortest that there are, also where these do not fit.
+        The shortest rungs, if not even these fit.
     """
 
     def rungs(steps: int) -> tuple[Rung, ...]:
@@ -104,11 +103,11 @@ def plan_rungs(
 
 
 def best_arms(results: Results, count: int) -> tuple[Arm, ...]:
-    """So many arms with the highest mean PSNR; the baseline is one of them in any case.
+    """The arms with the highest mean PSNR; always with the baseline.
 
     Args:
-        results: Of a rung.
-        count: How many, at least 2.
+        results: Results of a rung.
+        count: Number of arms, at least 2.
     """
     ranked = [arm for arm, _ in _ranking(results)]
     chosen = ranked[:count]
@@ -122,11 +121,11 @@ def _ranking(results: Results) -> list[tuple[Arm, float]]:
 
 
 def verdict(results: Results, steps: int) -> Verdict | None:
-    """What a rung says; None where it has no run of the baseline, or no other.
+    """The verdict of a rung; None without a run of the baseline, or of another arm.
 
     Args:
-        results: Of the rung.
-        steps: Of its runs.
+        results: Results of the rung.
+        steps: Steps of its runs.
     """
     ranking = _ranking(results)
     base = next((arm for arm, _ in ranking if is_baseline(arm)), None)
@@ -147,7 +146,7 @@ def verdict(results: Results, steps: int) -> Verdict | None:
 
 
 def _by_view(base: Mapping[int, RunResult], own: Mapping[int, RunResult]) -> np.ndarray:
-    """Differences of PSNR by view, mean over the repeats that both have, [V]."""
+    """PSNR differences by view, averaged over common repeats, [V]."""
     shared = sorted(base.keys() & own.keys())
     gains = [_of_views(own[r]) - _of_views(base[r]) for r in shared]
     mean = np.mean(gains, axis=0) if gains else np.zeros(0)

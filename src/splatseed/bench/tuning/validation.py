@@ -1,7 +1,7 @@
-"""A scene without its test views, so that what is chosen on it has never seen them.
+"""A scene without its test views, so that choices made on it have never seen them.
 
-Promise: the scene that is written names training views alone, and every eighth of these is what
-its runs are scored on; photographs are linked, those of the test views are never opened.
+Promise: the written scene lists training views only, and its runs are scored on every eighth of
+them; photographs are linked, and those of the test views never opened.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
 __all__ = ["LEAST_VIEWS", "make_validation_scene"]
 
 LEAST_VIEWS = 4
-"""Training views that a scene must have: some to train on, one or more to validate on."""
+"""Fewest training views of a scene: some to train on, and at least one to validate on."""
 
 
 def make_validation_scene(scene_path: Path, target: Path, test_every: int = 8) -> Path:
-    """Write a scene's training views as a scene of their own, unless it is there.
+    """Write a scene's training views as a scene of their own, unless that exists.
 
     Args:
         scene_path: The scene.
         target: The folder to write.
-        test_every: Which views are kept for the test.
+        test_every: Every n-th view is kept for testing.
 
     Returns:
         ``target``.
 
     Raises:
         SceneNotFoundError: There is no scene, or it has too few images.
-        SceneFormatError: A file of it is not what its format promises.
+        SceneFormatError: One of its files breaks its format.
         OutputError: The folder cannot be written.
     """
     if target.is_dir():

@@ -166,7 +166,7 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Asked]:
         raise ParameterError(
             "--scenes DIR..., --preset or --plan",
             found="none of them",
-            fix="splatseed bench --preset quick -o BENCH tries it on a made-up room.",
+            fix="splatseed bench --preset quick -o BENCH tries it on a synthetic room.",
         )
     return options, dataclasses.replace(asked, plan=plan)
 

@@ -45,13 +45,13 @@ Budget = Annotated[
 
 @dataclass(frozen=True)
 class Planned:
-    """How a scene is to be trained.
+    """How a scene will be trained.
 
     Args:
-        budget: Gaussians at the end, at most.
+        budget: Most Gaussians at the end.
         max_steps: Training steps.
-        strategy: What ``splatseed train`` takes for so many steps.
-        most_seeds: Seeds that it begins with at most.
+        strategy: The strategy that ``splatseed train`` chooses for these steps.
+        most_seeds: Most seeds with which training begins.
     """
 
     budget: int
@@ -61,7 +61,7 @@ class Planned:
 
     @classmethod
     def of(cls, scene: Scene, budget: str | None, max_steps: int) -> Planned:
-        """The plan that the options make for a scene.
+        """A scene's plan, from the options.
 
         Raises:
             ParameterError: One of them is out of its range.
@@ -81,26 +81,26 @@ class Planned:
 def advice_for(
     scene: Scene, planned: Planned, empty: float | None, progress: Progress | None = None
 ) -> tuple[Advice, Measured]:
-    """What to do, and what it rests on.
+    """What to do, and the measurements on which that rests.
 
     Args:
         scene: The scene.
-        planned: How it is to be trained.
-        empty: Share of the pictures without points, if known.
-        progress: Told how far it is; where it is given, stereo is tried on a few photographs, if
-            there is room for what it may find.
+        planned: How it will be trained.
+        empty: Share of the photographs' cells without points, if known.
+        progress: Told how much is done. Given this, stereo is tried on a few photographs, if there
+            is room for new points.
     """
-    found = measure(scene, empty)
-    said = advise(found, planned.most_seeds)
-    if progress is not None and said.method == "auto" and found.num_points:
-        found = replace(found, agreement=stereo_agreement(scene, progress=progress))
-        said = advise(found, planned.most_seeds)
-    return said, found
+    measured = measure(scene, empty)
+    said = advise(measured, planned.most_seeds)
+    if progress is not None and said.method == "auto" and measured.num_points:
+        measured = replace(measured, agreement=stereo_agreement(scene, progress=progress))
+        said = advise(measured, planned.most_seeds)
+    return said, measured
 
 
-def advice_rows(advice: Advice, found: Measured, planned: Planned) -> list[tuple[str, str]]:
+def advice_rows(advice: Advice, measured: Measured, planned: Planned) -> list[tuple[str, str]]:
     """The advice as a table's rows: what, why, and for which training."""
-    layout = [("cameras stand", found.layout)] if found.layout else []
+    layout = [("cameras stand", measured.layout)] if measured.layout else []
     why = [("why" if i == 0 else "", reason) for i, reason in enumerate(advice.reasons)]
     plan = (
         f"{planned.budget:,} Gaussians at most, {planned.max_steps:,} steps, strategy "
@@ -136,7 +136,7 @@ class _Options:
     scene: Annotated[Path, tyro.conf.Positional]
     """The scene."""
     budget: Budget = None
-    """Gaussians that training may end with: a number, or per pixel of a photograph."""
+    """Most Gaussians at the end of training: a number, or per pixel of a photograph."""
     max_steps: int = FULL_RUN
     """Steps that you plan to train."""
 
@@ -154,8 +154,8 @@ def run_advice(arguments: list[str]) -> None:
         planned = Planned.of(scene, options.budget, options.max_steps)
         regions = empty_regions(scene, clock)
         empty = None if regions is None else regions.mean
-        advice, found = advice_for(scene, planned, empty, clock)
-    print_pairs(str(options.scene), advice_rows(advice, found, planned))
+        advice, measured = advice_for(scene, planned, empty, clock)
+    print_pairs(str(options.scene), advice_rows(advice, measured, planned))
     OUT.print(
         "\nThe rules rest on runs of a few scenes (docs/methods.md); splatseed tune asks this "
         "very scene.",

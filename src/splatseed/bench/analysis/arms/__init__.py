@@ -1,1 +1,1 @@
-"""Arms of any seeds and any strategy beside one another, and what advice picks among them."""
+"""Arms with any seeds and strategy compared with each other, and the choices of advice."""

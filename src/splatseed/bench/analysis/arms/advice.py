@@ -1,8 +1,8 @@
-"""How good advice is, held against a ledger: each scene is advised by what the others taught.
+"""How good the advice is, by a ledger's runs: leave-one-out over scenes.
 
-Notation: *regret* is the PSNR of the best arm less that of the advised one, dB; the arms are those
-of one strategy, at one number of Gaussians, by method. Promise: the threshold by which a scene is
-advised is fitted on the other scenes alone, and scenes that lack an arm are told, not filled in.
+Notation: *regret* is the PSNR of the best arm minus that of the advised one, dB; the arms are those
+of one strategy, at one number of Gaussians, by method. Promise: the threshold for a scene is fitted
+on the other scenes only, and scenes that lack an arm are listed, not filled in.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from splatseed.train.settings import StrategyName
 __all__ = ["CLOSE", "AdviceScore", "Advised", "advice_table", "score_advice"]
 
 CLOSE = 0.1
-"""Decibels from the best arm that count as right."""
+"""Advice within this many decibels of the best arm counts as right."""
 ROOMS = (1.0, 1.1, 1.3, 1.6, 2.0, 3.0, 5.0, 1e9)
-"""Thresholds that are tried; the last leaves every scene as it is."""
+"""Candidate thresholds; the last leaves every scene as it is."""
 ALWAYS = (AS_IT_IS, "mls", "auto")
 
 
 @dataclass(frozen=True)
 class Advised:
-    """What was advised for a scene.
+    """The advice for a scene.
 
     Args:
         scene: The scene.
-        method: What the advice says.
+        method: The advised method.
         best: The method of the arm that scored highest.
         psnr: Mean PSNR by method, dB.
     """
@@ -43,7 +43,7 @@ class Advised:
 
     @property
     def regret(self) -> float:
-        """What was missed, dB."""
+        """The regret, dB."""
         return self.psnr[self.best] - self.psnr[self.method]
 
 
@@ -53,8 +53,8 @@ class AdviceScore:
 
     Args:
         strategy: The arms' strategy.
-        scenes: One by one.
-        left_out: Scenes without the runs that are needed.
+        scenes: The advice for each scene.
+        left_out: Scenes that lack a necessary run.
     """
 
     strategy: StrategyName
@@ -63,21 +63,21 @@ class AdviceScore:
 
     @property
     def right(self) -> int:
-        """On how many scenes the advice is within ``CLOSE`` of the best arm."""
+        """The number of scenes with advice within ``CLOSE`` of the best arm."""
         return sum(each.regret <= CLOSE for each in self.scenes)
 
     def gain_over(self, method: str) -> float | None:
-        """What following the advice gains over always taking one method, dB, mean over scenes."""
+        """Gain of following the advice over always taking one method, dB, mean over scenes."""
         known = [e.psnr[e.method] - e.psnr[method] for e in self.scenes if method in e.psnr]
         return fmean(known) if known else None
 
 
 def score_advice(study: Study, strategy: StrategyName) -> AdviceScore:
-    """Advise each scene by what the others taught, and look up what came of it.
+    """Advise each scene with a threshold fitted on the others, and look up the result.
 
     Args:
-        study: Of runs under a budget.
-        strategy: Which arms.
+        study: A study of runs under a budget.
+        strategy: The arms' strategy.
     """
     psnr = {scene: _by_method(study, strategy, scene) for scene in study.scenes}
     known = {s: p for s, p in psnr.items() if AS_IT_IS in p and "auto" in p}
@@ -94,20 +94,20 @@ def score_advice(study: Study, strategy: StrategyName) -> AdviceScore:
 
 
 def _by_method(study: Study, strategy: StrategyName, scene: str) -> dict[str, float]:
-    """Mean PSNR over repeats by method; of several variants of one, the default's fill."""
-    found: dict[str, float] = {}
+    """Mean PSNR over repeats by method; the first variant stands for its method."""
+    scores: dict[str, float] = {}
     for variant in (*study.variants_of(strategy), BASELINE):
         runs = study.cell(strategy, scene, variant)
         if runs and variant.profile == "default":
-            found.setdefault(variant.method, fmean(run.psnr for run in runs.values()))
-    return found
+            scores.setdefault(variant.method, fmean(run.psnr for run in runs.values()))
+    return scores
 
 
 def _facts(study: Study, strategy: StrategyName, scene: str) -> tuple[Measured, int]:
-    """What the ledger knows of a scene: how many seeds training began with, and how many it may."""
+    """A scene's measurements from the ledger, and the most seeds with which training may begin."""
     rows = [r for r in study.rows[scene] if r.spec.arm.strategy == strategy and r.result]
     base = next(r for r in rows if study.variant_of_key[r.spec.key] == BASELINE)
-    assert base.result is not None  # noqa: S101  (looked for above)
+    assert base.result is not None  # noqa: S101  (checked by the caller)
     most = base.spec.most_seeds or base.result.num_gaussians
     return Measured(base.result.num_seeds, 0, 0.0), most
 
@@ -118,7 +118,7 @@ def _followed(facts: tuple[Measured, int], scores: Mapping[str, float], room: fl
 
 
 def _fitted(others: Sequence[tuple[tuple[Measured, int], Mapping[str, float]]]) -> float:
-    """The threshold that would have served the other scenes best; of equals the one in use."""
+    """The threshold that suits the other scenes best; among equals the one in use."""
     if not others:
         return ROOM
 
@@ -130,10 +130,10 @@ def _fitted(others: Sequence[tuple[tuple[Measured, int], Mapping[str, float]]]) 
 
 
 def advice_table(score: AdviceScore) -> Table:
-    """The advice scene by scene, and what it is worth.
+    """The advice for each scene, and its worth.
 
     Args:
-        score: As ``score_advice`` gives it.
+        score: From ``score_advice``.
     """
     rows = [
         (
