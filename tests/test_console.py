@@ -60,7 +60,7 @@ def test_a_log_is_told_once_of_compilation_that_takes_long(capsys, monkeypatch):
     assert out == ""
     first, last = err.splitlines()
     assert first.startswith("compiling kernels, ")
-    assert last == "compiling kernels took 20 s; they are kept for the next time"
+    assert last == "compiling kernels took 20 s; cached for the next run"
 
 
 @pytest.fixture

@@ -46,7 +46,7 @@ HARMONICS = 0.03
 WAVELENGTH = 1.0
 """How far dense and sparse parts are from each other, metres."""
 NUM_VIEWS = 8
-VIEW = ("image", "K", "cam_from_world")
+VIEW = ("photograph", "K", "cam_from_world")
 """The arrays of a view."""
 SPARE = 1.6
 """Gaussians drawn for each that is seen."""

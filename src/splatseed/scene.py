@@ -157,7 +157,7 @@ class Split:
     def sentence(self) -> str:
         """What the user should know before training."""
         count = f"{len(self.train):,} training and {len(self.test):,} test images"
-        return f"The scene's {self.origin} sets the split: {count}; --test-every is ignored."
+        return f"The split is that of the scene's {self.origin}: {count}; --test-every is ignored."
 
 
 class LeftOut(NamedTuple):

@@ -83,7 +83,7 @@ def test_runs_everything_once_and_a_failed_run_ends_nothing_else(bench, plan_pat
     assert [row.status for row in (sfm, linear, depth)] == ["done", "done", "failed"]
     assert linear.result.num_seeds == 2 * sfm.result.num_seeds
     assert {path.name for path in folder.iterdir()} == {
-        "ledger.sqlite", "plan.toml", "runs", "splatseed.json", "work"
+        "covisible", "ledger.sqlite", "plan.toml", "runs", "splatseed.json", "twins", "work"
     }  # fmt: skip
     assert not list((folder / "work").iterdir())
 

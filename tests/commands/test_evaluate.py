@@ -59,7 +59,7 @@ def test_a_ply_of_another_trainer_is_scored(model, room, splatseed, tmp_path):
         assert image.name in run.out
         assert (out / image.name).is_file()
     assert "mean" in run.out
-    assert "LPIPS was not measured" in run.out
+    assert "LPIPS was not computed" in run.out
     assert "download.pytorch.org" in run.out
     assert run.err == ""
 

@@ -94,7 +94,7 @@ def test_images_are_left_out_for_a_reason(exact, make_maps):
     found = list(align(exact.replace(depths=make_maps("z", change))).values())
     reasons = [alignment.rejected for alignment in found]
     assert reasons[0] == "the map has no depth at any pixel"
-    assert "SfM points see depth, and 20 are needed" in reasons[1]
+    assert "SfM points see depth; 20 are needed" in reasons[1]
     assert "at half of the SfM points" in reasons[2]
     assert "typically" in reasons[3]
     assert set(reasons[4:]) == {None}

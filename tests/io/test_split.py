@@ -62,7 +62,7 @@ def test_two_lists_can_leave_images_out(scene_dir, names):
     (scene_dir / "test_list.txt").write_text("\n".join(test))
     assert _parts(scene_dir) == (set(train), set(test))
     scene = load_scene(scene_dir)
-    assert "train_list.txt and test_list.txt is followed: 3 training" in scene.listed.sentence
+    assert "scene's train_list.txt and test_list.txt: 3 training" in scene.listed.sentence
     assert not any("list.txt" in each for each in scene.warnings)
 
 

@@ -305,9 +305,7 @@ def test_a_disk_that_is_full_at_the_end_costs_nothing(begin, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_text", disk_full)
-        with pytest.raises(
-            OutputError, match=r"No space left.*kept as it was after step 30.*--resume"
-        ):
+        with pytest.raises(OutputError, match=r"No space left.*as of step 30 is kept.*--resume"):
             run.finish(_score)
     resumed = begin(options=RESUME, max_steps=30)
     assert resumed.state.step == 30

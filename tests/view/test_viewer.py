@@ -313,7 +313,7 @@ def test_a_taken_port_is_told(capsys, room):
             main(["view", str(room), "--port", str(port)])
     said = capsys.readouterr()
     assert stop.value.code == 2
-    assert re.fullmatch(r"error: expected to listen at .*in use.*\n", said.err)
+    assert re.fullmatch(r"error: expected to listen on .*in use.*\n", said.err)
 
 
 @pytest.mark.parametrize(

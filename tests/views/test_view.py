@@ -83,7 +83,7 @@ def test_files_resized_beforehand_scale_the_intrinsics(room_path, tmp_path):
     (view,) = load_views(scene, scene.images[:1])
     assert np.allclose(view.K[:2], scene.images[0].camera.K[:2] / 2)
     PilImage.open(path).resize((48, 48)).save(path)
-    with pytest.raises(SceneFormatError, match="shape of its camera"):
+    with pytest.raises(SceneFormatError, match="aspect ratio of its camera"):
         load_views(scene, scene.images[:1])
 
 

@@ -145,7 +145,7 @@ class TrainingResult:
         scores: Scores of the test views at the end.
         curve: Scores of the test views during training, in order of steps.
         steps: Steps done.
-        train_seconds: Wall time of the training steps alone.
+        train_seconds: Wall time of the training steps, and of finding the depth that growth needs.
         num_seeds: Points that training began with.
         held_by_memory_at: Gaussians at which a lack of memory ended growth; None if it did not.
     """

@@ -10,6 +10,7 @@ from PIL import Image
 
 from splatseed.commands.demo import command as demo
 from splatseed.errors import MissingDependencyError
+from splatseed.scores import CurvePoint, TrainingResult
 
 WORDS = ("demo", "--views", "4", "--ratio", "2", "--no-preview")
 
@@ -45,9 +46,10 @@ def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
 @pytest.mark.parametrize(("seconds", "psnr"), [(2.4, None), (2.5, 20.0), (9.9, 22.0)])
 def test_psnr_after_some_seconds_counts_those_of_the_seeds(seconds, psnr):
     training = pytest.importorskip("splatseed.commands.demo.training", reason="needs PyTorch")
-    tests = [{"seconds": 0.5, "psnr": 20.0}, {"seconds": 1.5, "psnr": 22.0}]
+    curve = (CurvePoint(10, 0.5, 20.0, 100), CurvePoint(30, 1.5, 22.0, 100))
     arm = training.Arm("auto", None, None, seconds=2.0)
-    each = training.TrainedArm(arm, {"tests": tests, "train_seconds": 1.5}, None, None)
+    result = TrainingResult(None, curve, steps=30, train_seconds=1.5, num_seeds=100)
+    each = training.TrainedArm(arm, result, None, None)
     assert training.psnr_after(seconds, each) == psnr
     assert training.total_seconds(each) == 3.5
 

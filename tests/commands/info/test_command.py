@@ -115,4 +115,4 @@ def test_many_kinds_of_cameras_are_counted_not_listed(own_room, splatseed):
     record = load_scene(own_room).intrinsics[0]
     kinds = [dataclasses.replace(record, camera_id=i, width=120 + i) for i in range(1, 41)]
     write_cameras(own_room / "sparse/0/cameras.bin", (record, *kinds[1:]))
-    assert _rows(splatseed("info", own_room).out)["cameras"].endswith("37 kinds more")
+    assert _rows(splatseed("info", own_room).out)["cameras"].endswith("37 more kinds")

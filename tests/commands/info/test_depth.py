@@ -91,7 +91,7 @@ def test_why_an_image_is_left_out(tour, tmp_path, splatseed):
     pairs = _pairs(out)
     assert pairs["maps"].startswith("8 of 15 images")
     assert pairs["left out"] == "1"
-    assert f"- {names[2]}: the map knows no depth at any pixel" in out
+    assert f"- {names[2]}: the map has no depth at any pixel" in out
     assert _rows(out)[names[2]] == ("0", "-", "", "-")
     assert next(iter(_rows(out))) == names[2]
 
@@ -120,7 +120,7 @@ def test_a_scenes_own_maps_are_counted(tmp_path, splatseed):
     assert _pairs(splatseed("info", folder).out)["depth maps"] == "3"
     run = splatseed("info", folder, "--depth", folder)
     assert run.code == 0
-    assert "0 SfM points see depth, and 20 are needed" in run.out
+    assert "0 SfM points see depth; 20 are needed" in run.out
     assert "splatseed sfm" in run.out.splitlines()[-1]
 
 

@@ -58,7 +58,7 @@ def test_the_default_looks_at_the_photographs(room, tmp_path, splatseed):
     assert (run.code, run.err) == (0, "")
     assert "as many as the photographs need" in run.out
     assert re.search(r"[\d,]+ original, [\d,]+ stereo, [\d,]+ cover", run.out)
-    assert re.search(r"covered +[\d.]+% of the pictures", run.out)
+    assert re.search(r"covered +[\d.]+% of the 8 x 8 pixel cells", run.out)
     written = _manifest(out)
     assert (written["method"], written["budget"]) == ("auto", "2000")
     assert len(load_scene(out).points) <= 2000

@@ -114,7 +114,7 @@ def test_the_output_may_not_lie_in_the_maps(own_room, splatseed):
 def test_flags_of_depth_do_nothing_for_other_methods(room, tmp_path, splatseed):
     run = splatseed("upsample", room, "--depth", room, "-o", tmp_path / "out")
     assert run.code == 0
-    assert "The flags of depth change nothing with --method auto." in run.out
+    assert "The flags of depth have no effect with --method auto." in run.out
 
 
 def test_previews_show_depth_where_there_is_some(room, tmp_path, splatseed, monkeypatch):
