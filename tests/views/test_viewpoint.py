@@ -78,7 +78,15 @@ def test_tiny_and_flat_clouds_get_a_camera_too(num, offset):
     assert _in_frame(camera, line.astype(np.float32)).any()
 
 
-def test_a_scene_without_points_is_refused():
+def test_a_cloud_without_points_is_refused():
     for xyz in (np.empty((0, 3)), np.full((3, 3), np.nan)):
         with pytest.raises(PointCloudError, match="finite point to look at"):
-            choose_camera(Scene(_cloud(xyz), (_image(1),), (INTRINSICS,)))
+            choose_camera(Scene(_cloud(xyz)))
+
+
+def test_photographs_without_points_are_looked_at_from_the_middle():
+    """Such as an RGB-D capture, whose seeds are all new."""
+    for xyz in (np.empty((0, 3)), np.full((3, 3), np.nan)):
+        scene = Scene(_cloud(xyz), tuple(_image(i) for i in (1, 2, 3)), (INTRINSICS,))
+        assert choose_image(scene).name == "2.png"
+        assert choose_camera(scene).width == INTRINSICS.width

@@ -59,7 +59,7 @@ def choose_camera(scene: Scene) -> Camera:
     where the cloud thins out, and looks down on the points nearest the median at 28 degrees.
 
     Raises:
-        PointCloudError: The scene has no finite points.
+        PointCloudError: The scene has neither finite points nor images.
     """
     image = choose_image(scene)
     return _made_up_camera(_finite_sample(scene)) if image is None else image.camera
@@ -70,11 +70,14 @@ def choose_image(scene: Scene) -> Image | None:
 
     An image's points are its features with a 3D point if the scene has features at all, else those
     of a sample that project into its frame. The mere number of points would favour close-ups of the
-    richest texture. None for a scene without images.
+    richest texture. Of a scene without points, such as an RGB-D capture, it is the image in the
+    middle. None for a scene without images.
 
     Raises:
-        PointCloudError: The scene has no finite points.
+        PointCloudError: The scene has neither finite points nor images.
     """
+    if scene.images and not scene.points.finite.any():
+        return scene.images[len(scene.images) // 2]
     xyz = _finite_sample(scene)
     seen = [_features(image) for image in scene.images]
     if not any(len(uv) for uv in seen):

@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 from PIL import Image as PilImage
 
-from splatseed.io import load_scene
+from splatseed.io import load_scene, write_scene
 from splatseed.io.ply.points import read_ply, write_ply
 from splatseed.upsample import METHODS, chooses_number, configure
 
@@ -271,3 +271,18 @@ def test_help_lists_every_method_with_its_flags(words, splatseed):
         assert f"{name} options" in run.out or name == "random"
     assert "--mls.k INT" in run.out
     assert "NoneType" not in run.out
+
+
+def test_photographs_without_points_are_seeded_and_drawn(room, tmp_path, splatseed):
+    """Poses and photographs, as of an RGB-D capture, and no point to choose a view by."""
+    bare = tmp_path / "bare"
+    write_scene(load_scene(room), bare, format="transforms")
+    content = json.loads((bare / "transforms.json").read_text())
+    del content["ply_file_path"]
+    (bare / "transforms.json").write_text(json.dumps(content))
+    out = tmp_path / "out"
+    run = splatseed("upsample", bare, "--preview", "-o", out)
+    assert (run.code, run.err) == (0, "")
+    assert len(load_scene(out).points) > 500
+    pictures = ("", "_methods", "_origins", "_cells", "_maps")
+    assert all((out / f"preview{name}.png").stat().st_size > 5000 for name in pictures)
