@@ -141,8 +141,8 @@ def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None
             ("fixed", "the strategy, grow, and the final number of Gaussians"),
             ("seconds", "of training and making the seeds; the last column is during training,"),
             ("", "before the mean that a run ends with is taken"),
-            ("limits", "a synthetic room, one run each, no error bars; in long runs growth"),
-            ("", "makes up for much of what seeds give"),
+            ("limits", "a synthetic room, one run each, no error bars; growth compares the"),
+            ("", "photographs too, and finds most of what seeds would give it"),
             *pictures,
         ],
     )

@@ -64,7 +64,7 @@ class Growing(Strategy):
         settings: How to train.
         capacity: The budget.
         depths: Of each training view, by its name, planar depth in training units, 0 where it is
-            unknown; see ``placing``. Without them all that is added are halves.
+            unknown; see ``placing``. Without them growth only splits.
     """
 
     capacity: Capacity
