@@ -104,8 +104,8 @@ class Plan:
             _check_distinct("budgets", self.budgets)
             if self.training.cap_max is not None:
                 raise _out_of_range("budgets or cap_max", "one of them", "both")
-        if self.long_side is not None and self.long_side < LEAST_SIDE:
-            raise _out_of_range("long_side", f"of {LEAST_SIDE} or more", self.long_side)
+        if self.long_side is not None:
+            self._check_long_side(self.long_side)
         for ratio in self.ratios:
             if not 1 < ratio < math.inf:
                 raise _out_of_range("ratios", "above 1 (points in all, per original)", ratio)
@@ -117,6 +117,12 @@ class Plan:
         for method in self.parameters:
             _check_choices("parameters", (method,), tuple(METHODS))
             configure(method, **self.parameters[method])
+
+    def _check_long_side(self, long_side: int) -> None:
+        if long_side < LEAST_SIDE:
+            raise _out_of_range("long_side", f"of {LEAST_SIDE} or more", long_side)
+        if self.training.data_factor != 1:
+            raise _out_of_range("long_side or data_factor", "one of them", "both")
 
     def parameters_of(self, method: str) -> Mapping[str, Any]:
         """Differences from the profile; no method sees the held-out test photographs."""

@@ -102,7 +102,8 @@ class Options:
     num_points: Annotated[int | None, _number(int, "by the ratio")] = None
     """Points in all, instead of a ratio."""
     budget: Annotated[str | None, _budget()] = None
-    """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph."""
+    """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph at
+    full size."""
     cover_cell: Annotated[int | None, _cover()] = None
     """Side in pixels of the parts of the photographs that get a seed if no point falls in."""
     verify: bool = False
