@@ -91,10 +91,10 @@ def advice_for(
             is room for new points.
     """
     measured = measure(scene, empty)
-    said = advise(measured, planned.most_seeds)
+    said = advise(measured, planned.most_seeds, strategy=planned.strategy)
     if progress is not None and said.method == "auto" and measured.num_points:
         measured = replace(measured, agreement=stereo_agreement(scene, progress=progress))
-        said = advise(measured, planned.most_seeds)
+        said = advise(measured, planned.most_seeds, strategy=planned.strategy)
     return said, measured
 
 
