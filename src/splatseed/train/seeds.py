@@ -18,6 +18,7 @@ from splatseed.io.output.staging import kind_of
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
+from splatseed.train.known_depths import stereo_size
 from splatseed.train.settings import AS_3DGS, TrainSettings
 from splatseed.views.view import View
 
@@ -63,9 +64,10 @@ def seeded(
 
     start = time.perf_counter()
     part = SEEDS_SHARE.get(settings.densification, 1.0)
+    size = stereo_size(scene.split(settings.test_every)[0], settings)
     cloud = upsample(
         scene,
-        Remembering(hold_out=settings.test_every),
+        Remembering(hold_out=settings.test_every, max_size=size),
         budget=None if settings.cap is None else max(2, round(part * settings.cap)),
         progress=progress,
         note=note,

@@ -169,12 +169,14 @@ def _prepare(
     What stereo knows, for growth, is found once for all runs of a repeat, and its time counts in
     each; not where seeds by ``auto`` have paid for it, as ``splatseed train`` shares the two.
     """
+    from splatseed.train.known_depths import stereo_size  # noqa: PLC0415  (PyTorch)
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (PyTorch)
 
     every = spec.training.test_every
+    size = stereo_size(scene.split(every)[0], spec.settings)
     ways: dict[str, Any] = {
         "cache_dir": user_cache_dir(),
-        "depths": bench / DEPTHS / f"{spec.scene_digest}_{every}_{spec.repeat}.npz",
+        "depths": bench / DEPTHS / f"{spec.scene_digest}_{every}_{size}_{spec.repeat}.npz",
         "seeding_knew": spec.arm.method == DEFAULT_METHOD and not is_full(scene, spec),
     }
     try:
