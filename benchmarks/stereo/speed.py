@@ -54,16 +54,16 @@ def hypothesis_seconds(peer_rows: int) -> dict[str, float]:
     shape = guesses.shape[2:]
     planes, costs = np.zeros((3, *shape), np.float32), np.empty(shape, np.float32)
     few = np.ascontiguousarray(guesses[:, :, :peer_rows])
-    found = np.empty((PLANES, peer_rows, shape[1]), np.float32)
+    peer_costs = np.empty((PLANES, peer_rows, shape[1]), np.float32)
     seconds = {
         "planes": _best(lambda: begin(pictures, guesses, planes, costs)) / guesses[:, 0].size,
         "sweep": _best(lambda: _sweeps(pictures, planes, costs)) / guesses[:, 0].size,
         "peer": _best(
-            lambda: costs_of_planes(images[0], images[1:], warps, GRID, few, found), 2
-        ) / found.size,
+            lambda: costs_of_planes(images[0], images[1:], warps, GRID, few, peer_costs), 2
+        ) / peer_costs.size,
     }  # fmt: skip
     begin(pictures, guesses[:1].copy(), planes, costs)
-    gap = np.abs(costs[:peer_rows] - found[0])
+    gap = np.abs(costs[:peer_rows] - peer_costs[0])
     return {**seconds, "gap": float(gap[np.isfinite(gap)].max())}
 
 

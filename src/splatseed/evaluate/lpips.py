@@ -199,8 +199,8 @@ def _read_state(path: Path) -> Mapping[str, Tensor]:
 
 def _read_heads(net: LpipsNet) -> tuple[Tensor, ...]:
     """The w_l that torchmetrics ships, [1, C_l, 1, 1] each."""
-    found = find_spec("torchmetrics")
-    places = found.submodule_search_locations if found else None
+    spec = find_spec("torchmetrics")
+    places = spec.submodule_search_locations if spec else None
     package = Path(places[0]) if places else Path()
     state = _read_state(package / "functional" / "image" / "lpips_models" / f"{net}.pth")
     stages = range(len(LPIPS_NETS[net].stages))

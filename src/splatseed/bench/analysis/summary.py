@@ -27,11 +27,11 @@ def summary(study: Study, strategy: StrategyName) -> tuple[str, ...]:
         study: The study.
         strategy: One of its strategies.
     """
-    found = gains(study, strategy)
-    if not found.variants:
+    gained = gains(study, strategy)
+    if not gained.variants:
         return (f"Strategy {strategy}: nothing can be compared with {BASELINE.label} yet.",)
-    best = max(found.variants, key=lambda each: found.on_these[each].mean)
-    said = [_answer(found, best), _by_scene(found, best), _elsewhere(found, best)]
+    best = max(gained.variants, key=lambda each: gained.on_these[each].mean)
+    said = [_answer(gained, best), _by_scene(gained, best), _elsewhere(gained, best)]
     return tuple(each for each in (*said, _cost(study, strategy, best)) if each)
 
 
@@ -41,25 +41,25 @@ def decibels(gain: Difference) -> str:
     return f"{gain.mean:+.2f}{spread} dB"
 
 
-def _answer(found: Gains, best: Variant) -> str:
+def _answer(gained: Gains, best: Variant) -> str:
     """Whether any variant gains, and which gains most."""
-    scenes = _count(len(found.scenes), "scene")
-    lead = f"Strategy {found.strategy}, {scenes}:"
-    top = found.on_these[best]
+    scenes = _count(len(gained.scenes), "scene")
+    lead = f"Strategy {gained.strategy}, {scenes}:"
+    top = gained.on_these[best]
     if top.verdict == "unknown":
         return (
             f"{lead} with one run of each nothing is known of the noise, so no gain can be claimed."
             f" The highest is that of {best.label}, {decibels(top)}."
         )
-    better, worse = (_those(found, verdict) for verdict in ("better", "worse"))
-    of = f"of {_count(len(found.variants), 'variant')}"
+    better, worse = (_those(gained, verdict) for verdict in ("better", "worse"))
+    of = f"of {_count(len(gained.variants), 'variant')}"
     if better:
         most = f"{best.label} most ({decibels(top)})"
         text = f"{lead} yes, {len(better)} {of} gain more than noise, {most}."
     else:
         text = (
             f"{lead} no gain beyond noise was found among "
-            f"{_count(len(found.variants), 'variant')}; the"
+            f"{_count(len(gained.variants), 'variant')}; the"
             f" highest is that of {best.label}, {decibels(top)}."
         )
     loses = (
@@ -68,13 +68,13 @@ def _answer(found: Gains, best: Variant) -> str:
     return text + loses
 
 
-def _those(found: Gains, verdict: Verdict) -> list[str]:
-    return [each.label for each in found.variants if found.on_these[each].verdict == verdict]
+def _those(gained: Gains, verdict: Verdict) -> list[str]:
+    return [each.label for each in gained.variants if gained.on_these[each].verdict == verdict]
 
 
-def _by_scene(found: Gains, best: Variant) -> str:
+def _by_scene(gained: Gains, best: Variant) -> str:
     """On how many scenes the best variant gains and loses."""
-    known = [d for s in found.scenes if (d := found.on_scene.get((s, best))) is not None]
+    known = [d for s in gained.scenes if (d := gained.on_scene.get((s, best))) is not None]
     if len(known) < 2 or all(each.verdict == "unknown" for each in known):
         return ""
     kinds: tuple[Verdict, ...] = ("better", "worse", "within noise")
@@ -85,9 +85,9 @@ def _by_scene(found: Gains, best: Variant) -> str:
     )
 
 
-def _elsewhere(found: Gains, best: Variant) -> str:
+def _elsewhere(gained: Gains, best: Variant) -> str:
     """Whether the gain can be expected on other scenes."""
-    like = found.on_like[best]
+    like = gained.on_like[best]
     if like.verdict == "unknown":
         return "One scene says nothing of others."
     low, high = like.interval()

@@ -173,19 +173,21 @@ class Estimator:
         Args:
             specs: In the order in which they are run.
         """
-        known, found = set(self._known), {}
+        known, seconds = set(self._known), {}
         for spec in specs:
             shared = _shared(spec)
-            found[spec.key] = self.seconds(spec)
+            seconds[spec.key] = self.seconds(spec)
             if ("seeds", *shared) in known:
-                found[spec.key] -= self._seeding.of(_by_method(spec)) * self._modelled_seeding(spec)
+                seconds[spec.key] -= self._seeding.of(_by_method(spec)) * self._modelled_seeding(
+                    spec
+                )
             if self._compares(spec):
                 if ("depths", *shared[::2]) in known:
-                    found[spec.key] -= self._looking(spec)
+                    seconds[spec.key] -= self._looking(spec)
                 known.add(("depths", *shared[::2]))
             if _makes(spec):
                 known.add(("seeds", *shared))
-        return found
+        return seconds
 
     def is_twin(self, spec: RunSpec) -> bool:
         """Whether a run will reuse the training of one that begins with the same seeds."""

@@ -55,16 +55,16 @@ def compared_views(study: Study, strategy: StrategyName, bench: Path) -> Iterato
         strategy: One of its strategies.
         bench: The benchmark's folder.
     """
-    found = gains(study, strategy)
+    gained = gains(study, strategy)
     most = VIEWS if len(study.strategies) == 1 else 1
-    for scene in found.scenes:
-        best = found.top(scene)
+    for scene in gained.scenes:
+        best = gained.top(scene)
         if best is None:
             continue
         folders = _folders(study, strategy, scene, best, bench)
         if folders is None:
             continue
-        gain = found.on_scene[scene, best].mean
+        gain = gained.on_scene[scene, best].mean
         for name in _common(*folders)[:most]:
             pictures = _pictures(folders[0] / name, folders[1] / name, best)
             if pictures is not None:

@@ -41,15 +41,15 @@ def arm_table(study: Study) -> Table:
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
-    with_lpips = any(each.lpips is not None for each in found)
-    with_covisible = any(each.covisible_psnr is not None for each in found)
+    base, compared = baseline_of(study), compared_arms(study)
+    with_lpips = any(each.lpips is not None for each in compared)
+    with_covisible = any(each.covisible_psnr is not None for each in compared)
     scores = ["PSNR, dB", "gain, dB"]
     scores += ["co-visible, dB", "its gain, dB"] if with_covisible else []
     scores += ["SSIM", "its gain"]
     scores += ["LPIPS", "its gain"] if with_lpips else []
     rows = []
-    for each in found:
+    for each in compared:
         own = each.arm == base
         cells = [number(each.psnr), _gain(each.gain, own)]
         if with_covisible:
@@ -93,9 +93,9 @@ def scene_arm_table(study: Study) -> Table:
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
+    base, compared = baseline_of(study), compared_arms(study)
     rows = []
-    for each in found:
+    for each in compared:
         cells = []
         for scene in study.scenes:
             own = _runs(study, each.arm, scene)
@@ -132,7 +132,7 @@ def seconds_table(study: Study) -> Table:
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
+    base, compared = baseline_of(study), compared_arms(study)
     rows = [
         (
             words(each.arm.variant.label),
@@ -142,7 +142,7 @@ def seconds_table(study: Study) -> Table:
             words(f"{each.reached} of {each.runs}"),
             _share_of_time(each.sooner),
         )
-        for each in found
+        for each in compared
     ]
     name = base.label if base else "the baseline"
     header = ("seeds", "strategy", "seconds in all", f"gain at {name}'s seconds, dB",
@@ -164,8 +164,8 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
-    others = [each for each in found if each.arm != base]
+    base, compared = baseline_of(study), compared_arms(study)
+    others = [each for each in compared if each.arm != base]
     if base is None or not others:
         return ()
     best, scenes = others[0], len(others[0].scenes)
