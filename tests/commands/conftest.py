@@ -10,7 +10,6 @@ from typing import NamedTuple
 import pytest
 
 from splatseed.cli import main
-from splatseed.synthetic import make_capture, write_capture
 
 
 class Run(NamedTuple):
@@ -22,10 +21,9 @@ class Run(NamedTuple):
 
 
 @pytest.fixture(scope="session")
-def room(tmp_path_factory) -> Path:
-    """A COLMAP scene of the procedural room: 12 images, about 460 points. Not to be written to."""
-    path = tmp_path_factory.mktemp("room") / "room"
-    return write_capture(make_capture(0, num_views=12, width=120, height=90), path)
+def room(larger_room_path) -> Path:
+    """The path of the larger room, which the commands are given."""
+    return larger_room_path
 
 
 @pytest.fixture

@@ -18,13 +18,11 @@ from splatseed.io import load_scene, write_scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.ply import write_gaussians
-from splatseed.synthetic import make_capture, write_capture
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    path = tmp_path_factory.mktemp("room") / "room"
-    return write_capture(make_capture(0, num_views=12, width=120, height=90), path)
+def room(larger_room_path):
+    return larger_room_path
 
 
 @pytest.fixture(scope="module")
