@@ -131,7 +131,7 @@ def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     here["most"] = 1
     with pytest.raises(SystemExit):
         main(words)
-    assert "the same command goes on" in capsys.readouterr().out
+    assert "repeat the command to continue" in capsys.readouterr().out
     here["most"] = 99
     main(words)
     out = capsys.readouterr().out

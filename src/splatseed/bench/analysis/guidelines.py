@@ -39,8 +39,8 @@ SCENE_NOTE = (
     "without points; texture: the mean gradient of grey values at 320 pixels."
 )
 WINNER_NOTE = (
-    "The best is chosen by the scores that it has, so that its gain flatters; within noise: it "
-    "may as well be any other."
+    "The best is chosen by its own scores, so its gain flatters; within noise: any other may be "
+    "as good."
 )
 
 

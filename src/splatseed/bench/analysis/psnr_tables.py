@@ -50,9 +50,9 @@ GAIN_NOTE = (
 )
 MEAN_NOTE = (
     "dB over sfm. All variants together: what a variant picked blindly gives. Best single "
-    "variant: a little flattering, as it is chosen by the scores that it is of. Best of each "
-    "scene: chosen on the very test views that it is scored on, so that noise counts as gain; not "
-    "a gain that anybody can have. Variants that some scene lacks are left out."
+    "variant: a little flattering, as it is chosen by its own scores. Best of each scene: chosen "
+    "on the very test views that it is scored on, so that noise counts as gain; not a gain that "
+    "anybody can have. Variants that some scene lacks are left out."
 )
 TABLE_NAMES = {"mipnerf360": "table1", "replica": "table2", "": "table_scenes"}
 

@@ -226,7 +226,7 @@ def _common(spec: RunSpec) -> dict[str, object]:
 
 
 def _by_factor(rows: Sequence[RunRow]) -> list[list[RunRow]]:
-    """The rows as one group, or one a ``data_factor`` where a scene has several."""
+    """The rows as one group, or one per ``data_factor`` where a scene has several."""
     factors: dict[str, set[int]] = defaultdict(set)
     groups: dict[int, list[RunRow]] = defaultdict(list)
     for row in rows:

@@ -89,7 +89,7 @@ def _elsewhere(gained: Gains, best: Variant) -> str:
     """Whether the gain can be expected on other scenes."""
     like = gained.on_like[best]
     if like.verdict == "unknown":
-        return "One scene says nothing of others."
+        return "One scene says nothing about others."
     low, high = like.interval()
     span = f"95% interval {low:+.2f} to {high:+.2f} dB"
     if like.verdict == "within noise":
@@ -113,7 +113,7 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
         return text
     if sooner.log_steps is None or sooner.log_seconds is None:
         part = f"{sooner.reached} of {sooner.pairs} runs"
-        return f"{text} {part} become as good as {BASELINE.label} is in the end."
+        return f"{text} {part} reach {BASELINE.label}'s final PSNR."
     return f"{text} {_when_as_good(sooner.log_steps, sooner.log_seconds)}"
 
 
@@ -121,17 +121,12 @@ def _when_as_good(steps: Difference, seconds: Difference) -> str:
     """How soon it reaches the baseline's final result; a single pair's NaN counts as unsure."""
     base = BASELINE.label
     if not any(each.p <= LEVEL for each in (steps, seconds)):
-        return (
-            f"Whether it is sooner as good as {base} becomes in the end cannot be told from noise."
-        )
+        return f"Whether it reaches {base}'s final PSNR sooner cannot be told from noise."
     parts = [
         f"{math.exp(each.mean):.0%} of the {unit}" + ("" if each.p <= LEVEL else " (may be chance)")
         for each, unit in ((steps, "steps"), (seconds, "seconds"))
     ]
-    return (
-        f"To become as good as {base} is in the end it takes {parts[0]} and {parts[1]} that "
-        f"{base} takes."
-    )
+    return f"To reach {base}'s final PSNR it takes {parts[0]} and {parts[1]} that {base} takes."
 
 
 def _pairs(

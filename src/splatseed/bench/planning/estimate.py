@@ -33,19 +33,19 @@ TESTS = 21
 RENDER_SHARE = 0.3
 """Fraction of a step's time that rendering takes."""
 LIKELY_RATIO = 3.0
-"""Seeds to every original, of methods that look at photographs."""
+"""Seeds per original, for methods that look at photographs."""
 PICTURES = 3
 BYTES_A_PIXEL = 2.0
 """Bytes of a PNG of a photograph, its render and its error, per pixel."""
 SMALL_FILES = 60_000
 SECONDS_A_VIEW = 0.8
-"""Of methods that compare photographs with each other."""
+"""Seconds per view of methods that compare photographs with each other."""
 SECONDS_A_POINT = 5e-6
-"""Of methods that interpolate, for each point of the scene and each new one."""
+"""Seconds of methods that interpolate, per point of the scene and per new one."""
 LEAST = 0.05
 """Seconds below which a part counts for nothing, and its factor would be noise."""
 SWEEPS = 3
-"""Of median polish: enough for two kinds of names."""
+"""Sweeps of the median polish: enough for two kinds of names."""
 
 
 @dataclass(frozen=True)
@@ -288,14 +288,14 @@ PHOTOGRAPHS = frozenset({AUTO, COVER})
 COMPARING = ("stereo", AUTO)
 """Methods whose time tells how long comparing photographs takes."""
 LEAST_STEPPING = 0.3
-"""Of training's time, what steps take at least."""
+"""Least share of training's time that the steps take."""
 COVERING = 0.1
 """What looking for gaps takes, as a share of comparing photographs."""
 FILLING = frozenset({SFM, *PHOTOGRAPHS, "linear", "triangle", "spline", "mls", "voronoi", "random",
                      "depth"})  # fmt: skip
 """Methods that add nothing where the originals fill the budget."""
 READING = 3.0
-"""Seconds of a run whose training is reused, besides its seeds."""
+"""Seconds that a run takes besides its seeds if its training is reused."""
 
 
 def _densification(spec: RunSpec) -> Densification:
@@ -313,7 +313,7 @@ def _shares(spec: RunSpec) -> bool:
 
 
 def _shared(spec: RunSpec) -> tuple[object, ...]:
-    """What runs of the same seeds have in common; every other word of it, of the same depth."""
+    """What runs with the same seeds share; without the method, what runs with the same depth do."""
     return spec.scene_digest, spec.arm.method, spec.repeat
 
 
@@ -361,5 +361,5 @@ def _seconds_around(row: RunRow) -> float:
 
 
 def _bytes_each(settings: TrainSettings) -> int:
-    """Of a Gaussian's numbers: place, scale, rotation, opacity, colours."""
+    """Bytes of a Gaussian: place, scale, rotation, opacity, colours."""
     return 4 * (3 + 3 + 4 + 1 + 3 * (settings.sh_degree + 1) ** 2)

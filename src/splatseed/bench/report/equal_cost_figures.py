@@ -38,7 +38,7 @@ LATE = 0.25
 
 
 def seconds_figure(study: Study) -> Plot | None:
-    """Test PSNR over seconds of seeding and training, a panel a scene; None without curves.
+    """Test PSNR over seconds of seeding and training, a panel per scene; None without curves.
 
     Args:
         study: The study.

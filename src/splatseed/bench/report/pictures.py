@@ -100,7 +100,7 @@ def _look(
     bench: Path,
     progress: Progress,
 ) -> None:
-    """Open a scene for what is not known of it."""
+    """Open a scene for what is not cached."""
     try:
         opened = open_unchanged([*specs.values(), anyone])
         if scene not in pictures.described:

@@ -115,7 +115,7 @@ class Options:
     """Processes on this machine, or tasks on a Ray cluster (extra cluster)."""
     jobs: Annotated[int | None, _one(int, "one per GPU, else 1; ray: what fits")] = None
     """Runs at a time."""
-    threads: Annotated[int | None, _one(int, "the cores shared out")] = None
+    threads: Annotated[int | None, _one(int, "an equal share of the cores")] = None
     """Threads of each run on the CPU."""
     address: Annotated[str | None, _one(str, "a cluster on this machine alone")] = None
     """The Ray cluster's, such as auto on its head node."""

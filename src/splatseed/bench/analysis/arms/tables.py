@@ -27,11 +27,11 @@ SCORES_NOTE = (
     "making the seeds and of training."
 )
 SECONDS_NOTE = (
-    "Seconds count making the seeds and training. The gain at {base}'s seconds holds an arm's PSNR "
-    "when {base} ends beside {base}'s last; an arm that ended sooner has its last. The time to "
-    "{base}'s PSNR is when an arm first is as good as {base} in the end, as a share of the time "
-    "that {base} takes: 0.50 is in half of it; a geometric mean, given only where all runs get "
-    "there."
+    "Seconds count making the seeds and training. The gain at {base}'s seconds is an arm's PSNR "
+    "when {base} ends, less {base}'s final PSNR; an arm that ended sooner counts with its own "
+    "final PSNR. The time to {base}'s PSNR is when an arm first reaches {base}'s final PSNR, as a "
+    "share of the time that {base} takes: 0.50 is half of it; a geometric mean, given only where "
+    "all runs get there."
 )
 
 
@@ -191,7 +191,7 @@ def _against(each: Compared, base: Arm) -> str:
     spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f})"
     doubt = {
         "within noise": ", which may be chance",
-        "unknown": ", of which one run says nothing sure",
+        "unknown": ", which a single run cannot confirm",
     }.get(gain.verdict, "")
     return f"{abs(gain.mean):.2f} dB{spread} {more} than {base.label}{doubt}"
 
@@ -209,9 +209,7 @@ def _in_time(best: Compared, base: Arm) -> tuple[str, ...]:
     if best.sooner is not None:
         share = math.exp(best.sooner.mean)
         sooner = f"{share:.0%} of the time" if share < 1 else f"{share:.2f} times as long"
-        told.append(f"To become as good as {base.label} is in the end it takes {sooner}.")
+        told.append(f"It takes {sooner} to reach {base.label}'s final PSNR.")
     elif best.reached < best.runs:
-        told.append(
-            f"{best.reached} of its {best.runs} runs become as good as {base.label} in the end."
-        )
+        told.append(f"{best.reached} of its {best.runs} runs reach {base.label}'s final PSNR.")
     return tuple(told)
