@@ -44,9 +44,9 @@ def _runs(*psnr, repeat=0):
 
 
 def test_the_baseline_stays_whatever_it_scores():
-    found = {SFM: _runs(20.0), GROW: _runs(23.0), AUTO: _runs(22.0), MLS: _runs(21.0)}
-    assert best_arms(found, 2) == (GROW, SFM)
-    assert best_arms(found, 4) == (GROW, AUTO, MLS, SFM)
+    results = {SFM: _runs(20.0), GROW: _runs(23.0), AUTO: _runs(22.0), MLS: _runs(21.0)}
+    assert best_arms(results, 2) == (GROW, SFM)
+    assert best_arms(results, 4) == (GROW, AUTO, MLS, SFM)
 
 
 def test_a_verdict_is_paired_by_view():

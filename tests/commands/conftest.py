@@ -1,23 +1,11 @@
-"""A small capture on disk, and the command line run in this process."""
+"""A small capture on disk, as the commands are given it."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
-
-from splatseed.cli import main
-
-
-class Run(NamedTuple):
-    """What a command left: its exit code and all it said."""
-
-    code: int
-    out: str
-    err: str
 
 
 @pytest.fixture(scope="session")
@@ -30,19 +18,3 @@ def room(larger_room_path) -> Path:
 def own_room(room, tmp_path) -> Path:
     """A copy of the room that a test may spoil."""
     return Path(shutil.copytree(room, tmp_path / "own"))
-
-
-@pytest.fixture
-def splatseed(capsys) -> Callable[..., Run]:
-    """Runs ``splatseed WORDS...``; only SystemExit may come out of it."""
-
-    def run(*words: object) -> Run:
-        capsys.readouterr()
-        code = 0
-        try:
-            main([str(word) for word in words])
-        except SystemExit as stop:
-            code = int(stop.code or 0)
-        return Run(code, *capsys.readouterr())
-
-    return run

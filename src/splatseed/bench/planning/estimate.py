@@ -133,30 +133,36 @@ class Estimator:
         }
         self._growth = _measured_growth(done)
         trained = [row for row in done if row.result and not row.result.twin]
-        self._seeding = _Factors(
-            [
-                (_by_method(row.spec), took / said)
-                for row in done
-                for took, said in [(_seed_seconds(row), self._modelled_seeding(row.spec))]
-                if took > LEAST and said > 0
-            ],
-            level=False,
-        )
-        self._training = _Factors(
-            [
-                (_by_strategy(row.spec), took / said)
-                for row in trained
-                for took, said in [(self._stepping(row), self._modelled_training(*_of(row)))]
-            ]
-        )
-        self._around = _Factors(
-            [
-                (_by_scene(row.spec), took / said)
-                for row in ([row for row in trained if not _shares(row.spec)] or trained)
-                for took, said in [(_seconds_around(row), self._modelled_around(*_of(row)))]
-                if took > LEAST
-            ]
-        )
+        self._seeding = _Factors(self._seeding_factors(done), level=False)
+        self._training = _Factors(self._training_factors(trained))
+        alone = [row for row in trained if not _shares(row.spec)]
+        self._around = _Factors(self._around_factors(alone or trained))
+
+    def _seeding_factors(self, rows: Sequence[RunRow]) -> list[tuple[Names, float]]:
+        """The factors of making seeds, by names."""
+        return [
+            (_by_method(row.spec), took / said)
+            for row in rows
+            for took, said in [(_seed_seconds(row), self._modelled_seeding(row.spec))]
+            if took > LEAST and said > 0
+        ]
+
+    def _training_factors(self, rows: Sequence[RunRow]) -> list[tuple[Names, float]]:
+        """The factors of the steps, by names."""
+        return [
+            (_by_strategy(row.spec), took / said)
+            for row in rows
+            for took, said in [(self._stepping(row), self._modelled_training(*_of(row)))]
+        ]
+
+    def _around_factors(self, rows: Sequence[RunRow]) -> list[tuple[Names, float]]:
+        """The factors of what is around the steps, by names."""
+        return [
+            (_by_scene(row.spec), took / said)
+            for row in rows
+            for took, said in [(_seconds_around(row), self._modelled_around(*_of(row)))]
+            if took > LEAST
+        ]
 
     def seconds(self, spec: RunSpec) -> float:
         """Of a run, from its start to its end."""
