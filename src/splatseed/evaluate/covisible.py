@@ -24,7 +24,7 @@ from splatseed.depthmap import DepthMap, DepthMaps
 from splatseed.errors import SceneFormatError
 from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
-from splatseed.scene import Scene
+from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world, grid_of
 from splatseed.views.view import View, data_factor, poses_of
 
@@ -104,7 +104,7 @@ def _cell(view: View) -> float:
     return max(max(view.width, view.height) / CELLS, LEAST_CELL)
 
 
-def _frames(images: Sequence, maps: DepthMaps | None) -> list[View]:  # type: ignore[type-arg]
+def _frames(images: Sequence[Image], maps: DepthMaps | None) -> list[View]:
     """The images' frames at the size that cells are stated for; with depth maps, those with one."""
     known = [image for image in images if maps is None or image.name in maps]
     return list(poses_of(known, data_factor(known, MAX_SIZE))) if known else []
