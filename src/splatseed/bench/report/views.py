@@ -101,15 +101,15 @@ def _pictures(base: Path, own: Path, best: Variant) -> tuple[dict[str, bytes], f
         return None
     if parts[0] is None or parts[1] is None or parts[0][0].shape != parts[1][0].shape:
         return None
-    (truth, base_render, base_error), (_, own_render, own_error) = parts[0], parts[1]
+    (photograph, base_render, base_error), (_, own_render, own_error) = parts[0], parts[1]
     shown = {
         BASELINE.label: base_render,
         best.label: own_render,
-        "photograph": truth,
+        "photograph": photograph,
         f"error of {BASELINE.label}": base_error,
         f"error of {best.label}": own_error,
     }
-    height, width = truth.shape[:2]
+    height, width = photograph.shape[:2]
     return {label: jpeg(pixels) for label, pixels in shown.items()}, width / height
 
 
