@@ -235,7 +235,7 @@ def _budget(given: object) -> str:
 
 
 def _scene_arms(plan: Plan, scenes: Sequence[SceneFacts]) -> list[tuple[SceneFacts, Arm]]:
-    found = [
+    pairs = [
         (scene, arm)
         for scene in scenes
         for strategy in plan.strategies
@@ -243,8 +243,8 @@ def _scene_arms(plan: Plan, scenes: Sequence[SceneFacts]) -> list[tuple[SceneFac
         if arm.method != DEPTH or scene.depth_digest
     ]
     if plan.budgets:  # runs that come to the same seeds as sfm's take over their training
-        found.sort(key=lambda pair: pair[1].method != SFM)
-    return found
+        pairs.sort(key=lambda pair: pair[1].method != SFM)
+    return pairs
 
 
 def _check_choices(name: str, given: Sequence[str], known: Sequence[str]) -> None:

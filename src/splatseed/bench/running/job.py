@@ -234,13 +234,13 @@ def _covisible(spec: RunSpec, target: Path, views: Sequence[View], progress: Pro
     return pixel_masks(grids, views)
 
 
-def _result(found: TrainingResult, run: TrainingRun, upsample_seconds: float) -> RunResult:
+def _result(trained: TrainingResult, run: TrainingRun, upsample_seconds: float) -> RunResult:
     return RunResult(
-        scores=found.scores,
-        curve=tuple(point for point in found.curve if math.isfinite(point.psnr)),
-        num_seeds=found.num_seeds,
+        scores=trained.scores,
+        curve=tuple(point for point in trained.curve if math.isfinite(point.psnr)),
+        num_seeds=trained.num_seeds,
         upsample_seconds=upsample_seconds,
-        train_seconds=found.train_seconds,
+        train_seconds=trained.train_seconds,
         peak_bytes=peak_bytes(),
         device=run.device,
         peak_gpu_bytes=run.peak_gpu_bytes,

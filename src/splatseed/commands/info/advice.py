@@ -157,7 +157,7 @@ def run_advice(arguments: list[str]) -> None:
         advice, measured = advice_for(scene, planned, empty, clock)
     print_pairs(str(options.scene), advice_rows(advice, measured, planned))
     OUT.print(
-        "\nThe rules rest on runs of a few scenes (docs/methods.md); splatseed tune asks this "
+        "\nThe rules rest on runs of a few scenes (docs/methods.md); splatseed tune tests this "
         "very scene.",
         soft_wrap=True,
     )
