@@ -16,10 +16,11 @@ from splatseed.scene import Image
 from splatseed.splat.frame import TrainingFrame
 from splatseed.stereo.depths import find_stereo
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train.known_depths import PER_RENDERED, known_depths, stereo_size
+from splatseed.train.known_depths import known_depths
 from splatseed.train.run import prepare_run
 from splatseed.train.seeds import seeded
 from splatseed.train.settings import TrainSettings
+from splatseed.train.stereo_size import PER_RENDERED, stereo_size
 
 FRAME = TrainingFrame(np.array([1.0, 2.0, 3.0]), 0.25)
 GROW = TrainSettings(strategy="grow", max_steps=60)

@@ -7,9 +7,8 @@ same scene and seed give the same bytes, so that a resumed run has the maps it b
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +19,14 @@ from torch import Tensor
 
 from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
-from splatseed.scene import Image, Scene
+from splatseed.scene import Scene
 from splatseed.splat.frame import TrainingFrame
 from splatseed.stereo.of_scene import stereo_depths
 from splatseed.stereo.result import Stereo
-from splatseed.stereo.settings import StereoSettings
 from splatseed.train.settings import TrainSettings
+from splatseed.train.stereo_size import stereo_size
 
-__all__ = ["known_depths", "seconds_of", "stereo_size"]
-
-PER_RENDERED = 0.13
-"""Most pixels compared per pixel rendered in training: stereo then takes about a quarter of
-training's seconds (on the CPU: fern, 0.045: 5 of 47 s; bonsai at 1,500 steps, 0.68: 83 of 64 s)."""
-LEAST_SIZE = 64
+__all__ = ["known_depths", "seconds_of"]
 
 
 def known_depths(
@@ -88,28 +82,6 @@ def known_depths(
         for name, depth in known.items()
         if np.isfinite(depth).any()
     }
-
-
-def stereo_size(images: Sequence[Image], settings: TrainSettings) -> int:
-    """Most pixels a side at which photographs are compared, for a run of this length.
-
-    ``StereoSettings``' own where training takes much longer than comparing; otherwise fewer, down
-    to the size that is trained.
-
-    Args:
-        images: The training photographs.
-        settings: Steps, and the size that is trained.
-    """
-    full = StereoSettings().max_size
-    if not images:
-        return full
-    longest = max(max(image.camera.width, image.camera.height) for image in images)
-    pixels = sum(image.camera.width * image.camera.height for image in images)
-    most = min(full, longest)
-    compared = pixels * (most / longest) ** 2
-    rendered = settings.max_steps * pixels / len(images) / settings.data_factor**2
-    affordable = most * math.sqrt(PER_RENDERED * rendered / compared)
-    return min(full, max(LEAST_SIZE, longest // settings.data_factor, int(affordable)))
 
 
 def seconds_of(kept: Path | None, took: float) -> float:

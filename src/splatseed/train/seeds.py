@@ -18,8 +18,8 @@ from splatseed.io.output.staging import kind_of
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
-from splatseed.train.known_depths import stereo_size
 from splatseed.train.settings import AS_3DGS, TrainSettings
+from splatseed.train.stereo_size import stereo_size
 from splatseed.views.view import View
 
 if TYPE_CHECKING:

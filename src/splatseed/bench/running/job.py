@@ -37,6 +37,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
 from splatseed.seeding.upsampling import DEFAULT_METHOD
+from splatseed.train.stereo_size import stereo_size
 from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
@@ -169,7 +170,6 @@ def _prepare(
     What stereo knows, for growth, is found once for all runs of a repeat, and its time counts in
     each; not where seeds by ``auto`` have paid for it, as ``splatseed train`` shares the two.
     """
-    from splatseed.train.known_depths import stereo_size  # noqa: PLC0415  (PyTorch)
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (PyTorch)
 
     every = spec.training.test_every
