@@ -27,6 +27,7 @@ __all__ = [
     "SceneFormatError",
     "SceneNotFoundError",
     "SplatseedError",
+    "TaskLostError",
 ]
 
 
@@ -76,3 +77,7 @@ class ReconstructionError(SplatseedError):
 
 class MissingDependencyError(SplatseedError):
     """An optional package is needed and absent."""
+
+
+class TaskLostError(SplatseedError):
+    """A task was lost with its process or node too often."""

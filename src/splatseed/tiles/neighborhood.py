@@ -138,6 +138,8 @@ def _query(
     tree: cKDTree, xyz: np.ndarray, own: np.ndarray, k: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """``nearest_others`` on all cores."""
+    if len(xyz) <= QUERY_BLOCK:
+        return nearest_others(tree, xyz, own, k)
     distance, number = np.empty((len(xyz), k)), np.empty((len(xyz), k), np.int64)
 
     def query(start: int, stop: int) -> None:

@@ -78,7 +78,7 @@ def _resolved(
         last = found[:, -1]
         open_ = np.flatnonzero((last == found[:, k - 1]) & np.isfinite(last)) + start
         if len(open_):
-            more = min(2 * wanted, tree.n + 1)
+            more = min(2 * wanted, tree.n + 2)  # then the last is missing
             distance[open_], number[open_] = _resolved(tree, xyz[open_], own[open_], k, more)
     return distance, number
 
