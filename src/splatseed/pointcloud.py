@@ -112,7 +112,8 @@ class PointCloud:
     @property
     def finite(self) -> Bool[np.ndarray, " N"]:
         """Which points have three finite coordinates, so that distances can be computed."""
-        return np.asarray((np.abs(self.xyz) < FARTHEST).all(axis=1))  # NaN compares false
+        x, y, z = (np.abs(self.xyz[:, axis]) < FARTHEST for axis in range(3))  # NaN compares false
+        return np.asarray(x & y & z)
 
     @property
     def distinct(self) -> Bool[np.ndarray, " N"]:

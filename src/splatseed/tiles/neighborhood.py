@@ -112,7 +112,9 @@ def find_neighborhood(store: TileStore, tile: int, k: int) -> Neighborhood:
     own = store.points(tile)
     tree = cKDTree(own.xyz, balanced_tree=False)
     order = np.asarray(tree.indices, np.int32)
-    reach, position = _reach_in_tile(tree, own, order, k)
+    row_of = np.empty(len(own), np.int32)
+    row_of[order] = np.arange(len(own), dtype=np.int32)
+    reach, inner = _in_tile(tree, own, order, row_of, k)
     open_ = _beyond_walls(own.xyz[order], reach, store.walls[tile])
     search = _start(tree, own, own.select(order[open_]), order[open_], k)
     _search_tiles(store, search, tile)
@@ -122,9 +124,7 @@ def find_neighborhood(store: TileStore, tile: int, k: int) -> Neighborhood:
     _search_tiles(store, further, tile)
     rim = _others(Points.union([around, *further.met]), further.rank, own, ring)
     idx = np.empty((len(own) + len(ring), k), np.int32)
-    row_of = np.empty(len(own), np.int32)
-    row_of[order] = np.arange(len(own), dtype=np.int32)
-    idx[: len(own)] = row_of[np.minimum(position, len(own) - 1)]  # those not found are replaced
+    idx[: len(own)] = inner
     idx[open_] = _rows(search.rank, own, row_of, ring, rim)
     idx[len(own) :] = _rows(further.rank, own, row_of, ring, rim)
     parts = [own.select(order), ring, rim]
@@ -150,19 +150,23 @@ def _query(
     return distance, number
 
 
-def _reach_in_tile(
-    tree: cKDTree, own: Points, order: Int32[np.ndarray, " n"], k: int
+def _in_tile(
+    tree: cKDTree, own: Points, order: np.ndarray, row_of: np.ndarray, k: int
 ) -> tuple[Float64[np.ndarray, " n"], Int32[np.ndarray, "n k"]]:
-    """How far the k-th neighbour in the tile is from each row, and their positions, n if absent."""
-    reach, position = np.empty(len(own)), np.empty((len(own), k), np.int32)
+    """How far the k-th neighbour in the tile is from each row, and the rows of all k.
+
+    Where there are fewer, the distance is infinite, and the others are any rows.
+    """
+    reach, rows = np.empty(len(own)), np.empty((len(own), k), np.int32)
 
     def query(start: int, stop: int) -> None:
         part = order[start:stop].astype(np.int64)
-        distance, position[start:stop] = nearest_others(tree, own.xyz[part], part, k)
+        distance, position = nearest_others(tree, own.xyz[part], part, k)
         reach[start:stop] = distance[:, -1]
+        rows[start:stop] = row_of[np.minimum(position, len(own) - 1)]
 
     in_threads(query, len(own), QUERY_BLOCK, "neighbours", silent)
-    return reach, position
+    return reach, rows
 
 
 def _beyond_walls(
@@ -171,8 +175,11 @@ def _beyond_walls(
     walls: Float64[np.ndarray, "2 3"],
 ) -> Int64[np.ndarray, " open"]:
     """The points whose ball reaches a wall of the tile."""
-    room = np.minimum((xyz - walls[0]).min(axis=1), (walls[1] - xyz).min(axis=1))
-    return np.flatnonzero(reach * SLACK >= room)
+    near = np.zeros(len(xyz), bool)
+    for axis in range(3):  # column by column: NumPy is slow along short axes
+        near |= reach * SLACK >= xyz[:, axis] - walls[0, axis]
+        near |= reach * SLACK >= walls[1, axis] - xyz[:, axis]
+    return np.flatnonzero(near)
 
 
 def _start(tree: cKDTree, among: Points, own: Points, who: np.ndarray, k: int) -> _Search:
@@ -200,8 +207,11 @@ def _search_tiles(store: TileStore, search: _Search, tile: int) -> None:
             continue
         bounds, reach = store.bounds[other], search.reach
         xyz = search.points.xyz
-        away = np.maximum(np.maximum(bounds[0] - xyz, xyz - bounds[1]), 0.0)
-        who = np.flatnonzero(np.sqrt((away**2).sum(axis=1)) <= reach)
+        squared = np.zeros(len(xyz))
+        for axis in range(3):
+            x = xyz[:, axis]
+            squared += np.maximum(np.maximum(bounds[0, axis] - x, x - bounds[1, axis]), 0.0) ** 2
+        who = np.flatnonzero(np.sqrt(squared) <= reach)
         if not len(who):
             continue
         ball = reach[who, None]

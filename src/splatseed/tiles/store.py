@@ -104,12 +104,23 @@ class TileStore:
             within: Only those in this box, relative to the centroid; all when left out.
         """
         records = np.fromfile(self.work.file("tiles") / tile_name(tile), RECORD)
-        xyz = records["xyz"].astype(np.float64) - self.center
         if within is not None:
-            inside = ((xyz >= within[0]) & (xyz <= within[1])).all(axis=1)
-            xyz, records = xyz[inside], records[inside]
+            records = records[self._inside(records["xyz"], within)]
+        xyz = records["xyz"].astype(np.float64) - self.center
         row = records["row"]
         return Points(xyz, records["rgb"].copy(), self._ranks(row), self._rows.trusted(row))
+
+    def _inside(
+        self, xyz: Float32[np.ndarray, "n 3"], within: Float64[np.ndarray, "2 3"]
+    ) -> Bool[np.ndarray, " n"]:
+        """Which positions are in a box, and perhaps some just outside."""
+        with np.errstate(over="ignore"):
+            low, high = (within + self.center).astype(np.float32)
+        low, high = np.nextafter(low, np.float32(-np.inf)), np.nextafter(high, np.float32(np.inf))
+        inside = np.ones(len(xyz), bool)
+        for axis in range(3):  # column by column: NumPy is slow along short axes
+            inside &= (xyz[:, axis] >= low[axis]) & (xyz[:, axis] <= high[axis])
+        return inside
 
     def _ranks(self, row: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
         dropped = self._dropped

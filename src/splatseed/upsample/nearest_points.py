@@ -46,6 +46,9 @@ def _others(
     tree: cKDTree, xyz: np.ndarray, own: np.ndarray, wanted: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """The nearest ``wanted - 1`` points other than the query, ties in any order."""
+    if (own < 0).all():
+        distance, number = tree.query(xyz, wanted - 1)
+        return distance, number
     distance, number = tree.query(xyz, wanted)
     # Queries are mostly the first of their own neighbours, but for those at distance 0 beside
     # another that rounding has brought together.
