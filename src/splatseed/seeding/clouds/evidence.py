@@ -1,12 +1,12 @@
 """What the photographs see of a cloud: which points, in which colours, and which cannot be there.
 
-Notation: a view's *surface* is the depth of its cells (``coverage.cell_depths``), of a side at which
-a typical cell holds ``FILLED`` points, so that walls have no holes. A view *sees* a point that lies
-in front of its surface or up to ``BEHIND`` of the depth behind it. The *samples* of a point are its
-pixels in the ``CLOSEST`` views that see it; their *agreement* is the share of them within ``ALIKE``
-grey levels of their median, channel by channel. A tracked point of Structure-from-Motion proves
-that the ray to it is free: a cloud point in the same cell of the same view, clearly nearer, is
-*seen through*, and *confirmed* if it is about as far.
+Notation: a view's *surface* is the depth of its cells (``coverage.cell_depths``), of a side at
+which a typical cell holds ``FILLED`` points, so that walls have no holes. A view *sees* points in
+front of its surface, and up to ``BEHIND`` of the depth behind it. The *samples* of a point are its
+pixels in the ``CLOSEST`` views that see it; their *agreement* is the share within ``ALIKE`` grey
+levels of their median, channel by channel. A tracked point of Structure-from-Motion proves that the
+ray to it is free: a cloud point in the same cell of the same view, clearly nearer, is *seen
+through*, and *confirmed* if it is about as far.
 Promise: depends neither on the order of the points nor on the threads.
 """
 
