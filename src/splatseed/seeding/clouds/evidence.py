@@ -15,7 +15,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
@@ -81,6 +81,10 @@ class Evidence:
     agreement: Float32[np.ndarray, " N"]
     through: UInt16[np.ndarray, " N"]
     confirmed: UInt16[np.ndarray, " N"]
+
+    def select(self, which: Bool[np.ndarray, " N"]) -> Evidence:
+        """That on some of the points."""
+        return Evidence(*(getattr(self, field.name)[which] for field in fields(Evidence)))
 
 
 def find_surfaces(

@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Float64
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views
@@ -29,7 +28,7 @@ from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
-    from splatseed.seeding.clouds.evidence import Evidence
+    from splatseed.seeding.clouds.judging import Judged
     from splatseed.seeding.clouds.streaming import Streamed
     from splatseed.views.view import View
 
@@ -42,12 +41,8 @@ in the right place have 0.8 to 1, those of another 0.1 to 0.25."""
 DOUBTFUL = 0.6
 ENOUGH = 50
 """Points of the scene below which the share says nothing."""
-AGREES = 0.5
-"""Least agreement of the photographs on a point's colour, where at least ``ASKED`` see it."""
-ASKED = 4
-THROUGH = 2
-"""Views that see through a point from which on it is not there, if fewer confirm it."""
-NEIGHBORS = 8
+UNKNOWN = 0.5
+"""Confidence of a point that fewer than two photographs see."""
 CORNER = 0.5
 """Below this share of the photographs' cells, a note says how little the cloud covers."""
 CELL = 8
@@ -135,62 +130,30 @@ class GivenClouds(Cloud):
 
     def _choose(self, scene: Scene, streamed: Streamed, progress: Progress) -> NewPoints:
         """The points that stay, their colours, and notes."""
-        from splatseed.seeding.clouds.evidence import FreeRays, find_evidence, find_surfaces  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.clouds.judging import judge  # noqa: PLC0415  (loads Numba)
         from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
-        voxels = streamed.voxels
-        images = _images(scene)
+        voxels, images = streamed.voxels, _images(scene)
         views = _views(scene, images, progress)
         visibility = find_visibility(scene)
-        seen = [
-            visibility.of(image) if len(visibility.xyz) else np.empty((0, 3)) for image in images
-        ]
-        surfaces, cell = find_surfaces(views, voxels.xyz, progress)
-        fit = _check_fit(views, surfaces, seen)
-        rays = FreeRays.of(views, seen) if scene.tracks is not None else None
-        evidence = find_evidence(views, voxels.xyz, surfaces, cell, rays, progress)
-        kept, fates = self._decide(voxels.xyz, evidence, progress)
-        rgb = self._paint(streamed, evidence)[kept]
-        confidence = np.nan_to_num(evidence.agreement, nan=AGREES)[kept]
-        covered = _note_on_cover(scene, voxels.xyz[kept])
-        notes = (*_read_notes(streamed), *fit, *fates, *covered)
-        source = np.full(len(rgb), source_code("cloud"), np.uint8)
-        return NewPoints(voxels.xyz[kept], rgb, notes, confidence=confidence, source=source)
-
-    def _decide(
-        self, xyz: np.ndarray, evidence: Evidence, progress: Progress
-    ) -> tuple[Bool[np.ndarray, " N"], tuple[str, ...]]:
-        """Which voxels stay, and a sentence on each reason why others do not."""
-        visible = evidence.seen > 0
-        if not visible.any():
-            raise PointCloudError(
-                "points of the cloud that a photograph sees", found="none", fix="Check the frame."
-            )
-        hidden = f"{np.count_nonzero(~visible):,} lie behind surfaces in every photograph"
-        if not self.clean:
-            return visible, (f"Of {len(xyz):,} points, {hidden}.",)
-        through = visible & (evidence.through >= THROUGH) & (evidence.through > evidence.confirmed)
-        differs = visible & ~through & (evidence.seen >= ASKED) & (evidence.agreement < AGREES)
-        kept = visible & ~through & ~differs
-        alone = np.zeros_like(kept)
-        alone[kept] = _isolated(xyz[kept], progress)
-        told = (
-            hidden,
-            f"photographs see past {np.count_nonzero(through):,}",
-            f"they do not agree on {np.count_nonzero(differs):,}",
-            f"{np.count_nonzero(alone):,} float alone",
-        )
-        return kept & ~alone, (f"Of {len(xyz):,} points, {', '.join(told)}: these are left out.",)
-
-    def _paint(self, streamed: Streamed, evidence: Evidence) -> UInt8[np.ndarray, "N 3"]:
-        """Colours: the cloud's, or the photographs' where it has none or they are preferred."""
-        sampled = ~np.isnan(evidence.agreement) | (evidence.rgb != 128).any(axis=1)
+        nothing = np.empty((0, 3))
+        seen = [visibility.of(image) if len(visibility.xyz) else nothing for image in images]
         colored = all(file.has_color for file in streamed.files)
-        if colored and not self.recolor:
-            return streamed.voxels.rgb
-        painted = all(file.colors != "none" for file in streamed.files)
-        own = streamed.voxels.rgb if painted else np.full_like(evidence.rgb, 128)
-        return np.where(sampled[:, None], evidence.rgb, own)
+        own = voxels.rgb if any(file.colors != "none" for file in streamed.files) else None
+        judged = judge(
+            views, seen, voxels, own if colored else None, progress,
+            clean=self.clean, tracked=scene.tracks is not None,
+        )  # fmt: skip
+        xyz, evidence = voxels.xyz[judged.kept], judged.evidence
+        rgb = evidence.rgb if own is None else own[judged.kept]
+        if scene.has_photographs and (self.recolor or not colored):
+            rgb = evidence.rgb
+        notes = (*_read_notes(streamed), *_check_fit(judged), *_fates(judged, len(voxels)))
+        return NewPoints(
+            xyz, rgb, (*notes, *_note_on_cover(scene, xyz)),
+            confidence=np.nan_to_num(evidence.agreement, nan=UNKNOWN),
+            source=np.full(len(xyz), source_code("cloud"), np.uint8),
+        )  # fmt: skip
 
 
 def _frames(scene: Scene) -> tuple[View, ...]:
@@ -237,42 +200,32 @@ def _span(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> st
     return f"from ({first}) to ({last})"
 
 
-def _check_fit(
-    views: Sequence[View], surfaces: Sequence[np.ndarray], seen: Sequence[np.ndarray]
-) -> tuple[str, ...]:
+def _check_fit(judged: Judged) -> tuple[str, ...]:
     """Refuse a cloud that does not lie where the scene's own points do.
 
     Raises:
         PointCloudError: It is of another place, or in another frame.
     """
-    from splatseed.seeding.clouds.evidence import surface_agreement  # noqa: PLC0415  (loads Numba)
-
-    share, count = surface_agreement(views, surfaces, seen)
-    if count < ENOUGH:
+    if judged.asked < ENOUGH:
         return ()
-    found = f"{share:.0%} of the scene's own points that are seen there lie at the cloud's depth"
-    if share < FITS:
+    found = f"{judged.fit:.0%} of the scene's own points that are seen there lie at its depth"
+    if judged.fit < FITS:
         raise PointCloudError(
-            "a cloud that fits the scene's own points", found=found,
+            "a cloud that fits the scene's own points",
+            found=found,
             fix="It is in another frame (try --align, or give --transform FILE), or of another "
             "place.",
-        )  # fmt: skip
-    doubt = ": check the frame" if share < DOUBTFUL else ""
-    return (f"{found}, within 10%{doubt}.",)
+        )
+    doubt = ": check its frame" if judged.fit < DOUBTFUL else ""
+    return (f"The cloud fits: {found}, within 10%{doubt}.",)
 
 
-def _isolated(xyz: np.ndarray, progress: Progress) -> Bool[np.ndarray, " N"]:
-    """Which points lie much farther from their neighbours than these from theirs."""
-    from splatseed.upsample.neighbors import prepare, sound_bases  # noqa: PLC0415  (loads SciPy)
-
-    if len(xyz) <= NEIGHBORS:
-        return np.zeros(len(xyz), bool)
-    points = PointCloud(xyz, np.zeros((len(xyz), 3), np.uint8))
-    distinct = np.flatnonzero(points.distinct)
-    cloud = prepare(points, progress=progress)
-    alone = np.zeros(len(xyz), bool)
-    alone[distinct[cloud.rank]] = sound_bases(cloud, cloud.neighbors(NEIGHBORS)) == 0
-    return alone
+def _fates(judged: Judged, num: int) -> tuple[str, ...]:
+    """How many voxels stay, and why others do not."""
+    gone = [f"{count:,} {reason}" for reason, count in judged.reasons.items() if count]
+    gone = [f"{judged.hidden:,} are hidden in every photograph", *gone]
+    told = f"{len(judged.kept):,} stay of the {num:,} points that they were merged to"
+    return (f"{told}: {', '.join(gone)}.",)
 
 
 def _read_notes(streamed: Streamed) -> tuple[str, ...]:
