@@ -21,15 +21,56 @@ from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.seeding.coverage import grid_from_world
 from splatseed.views.view import View
 
-__all__ = ["BYTES_EACH", "Voxels"]
+__all__ = ["BYTES_EACH", "EvenVoxels", "Voxels"]
 
 BYTES_EACH = 320
 """Bytes per voxel, at most: 45 here, the others where voxels are looked at, thinned and written."""
 CHUNKS, BLOCK = 64, 512
 UNSEEN = -(1 << 15)
+FINEST = 20
+"""Halvings of the first points' extent that make the first side of even voxels."""
 
 
-class Voxels:
+class _Growing:
+    """Voxels that grow when they are all filled.
+
+    Attributes:
+        coarser: s, how often they did.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._entries = _Entries(capacity)
+        self.coarser = 0
+
+    def __len__(self) -> int:
+        return self._entries.num
+
+    @property
+    def xyz(self) -> Float32[np.ndarray, "N 3"]:
+        """Mean positions."""
+        return self._entries.mean[: len(self)]
+
+    @property
+    def rgb(self) -> UInt8[np.ndarray, "N 3"]:
+        """Mean colours."""
+        return np.asarray(np.rint(self._entries.color[: len(self)]).astype(np.uint8))
+
+    def _fill(
+        self,
+        xyz: Float64[np.ndarray, "n 3"],
+        rgb: UInt8[np.ndarray, "n 3"],
+        levels: Int16[np.ndarray, " n"],
+    ) -> None:
+        """Merge points into voxels, which grow when none is free."""
+        at = 0
+        while at < len(xyz):
+            at = self._entries.fill(at, xyz, rgb, levels, self.coarser)
+            while at < len(xyz) and self._entries.num == self._entries.capacity:
+                self.coarser += 1
+                self._entries = self._entries.merged(self.coarser)
+
+
+class Voxels(_Growing):
     """Points merged as they come.
 
     Args:
@@ -40,30 +81,16 @@ class Voxels:
     Attributes:
         total: Points given.
         unseen: Of these, those that fall in no frame.
-        coarser: s, how often voxels were made coarser.
     """
 
     def __init__(self, views: Sequence[View], pixels: float, capacity: int) -> None:
+        super().__init__(capacity)
         matrices = np.stack([grid_from_world(view, 1) for view in views])
         focals = [np.sqrt(abs(view.K[0, 0] * view.K[1, 1])) for view in views]
         self._matrices = matrices.astype(np.float32)
         self._sides = (pixels / np.array(focals)).astype(np.float32)
         self._sizes = np.array([[view.width, view.height] for view in views], np.float32)
-        self._entries = _Entries(capacity)
-        self.total = self.unseen = self.coarser = 0
-
-    def __len__(self) -> int:
-        return self._entries.num
-
-    @property
-    def xyz(self) -> Float32[np.ndarray, "N 3"]:
-        """Mean positions, world."""
-        return self._entries.mean[: len(self)]
-
-    @property
-    def rgb(self) -> UInt8[np.ndarray, "N 3"]:
-        """Mean colours."""
-        return np.asarray(np.rint(self._entries.color[: len(self)]).astype(np.uint8))
+        self.total = self.unseen = 0
 
     @property
     def count(self) -> Int32[np.ndarray, " N"]:
@@ -84,21 +111,31 @@ class Voxels:
         colors = np.zeros((1, 3), np.uint8) if rgb is None else np.ascontiguousarray(rgb)
         self.total += len(xyz)
         self.unseen += int(np.count_nonzero(levels == UNSEEN))
-        at = 0
-        while at < len(xyz):
-            at = self._entries.fill(at, xyz, colors, levels, self.coarser)
-            if at < len(xyz):
-                self._coarsen()
+        self._fill(xyz, colors, levels)
 
-    def _coarsen(self) -> None:
-        """Merge voxels into those of twice the side, until some are free."""
-        full = self._entries
-        while full.num == full.capacity:
-            self.coarser += 1
-            merged = _Entries(full.capacity)
-            merged.merge(full, self.coarser)
-            full = merged
-        self._entries = full
+
+class EvenVoxels(_Growing):
+    """Points merged in voxels of one side, which doubles until ``capacity`` suffice."""
+
+    def __init__(self, capacity: int) -> None:
+        super().__init__(capacity)
+        self._level = 0
+
+    @property
+    def spacing(self) -> float:
+        """The side of the voxels."""
+        return float(np.exp2(float(self._level + self.coarser)))
+
+    def add(
+        self, xyz: Float64[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"] | None = None
+    ) -> None:
+        """Merge points, finite."""
+        if not len(self):
+            extent = max(float(np.ptp(xyz, axis=0).max()), float(np.finfo(np.float32).tiny))
+            self._level = int(np.floor(np.log2(extent))) - FINEST
+        levels = np.full(len(xyz), self._level, np.int16)
+        colors = np.zeros((1, 3), np.uint8) if rgb is None else np.ascontiguousarray(rgb)
+        self._fill(np.ascontiguousarray(xyz), colors, levels)
 
 
 class _Entries:
@@ -132,14 +169,16 @@ class _Entries:
         self.num = int(num)
         return int(at)
 
-    def merge(self, finer: _Entries, coarser: int) -> None:
-        """Fill with the voxels of another."""
-        self.num = int(
+    def merged(self, coarser: int) -> _Entries:
+        """The same in voxels of a greater side."""
+        new = _Entries(self.capacity)
+        new.num = int(
             _merge(
-                finer.mean, finer.color, finer.count, finer.level, finer.num, coarser,
-                self.keys, self.mean, self.color, self.count, self.level, self.table,
+                self.mean, self.color, self.count, self.level, self.num, coarser,
+                new.keys, new.mean, new.color, new.count, new.level, new.table,
             )
         )  # fmt: skip
+        return new
 
 
 @kernel
