@@ -32,8 +32,13 @@ __all__ = ["Alignment", "align"]
 
 LEAST_MARKS = 200
 MOST_MARKS = 20000
-ROUNDS = ((160, 500, 8, 0.15), (24, 2000, 20, 0.06), (6, MOST_MARKS, 40, 0.03))
-"""Stages: alignments, marks, rounds of ICP, and the first reach in extents."""
+ROUNDS = (
+    (150, 250, 10, 0.25, 0.04),
+    (16, 1500, 15, 0.1, 0.02),
+    (4, MOST_MARKS, 40, 0.04, 0.01),
+)
+"""Stages: alignments, marks, rounds of ICP, the first reach, and within how much of the cloud marks
+count, in extents."""
 FINEST = 0.002
 """Least reach, in extents."""
 CLOSE = 0.01
@@ -201,17 +206,17 @@ def _candidates(
     Raises:
         PointCloudError: None holds.
     """
-    starts = find_starts(cloud, marks, ROUNDS[0][0])
+    starts = find_starts(cloud, marks, ROUNDS[0][0], progress)
     rows = zip(starts.scale, starts.rotation, starts.shift, strict=True)
     waiting = [Similarity(float(scale), rotation, shift) for scale, rotation, shift in rows]
     found: list[_Candidate] = []
-    for stage, (num, count, rounds, far) in enumerate(ROUNDS):
+    for stage, (num, count, rounds, far, close) in enumerate(ROUNDS):
         some = marks[:: -(-len(marks) // count)]
         found = []
         for i, start in enumerate(waiting[:num]):
             fitted = fit(surface, some, start, far, rounds, FINEST)
             if fitted is not None and 0.3 < fitted.cloud_from_scene.scale < 3.0:
-                found.append(_Candidate(fitted, float(np.mean(fitted.residuals < CLOSE))))
+                found.append(_Candidate(fitted, float(np.mean(fitted.residuals < close))))
             progress("align", (stage + (i + 1) / len(waiting[:num])) / len(ROUNDS))
         found = _different(sorted(found, key=lambda each: -each.share))
         waiting = [each.fitted.cloud_from_scene for each in found]

@@ -1,9 +1,11 @@
-"""Coarse alignment: every orientation, at several scales and shifts, by a grid of distances.
+"""Coarse alignment: every orientation and shift, at several scales, by correlation on a grid.
 
-Notation: both clouds are first brought to extent 1 around 0 (``Unit``). A start takes a *mark* (a
-point of the scene) to the cloud's frame: x -> s R x + t. Its cost is the mean distance from a mark
-to the cloud, at most ``FAR``, in units of the scene's extent: divided by s, since otherwise
-shrinking all marks to one point of the cloud would be best.
+Notation: both clouds are first brought to root mean square size 1 around 0 (``Unit``). A start
+takes a *mark* (a point of the scene) to the cloud's frame: x -> s R x + t. Its *reward* is the mean
+over the marks of max(``FAR`` - d / s, 0), with d the distance to the cloud: in the scene's units,
+as otherwise shrinking all marks to one point of the cloud would be best. For each rotation and
+scale the rewards of all shifts are one correlation of the marks' histogram with the grid of
+max(``FAR`` - d / s, 0), computed by Fourier transforms.
 Promise: the same points give the same starts; nothing is random.
 
 Orientations are Alexa's super-Fibonacci spirals on unit quaternions ("Super-Fibonacci Spirals:
@@ -18,20 +20,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from splatseed.kernels.jit import kernel, parallel_range
+from splatseed.progress import Progress, silent
 from splatseed.similarity import Similarity
 
-__all__ = ["Unit", "find_starts", "spread_rotations"]
+__all__ = ["Unit", "even", "find_starts", "spread_rotations"]
 
-ROTATIONS = 4000
-"""About 12 degrees from any orientation to the nearest."""
-SCALES = (0.65, 0.8, 1.0, 1.25, 1.55)
-SHIFTS = (-0.15, 0.0, 0.15)
-"""Along each axis, in units of the extent."""
-MARKS = 256
-CELLS, HALF = 96, 1.2
+ROTATIONS = 1200
+"""About 18 degrees from any orientation to the nearest."""
+SCALES = (0.7, 0.84, 1.0, 1.19, 1.42)
+EVEN = 0.1
+"""Side of the cells of which each counts once, however many marks it holds."""
+CELLS, HALF = 36, 2.7
 """Cells of the grid along each axis, and half its side."""
-FAR = 0.15
+FAR = 0.3
+INNER = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ class Unit:
 
     Args:
         center: float64 [3].
-        extent: Greatest extent along an axis.
+        extent: Root mean square distance from it.
     """
 
     center: Float64[np.ndarray, " 3"]
@@ -48,10 +50,13 @@ class Unit:
 
     @classmethod
     def of(cls, xyz: Float64[np.ndarray, "N 3"]) -> Unit:
-        """That of some points; the size does not change when they are turned."""
+        """That of some points; the farthest twentieth does not count."""
         center = np.median(xyz, axis=0)
-        distance = np.linalg.norm(xyz - center, axis=1)
-        return cls(center, float(np.sqrt(np.mean(np.sort(distance)[: int(0.95 * len(xyz))] ** 2))))
+        for _ in range(3):
+            distance = np.linalg.norm(xyz - center, axis=1)
+            inner = xyz[distance <= np.quantile(distance, INNER)]
+            center = inner.mean(axis=0)
+        return cls(center, float(np.sqrt(np.mean(np.sum((inner - center) ** 2, axis=1)))))
 
     @property
     def similarity(self) -> Similarity:
@@ -65,30 +70,54 @@ class Starts(NamedTuple):
     rotation: Float64[np.ndarray, "n 3 3"]
     scale: Float64[np.ndarray, " n"]
     shift: Float64[np.ndarray, "n 3"]
-    cost: Float64[np.ndarray, " n"]
+    reward: Float64[np.ndarray, " n"]
 
 
 def find_starts(
-    cloud: Float64[np.ndarray, "N 3"], marks: Float64[np.ndarray, "M 3"], num: int
+    cloud: Float64[np.ndarray, "N 3"],
+    marks: Float64[np.ndarray, "M 3"],
+    num: int,
+    progress: Progress = silent,
 ) -> Starts:
-    """The best starts of different orientations.
+    """The best starts, one for each orientation.
 
     Args:
         cloud: Its points, at unit size.
         marks: The scene's points, at unit size.
         num: How many starts.
+        progress: Told how far it is.
     """
-    some = marks[:: -(-len(marks) // MARKS)]
-    rotations = spread_rotations(ROTATIONS)
-    shifts = np.stack(np.meshgrid(SHIFTS, SHIFTS, SHIFTS, indexing="ij"), axis=-1).reshape(-1, 3)
-    costs = np.empty((len(rotations), len(SCALES), len(shifts)))
-    _score(some, rotations, np.array(SCALES), shifts, _distances(cloud), HALF, FAR, costs)
-    flat = costs.reshape(len(rotations), -1)
-    best = flat.argmin(axis=1)
-    cost = flat[np.arange(len(flat)), best]
-    order: Int64[np.ndarray, " n"] = np.argsort(cost, kind="stable")[:num]
-    scale, shift = np.unravel_index(best[order], costs.shape[1:])
-    return Starts(rotations[order], np.array(SCALES)[scale], shifts[shift], cost[order])
+    from scipy.fft import irfftn, rfftn  # noqa: PLC0415  (slow to import)
+
+    shape, side = (CELLS,) * 3, 2 * HALF / CELLS
+    distances = _distances(cloud)
+    rotations, some = spread_rotations(ROTATIONS), even(marks, EVEN)
+    fields = [rfftn(np.maximum(FAR - distances / scale, 0).astype(np.float32)) for scale in SCALES]
+    reward = np.full(len(rotations), -np.inf)
+    scale, shift = np.empty(len(rotations)), np.empty((len(rotations), 3))
+    for r, rotation in enumerate(rotations):
+        turned = some @ rotation.T
+        for s, field in zip(SCALES, fields, strict=True):
+            cells = np.floor(s * turned / side).astype(np.int64) % CELLS
+            flat = np.ravel_multi_index(tuple(cells.T), shape)
+            counts = np.bincount(flat, minlength=CELLS**3).reshape(shape).astype(np.float32)
+            rewards = irfftn(field * np.conj(rfftn(counts)), shape)
+            if rewards.max() > reward[r]:
+                best = np.array(np.unravel_index(int(rewards.argmax()), shape))
+                reward[r], scale[r] = rewards.max(), s
+                shift[r] = (best + 0.5) * side - HALF
+        if r % 50 == 0:
+            progress("try orientations", r / len(rotations))
+    progress("try orientations", 1.0)
+    order: Int64[np.ndarray, " n"] = np.argsort(-reward, kind="stable")[:num]
+    return Starts(rotations[order], scale[order], shift[order], reward[order] / len(some))
+
+
+def even(xyz: Float64[np.ndarray, "N 3"], side: float) -> Float64[np.ndarray, "M 3"]:
+    """The first point in each cell of this side."""
+    cells = np.floor(xyz / side).astype(np.int64)
+    first = np.unique(cells, axis=0, return_index=True)[1]
+    return xyz[np.sort(first)]
 
 
 def spread_rotations(num: int) -> Float64[np.ndarray, "n 3 3"]:
@@ -116,27 +145,3 @@ def _distances(cloud: Float64[np.ndarray, "N 3"]) -> np.ndarray:
     empty = np.ones((CELLS,) * 3, np.bool_)
     empty[tuple(place.T)] = False
     return np.asarray(distance_transform_edt(empty) * side, np.float32)
-
-
-@kernel
-def _score(marks, rotations, scales, shifts, grid, half, far, costs):  # type: ignore[no-untyped-def]  # Numba's types
-    """The cost of every start."""
-    per_side = len(grid) / (2.0 * half)
-    for r in parallel_range(len(rotations)):
-        turned = np.empty((len(marks), 3))
-        for m in range(len(marks)):
-            for axis in range(3):
-                turned[m, axis] = 0.0
-                for k in range(3):
-                    turned[m, axis] += rotations[r, axis, k] * marks[m, k]
-        for s in range(len(scales)):
-            for t in range(len(shifts)):
-                total = 0.0
-                for m in range(len(marks)):
-                    i = int((scales[s] * turned[m, 0] + shifts[t, 0] + half) * per_side)
-                    j = int((scales[s] * turned[m, 1] + shifts[t, 1] + half) * per_side)
-                    k = int((scales[s] * turned[m, 2] + shifts[t, 2] + half) * per_side)
-                    inside = 0 <= min(i, j, k) and max(i, j, k) < len(grid)
-                    distance = grid[i, j, k] / scales[s] if inside else far
-                    total += min(distance, far)
-                costs[r, s, t] = total / len(marks)
