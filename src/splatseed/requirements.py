@@ -21,6 +21,9 @@ INSTALL = {
     "imageio_ffmpeg": "imageio-ffmpeg>=0.6",
     "viser": "viser>=1.1",
     "zstandard": "zstandard>=0.22",
+    "laspy": "laspy>=2.5",
+    "lazrs": "lazrs>=0.6",
+    "pye57": "pye57>=0.4.13",
 }
 """What to ask pip for, as in pyproject.toml: splatseed's extras can only be installed from its
 folder."""

@@ -12,7 +12,6 @@ refused, naming a transform that fits if there is one.
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
@@ -21,8 +20,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.photograph import photograph_bytes
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io.transform_file import NERFSTUDIO, read_json, similarity_in
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import Gaussians
@@ -47,7 +46,6 @@ SAMPLES = 3000
 LEAST = 20
 VISIBLE = -2.2
 """Logit of the least opacity that counts, a tenth."""
-NERFSTUDIO = "dataparser_transforms.json"
 FILES = (NERFSTUDIO, "cameras.json")
 """Files of nerfstudio and graphdeco, in the model's folder or up to three above, that give a
 transform."""
@@ -150,48 +148,10 @@ def _candidates(path: Path, scene: Scene) -> Iterator[tuple[str, Similarity | No
 
 def _of_file(path: Path, scene: Scene) -> Similarity:
     """A transform from a file: a matrix, nerfstudio's ``transform`` and ``scale``, or cameras."""
-    content = _json(path)
+    content = read_json(path, _FIX)
     if isinstance(content, list) and content and isinstance(content[0], dict):
         return _of_cameras(path, content, scene)
-    scale = content.get("scale", 1.0) if isinstance(content, dict) else 1.0
-    rows = content.get("transform") if isinstance(content, dict) else content
-    try:
-        matrix = np.atleast_1d(np.array(rows, np.float64))
-        matrix = np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]])
-        if path.name == NERFSTUDIO:
-            matrix = matrix @ _unapplied(scene)
-        world = similarity_of(matrix)
-    except (TypeError, ValueError):
-        world = None
-    if world is None:
-        raise SceneFormatError(
-            f"{path} to hold a similarity: a matrix of 3 or 4 rows of 4, by itself or as "
-            "transform, with a scale beside it",
-            found=repr(rows)[:80],
-            fix=_FIX,
-        )
-    return world
-
-
-def _unapplied(scene: Scene) -> Float64[np.ndarray, "4 4"]:
-    """From the scene's world to the one that nerfstudio's transform begins from, COLMAP's own.
-
-    A scene read from transforms.json is in that file's world, to which ``applied_transform`` leads.
-    """
-    path = None if scene.source is None else scene.source.transforms_path
-    if path is None:
-        return np.eye(4)
-    applied = _json(path).get("applied_transform", np.eye(4)[:3])
-    return np.linalg.inv(np.vstack([np.array(applied, np.float64)[:3], np.eye(4)[3:]]))
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json.loads(photograph_bytes(path))
-    except SceneNotFoundError:
-        raise SceneNotFoundError(f"a file {path}", found="none", fix=_FIX) from None
-    except (SceneFormatError, ValueError, RecursionError) as error:
-        raise SceneFormatError(f"{path} to be JSON", found=str(error), fix=_FIX) from None
+    return similarity_in(path, content, scene, _FIX)
 
 
 def _of_cameras(path: Path, cameras: Sequence[Any], scene: Scene) -> Similarity:

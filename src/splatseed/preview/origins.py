@@ -40,6 +40,7 @@ COLORS: Mapping[int, tuple[int, int, int]] = MappingProxyType(
         SOURCE_CODES["random"]: (128, 128, 128),
         SOURCE_CODES["stereo"]: (0, 114, 178),
         SOURCE_CODES["cover"]: (213, 94, 0),
+        SOURCE_CODES["cloud"]: (240, 228, 66),
         GENERATED: (140, 86, 75),
     }
 )

@@ -12,5 +12,6 @@ add_built_in(
         "stereo": "splatseed.seeding.photographs:Stereo",
         "cover": "splatseed.seeding.photographs:Cover",
         "auto": "splatseed.seeding.photographs:Auto",
+        "cloud": "splatseed.seeding.clouds.method:Cloud",
     }
 )

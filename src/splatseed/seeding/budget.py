@@ -51,22 +51,23 @@ def parse_budget(budget: str | float, pixels: float) -> int:
     """The number of seeds that a budget asks for.
 
     Args:
-        budget: A number such as 50000 or "50000", or "0.25rho" for Gaussians per pixel of one
-            image.
+        budget: A number such as 50000, "50000", "50k" or "0.5M", or "0.25rho" for Gaussians per
+            pixel of one image.
         pixels: Pixels of one image; see ``median_pixels``.
 
     Raises:
         ParameterError: It is neither, or below one seed.
     """
     text = str(budget).strip().lower()
-    factor = pixels if text.endswith("rho") else 1.0
+    units = {"rho": pixels, "k": 1e3, "m": 1e6}
+    unit = next((each for each in units if text.endswith(each)), "")
     try:
-        number = float(text.removesuffix("rho")) * factor
+        number = float(text.removesuffix(unit)) * units.get(unit, 1.0)
     except ValueError:
         number = np.nan
     if not (np.isfinite(number) and round(number) >= 1):
         raise ParameterError(
-            "a budget such as 50000, or 0.25rho (a quarter of the pixels of an image)",
+            "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
             found=repr(budget),
             fix="Give a number of at least one seed.",
         )

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.kernels.jit import inline
@@ -31,6 +31,7 @@ from splatseed.views.view import View
 __all__ = [
     "HIDING",
     "NEARER",
+    "cell_counts",
     "cell_depths",
     "check_points",
     "covered_cells",
@@ -137,6 +138,16 @@ def cell_depths(
     visible = np.empty_like(quartiles)
     _drop_hidden(quartiles, visible)
     return visible
+
+
+def cell_counts(
+    view: View, xyz: Float32[np.ndarray, "N 3"], cell: float
+) -> Int64[np.ndarray, " C"]:
+    """How many points lie in each of a view's cells, visible or not, row by row."""
+    rows, cols = grid_of(view, cell)
+    cells, depths = np.empty(len(xyz), np.int32), np.empty(len(xyz), np.float32)
+    _find_cells(xyz, grid_from_world(view, cell), rows, cols, cells, depths)
+    return np.bincount(cells[cells >= 0], minlength=rows * cols)
 
 
 @inline

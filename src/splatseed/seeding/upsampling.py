@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from splatseed.pointcloud import ATTRIBUTES, PointCloud
+from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views, with_cover
@@ -44,6 +44,9 @@ INTERPOLATING = ("linear", "triangle", "spline", "mls", "voronoi", "random")
 """Methods that interpolate between points; ``verify`` checks their points against the
 photographs."""
 
+FILLING = ("auto", "cover", "stereo")
+"""Methods that look where there are points already."""
+
 Note = Callable[[str], None]
 
 
@@ -56,6 +59,7 @@ def upsample(
     budget: int | str | None = None,
     cover: int | None = None,
     verify: bool = False,
+    beside: Upsampler | None = None,
     seed: int = 0,
     profile: Profile = "default",
     progress: Progress = silent,
@@ -78,6 +82,8 @@ def upsample(
         cover: Side in pixels of the parts of the photographs that get a seed if no point falls in.
         verify: Check interpolated points against the photographs: slide them onto the surface, drop
             those that do not fit.
+        beside: Another method, such as ``Cloud().of("scan.laz")``, whose points come before those
+            of ``method``; ``auto`` and ``cover`` take them into account.
         seed: The same seed gives the same bytes, whatever the number of threads.
         profile: "default", or "paper" for the paper's text to the letter.
         progress: Told each stage and the fraction done.
@@ -104,7 +110,7 @@ def upsample(
     """
     whole = scene if isinstance(scene, Scene) else Scene(scene)
     most = None if budget is None else points_within(whole, budget)
-    if DEFAULT_METHOD in {method, getattr(method, "name", None)}:
+    if beside is None and DEFAULT_METHOD in {method, getattr(method, "name", None)}:
         method = method_for(scene, method, note)
         originals = whole.points.originals
         originals = originals.select(originals.distinct)
@@ -115,10 +121,14 @@ def upsample(
                 "they are thinned, and none are added."
             )
             return thin_to(whole, originals, most, CELL, 0, seed, progress)
+    options: dict[str, Any] = {"seed": seed, "progress": progress, "note": note}
+    first = None if beside is None else add_points(whole, beside, **options)
     cloud = add_points(
-        scene, method, ratio=ratio, num_points=num_points, seed=seed, profile=profile,
-        progress=progress, note=note, **parameters,
+        scene if first is None else _with(whole, first, method), method, ratio=ratio,
+        num_points=num_points, profile=profile, **options, **parameters,
     )  # fmt: skip
+    if first is not None:
+        cloud = PointCloud.concatenate(first, cloud.select(cloud.source != ORIGINAL))
     if verify:
         cloud = add_verified(whole, cloud, progress=progress, note=note)
     if cover is not None:
@@ -127,6 +137,15 @@ def upsample(
         hold_out = getattr(method, "hold_out", parameters.get("hold_out", 0))
         cloud = thin_to(whole, cloud, most, cover or CELL, hold_out, seed, progress)
     return cloud
+
+
+def _with(scene: Scene, points: PointCloud, method: str | Upsampler) -> Scene:
+    """The scene with other points, for a method.
+
+    Methods that fill gaps look at originals only, so for these all points are.
+    """
+    name = method if isinstance(method, str) else getattr(method, "name", None)
+    return scene.replace(points=points.replace(source=None) if name in FILLING else points)
 
 
 def add_cover(

@@ -52,7 +52,7 @@ class NewPoints(NamedTuple):
     """Codes of the methods that made them, uint8 [M], never 0; the method's own when left out."""
 
 
-Need = Literal["points", "depth", "photographs"]
+Need = Literal["points", "depth", "photographs", "cloud"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -42,6 +42,7 @@ SOURCE_CODES = {
     "random": 7,
     "stereo": 8,
     "cover": 9,
+    "cloud": 10,
 }
 """The ``PointCloud.source`` code of each built-in method."""
 

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import numpy as np
 import tyro
 
 from splatseed.commands.info.advice import run_advice
 from splatseed.commands.options import parse_options
+from splatseed.commands.upsample.cloud import CLOUD, Bringing, cloud_method, settle_cloud
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
 from splatseed.commands.upsample.start import check_start, write_start
 from splatseed.console import (
@@ -42,6 +43,9 @@ from splatseed.upsample import (
     planned_size,
     traits_of,
 )
+
+if TYPE_CHECKING:
+    from splatseed.seeding.clouds.method import Cloud
 
 __all__ = ["Options", "parse", "run"]
 
@@ -119,8 +123,23 @@ class Options:
     depth_scale: Annotated[float | None, _number(float, "what the folder says")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
     align: bool = True
-    """For --method depth: --no-align takes metric depth and poses as given
-    (--depth.no-align)."""
+    """With --cloud, --align finds the transform to the scene's own points; for --method depth,
+    --no-align takes metric depth and poses as given (--depth.no-align)."""
+    cloud_files: Annotated[
+        tyro.conf.UseAppendAction[tuple[Path, ...]],
+        tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),
+    ] = ()
+    """Seeds from a scan or a dense cloud, in any format that docs/scans.md lists; alone, or beside
+    those of --method auto, stereo, cover or depth."""
+    cloud_transform: Annotated[
+        Path | None,
+        tyro.conf.arg(name="transform", constructor=Path, help_behavior_hint="(default: none)"),
+    ] = None
+    """For --cloud: a 4x4 matrix from its frame to the scene's, as text or JSON, or nerfstudio's
+    dataparser_transforms.json."""
+    recenter: bool = False
+    """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
+    cloud_align: tyro.conf.Suppress[bool] = False
     preview: bool = False
     """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's
     maps."""
@@ -136,6 +155,11 @@ class Options:
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
 
+    @property
+    def bringing(self) -> Bringing:
+        """The options about clouds."""
+        return Bringing(self.cloud_files, self.cloud_transform, self.cloud_align, self.recenter)
+
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """The options, and every method with its parameters, from the words of the command line."""
@@ -149,7 +173,7 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     methods = {name: getattr(options, name) for name in METHODS}
     if not options.align:
         methods["depth"] = dataclasses.replace(methods["depth"], align=False)
-    return options, methods
+    return settle_cloud(options, arguments), methods
 
 
 def _help(arguments: list[str]) -> None:
@@ -187,7 +211,8 @@ def run(arguments: list[str]) -> None:
         return
     options, methods = parse(arguments)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
-    inputs = [path for path in (options.scene, options.depth_maps) if path is not None]
+    given = (options.scene, options.depth_maps, options.cloud_transform, *options.cloud_files)
+    inputs = [path for path in given if path is not None]
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=inputs)
     if options.gaussians is not None:
         check_start(options.gaussians, options.output, overwrite=options.overwrite)
@@ -198,11 +223,13 @@ def run(arguments: list[str]) -> None:
         if options.gaussians is not None:
             photographed(scene)  # raises without photographs: views bound the Gaussians' sizes
         options = _settle(options, scene, notes)
+        methods = _with_clouds(options, scene, methods)
         method = methods[options.method]
         total = _planned(options, method, len(scene.points))
     _announce(options, scene, method, total, _idle(options, methods))
     with stage_display(clock):
-        seeds = _make(options, scene, method, total, clock, notes)
+        beside = methods[CLOUD] if options.cloud_files and options.method != CLOUD else None
+        seeds = _make(options, scene, method, beside, total, clock, notes)
         clock("check", 0.0)
         checks = _check(scene, seeds, method)
         clock("write", 0.0)
@@ -235,6 +262,16 @@ def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
     return dataclasses.replace(options, method=str(method))
 
 
+def _with_clouds(
+    options: Options, scene: Scene, methods: dict[str, Upsampler]
+) -> dict[str, Upsampler]:
+    """The methods, with ``cloud`` knowing its files and their frame."""
+    if not options.cloud_files:
+        return methods
+    plain = cast("Cloud", methods[CLOUD])
+    return {**methods, CLOUD: cloud_method(options.bringing, scene, plain)}
+
+
 def _planned(options: Options, method: Upsampler, count: int) -> int | None:
     """Points in all; None if the photographs determine the number."""
     new = number_of_new(method, options.method, count, options.ratio, options.num_points)
@@ -245,6 +282,7 @@ def _make(
     options: Options,
     scene: Scene,
     method: Upsampler,
+    beside: Upsampler | None,
     total: int | None,
     clock: StageClock,
     notes: list[str],
@@ -252,7 +290,7 @@ def _make(
     """The originals and the new points."""
     return upsample(
         scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
-        verify=options.verify, seed=options.seed, progress=clock, note=notes.append,
+        verify=options.verify, beside=beside, seed=options.seed, progress=clock, note=notes.append,
     )  # fmt: skip
 
 
@@ -295,7 +333,7 @@ def _announce(
     for name in idle:
         print_note(f"The flags of {name} have no effect with --method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
-    parameters = ", ".join(f"{k}={v}" for k, v in dataclasses.asdict(method).items())  # type: ignore[call-overload]  # a method is a dataclass
+    parameters = ", ".join(f"{k}={v}" for k, v in _parameters(method).items())
     number = "as many as the photographs need" if total is None else f"{total:,} points"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} "
@@ -313,6 +351,7 @@ def _idle(options: Options, methods: dict[str, Upsampler]) -> list[str]:
     changed = {name for name in methods if methods[name] != plain[name]}
     if options.depth_maps is not None:
         changed.add("depth")
+    changed -= {CLOUD} if options.cloud_files else set()
     return [name for name in methods if name in changed - {options.method}]
 
 
@@ -327,13 +366,20 @@ def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
     )
 
 
+def _parameters(method: Upsampler) -> dict[str, object]:
+    """The parameters of a method; a cloud's files are told elsewhere."""
+    given = dataclasses.asdict(method)  # type: ignore[call-overload]  # a method is a dataclass
+    return {name: given[name] for name in given if name not in {"files", "transform"}}
+
+
 def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
     """How the output was made, for ``splatseed.json``."""
     return {
         "command": "upsample",
         "method": options.method,
         "profile": options.profile,
-        "parameters": dataclasses.asdict(method),  # type: ignore[call-overload]  # a method is a dataclass
+        "parameters": _parameters(method),
+        "cloud": options.bringing.provenance if options.cloud_files else None,
         "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
         "ratio": options.ratio,
         "num_points_asked": options.num_points,

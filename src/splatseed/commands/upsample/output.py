@@ -63,7 +63,7 @@ def write_previews(
     )
 
     clouds = {}
-    for name in methods_for(scene):
+    for name in dict.fromkeys((*methods_for(scene), method)):
         if name == method:
             clouds[name] = seeds
             continue

@@ -89,12 +89,16 @@ class TextTable:
         Raises:
             SceneFormatError: A word is no number, or lines are missing.
         """
-        left = self.count
-        skip, given = self.skip, 0
-        for lines in _gathered(self._lines(), size, skip, left):
-            table = self._table(lines, given)
+        for chunk, _ in self.tables(size):
+            yield chunk
+
+    def tables(self, size: int) -> Iterator[tuple[CloudChunk, Callable[[str], np.ndarray]]]:
+        """The same, and with each chunk its columns by name."""
+        left, given = self.count, 0
+        for lines in _gathered(self._lines(), size, self.skip, left):
+            column = self._column(self._table(lines, given))
             given += len(lines)
-            yield chunk_of(self._painter, self._column(table))
+            yield chunk_of(self._painter, column), column
         if left is not None and given < left:
             raise SceneFormatError(
                 f"{left:,} points in {self.path}, as its header promises",

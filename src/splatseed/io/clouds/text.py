@@ -1,0 +1,172 @@
+"""XYZ, CSV, TXT, ASC and PTS: a point per line, whatever stands between the numbers.
+
+The delimiter, a decimal comma, and a line of names are recognised from the first lines. Without
+names, columns 1 to 3 are the position; of the others, three whole numbers from 0 to 65535 in a row,
+or three numbers from 0 to 1 that are not unit normals, are the colour, and the fourth of four is
+intensity. A PTS file begins with the number of its points and has intensity before colours.
+Promise: what was assumed about columns without names is told in ``warnings``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.errors import SceneFormatError
+from splatseed.io.clouds.cloud_file import CHUNK, CloudChunk, CloudFile
+from splatseed.io.clouds.rows import RGB_NAMES, XYZ, Columns
+from splatseed.io.clouds.tables import Dialect, TextTable
+from splatseed.io.files import open_file
+
+__all__ = ["TextCloud"]
+
+_LOOKED_AT = 1 << 16
+"""Bytes from which names and columns are recognised."""
+_NAMES = {
+    "easting": "x",
+    "northing": "y",
+    "elevation": "z",
+    "height": "z",
+    "altitude": "z",
+    "rf": "red",
+    "gf": "green",
+    "bf": "blue",
+    "r": "red",
+    "g": "green",
+    "b": "blue",
+    "i": "intensity",
+}
+"""What columns are called elsewhere, in lower case."""
+_MARKS = re.compile(r"^(//|#|%|;)+\s*")
+_UNIT = 1e-2
+"""By how much the length of a triple may differ from 1 for it to count as a normal."""
+_RGB = RGB_NAMES[0]
+
+
+class TextCloud(CloudFile):
+    """A text file of points.
+
+    Raises:
+        SceneFormatError: Its lines hold no three numbers.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with open_file(path) as file:
+            head = file.read(_LOOKED_AT).decode("latin-1")
+            whole = len(head) < _LOOKED_AT
+        lines = head.split("\n") if whole else head.split("\n")[:-1]
+        first, dialect = _first_line(path, lines)
+        rows = [line.strip() for line in lines[first:] if line.strip()]
+        sample = _parse(path, rows, dialect)
+        names = _named(lines[:first], dialect, sample.shape[1])
+        if names is None:
+            names = _guessed(sample, path.suffix.lower() == ".pts")
+            self.warnings = (_told(path, names),)
+        columns = Columns.among(names)
+        self.colors = columns.colors
+        offset = sum(len(line) + 1 for line in lines[:first])  # latin-1: a byte per character
+        self._table = TextTable(path, names, columns, offset, dialect=dialect)
+
+    def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
+        """See ``CloudFile.chunks``."""
+        yield from self._table.chunks(size)
+
+
+def _first_line(path: Path, lines: Sequence[str]) -> tuple[int, Dialect]:
+    """The first line of at least three numbers, and how it is written."""
+    for i, line in enumerate(lines):
+        for dialect in _dialects(line):
+            if line.strip() and len(_words(line, dialect)) >= 3 and _is_numeric(line, dialect):
+                return i, dialect
+    found = next((repr(line.strip()[:60]) for line in lines if line.strip()), "an empty file")
+    raise SceneFormatError(
+        f"{path} to hold a point per line, x y z first or under a line of names",
+        found=found,
+        fix="Export the cloud as text with x, y, z, or in another format.",
+    )
+
+
+def _dialects(line: str) -> Iterator[Dialect]:
+    if ";" in line:
+        yield Dialect(";", decimal_comma="," in line)
+    if "," in line:
+        yield Dialect(",")
+    yield Dialect(None)
+    if "," in line:
+        yield Dialect(None, decimal_comma=True)
+
+
+def _words(line: str, dialect: Dialect) -> list[str]:
+    text = line.strip().replace(",", ".") if dialect.decimal_comma else line.strip()
+    return [word.strip().strip('"') for word in text.split(dialect.delimiter)]
+
+
+def _is_numeric(line: str, dialect: Dialect) -> bool:
+    try:
+        [float(word) for word in _words(line, dialect)]
+    except ValueError:
+        return False
+    return True
+
+
+def _parse(path: Path, rows: Sequence[str], dialect: Dialect) -> Float64[np.ndarray, "N C"]:
+    """The sample's numbers; rows of another length than the first are left to the reader."""
+    count = len(_words(rows[0], dialect))
+    even = [row for row in rows if len(_words(row, dialect)) == count]
+    try:
+        return dialect.parse(even, range(count))
+    except ValueError as error:
+        raise SceneFormatError(
+            f"numbers in every row of {path}", found=str(error)[:120], fix="Export it again."
+        ) from None
+
+
+def _named(lines: Sequence[str], dialect: Dialect, count: int) -> list[str] | None:
+    """Names of the columns, from the last line before the numbers that has as many words."""
+    for line in reversed(lines):
+        bare = _MARKS.sub("", line.strip())
+        for delimiter in (dialect.delimiter, None, ",", ";", "\t"):
+            words = [word.strip().strip('"').lower() for word in bare.split(delimiter)]
+            names = [_NAMES.get(word, word) for word in words]
+            if len(names) == count and set(XYZ) <= set(names):
+                return names
+    return None
+
+
+def _guessed(sample: Float64[np.ndarray, "N C"], is_pts: bool) -> list[str]:
+    """Names for columns that have none, from their values."""
+    count = sample.shape[1]
+    names = [*XYZ, *(f"column {i + 1}" for i in range(3, count))]
+    starts = range(3, count - 2)
+    if is_pts and count == 7:
+        starts = range(4, 5)
+    start = next((i for i in starts if _like_colors(sample[:, i : i + 3])), None)
+    if start is not None:
+        names[start : start + 3] = _RGB
+    elif count == 4:
+        names[3] = "intensity"
+    return names
+
+
+def _like_colors(values: Float64[np.ndarray, "N 3"]) -> bool:
+    known = values[np.isfinite(values).all(axis=1)]
+    if not len(known) or known.min() < 0:
+        return False
+    if known.max() <= 1.0 and (known != np.rint(known)).any():
+        return bool((np.abs(np.linalg.norm(known, axis=1) - 1.0) > _UNIT).mean() > 0.5)
+    return bool(known.max() <= 65535 and (known == np.rint(known)).all())
+
+
+def _told(path: Path, names: Sequence[str]) -> str:
+    what = f"columns 1 to 3 of {path.name} are taken as x, y, z"
+    if _RGB[0] in names:
+        at = names.index(_RGB[0]) + 1
+        return f"It has no line of names: {what}, {at} to {at + 2} as red, green, blue."
+    if "intensity" in names:
+        return f"It has no line of names: {what}, 4 as intensity."
+    return f"It has no line of names: {what}, none as colours."

@@ -1,0 +1,318 @@
+"""Aligning a cloud with a scene, or refusing to, with the reason.
+
+Notation: *marks* are the scene's own points; *extent* is their root mean square distance from
+their median. The *share* is the fraction of marks within ``CLOSE`` extents of the cloud's surface.
+A *rival* is another alignment, turned by more than ``TURNED`` degrees, scaled by more than
+``SCALED`` or shifted by more than ``SHIFTED`` extents. The *error* is the standard error of the
+alignment at the farthest corner of the marks, by least squares: it is large where the cloud lets
+the scene slide.
+Promise: an alignment is returned only if most marks lie on the cloud, no rival is nearly as good,
+and the error is small; else the reason is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from splatseed.errors import PointCloudError
+from splatseed.pointcloud import ORIGINAL
+from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
+from splatseed.seeding.alignment.coarse import Unit, find_starts
+from splatseed.seeding.alignment.icp import Fitted, Surface, fit
+from splatseed.seeding.alignment.sampling import CloudSample, normals_of, sample_cloud
+from splatseed.similarity import Similarity
+
+__all__ = ["Alignment", "align"]
+
+LEAST_MARKS = 200
+MOST_MARKS = 20000
+ROUNDS = (
+    (150, 250, 10, 0.25, 0.04),
+    (16, 1500, 15, 0.1, 0.02),
+    (4, MOST_MARKS, 40, 0.04, 0.01),
+)
+"""Stages: alignments, marks, rounds of ICP, the first reach, and within how much of the cloud marks
+count, in extents."""
+FINEST = 0.002
+"""Least reach, in extents."""
+CLOSE = 0.01
+SHARE = 0.6
+"""Least share of marks on the cloud."""
+RIVAL = 0.85
+"""A rival with this part of the best share is nearly as good."""
+TURNED, SCALED, SHIFTED = 8.0, 0.08, 0.1
+LIKE, UNLIKE = 0.5, 0.25
+"""Correlations of colours at the marks that tell an alignment from its rival."""
+SURE = 0.003
+"""Greatest error, in extents."""
+_FIX = "Give the transform with --transform FILE, or bring more of the scene in both."
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Where a cloud lies in a scene.
+
+    Args:
+        scene_from_cloud: The transform.
+        share: Of the marks, those on the cloud's surface.
+        residual: Median distance of these from the surface, scene units.
+        error: Standard error at the farthest corner, scene units.
+        extent: Of the marks, scene units.
+        likeness: Correlation of brightness between marks and cloud, -1 to 1; None without colours.
+        rival: Share of the best rival; 0 without one.
+        marks: The scene's points, float64 [M, 3].
+        residuals: Of each mark, scene units, float64 [M].
+        sample: The cloud in the scene's frame, float64 [N, 3].
+        rgb: Its colours; None without.
+    """
+
+    scene_from_cloud: Similarity
+    share: float
+    residual: float
+    error: float
+    extent: float
+    likeness: float | None
+    rival: float
+    marks: Float64[np.ndarray, "M 3"]
+    residuals: Float64[np.ndarray, " M"]
+    sample: Float64[np.ndarray, "N 3"]
+    rgb: UInt8[np.ndarray, "N 3"] | None
+
+    @property
+    def report(self) -> dict[str, object]:
+        """What was found, for a file."""
+        matrix = np.vstack([self.scene_from_cloud.matrix, [0.0, 0.0, 0.0, 1.0]])
+        return {
+            "matrix": matrix.tolist(),
+            "scale": self.scene_from_cloud.scale,
+            "share_of_points_on_the_cloud": self.share,
+            "median_residual": self.residual,
+            "standard_error": self.error,
+            "extent": self.extent,
+            "likeness_of_colours": self.likeness,
+            "share_of_next_best": self.rival,
+        }
+
+    @property
+    def sentence(self) -> str:
+        """What was found, in a sentence."""
+        return (
+            f"Aligned at scale {self.scene_from_cloud.scale:.6g}: {self.share:.0%} of the scene's "
+            f"points lie on the cloud, {self.residual:.3g} from it in the median, sure to "
+            f"{self.error:.2g} (the scene's unit)."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """An alignment that was refined, with its share of marks on the cloud."""
+
+    fitted: Fitted
+    share: float
+
+
+def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> Alignment:
+    """Find where clouds lie in a scene.
+
+    Args:
+        scene: With points of its own.
+        paths: Clouds in one frame, of any scale.
+        progress: Told how far it is.
+
+    Raises:
+        PointCloudError: The scene or the cloud has too few points, or the alignment is not sure.
+        SceneNotFoundError: A file is missing.
+        SceneFormatError: One is damaged.
+    """
+    marks, brightness = _marks_of(scene)
+    sample = sample_cloud(paths, progress)
+    progress("align", 0.0)
+    unit_of_marks, unit_of_cloud = Unit.of(marks), Unit.of(sample.xyz)
+    small, cloud = (
+        unit.similarity.points(xyz)
+        for unit, xyz in ((unit_of_marks, marks), (unit_of_cloud, sample.xyz))
+    )
+    best, *others = _candidates(_surface_of(cloud), cloud, small, progress)
+    likeness = _likeness(best, cloud, small, sample, brightness)
+    rival = next((each for each in others if _differs(best.fitted, each.fitted)), None)
+    unlike = (
+        rival is not None
+        and likeness is not None
+        and (
+            likeness > LIKE and (_likeness(rival, cloud, small, sample, brightness) or 0.0) < UNLIKE
+        )
+    )
+    error = _error(best.fitted, small)
+    _check(best, None if unlike else rival, error)
+    # scene <- unit marks <- unit cloud <- cloud
+    to_scene = _then(
+        _then(_recentred(sample, unit_of_cloud), best.fitted.cloud_from_scene.inverse),
+        unit_of_marks.similarity.inverse,
+    )
+    on = best.fitted.residuals < CLOSE
+    return Alignment(
+        to_scene, best.share, float(np.median(best.fitted.residuals[on])) * unit_of_marks.extent,
+        error * unit_of_marks.extent, unit_of_marks.extent, likeness,
+        rival.share if rival else 0.0, marks, best.fitted.residuals * unit_of_marks.extent,
+        to_scene.points(sample.xyz + sample.offset), sample.rgb,
+    )  # fmt: skip
+
+
+def _marks_of(scene: Scene) -> tuple[Float64[np.ndarray, "M 3"], Float64[np.ndarray, " M"]]:
+    """The scene's own points, an even choice of them, and their brightness.
+
+    Raises:
+        PointCloudError: There are too few.
+    """
+    points = scene.points
+    own = (points.source == ORIGINAL) & points.distinct
+    if scene.tracks is not None:
+        own[: len(scene.tracks)] &= scene.tracks.lengths >= 3  # two rays may meet by chance
+    if np.count_nonzero(own) < LEAST_MARKS:
+        raise PointCloudError(
+            f"at least {LEAST_MARKS} points of the scene's own, to align a cloud with",
+            found=f"{np.count_nonzero(own):,}",
+            fix="Make some: splatseed sfm IMAGES --poses-from SCENE; or give --transform FILE.",
+        )
+    which = np.flatnonzero(own)
+    which = which[:: -(-len(which) // MOST_MARKS)]
+    xyz = points.xyz[which].astype(np.float64)
+    if scene.tracks is not None and which[-1] < len(scene.tracks):
+        xyz = scene.tracks.xyz[which]
+    return xyz, points.rgb[which].astype(np.float64).mean(axis=1)
+
+
+def _surface_of(cloud: Float64[np.ndarray, "N 3"]) -> Surface:
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
+
+    normals, _ = normals_of(cloud)
+    return Surface(cloud, normals, cKDTree(cloud, balanced_tree=False))
+
+
+def _candidates(
+    surface: Surface,
+    cloud: Float64[np.ndarray, "N 3"],
+    marks: Float64[np.ndarray, "M 3"],
+    progress: Progress,
+) -> list[_Candidate]:
+    """Alignments, best first.
+
+    Raises:
+        PointCloudError: None holds.
+    """
+    starts = find_starts(cloud, marks, ROUNDS[0][0], progress)
+    rows = zip(starts.scale, starts.rotation, starts.shift, strict=True)
+    waiting = [Similarity(float(scale), rotation, shift) for scale, rotation, shift in rows]
+    found: list[_Candidate] = []
+    for stage, (num, count, rounds, far, close) in enumerate(ROUNDS):
+        some = marks[:: -(-len(marks) // count)]
+        found = []
+        for i, start in enumerate(waiting[:num]):
+            fitted = fit(surface, some, start, far, rounds, FINEST)
+            if fitted is not None and 0.3 < fitted.cloud_from_scene.scale < 3.0:
+                found.append(_Candidate(fitted, float(np.mean(fitted.residuals < close))))
+            progress("align", (stage + (i + 1) / len(waiting[:num])) / len(ROUNDS))
+        found = _different(sorted(found, key=lambda each: -each.share))
+        waiting = [each.fitted.cloud_from_scene for each in found]
+    if not found:
+        raise _unsure("no way to lay one on the other")
+    return found
+
+
+def _different(found: list[_Candidate]) -> list[_Candidate]:
+    """The best of each group of like alignments."""
+    kept: list[_Candidate] = []
+    for each in found:
+        if all(_differs(each.fitted, other.fitted) for other in kept):
+            kept.append(each)
+    return kept
+
+
+def _differs(first: Fitted, second: Fitted) -> bool:
+    """Whether two alignments, of unit clouds, are rivals."""
+    a, b = first.cloud_from_scene, second.cloud_from_scene
+    cosine = (np.trace(a.rotation.T @ b.rotation) - 1) / 2
+    turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    scaled = abs(np.log(a.scale / b.scale))
+    shifted = float(np.linalg.norm(a.translation - b.translation))
+    return bool(turned > TURNED or scaled > SCALED or shifted > SHIFTED)
+
+
+def _likeness(
+    candidate: _Candidate,
+    cloud: Float64[np.ndarray, "N 3"],
+    marks: Float64[np.ndarray, "M 3"],
+    sample: CloudSample,
+    brightness: Float64[np.ndarray, " M"],
+) -> float | None:
+    """Correlation of brightness between marks and their nearest cloud points."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
+
+    if sample.rgb is None or brightness.std() == 0:
+        return None
+    on = candidate.fitted.residuals < CLOSE
+    if np.count_nonzero(on) < LEAST_MARKS // 2:
+        return None
+    idx = cKDTree(cloud).query(candidate.fitted.cloud_from_scene.points(marks[on]))[1]
+    there = sample.rgb[idx].astype(np.float64).mean(axis=1)
+    return float(np.corrcoef(there, brightness[on])[0, 1]) if there.std() > 0 else None
+
+
+def _error(fitted: Fitted, marks: Float64[np.ndarray, "M 3"]) -> float:
+    """Standard error at the farthest corner of the marks, in their extents."""
+    q = fitted.cloud_from_scene.points(np.percentile(marks, (2, 98), axis=0))
+    corners = np.stack(np.meshgrid(*q.T, indexing="ij"), axis=-1).reshape(-1, 3) - fitted.center
+    worst = 0.0
+    for corner in corners:
+        cross = np.array(
+            [[0, corner[2], -corner[1]], [-corner[2], 0, corner[0]], [corner[1], -corner[0], 0]]
+        )  # w x a = cross w
+        J = np.column_stack([cross, np.eye(3), corner])
+        worst = max(worst, float(np.linalg.eigvalsh(J @ fitted.covariance @ J.T)[-1]))
+    return float(np.sqrt(worst)) / fitted.cloud_from_scene.scale
+
+
+def _check(best: _Candidate, rival: _Candidate | None, error: float) -> None:
+    """Refuse what is not sure.
+
+    Raises:
+        PointCloudError: Too few marks lie on the cloud, a rival is nearly as good, or it slides.
+    """
+    if best.share < SHARE:
+        raise _unsure(
+            f"at best {best.share:.0%} of the scene's points on the cloud, {SHARE:.0%} needed: it is "
+            "of another place, or too little of this one"
+        )
+    if rival is not None and rival.share > RIVAL * best.share:
+        raise _unsure(
+            f"two ways that fit nearly as well ({best.share:.0%} and {rival.share:.0%} of the "
+            "scene's points on the cloud): the place looks alike from several sides"
+        )
+    if error > SURE:
+        raise _unsure(
+            f"it free to slide by {error:.2%} of the scene's extent: there is little but one plane"
+        )
+
+
+def _unsure(found: str) -> PointCloudError:
+    return PointCloudError("one alignment of the cloud that is sure", found=found, fix=_FIX)
+
+
+def _recentred(sample: CloudSample, unit: Unit) -> Similarity:
+    """From the cloud's file to its unit frame, with the offset in double precision."""
+    return _then(Similarity(1.0, np.eye(3), -sample.offset), unit.similarity)
+
+
+def _then(first: Similarity, second: Similarity) -> Similarity:
+    """One similarity after another."""
+    return Similarity(
+        second.scale * first.scale,
+        second.rotation @ first.rotation,
+        second.scale * second.rotation @ first.translation + second.translation,
+    )

@@ -1,0 +1,179 @@
+"""Robust similarity ICP: marks slide onto the tangent planes of a cloud, with one free scale.
+
+Notation: a mark p goes to q = s R p + t, whose nearest cloud point is y with normal n. Each round
+minimises the sum of w (n . (q - y))^2 over a small rotation, a shift and a change of scale about
+the marks' centre (Chen and Medioni 1992, with a seventh unknown), with Tukey's weights w, whose
+reach falls from ``far`` to three times the marks' noise. Residuals are in the cloud's units, and
+divided by s where alignments are compared.
+Promise: the covariance of the seven unknowns is that of least squares at the last round.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.similarity import Similarity
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+__all__ = ["Fitted", "Surface", "fit"]
+
+SHRINK = 0.75
+"""Factor of the reach from round to round."""
+NOISES = 3.0
+"""Least reach, in robust standard deviations of the residuals."""
+SIGMA = 1.4826
+"""Median absolute deviation to standard deviation."""
+STILL = 1e-7
+LEAST = 12
+"""Marks within reach that a fit needs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A cloud to align with.
+
+    Args:
+        xyz: Points, float64 [N, 3].
+        normals: Unit, of either sign, float64 [N, 3].
+        tree: Of the points.
+    """
+
+    xyz: Float64[np.ndarray, "N 3"]
+    normals: Float64[np.ndarray, "N 3"]
+    tree: cKDTree
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """An alignment.
+
+    Args:
+        cloud_from_scene: Where marks go.
+        residuals: Distance of each mark from its nearest cloud point's tangent plane, or from the
+            point itself where that is beyond the reach, in the scene's units, float64 [M].
+        reach: Residuals within which marks counted at last, in the scene's units.
+        covariance: Of rotation (radians, about ``center``), shift and log scale, float64 [7, 7], in
+            the cloud's units.
+        center: The centre of the marks, in the cloud's frame.
+    """
+
+    cloud_from_scene: Similarity
+    residuals: Float64[np.ndarray, " M"]
+    reach: float
+    covariance: Float64[np.ndarray, "7 7"]
+    center: Float64[np.ndarray, " 3"]
+
+
+def fit(
+    surface: Surface,
+    marks: Float64[np.ndarray, "M 3"],
+    start: Similarity,
+    far: float,
+    rounds: int,
+    least: float,
+) -> Fitted | None:
+    """Refine an alignment.
+
+    Args:
+        surface: The cloud.
+        marks: The scene's points.
+        start: ``cloud_from_scene`` to begin with.
+        far: The first reach, in the scene's units.
+        rounds: How many rounds.
+        least: The least reach, in the scene's units.
+
+    Returns:
+        The alignment; None where too few marks are within reach, or nothing holds them.
+    """
+    found, reach = start, far
+    for _ in range(rounds):
+        step = _step(surface, marks, found, reach)
+        if step is None:
+            return None
+        found, noise, moved = step
+        reach = max(min(reach * SHRINK, far), NOISES * noise, least)
+        if moved < STILL and reach <= max(NOISES * noise, least):
+            break
+    return _result(surface, marks, found, reach)
+
+
+def _pairs(
+    surface: Surface, marks: Float64[np.ndarray, "M 3"], found: Similarity
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Marks in the cloud's frame, normals, signed plane residuals and distances, there."""
+    q = found.points(marks)
+    distance, idx = surface.tree.query(q)
+    normals = surface.normals[idx]
+    return q, normals, np.einsum("ij,ij->i", normals, q - surface.xyz[idx]), distance
+
+
+def _step(
+    surface: Surface, marks: Float64[np.ndarray, "M 3"], found: Similarity, reach: float
+) -> tuple[Similarity, float, float] | None:
+    """One round: the better similarity, the marks' noise in scene units, and how far it moved."""
+    q, normals, off, distance = _pairs(surface, marks, found)
+    limit = reach * found.scale
+    near = distance < 2 * limit
+    if np.count_nonzero(near) < LEAST:
+        return None
+    q, normals, off = q[near], normals[near], off[near]
+    weights = (1 - np.minimum(np.abs(off) / limit, 1.0) ** 2) ** 2
+    if np.count_nonzero(weights) < LEAST:
+        return None
+    center = np.average(q, axis=0, weights=weights)
+    A = _design(q - center, normals)
+    normal = (A * weights[:, None]).T @ A
+    try:
+        x = np.linalg.solve(normal, -(A * weights[:, None]).T @ off)
+    except np.linalg.LinAlgError:
+        return None
+    noise = SIGMA * float(np.median(np.abs(off[weights > 0]))) / found.scale
+    return _moved(found, center, x), noise, float(np.abs(x).max())
+
+
+def _design(around: np.ndarray, normals: np.ndarray) -> Float64[np.ndarray, "M 7"]:
+    """Rows of n . (w x a + t + d a) for the rotation w, the shift t and the change of scale d."""
+    along = np.einsum("ij,ij->i", normals, around)
+    return np.column_stack([np.cross(around, normals), normals, along])
+
+
+def _moved(found: Similarity, center: np.ndarray, x: np.ndarray) -> Similarity:
+    """A similarity followed by a small one about a centre."""
+    turn, grow = _rotation(x[:3]), float(np.exp(np.clip(x[6], -0.2, 0.2)))
+    rotation, scale = turn @ found.rotation, grow * found.scale
+    moved = grow * turn @ (found.translation - center) + center + x[3:6]
+    return Similarity(scale, rotation, moved)
+
+
+def _rotation(w: np.ndarray) -> Float64[np.ndarray, "3 3"]:
+    """Rodrigues' formula."""
+    angle = float(np.linalg.norm(w))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = w / angle
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
+
+
+def _result(
+    surface: Surface, marks: Float64[np.ndarray, "M 3"], found: Similarity, reach: float
+) -> Fitted | None:
+    q, normals, off, distance = _pairs(surface, marks, found)
+    limit = reach * found.scale
+    inside = (np.abs(off) < limit) & (distance < 2 * limit)
+    if np.count_nonzero(inside) < LEAST:
+        return None
+    center = q[inside].mean(axis=0)
+    A = _design(q[inside] - center, normals[inside])
+    try:
+        covariance = np.linalg.inv(A.T @ A) * float(np.mean(off[inside] ** 2))
+    except np.linalg.LinAlgError:
+        return None
+    residuals = np.where(inside, np.abs(off), distance) / found.scale
+    return Fitted(found, residuals, reach, covariance, center)

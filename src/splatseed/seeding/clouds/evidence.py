@@ -1,0 +1,280 @@
+"""What the photographs see of a cloud: which points, in which colours, and which cannot be there.
+
+Notation: a view's *surface* is the depth of its cells (``coverage.cell_depths``), of a side at
+which a typical cell holds ``FILLED`` points, so that walls have no holes. A view *sees* points in
+front of its surface, and up to ``BEHIND`` of the depth behind it. The *samples* of a point are its
+pixels in the ``CLOSEST`` views that see it; their *agreement* is the share within ``ALIKE`` grey
+levels of their median, channel by channel. A tracked point of Structure-from-Motion proves that the
+ray to it is free: a cloud point in the same cell of the same view, clearly nearer, is *seen
+through*, and *confirmed* if it is about as far.
+Promise: depends neither on the order of the points nor on the threads.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
+
+from splatseed.kernels.jit import inline, kernel, parallel_range
+from splatseed.progress import Progress
+from splatseed.seeding.coverage import cell_counts, cell_depths, grid_from_world
+from splatseed.views.projection import place
+from splatseed.views.view import View
+
+__all__ = ["Evidence", "FreeRays", "find_evidence", "find_surfaces", "surface_agreement"]
+
+CELLS = (4, 8, 16, 32)
+"""Sides of cells to choose from, in pixels."""
+FILLED = 3
+BEHIND = 0.03
+"""How far behind a surface a point still counts as on it, as a share of the depth, at cells of 4
+pixels; surfaces slant within a cell."""
+CLOSEST = 6
+ALIKE = 32
+RAY_CELL = 4
+"""Side in pixels of the cells in which rays are free."""
+THROUGH = 0.1
+"""A point is clearly nearer by this share of the depth."""
+BLOCK = 1 << 20
+NO_VIEW = np.float32(0.0)
+
+Surface = Float32[np.ndarray, "rows cols"]
+
+
+@dataclass(frozen=True, eq=False)
+class FreeRays:
+    """Where tracked points prove that rays are free, in each view.
+
+    Args:
+        depths: For each view, the least depth of its tracked points per cell of ``RAY_CELL``
+            pixels, float32; infinite where there is none.
+    """
+
+    depths: tuple[Surface, ...]
+
+    @classmethod
+    def of(cls, views: Sequence[View], seen: Sequence[Float64[np.ndarray, "M 3"]]) -> FreeRays:
+        """The free rays of views that each see some points for certain."""
+        depths = (_nearest(view, xyz) for view, xyz in zip(views, seen, strict=True))
+        return cls(tuple(depths))
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What N points have speaking for and against them.
+
+    Args:
+        seen: In how many views each is visible, uint16 [N].
+        rgb: Robust mean of its samples, uint8 [N, 3]; mid grey without any.
+        agreement: Of its samples, 0 to 1, float32 [N]; NaN for fewer than two.
+        through: How many views see through it, uint16 [N].
+        confirmed: How many views confirm it, uint16 [N].
+    """
+
+    seen: UInt16[np.ndarray, " N"]
+    rgb: UInt8[np.ndarray, "N 3"]
+    agreement: Float32[np.ndarray, " N"]
+    through: UInt16[np.ndarray, " N"]
+    confirmed: UInt16[np.ndarray, " N"]
+
+    def select(self, which: Bool[np.ndarray, " N"]) -> Evidence:
+        """That on some of the points."""
+        return Evidence(*(getattr(self, field.name)[which] for field in fields(Evidence)))
+
+
+def find_surfaces(
+    views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], progress: Progress
+) -> tuple[tuple[Surface, ...], int]:
+    """The surface of each view, and the side of its cells in pixels."""
+    cell = _choose_cell(views, xyz)
+    surfaces: list[Surface] = []
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the kernels release the GIL
+        for depths in pool.map(lambda view: cell_depths(view, xyz, cell), views):
+            surfaces.append(depths)
+            progress("find surfaces", len(surfaces) / len(views))
+    return tuple(surfaces), cell
+
+
+def _choose_cell(views: Sequence[View], xyz: Float32[np.ndarray, "N 3"]) -> int:
+    """The smallest side at which a cell that holds points typically holds enough."""
+    some = views[:: -(-len(views) // 8)]
+    for cell in CELLS[:-1]:
+        counts = [count[count > 0] for view in some if len(count := cell_counts(view, xyz, cell))]
+        found = np.concatenate(counts)
+        if len(found) and np.median(found) >= FILLED:
+            return cell
+    return CELLS[-1]
+
+
+def find_evidence(
+    views: Sequence[View],
+    xyz: Float32[np.ndarray, "N 3"],
+    surfaces: Sequence[Surface],
+    cell: int,
+    rays: FreeRays | None,
+    progress: Progress,
+) -> Evidence:
+    """Hold points against the photographs.
+
+    Args:
+        views: The views; those without pixels give no colours.
+        xyz: The points.
+        surfaces: Of each view, from ``find_surfaces``.
+        cell: The side of their cells, in pixels.
+        rays: Where rays are known to be free.
+        progress: Told how far it is.
+    """
+    num = len(xyz)
+    found = Evidence(
+        np.zeros(num, np.uint16),
+        np.full((num, 3), 128, np.uint8),
+        np.full(num, np.nan, np.float32),
+        np.zeros(num, np.uint16),
+        np.zeros(num, np.uint16),
+    )
+    behind = BEHIND * cell / CELLS[0]
+    steps = max(len(range(0, num, BLOCK)) * len(views), 1)
+    for b, start in enumerate(range(0, num, BLOCK)):
+        part = slice(start, start + BLOCK)
+        block = xyz[part]
+        closeness = np.zeros((len(block), CLOSEST), np.float32)
+        samples = np.zeros((len(block), CLOSEST, 3), np.uint8)
+        for v, view in enumerate(views):
+            free = np.empty((0, 0), np.float32) if rays is None else rays.depths[v]
+            _observe(
+                block, grid_from_world(view, 1), np.sqrt(abs(view.K[0, 0] * view.K[1, 1])),
+                view.width, view.height, surfaces[v], behind, free, view.photograph, _mask(view),
+                closeness, samples, found.seen[part], found.through[part], found.confirmed[part],
+            )  # fmt: skip
+            progress("look at photographs", (b * len(views) + v + 1) / steps)
+        _summarise(closeness, samples, found.rgb[part], found.agreement[part])
+    return found
+
+
+def surface_agreement(
+    views: Sequence[View], surfaces: Sequence[Surface], seen: Sequence[Float64[np.ndarray, "M 3"]]
+) -> tuple[float, int]:
+    """How well a scene's own points fit the surfaces of a cloud.
+
+    Args:
+        views: The views.
+        surfaces: Of each.
+        seen: The points of the scene that each view sees, world.
+
+    Returns:
+        Of the points that are seen where the cloud has a surface, the share that lies within
+        ``THROUGH`` of its depth; and the number of these points.
+    """
+    close = total = 0
+    for view, surface, xyz in zip(views, surfaces, seen, strict=True):
+        rows, cols, depth = _cells(view, xyz, surface.shape)
+        there = surface[rows, cols]
+        known = np.isfinite(there)
+        total += int(np.count_nonzero(known))
+        close += int(np.count_nonzero(np.abs(depth[known] / there[known] - 1.0) <= THROUGH))
+    return (close / total if total else 0.0), total
+
+
+def _mask(view: View) -> Bool[np.ndarray, "H W"]:
+    return np.ones((1, 1), np.bool_) if view.mask is None else view.mask
+
+
+def _nearest(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Surface:
+    """The least depth of points per cell of ``RAY_CELL`` pixels."""
+    shape = -(-view.height // RAY_CELL), -(-view.width // RAY_CELL)
+    nearest = np.full(shape, np.inf, np.float32)
+    rows, cols, depth = _cells(view, xyz, shape)
+    np.minimum.at(nearest, (rows, cols), depth.astype(np.float32))
+    return nearest
+
+
+def _cells(
+    view: View, xyz: Float64[np.ndarray, "M 3"], shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, columns and depths of the points that fall into a view's grid of cells."""
+    cam = xyz @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+    cam = cam[cam[:, 2] > 0]
+    uv = (cam @ view.K.T)[:, :2] / cam[:, 2:]
+    inside = ((uv >= 0) & (uv < [view.width, view.height])).all(axis=1)
+    cols, rows = (uv[inside] * [shape[1] / view.width, shape[0] / view.height]).astype(np.int64).T
+    return rows, cols, cam[inside, 2]
+
+
+@kernel
+def _observe(  # type: ignore[no-untyped-def]  # Numba's types
+    xyz, matrix, focal, width, height, surface, behind, free, photograph, mask, closeness, samples,
+    seen, through, confirmed,
+):  # fmt: skip
+    """Add what one view sees of the points."""
+    for k in parallel_range(len(xyz)):
+        column, row, depth = place(xyz[k], matrix)
+        if not (depth > 0.0 and 0.0 <= column < width and 0.0 <= row < height):
+            continue
+        i, j = int(row), int(column)
+        if mask.size > 1 and not mask[i, j]:
+            continue
+        if free.size > 0:
+            end = free[int(row * free.shape[0] / height), int(column * free.shape[1] / width)]
+            if depth < end * (1.0 - THROUGH):
+                if end < np.inf:
+                    through[k] += 1
+            elif depth <= end * (1.0 + THROUGH):
+                confirmed[k] += 1
+        at = surface[int(row * surface.shape[0] / height), int(column * surface.shape[1] / width)]
+        if at < np.inf and depth <= at * (1.0 + behind):
+            seen[k] += 1
+            if photograph.size > 0:
+                _insert(np.float32(focal / depth), photograph[i, j], closeness[k], samples[k])
+
+
+@inline
+def _insert(close, pixel, closeness, samples):  # type: ignore[no-untyped-def]  # Numba's types
+    """Keep a pixel if its view is among the closest; among equals the earlier stays."""
+    k = len(closeness) - 1
+    if closeness[k] >= close:
+        return
+    while k > 0 and closeness[k - 1] < close:
+        closeness[k], samples[k] = closeness[k - 1], samples[k - 1]
+        k -= 1
+    closeness[k], samples[k] = close, pixel
+
+
+@kernel
+def _summarise(closeness, samples, rgb, agreement):  # type: ignore[no-untyped-def]  # Numba's types
+    """Robust means of samples, and the share of them that agrees."""
+    for k in parallel_range(len(closeness)):
+        num = 0
+        while num < closeness.shape[1] and closeness[k, num] > NO_VIEW:
+            num += 1
+        if num == 0:
+            continue
+        middle = np.empty(3, np.int64)
+        for channel in range(3):
+            ordered = np.sort(samples[k, :num, channel])
+            middle[channel] = ordered[(num - 1) // 2]
+        alike, total = 0, np.zeros(3, np.int64)
+        for s in range(num):
+            if _is_alike(samples[k, s], middle):
+                alike += 1
+                for channel in range(3):
+                    total[channel] += samples[k, s, channel]
+        for channel in range(3):
+            if alike > 0:
+                rgb[k, channel] = (2 * total[channel] + alike) // (2 * alike)
+            else:
+                rgb[k, channel] = middle[channel]
+        if num > 1:
+            agreement[k] = np.float32(alike) / np.float32(num)
+
+
+@inline
+def _is_alike(sample, middle):  # type: ignore[no-untyped-def]  # Numba's types
+    alike = True
+    for channel in range(3):
+        alike &= abs(np.int64(sample[channel]) - middle[channel]) <= ALIKE
+    return alike

@@ -1,0 +1,253 @@
+"""The method ``cloud``: seeds from scans and dense clouds, as many as the photographs resolve.
+
+Points stream into voxels (``voxels``); of these, those stay that a photograph sees and nothing
+speaks against (``evidence``): no ray of Structure-from-Motion passes through them, the photographs
+that see them agree on a colour, and they do not float alone. A budget thins them afterwards, as
+those of every method.
+Promise: memory does not grow with the clouds; a cloud that is nowhere near the cameras, or does not
+fit the scene's own points, is refused with the reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from jaxtyping import Float64
+
+from splatseed.errors import ParameterError, PointCloudError
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image, Scene
+from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views
+from splatseed.seeding.thinning import frames_of
+from splatseed.similarity import Similarity
+from splatseed.upsample.method import NewPoints, Traits, check_fields, require
+from splatseed.upsample.registry import source_code
+
+if TYPE_CHECKING:
+    from splatseed.seeding.clouds.judging import Judged
+    from splatseed.seeding.clouds.streaming import Streamed
+    from splatseed.views.view import View
+
+__all__ = ["Cloud", "GivenClouds"]
+
+GIGABYTE = 1e9
+FITS = 0.4
+"""Below this share of the scene's own points at the cloud's depth, the cloud is another's: clouds
+in the right place have 0.8 to 1, those of another 0.1 to 0.25."""
+DOUBTFUL = 0.6
+ENOUGH = 50
+"""Points of the scene below which the share says nothing."""
+UNKNOWN = 0.5
+"""Confidence of a point that fewer than two photographs see."""
+CORNER = 0.5
+"""Below this share of the photographs' cells, a note says how little the cloud covers."""
+CELL = 8
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Seeds from scans and dense clouds (--cloud), as many as the photographs resolve."""
+
+    pixels: float = 2.0
+    """Side of the voxels that merge points, in pixels of the photograph that is closest."""
+    recolor: bool = False
+    """Take colours from the photographs even if the cloud has some."""
+    clean: bool = True
+    """Leave out points that the photographs contradict, and points that float alone."""
+    memory: float = 4.0
+    """Most memory, in gigabytes; voxels grow where they do not fit."""
+
+    name: ClassVar[str] = "cloud"
+    traits: ClassVar[Traits] = Traits(frozenset({"cloud"}), chooses_number=True)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        require(0.25 <= self.pixels <= 64, "cloud.pixels from 0.25 to 64", self.pixels)
+        require(self.memory >= 1, "cloud.memory of at least 1 gigabyte", self.memory)
+
+    def of(self, *files: Path | str, transform: Similarity | None = None) -> GivenClouds:
+        """The method for some files.
+
+        Args:
+            files: The clouds, in one frame.
+            transform: From their frame to the scene's; the same frame when None.
+        """
+        known = {field.name: getattr(self, field.name) for field in fields(Cloud)}
+        return GivenClouds(**known, files=tuple(map(str, files)), transform=transform)
+
+    def __call__(
+        self,
+        scene: Scene,  # noqa: ARG002  (a method's arguments)
+        num_new: int,  # noqa: ARG002
+        rng: np.random.Generator,  # noqa: ARG002
+        progress: Progress,  # noqa: ARG002
+    ) -> NewPoints:
+        """Ask for a cloud: ``of`` names it.
+
+        Raises:
+            ParameterError: Always.
+        """
+        raise ParameterError(
+            "--cloud FILE for the method cloud", found="none", fix="Name the scan."
+        )
+
+
+@dataclass(frozen=True)
+class GivenClouds(Cloud):
+    """The method for some files; ``Cloud.of`` makes it."""
+
+    files: tuple[str, ...] = ()
+    """The clouds."""
+    transform: Similarity | None = None
+    """From their frame to the scene's; the same frame when None."""
+
+    def __call__(
+        self,
+        scene: Scene,
+        num_new: int,  # noqa: ARG002  (the photographs determine the number)
+        rng: np.random.Generator,  # noqa: ARG002  (nothing is random)
+        progress: Progress,
+    ) -> NewPoints:
+        """Seeds from the clouds.
+
+        Raises:
+            SceneNotFoundError: A file is missing.
+            SceneFormatError: One is damaged.
+            PointCloudError: No point is in view, or the cloud does not fit the scene.
+        """
+        from splatseed.seeding.clouds.streaming import capacity_of, stream  # noqa: PLC0415  (loads Numba)
+
+        frames = _frames(scene)
+        capacity = capacity_of(self.memory * GIGABYTE)
+        paths = [Path(each) for each in self.files]
+        streamed = stream(paths, self.transform, frames, self.pixels, capacity, progress)
+        _check_in_view(streamed, scene)
+        return self._choose(scene, streamed, progress)
+
+    def _choose(self, scene: Scene, streamed: Streamed, progress: Progress) -> NewPoints:
+        """The points that stay, their colours, and notes."""
+        from splatseed.seeding.clouds.judging import judge  # noqa: PLC0415  (loads Numba)
+        from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
+
+        voxels, images = streamed.voxels, _images(scene)
+        views = _views(scene, images, progress)
+        visibility = find_visibility(scene)
+        nothing = np.empty((0, 3))
+        seen = [visibility.of(image) if len(visibility.xyz) else nothing for image in images]
+        colored = all(file.has_color for file in streamed.files)
+        own = voxels.rgb if any(file.colors != "none" for file in streamed.files) else None
+        judged = judge(
+            views, seen, voxels, own if colored else None, progress,
+            clean=self.clean, tracked=scene.tracks is not None,
+        )  # fmt: skip
+        xyz, evidence = voxels.xyz[judged.kept], judged.evidence
+        rgb = evidence.rgb if own is None else own[judged.kept]
+        if scene.has_photographs and (self.recolor or not colored):
+            rgb = evidence.rgb
+        notes = (*_read_notes(streamed), *_check_fit(judged), *_fates(judged, len(voxels)))
+        return NewPoints(
+            xyz, rgb, (*notes, *_note_on_cover(scene, xyz)),
+            confidence=np.nan_to_num(evidence.agreement, nan=UNKNOWN),
+            source=np.full(len(xyz), source_code("cloud"), np.uint8),
+        )  # fmt: skip
+
+
+def _frames(scene: Scene) -> tuple[View, ...]:
+    if not scene.images:
+        raise ParameterError(
+            "a scene with cameras, which choose among the points of a cloud",
+            found="none",
+            fix="Name the scene of the photographs; for a cloud alone: --method mls or linear.",
+        )
+    return frames_of(scene)
+
+
+def _images(scene: Scene) -> tuple[Image, ...]:
+    return photographed(scene) if scene.has_photographs else scene.images
+
+
+def _views(scene: Scene, images: Sequence[Image], progress: Progress) -> tuple[View, ...]:
+    """The photographs, or their frames alone if there are none."""
+    if scene.has_photographs:
+        return read_views(scene, images, MAX_SIZE, progress)
+    return frames_of(scene)
+
+
+def _check_in_view(streamed: Streamed, scene: Scene) -> None:
+    """Refuse clouds of which no point falls in any photograph.
+
+    Raises:
+        PointCloudError: They are elsewhere.
+    """
+    if len(streamed.voxels):
+        return
+    centers = np.array([image.camera.center for image in scene.images])
+    raise PointCloudError(
+        "points of the cloud in view of the scene's cameras, which stand "
+        f"{_span(centers.min(axis=0), centers.max(axis=0))}",
+        found=f"none of {streamed.voxels.total:,}, which lie {_span(streamed.low, streamed.high)}",
+        fix="They are in different frames: find the transform with --align, or give it with "
+        "--transform FILE.",
+    )
+
+
+def _span(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> str:
+    first, last = (", ".join(f"{value:.6g}" for value in each) for each in (low, high))
+    return f"from ({first}) to ({last})"
+
+
+def _check_fit(judged: Judged) -> tuple[str, ...]:
+    """Refuse a cloud that does not lie where the scene's own points do.
+
+    Raises:
+        PointCloudError: It is of another place, or in another frame.
+    """
+    if judged.asked < ENOUGH:
+        return ()
+    found = f"{judged.fit:.0%} of the scene's own points that are seen there lie at its depth"
+    if judged.fit < FITS:
+        raise PointCloudError(
+            "a cloud that fits the scene's own points",
+            found=found,
+            fix="It is in another frame (try --align, or give --transform FILE), or of another "
+            "place.",
+        )
+    doubt = ": check its frame" if judged.fit < DOUBTFUL else ""
+    return (f"The cloud fits: {found}, within 10%{doubt}.",)
+
+
+def _fates(judged: Judged, num: int) -> tuple[str, ...]:
+    """How many voxels stay, and why others do not."""
+    gone = [f"{count:,} {reason}" for reason, count in judged.reasons.items() if count]
+    gone = [f"{judged.hidden:,} are hidden in every photograph", *gone]
+    told = f"{len(judged.kept):,} stay of the {num:,} points that they were merged to"
+    return (f"{told}: {', '.join(gone)}.",)
+
+
+def _read_notes(streamed: Streamed) -> tuple[str, ...]:
+    voxels = streamed.voxels
+    outside = f"{voxels.unseen:,} of them outside of every photograph"
+    told = [f"{voxels.total + streamed.bad:,} points were read, {outside}."]
+    told += [sentence for file in streamed.files for sentence in file.warnings]
+    if streamed.bad:
+        told.append(f"{streamed.bad:,} points of the cloud are not finite and were left out.")
+    if voxels.coarser:
+        told.append(
+            f"The cloud was merged at {2**voxels.coarser} times the spacing asked for, to stay "
+            "within the memory: --cloud.memory raises it."
+        )
+    return tuple(told)
+
+
+def _note_on_cover(scene: Scene, xyz: np.ndarray) -> tuple[str, ...]:
+    from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (loads Numba)
+
+    share = covered_share(frames_of(scene), xyz, CELL, silent)
+    if share >= CORNER:
+        return ()
+    told = f"The cloud covers {share:.0%} of the photographs"
+    return (f"{told}: --method auto beside --cloud seeds the rest.",)
