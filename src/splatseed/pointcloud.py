@@ -93,6 +93,11 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    @staticmethod
+    def empty() -> PointCloud:
+        """No points."""
+        return PointCloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
+
     @property
     def attributes(self) -> dict[str, Float32[np.ndarray, "N ..."]]:
         """The ``ATTRIBUTES`` that the cloud has, by name."""

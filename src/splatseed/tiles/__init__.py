@@ -6,7 +6,7 @@ makes the new points of each tile; ``assembly`` puts all points in order. Promis
 in memory, whatever the size of the tiles and whoever works on them.
 """
 
-from splatseed.tiles.planning import TilePlan, bytes_of, check_disk, plan_tiles
+from splatseed.tiles.planning import TilePlan, check_disk, plan_tiles
 from splatseed.tiles.run import Request, Tiled, check_tileable, make_tiled
 from splatseed.tiles.sources import FileSource, SceneSource, Source
 from splatseed.tiles.work import WorkFolder, open_work, work_path
@@ -19,7 +19,6 @@ __all__ = [
     "TilePlan",
     "Tiled",
     "WorkFolder",
-    "bytes_of",
     "check_disk",
     "check_tileable",
     "make_tiled",

@@ -13,7 +13,7 @@ from splatseed.errors import OutputError, ParameterError
 from splatseed.tiles.work import free_space
 from splatseed.upsample.nearest import NearestMethod
 
-__all__ = ["TilePlan", "bytes_of", "check_disk", "plan_tiles", "words_of"]
+__all__ = ["TilePlan", "check_disk", "plan_tiles", "words_of"]
 
 PROCESS = 420 << 20
 """Memory of a process before it holds any points: libraries, compiled kernels, and their slack."""
@@ -25,7 +25,6 @@ AT_ONCE = 1 << 19
 """Rows of a pass over the disk."""
 PER_ROW = 250
 """Bytes that such a pass takes for each of its rows."""
-SUFFIXES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
 @dataclass(frozen=True)
@@ -99,9 +98,9 @@ def plan_tiles(
     at_once = max(min(AT_ONCE, room // PER_ROW), LEAST)
     disk = None if count is None else _disk(method, count, num_new or 0)
     tiles = None if count is None else max(-(-count // most), 1)
-    if tiles == 1:
-        memory = min(memory, processes * (PROCESS + max(count or 0, LEAST) * each) + fixed)
-    return TilePlan(int(most), int(at_once), tiles, disk, memory)
+    held = min(most, count or most)  # points of a tile
+    peak = processes * PROCESS + max(processes * held * each, at_once * PER_ROW) + fixed
+    return TilePlan(int(most), int(at_once), tiles, disk, min(int(peak), memory))
 
 
 def _disk(method: object, count: int, num_new: int) -> int:
@@ -129,26 +128,6 @@ def check_disk(path: Path, needed: int | None, there: int = 0) -> None:
             found=words_of(free),
             fix="Free some space, choose an output on a larger disk, or ask for fewer points.",
         )
-
-
-def bytes_of(text: str) -> int:
-    """An amount of memory such as 4G, 500M or a number of bytes.
-
-    Raises:
-        ParameterError: It is none.
-    """
-    plain = text.strip().upper().removesuffix("B").removesuffix("I")
-    number, suffix = (plain[:-1], plain[-1]) if plain[-1:] in SUFFIXES else (plain, "")
-    try:
-        amount = float(number)
-        known = 0 < amount < float("inf")
-    except ValueError:
-        known = False
-    if not known:
-        raise ParameterError(
-            "an amount of memory such as 4G or 500M", found=repr(text), fix="Give such an amount."
-        )
-    return int(amount * SUFFIXES[suffix])
 
 
 def words_of(amount: int, *, up: bool = False) -> str:

@@ -17,6 +17,7 @@ from splatseed.commands.options import parse_options
 from splatseed.commands.upsample.cloud import CLOUD, Bringing, cloud_method, settle_cloud
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
 from splatseed.commands.upsample.start import check_start, write_start
+from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
 from splatseed.console import (
     OUT,
     StageClock,
@@ -30,6 +31,7 @@ from splatseed.io import WriteReport, find_depths, load_scene, write_scene
 from splatseed.io.output.staging import check_output
 from splatseed.literal import visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.process.memory import bytes_of
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import photographed
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
@@ -75,6 +77,13 @@ def _budget() -> Any:
     """How a budget appears in the help."""
     return tyro.conf.arg(
         constructor=str, metavar="N|Xrho", help_behavior_hint="(default: no limit)"
+    )
+
+
+def _memory() -> Any:
+    """How an amount of memory appears in the help."""
+    return tyro.conf.arg(
+        constructor=str, metavar="BYTES|4G", help_behavior_hint="(default: what is free)"
     )
 
 
@@ -140,6 +149,16 @@ class Options:
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
     cloud_align: tyro.conf.Suppress[bool] = False
+    memory: Annotated[str | None, _memory()] = None
+    """Most memory. A cloud that takes more is worked on in tiles on disk, with the same result."""
+    jobs: Annotated[int | None, _number(int, "1; with Ray, as many as fit")] = None
+    """Tiles at a time, each in a process of its own."""
+    executor: Literal["local", "ray"] = "local"
+    """Who works on tiles: this machine, or a Ray cluster that shares its disk."""
+    address: Annotated[str | None, _default("a cluster on this machine")] = None
+    """The cluster's address, or auto on one of its nodes."""
+    tile_points: Annotated[int | None, _number(int, "by the memory")] = None
+    """Most points in a tile."""
     preview: bool = False
     """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's
     maps."""
@@ -154,6 +173,12 @@ class Options:
     """Copy the images instead of linking to them."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
+
+    @property
+    def tiling(self) -> Tiling:
+        """The options about memory and who works."""
+        memory = None if self.memory is None else bytes_of(self.memory)
+        return Tiling(memory, self.jobs, self.executor, self.address, self.tile_points)
 
     @property
     def bringing(self) -> Bringing:
@@ -216,6 +241,10 @@ def run(arguments: list[str]) -> None:
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=inputs)
     if options.gaussians is not None:
         check_start(options.gaussians, options.output, overwrite=options.overwrite)
+    source = find_source(options, methods)
+    if source is not None:
+        run_tiled(options, methods, source, _provenance)
+        return
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
