@@ -44,8 +44,8 @@ __all__ = ["Tiling", "find_source", "run_tiled"]
 
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz", ".glb")
 """Files of points that only ``open_cloud`` reads."""
-PER_POINT, PER_NEIGHBOR = 120, 20
-"""Bytes that a cloud in memory takes for each original, and for each neighbour of each."""
+PROCESS, PER_POINT, PER_NEIGHBOR = 420 << 20, 120, 20
+"""Bytes that the process takes, a cloud in memory for each original, and for each neighbour."""
 WHOLE = ("budget", "cover_cell", "verify", "preview", "gaussians", "depth_maps", "cloud_files")
 """Options that need all points in memory."""
 
@@ -109,7 +109,7 @@ def _is_large(options: Options, method: Upsampler, count: int) -> bool:
     """Whether the whole cloud takes more memory than it may."""
     total = planned_size(count, options.ratio, options.num_points)
     neighbors = method.num_queried if isinstance(method, NearestMethod) else 16
-    needed = total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
+    needed = PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
     bound = options.tiling.bound
     return bound is not None and needed > bound
 
