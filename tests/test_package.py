@@ -44,6 +44,7 @@ ORDER = (
     "depth",
     "stereo",
     "upsample",
+    "tiles",
     "seeding",
     "diagnostics",
     "preview",

@@ -10,7 +10,7 @@ import pytest
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError
 from splatseed.pointcloud import PointCloud
-from splatseed.process.tasks import HereTasks, ProcessTasks
+from splatseed.process.tasks import HereTasks
 from splatseed.tiles import check_disk, check_tileable, plan_tiles, run
 from splatseed.tiles.reading import origin_of
 from splatseed.upsample import configure, upsample
@@ -101,7 +101,7 @@ def test_a_damaged_note_is_one_line(sheet, tiles):
 def test_a_foreign_folder_is_left_alone(sheet, tiles):
     tiles.path.mkdir()
     (tiles.path / "holiday.jpg").touch()
-    with pytest.raises(OutputError, match="found a folder without job.json"):
+    with pytest.raises(OutputError, match=r"found a folder without job\.json"):
         tiles(sheet, "linear", LINEAR)
     assert [each.name for each in tiles.path.iterdir()] == ["holiday.jpg"]
 
@@ -152,26 +152,6 @@ def test_only_clouds_far_off_are_moved():
     assert not origin_of(low - low, high - low, exact=False).any()
 
 
-def die(path):
-    """A task that ends its process the first time."""
-    import os
-    from pathlib import Path
-
-    if not Path(path).exists():
-        Path(path).touch()
-        os._exit(9)
-
-
-
-
-def test_tasks_whose_process_is_killed_are_done_again(tmp_path):
-    calls = [(str(tmp_path / str(number)),) for number in range(2)]
-    ProcessTasks(2, 1).run(die, calls, "stage", lambda *_: None)
-    assert len(list(tmp_path.iterdir())) == 2
-
-
 def test_notes_are_json(sheet, tiles):
     tiles(sheet, "linear", LINEAR, tasks=HereTasks())
     assert json.loads((tiles.path / "job.json").read_text())["method"] == "linear"
-
-

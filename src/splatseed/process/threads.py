@@ -55,4 +55,3 @@ def few_threads(threads: int) -> Iterator[None]:
     finally:
         thread_limit.reset(limit)
         numba.set_num_threads(before)
-

@@ -1,7 +1,7 @@
 """Clouds larger than memory: cut into tiles on disk, upsampled tile by tile.
 
 The steps, each of them resumable: ``reading`` copies the cloud to disk; ``splitting`` sorts it into
-tiles; ``steps`` weighs the points of each tile; ``drawing`` draws the bases in file order; ``steps``
+tiles; ``steps`` weighs each tile's points; ``drawing`` draws the bases in file order; ``steps``
 makes the new points of each tile; ``assembly`` puts all points in order. Promise: the same bytes as
 in memory, whatever the size of the tiles and whoever works on them.
 """

@@ -1,4 +1,4 @@
-"""The method ``random`` without the cloud in memory: its numbers come from two places of one stream.
+"""The method ``random`` without the cloud in memory: numbers from two places of one stream.
 
 In memory, the positions of all M new points are drawn first, three numbers each, then their
 colours. Here one generator draws positions, and another, 3 M numbers ahead, colours. Promise: the

@@ -53,9 +53,7 @@ def prepared(store: TileStore, points: Points, num_own: int) -> PreparedCloud:
     )  # fmt: skip
 
 
-def neighbors_of(
-    store: TileStore, points: Points, idx: Int32[np.ndarray, "m k"]
-) -> Neighbors:
+def neighbors_of(store: TileStore, points: Points, idx: Int32[np.ndarray, "m k"]) -> Neighbors:
     """Neighbours with their distances."""
     return Neighbors(idx, distances_of(points.xyz, idx, store.least))
 

@@ -200,4 +200,3 @@ def place(path: str, method: NearestMethod, tile: int) -> None:
     work = WorkFolder(Path(path))
     place_tile(work, method, tile)
     work.discard(weighed_name(tile))
-

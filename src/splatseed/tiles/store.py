@@ -94,9 +94,7 @@ class TileStore:
         """The least distance of two points."""
         return least_distance(float(np.nanmax(np.abs(self.bounds))))
 
-    def points(
-        self, tile: int, within: Float64[np.ndarray, "2 3"] | None = None
-    ) -> Points:
+    def points(self, tile: int, within: Float64[np.ndarray, "2 3"] | None = None) -> Points:
         """The points of a tile.
 
         Args:

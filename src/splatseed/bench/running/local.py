@@ -131,4 +131,3 @@ class LocalExecutor(Executor):
             child = Child(spec, work, target, self._options, environment)
             self._children[spec.key] = child
         return child
-

@@ -36,9 +36,9 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
 __all__ = [
+    "point_rows",
     "read_cameras",
     "read_images",
-    "point_rows",
     "read_points3d",
     "set_point_count",
     "write_cameras",
