@@ -67,8 +67,8 @@ class TileDraws:
         local = np.cumsum(self._count) - self._count
         first = self._drawn + self._start * columns
         powers = _powers(self._step)
-        _fill(first, self._count * columns, local * columns, _words([self._state])[0],
-              _words([self._step])[0], powers, out.reshape(-1))  # fmt: skip
+        state = _words([self._state])[0]
+        _fill(first, self._count * columns, local * columns, state, powers, out.reshape(-1))
         self._drawn += self._total * columns
         return out.reshape(shape)
 
@@ -87,7 +87,7 @@ def _words(numbers: list[int]) -> np.ndarray:
 
 
 @kernel
-def _fill(first, count, local, state, step, powers, out):  # type: ignore[no-untyped-def]  # Numba's types
+def _fill(first, count, local, state, powers, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Floats ``first[i] : first[i] + count[i]`` of the stream to ``out[local[i] :]``, for all i."""
     pieces = 64
     each = (len(first) + pieces - 1) // pieces
@@ -99,7 +99,7 @@ def _fill(first, count, local, state, step, powers, out):  # type: ignore[no-unt
             for f in range(count[i]):
                 word = (first[i] + f) >> 1
                 if word != at:
-                    high, low = _advance(high, low, word - at, step, powers)
+                    high, low = _advance(high, low, word - at, powers)
                     at = word
                 bits = _output(high, low)
                 if (first[i] + f) & 1:
@@ -109,7 +109,7 @@ def _fill(first, count, local, state, step, powers, out):  # type: ignore[no-unt
 
 
 @inline
-def _advance(high, low, steps, step, powers):  # type: ignore[no-untyped-def]  # Numba's types
+def _advance(high, low, steps, powers):  # type: ignore[no-untyped-def]  # Numba's types
     power = 0
     while steps > 0:
         if steps & 1:
