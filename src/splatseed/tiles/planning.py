@@ -15,9 +15,9 @@ from splatseed.upsample.nearest import NearestMethod
 
 __all__ = ["TilePlan", "check_disk", "plan_tiles", "words_of"]
 
-PROCESS = 420 << 20
+PROCESS = 300 << 20
 """Memory of a process before it holds any points: libraries, compiled kernels, and their slack."""
-PER_POINT, PER_NEIGHBOR, PER_NEW = 420, 22, 90
+PER_POINT, PER_NEIGHBOR, PER_NEW = 200, 20, 50
 """Bytes that a tile takes for each point, for each neighbour of each, and for each new point."""
 MOST, LEAST = 1 << 20, 1 << 13
 """Larger tiles are no faster; smaller ones spend their time on their borders."""

@@ -44,7 +44,7 @@ __all__ = ["Tiling", "find_source", "run_tiled"]
 
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz", ".glb")
 """Files of points that only ``open_cloud`` reads."""
-PROCESS, PER_POINT, PER_NEIGHBOR = 420 << 20, 120, 20
+PROCESS, PER_POINT, PER_NEIGHBOR = 300 << 20, 120, 20
 """Bytes that the process takes, a cloud in memory for each original, and for each neighbour."""
 WHOLE = ("budget", "cover_cell", "verify", "preview", "gaussians", "depth_maps", "cloud_files")
 """Options that need all points in memory."""
