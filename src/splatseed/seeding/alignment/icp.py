@@ -104,22 +104,25 @@ def fit(
 
 
 def _pairs(
-    surface: Surface, marks: Float64[np.ndarray, "M 3"], found: Similarity
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Marks in the cloud's frame, normals, signed plane residuals and distances, there."""
-    q = found.points(marks)
-    distance, idx = surface.tree.query(q)
+    surface: Surface, q: Float64[np.ndarray, "M 3"], bound: float = np.inf
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normals, signed plane residuals and distances of marks in the cloud's frame.
+
+    Beyond ``bound`` the distance is infinite, and the others say nothing.
+    """
+    distance, idx = surface.tree.query(q, distance_upper_bound=bound)
+    idx = np.minimum(idx, len(surface.xyz) - 1)
     normals = surface.normals[idx]
-    return q, normals, np.einsum("ij,ij->i", normals, q - surface.xyz[idx]), distance
+    return normals, np.einsum("ij,ij->i", normals, q - surface.xyz[idx]), distance
 
 
 def _step(
     surface: Surface, marks: Float64[np.ndarray, "M 3"], found: Similarity, reach: float
 ) -> tuple[Similarity, float, float] | None:
     """One round: the better similarity, the marks' noise in scene units, and how far it moved."""
-    q, normals, off, distance = _pairs(surface, marks, found)
-    limit = reach * found.scale
-    near = distance < 2 * limit
+    q, limit = found.points(marks), reach * found.scale
+    normals, off, distance = _pairs(surface, q, 2 * limit)
+    near = np.isfinite(distance)
     if np.count_nonzero(near) < LEAST:
         return None
     q, normals, off = q[near], normals[near], off[near]
@@ -164,8 +167,8 @@ def _rotation(w: np.ndarray) -> Float64[np.ndarray, "3 3"]:
 def _result(
     surface: Surface, marks: Float64[np.ndarray, "M 3"], found: Similarity, reach: float
 ) -> Fitted | None:
-    q, normals, off, distance = _pairs(surface, marks, found)
-    limit = reach * found.scale
+    q, limit = found.points(marks), reach * found.scale
+    normals, off, distance = _pairs(surface, q)
     inside = (np.abs(off) < limit) & (distance < 2 * limit)
     if np.count_nonzero(inside) < LEAST:
         return None
