@@ -14,7 +14,7 @@ import tyro
 
 from splatseed.commands.info.advice import run_advice
 from splatseed.commands.options import parse_options
-from splatseed.commands.upsample.cloud import CLOUD, Bringing, cloud_method, settle_cloud
+from splatseed.commands.upsample.cloud import CLOUD, Bringing, bring_clouds, settle_cloud
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
 from splatseed.commands.upsample.start import check_start, write_start
 from splatseed.console import (
@@ -223,7 +223,10 @@ def run(arguments: list[str]) -> None:
         if options.gaussians is not None:
             photographed(scene)  # raises without photographs: views bound the Gaussians' sizes
         options = _settle(options, scene, notes)
-        methods = _with_clouds(options, scene, methods)
+        plain = cast("Cloud", methods[CLOUD])
+        brought = bring_clouds(options.bringing, scene, plain, clock)
+        scene, methods = brought.scene, {**methods, CLOUD: brought.method}
+        notes += brought.notes
         method = methods[options.method]
         total = _planned(options, method, len(scene.points))
     _announce(options, scene, method, total, _idle(options, methods))
@@ -234,6 +237,7 @@ def run(arguments: list[str]) -> None:
         checks = _check(scene, seeds, method)
         clock("write", 0.0)
         report = _write(options, scene.replace(points=seeds), method)
+        brought.write(options.output)
         if options.gaussians is not None:
             write_start(options.gaussians, scene.replace(points=seeds), method, clock)
             notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
@@ -260,16 +264,6 @@ def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
         return options
     method = method_for(scene, options.method, notes.append)
     return dataclasses.replace(options, method=str(method))
-
-
-def _with_clouds(
-    options: Options, scene: Scene, methods: dict[str, Upsampler]
-) -> dict[str, Upsampler]:
-    """The methods, with ``cloud`` knowing its files and their frame."""
-    if not options.cloud_files:
-        return methods
-    plain = cast("Cloud", methods[CLOUD])
-    return {**methods, CLOUD: cloud_method(options.bringing, scene, plain)}
 
 
 def _planned(options: Options, method: Upsampler, count: int) -> int | None:
