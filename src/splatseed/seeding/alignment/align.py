@@ -33,18 +33,16 @@ __all__ = ["Alignment", "align"]
 LEAST_MARKS = 200
 MOST_MARKS = 20000
 ROUNDS = (
-    (150, 250, 10, 0.25, 0.04),
-    (16, 1500, 15, 0.1, 0.02),
-    (4, MOST_MARKS, 40, 0.04, 0.01),
+    (150, 250, 10, 0.25, 0.04, 0.04),
+    (16, 1500, 15, 0.1, 0.02, 0.02),
+    (4, MOST_MARKS, 40, 0.04, 0.005, 0.01),
 )
-"""Stages: alignments, marks, rounds of ICP, the first reach, and within how much of the cloud marks
+"""Stages: alignments, marks, rounds of ICP, the first and the last reach, and within how much of the cloud marks
 count, in extents."""
-FINEST = 0.002
-"""Least reach, in extents."""
 CLOSE = 0.01
-SHARE = 0.25
-"""Least share of marks on the cloud: a third of a handheld depth camera's are, and 0.75 of a
-render's."""
+SHARE = 0.5
+"""Least share of marks on the cloud: 0.75 in a good one (room0), 0.33 of a handheld depth camera's
+(red kitchen), where right and wrong alignments cannot be told apart."""
 RIVAL = 0.65
 """A rival with this part of the best share is nearly as good. Among wrong alignments the best and
 the next are always so."""
@@ -106,8 +104,8 @@ class Alignment:
         """What was found, in a sentence."""
         return (
             f"Aligned at scale {self.scene_from_cloud.scale:.6g}: {self.share:.0%} of the scene's "
-            f"points lie on the cloud, {self.residual:.3g} from it in the median, sure to "
-            f"{self.error:.2g} (the scene's unit)."
+            f"points lie on the cloud, {self.residual:.3g} from it in the median, standard "
+            f"error {self.error:.2g} (the scene's unit)."
         )
 
 
@@ -209,11 +207,11 @@ def _candidates(
     rows = zip(starts.scale, starts.rotation, starts.shift, strict=True)
     waiting = [Similarity(float(scale), rotation, shift) for scale, rotation, shift in rows]
     found: list[_Candidate] = []
-    for stage, (num, count, rounds, far, close) in enumerate(ROUNDS):
+    for stage, (num, count, rounds, far, least, close) in enumerate(ROUNDS):
         some = marks[:: -(-len(marks) // count)]
         found = []
         for i, start in enumerate(waiting[:num]):
-            fitted = fit(surface, some, start, far, rounds, FINEST)
+            fitted = fit(surface, some, start, far, rounds, least)
             if fitted is not None and 0.3 < fitted.cloud_from_scene.scale < 3.0:
                 found.append(_Candidate(fitted, float(np.mean(fitted.residuals < close))))
             progress("align", (stage + (i + 1) / len(waiting[:num])) / len(ROUNDS))
