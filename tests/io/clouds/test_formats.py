@@ -235,6 +235,11 @@ def test_point_maps_of_networks(tmp_path, rng):
     check(tmp_path / "d.npz", xyz.reshape(-1, 3)[kept], rgb.reshape(-1, 3)[kept], 1e-6)
 
 
+def test_an_array_stored_column_by_column(tmp_path, points):
+    np.savez(tmp_path / "f.npz", xyz=np.asfortranarray(points[0]), rgb=np.asfortranarray(points[1]))
+    check(tmp_path / "f.npz", *points)
+
+
 @settings(max_examples=20, deadline=None)
 @given(size=st.integers(1, 300), name=st.sampled_from(["a.ply", "a.xyz", "a.npz"]))
 def test_chunks_of_any_size_hold_the_same(tmp_path_factory, size, name):

@@ -31,11 +31,11 @@ from splatseed.similarity import Similarity
 __all__ = ["Alignment", "align"]
 
 LEAST_MARKS = 200
-MOST_MARKS = 20000
+MOST_MARKS = 6000
 ROUNDS = (
-    (150, 250, 10, 0.25, 0.04, 0.04),
-    (16, 1500, 15, 0.1, 0.02, 0.02),
-    (4, MOST_MARKS, 40, 0.04, 0.005, 0.01),
+    (120, 200, 10, 0.25, 0.04, 0.04),
+    (12, 800, 12, 0.1, 0.02, 0.02),
+    (3, MOST_MARKS, 30, 0.04, 0.005, 0.01),
 )
 """Stages: alignments, marks, rounds of ICP, the first and the last reach, and within how much of the cloud marks
 count, in extents."""
@@ -43,7 +43,7 @@ CLOSE = 0.01
 SHARE = 0.5
 """Least share of marks on the cloud: 0.75 in a good one (room0), 0.33 of a handheld depth camera's
 (red kitchen), where right and wrong alignments cannot be told apart."""
-RIVAL = 0.65
+RIVAL = 0.7
 """A rival with this part of the best share is nearly as good. Among wrong alignments the best and
 the next are always so."""
 TURNED, SCALED, SHIFTED = 8.0, 0.08, 0.1
