@@ -69,7 +69,8 @@ def test_a_cloud_that_is_shifted_scaled_and_turned(made):
     assert found.error < 0.003 * found.extent
     np.testing.assert_allclose(
         np.array(found.report["matrix"])[:3] @ np.append(MOVE.translation, 1.0),
-        found.scene_from_cloud.points(MOVE.translation[None])[0], atol=1e-6,
+        found.scene_from_cloud.points(MOVE.translation[None])[0],
+        atol=1e-6,
     )
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.seeding.clouds.support import find_support
-from splatseed.seeding.clouds.voxels import EvenVoxels, Voxels
+from splatseed.seeding.clouds.voxels import ASIDE, EvenVoxels, Voxels
 from splatseed.views.view import View
 
 
@@ -36,7 +36,7 @@ def reference(xyz, rgb, pixels):
                 least = min(least, pixels * cam[2] / each.K[0, 0])
         if least < np.inf:
             level = int(np.floor(np.log2(least)))
-            groups[level, *np.floor(point / 2.0**level).astype(int)].append(i)
+            groups[level, *np.floor((point + ASIDE) / 2.0**level).astype(int)].append(i)
     mean = np.array([xyz[which].mean(axis=0) for which in groups.values()])
     color = np.array([rgb[which].mean(axis=0) for which in groups.values()])
     return mean, np.rint(color), np.array([len(which) for which in groups.values()])
@@ -92,7 +92,7 @@ def test_even_voxels_fit_their_capacity_at_the_smallest_side(rng):
     voxels.add(xyz[:10])
     voxels.add(xyz[10:])
     assert 250 <= len(voxels) <= 1000
-    cells = np.floor(voxels.xyz / voxels.spacing)
+    cells = np.floor((voxels.xyz + ASIDE) / voxels.spacing)
     assert len(np.unique(cells, axis=0)) == len(cells)
 
 
