@@ -34,7 +34,6 @@ from splatseed.synthetic.capture import Capture, make_capture, write_capture
 
 __all__: list[str] = []
 
-NUM_VIEWS, WIDTH, HEIGHT = 100, 800, 600
 NOISE = 0.002
 GHOSTS = 0.01
 CLUSTERS, CLUSTER = 3, 0.06
@@ -58,6 +57,10 @@ class Options:
     """Points of the scan."""
     budget: str = "500k"
     """Seeds."""
+    views: int = 100
+    """Photographs."""
+    width: int = 800
+    """Their width in pixels; their height is three quarters of it."""
 
 
 def grid_from_room() -> Similarity:
@@ -128,8 +131,11 @@ def main(options: Options) -> None:
     """Make what is missing, run, and print a table."""
     warn_if_busy()
     options.work.mkdir(parents=True, exist_ok=True)
-    capture = make_capture(0, NUM_VIEWS, WIDTH, HEIGHT)
-    scene, scan = options.work / "scene", options.work / f"scan_{options.limit}.laz"
+    capture = make_capture(0, options.views, options.width, options.width * 3 // 4)
+    scene, scan = (
+        options.work / f"scene_{options.views}_{options.width}",
+        options.work / f"scan_{options.limit}.laz",
+    )
     if not scene.exists():
         write_capture(capture, scene)
     if not scan.exists():
