@@ -50,6 +50,14 @@ class Similarity:
         rotation = self.rotation.T
         return Similarity(1 / self.scale, rotation, -rotation @ self.translation / self.scale)
 
+    def then(self, second: Similarity) -> Similarity:
+        """This similarity, and another after it."""
+        return Similarity(
+            second.scale * self.scale,
+            second.rotation @ self.rotation,
+            second.scale * second.rotation @ self.translation + second.translation,
+        )
+
     @property
     def matrix(self) -> Float64[np.ndarray, "3 4"]:
         """The similarity as an affine map."""

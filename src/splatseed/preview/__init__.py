@@ -5,6 +5,7 @@ Promise: the functions that make pictures and tiles touch no files; the same inp
 bytes; files appear whole or not at all.
 """
 
+from splatseed.preview.alignment import preview_alignment
 from splatseed.preview.cells import CoveredView, cell_picture, preview_cells
 from splatseed.preview.clouds import preview_errors, preview_methods, preview_pair
 from splatseed.preview.colors import color_bar, heat
@@ -25,6 +26,7 @@ __all__ = [
     "map_tiles",
     "origin_legend",
     "origin_picture",
+    "preview_alignment",
     "preview_cells",
     "preview_errors",
     "preview_maps",

@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+from jaxtyping import Float64
+
 from splatseed.errors import ParameterError
+from splatseed.io.output.staging import atomic_file
+from splatseed.io.recentring import check_precision, offset_of, recentred
 from splatseed.io.transform_file import read_cloud_transform
+from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
 
 if TYPE_CHECKING:
-    from splatseed.seeding.clouds.method import Cloud, GivenClouds
+    from splatseed.seeding.alignment.align import Alignment
+    from splatseed.seeding.clouds.method import Cloud
 
-__all__ = ["CLOUD", "Bringing", "cloud_method", "settle_cloud"]
+__all__ = ["CLOUD", "Bringing", "Brought", "bring_clouds", "settle_cloud"]
 
 CLOUD = "cloud"
+RECENTER, ALIGNMENT = "recenter.json", "alignment.json"
+CLOSE = 0.01
+"""Residual at which a point's colour is halfway, in extents."""
 BESIDE = (CLOUD, "auto", "stereo", "cover", "depth")
 """Methods that --cloud can be combined with."""
 
@@ -65,22 +76,88 @@ def settle_cloud(options: Any, arguments: Sequence[str]) -> Any:
             found=method,
             fix="Leave --method out for the cloud's points alone: interpolating needs no scan.",
         )
+    if options.recenter and options.format == "transforms":
+        raise ParameterError(
+            "--format colmap with --recenter", found="transforms", fix="Leave --format out."
+        )
     asked = "--align" in arguments
     if asked and options.cloud_transform is not None:
         raise ParameterError("--align or --transform", found="both", fix="Leave one of them out.")
-    return dataclasses.replace(options, method=method, cloud_align=asked)
+    layout = "colmap" if options.recenter else options.format
+    return dataclasses.replace(options, method=method, cloud_align=asked, format=layout)
 
 
-def cloud_method(
-    bringing: Bringing, scene: Scene, method: Cloud, found: Similarity | None = None
-) -> GivenClouds:
-    """The method ``cloud`` with its files and their transform.
+class Brought(NamedTuple):
+    """A scene and the clouds for it."""
+
+    scene: Scene
+    method: Cloud
+    """The method ``cloud``, with its files if there are any."""
+    alignment: Alignment | None = None
+    offset: Float64[np.ndarray, " 3"] | None = None
+    """What was subtracted from all coordinates of the scene."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the user should know, one sentence each."""
+        notes = () if self.alignment is None else (self.alignment.sentence,)
+        if self.offset is None:
+            return notes
+        place = ", ".join(f"{value:.0f}" for value in self.offset)
+        return (*notes, f"Scene and cloud were moved by -({place}), as {RECENTER} has it.")
+
+    def write(self, folder: Path) -> None:
+        """Write the reports beside the scene, if there are any.
+
+        Raises:
+            OutputError: One cannot be written.
+        """
+        if self.offset is not None:
+            told = {
+                "offset": self.offset.tolist(),
+                "meaning": "coordinates before = after + offset",
+            }
+            _write_json(folder / RECENTER, told)
+        if self.alignment is not None:
+            from splatseed.preview import preview_alignment  # noqa: PLC0415  (Pillow)
+
+            found = self.alignment
+            _write_json(folder / ALIGNMENT, found.report)
+            off = found.residuals / (2 * CLOSE * found.extent)
+            picture = folder / "preview_alignment.png"
+            preview_alignment(self.scene, found.sample, found.rgb, found.marks, off, picture)
+
+
+def _write_json(path: Path, content: Mapping[str, object]) -> None:
+    with atomic_file(path) as partial:
+        partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def bring_clouds(bringing: Bringing, scene: Scene, method: Cloud, progress: Progress) -> Brought:
+    """The scene, recentred if so asked, and the method ``cloud`` with its files in its frame.
 
     Raises:
-        SceneNotFoundError: There is no such transform.
-        SceneFormatError: It is no similarity.
+        ParameterError: The scene's coordinates need recentring.
+        PointCloudError: An alignment is not sure.
+        SceneNotFoundError: A file is missing.
+        SceneFormatError: One is damaged.
     """
-    transform = found
+    if not bringing.files:
+        return Brought(scene, method)
+    transform = None
     if bringing.transform is not None:
         transform = read_cloud_transform(bringing.transform, scene)
-    return method.of(*bringing.files, transform=transform)
+    offset = None
+    if bringing.recenter:
+        offset = offset_of(scene)
+        scene = recentred(scene, offset)
+        moved = Similarity(1.0, np.eye(3), -offset)
+        transform = moved if transform is None else transform.then(moved)
+    check_precision(scene)
+    alignment = None
+    if bringing.align:
+        from splatseed.seeding.alignment.align import align  # noqa: PLC0415  (loads Numba)
+
+        alignment = align(scene, bringing.files, progress)
+        transform = alignment.scene_from_cloud
+    return Brought(scene, method.of(*bringing.files, transform=transform), alignment, offset)

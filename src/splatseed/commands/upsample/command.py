@@ -14,7 +14,15 @@ import tyro
 
 from splatseed.commands.info.advice import run_advice
 from splatseed.commands.options import parse_options
-from splatseed.commands.upsample.cloud import CLOUD, Bringing, cloud_method, settle_cloud
+from splatseed.commands.upsample.cloud import CLOUD, Bringing, bring_clouds, settle_cloud
+from splatseed.commands.upsample.flags import (
+    budget_flag,
+    cover_flag,
+    default_flag,
+    depth_folder_flag,
+    memory_flag,
+    number_flag,
+)
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
 from splatseed.commands.upsample.start import check_start, write_start
 from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
@@ -54,51 +62,6 @@ __all__ = ["Options", "parse", "run"]
 HELP_ALL = "--help-all"
 
 
-def _number(kind: type, default: str) -> Any:
-    """How an optional number appears in the help: as a number, with its default in words."""
-    return tyro.conf.arg(
-        constructor=kind,
-        metavar=kind.__name__.upper(),
-        help_behavior_hint=f"(default: {default})",
-    )
-
-
-def _cover() -> Any:
-    """The flag --cover; its field has another name, since the method cover has that one."""
-    return tyro.conf.arg(
-        name="cover",
-        constructor=int,
-        metavar="INT",
-        help_behavior_hint="(default: none; auto and cover do so anyway)",
-    )
-
-
-def _budget() -> Any:
-    """How a budget appears in the help."""
-    return tyro.conf.arg(
-        constructor=str, metavar="N|Xrho", help_behavior_hint="(default: no limit)"
-    )
-
-
-def _memory() -> Any:
-    """How an amount of memory appears in the help."""
-    return tyro.conf.arg(
-        constructor=str, metavar="BYTES|4G", help_behavior_hint="(default: what is free)"
-    )
-
-
-def _default(stands_in: str) -> Any:
-    """How an optional choice appears in the help: with its default in words."""
-    return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
-
-
-def _depth_folder() -> Any:
-    """The flag --depth; its field has another name, since the method depth has that one."""
-    return tyro.conf.arg(
-        name="depth", constructor=Path, metavar="DIR", help_behavior_hint="(default: the scene's)"
-    )
-
-
 @dataclass(frozen=True)
 class Options:
     """Upsample the points of a scene, ready for any 3DGS trainer."""
@@ -110,13 +73,13 @@ class Options:
     method: str = DEFAULT_METHOD
     """The method that makes new points; the flags of each are below. auto uses the
     photographs."""
-    ratio: Annotated[float | None, _number(float, "4, unless --num-points is given")] = None
+    ratio: Annotated[float | None, number_flag(float, "4, unless --num-points is given")] = None
     """Points in all, as a multiple of the originals, for methods that interpolate."""
-    num_points: Annotated[int | None, _number(int, "by the ratio")] = None
+    num_points: Annotated[int | None, number_flag(int, "by the ratio")] = None
     """Points in all, instead of a ratio."""
-    budget: Annotated[str | None, _budget()] = None
+    budget: Annotated[str | None, budget_flag()] = None
     """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph."""
-    cover_cell: Annotated[int | None, _cover()] = None
+    cover_cell: Annotated[int | None, cover_flag()] = None
     """Side in pixels of the parts of the photographs that get a seed if no point falls in."""
     verify: bool = False
     """Check interpolated points against the photographs: slide them onto surfaces, drop those that
@@ -125,11 +88,11 @@ class Options:
     """The same seed gives the same bytes."""
     profile: Profile = "default"
     """Defaults of the method flags below: improved ones, or those of the paper's text."""
-    depth_maps: Annotated[Path | None, _depth_folder()] = None
+    depth_maps: Annotated[Path | None, depth_folder_flag()] = None
     """For --method depth: a folder of depth maps, in any layout that docs/formats.md lists."""
-    depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
+    depth_kind: Annotated[DepthKind | None, default_flag("what the folder says, else z")] = None
     """What their values are: planar depth, distance along the ray, or inverse depth."""
-    depth_scale: Annotated[float | None, _number(float, "what the folder says")] = None
+    depth_scale: Annotated[float | None, number_flag(float, "what the folder says")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
     align: bool = True
     """With --cloud, --align finds the transform to the scene's own points; for --method depth,
@@ -149,15 +112,15 @@ class Options:
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
     cloud_align: tyro.conf.Suppress[bool] = False
-    memory: Annotated[str | None, _memory()] = None
+    memory: Annotated[str | None, memory_flag()] = None
     """Most memory. A cloud that takes more is worked on in tiles on disk, with the same result."""
-    jobs: Annotated[int | None, _number(int, "1; with Ray, as many as fit")] = None
+    jobs: Annotated[int | None, number_flag(int, "1; with Ray, as many as fit")] = None
     """Tiles at a time, each in a process of its own."""
     executor: Literal["local", "ray"] = "local"
     """Who works on tiles: this machine, or a Ray cluster that shares its disk."""
-    address: Annotated[str | None, _default("a cluster on this machine")] = None
+    address: Annotated[str | None, default_flag("a cluster on this machine")] = None
     """The cluster's address, or auto on one of its nodes."""
-    tile_points: Annotated[int | None, _number(int, "by the memory")] = None
+    tile_points: Annotated[int | None, number_flag(int, "by the memory")] = None
     """Most points in a tile."""
     preview: bool = False
     """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's
@@ -252,7 +215,10 @@ def run(arguments: list[str]) -> None:
         if options.gaussians is not None:
             photographed(scene)  # raises without photographs: views bound the Gaussians' sizes
         options = _settle(options, scene, notes)
-        methods = _with_clouds(options, scene, methods)
+        plain = cast("Cloud", methods[CLOUD])
+        brought = bring_clouds(options.bringing, scene, plain, clock)
+        scene, methods = brought.scene, {**methods, CLOUD: brought.method}
+        notes += brought.notes
         method = methods[options.method]
         total = _planned(options, method, len(scene.points))
     _announce(options, scene, method, total, _idle(options, methods))
@@ -263,6 +229,7 @@ def run(arguments: list[str]) -> None:
         checks = _check(scene, seeds, method)
         clock("write", 0.0)
         report = _write(options, scene.replace(points=seeds), method)
+        brought.write(options.output)
         if options.gaussians is not None:
             write_start(options.gaussians, scene.replace(points=seeds), method, clock)
             notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
@@ -289,16 +256,6 @@ def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
         return options
     method = method_for(scene, options.method, notes.append)
     return dataclasses.replace(options, method=str(method))
-
-
-def _with_clouds(
-    options: Options, scene: Scene, methods: dict[str, Upsampler]
-) -> dict[str, Upsampler]:
-    """The methods, with ``cloud`` knowing its files and their frame."""
-    if not options.cloud_files:
-        return methods
-    plain = cast("Cloud", methods[CLOUD])
-    return {**methods, CLOUD: cloud_method(options.bringing, scene, plain)}
 
 
 def _planned(options: Options, method: Upsampler, count: int) -> int | None:

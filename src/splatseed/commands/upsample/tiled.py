@@ -32,7 +32,6 @@ from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for
 from splatseed.upsample import BYTES_EACH, Upsampler, planned_size
-from splatseed.upsample.nearest import NearestMethod
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
@@ -88,16 +87,18 @@ def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | 
         SceneFormatError: It is not what its name says.
         OutputError: It has attributes that tiles do not.
     """
+    tiling, path = options.tiling, options.scene
+    if path.is_dir() and not tiling.asked and tiling.memory is None:
+        return None
     from splatseed.tiles import FileSource, SceneSource  # noqa: PLC0415  (Numba)
 
-    tiling, path = options.tiling, options.scene
     if path.is_file() and path.suffix.lower() in CLOUDS and find_model(path.parent) is None:
         return FileSource(open_cloud(path))
     method = methods[options.method]
     if path.is_file() and path.suffix.lower() == ".ply":
         file = FileSource(open_cloud(path))
         return file if tiling.asked or _is_large(options, method, file.count or 0) else None
-    if not tiling.asked and tiling.memory is None:
+    if not tiling.asked and tiling.memory is None:  # a file that holds no cloud alone
         return None
     scene = load_scene(path)
     scene = scene.replace(points=scene.points.originals)
@@ -107,6 +108,8 @@ def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | 
 
 def _is_large(options: Options, method: Upsampler, count: int) -> bool:
     """Whether the whole cloud takes more memory than it may."""
+    from splatseed.upsample.nearest import NearestMethod  # noqa: PLC0415  (SciPy, Numba)
+
     total = planned_size(count, options.ratio, options.num_points)
     neighbors = method.num_queried if isinstance(method, NearestMethod) else 16
     needed = PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
@@ -154,7 +157,7 @@ def run_tiled(
         plan = _plan(options, method, source, tasks.processes)
         check_disk(path, plan.disk, _size_of(path))
         with _kept(path), open_work(path, request.job(source)) as (work, resumed):
-            _announce(options, method, source, plan, tasks, path if resumed else None)
+            _announce(options, source, plan, tasks, path if resumed else None)
             with stage_display(clock, remaining=True):
                 from splatseed.tiles import make_tiled  # noqa: PLC0415  (Numba)
 
@@ -221,7 +224,6 @@ def _plan(options: Options, method: Upsampler, source: Source, processes: int) -
 
 def _announce(
     options: Options,
-    method: Upsampler,
     source: Source,
     plan: TilePlan,
     tasks: Tasks,
@@ -235,7 +237,6 @@ def _announce(
         f" (seed {options.seed}, {tasks.words})",
         soft_wrap=True,
     )
-    del method
     if resumed is not None:
         done = {name: len(list((resumed / name).glob("*[0-9]"))) for name in ("weighed", "made")}
         print_note(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -21,6 +21,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.clouds.cloud_file import CHUNK, CloudChunk, CloudFile
 from splatseed.io.clouds.colors import ColorRange
 from splatseed.io.clouds.rows import COPY_AGAIN
+from splatseed.process.memory import check_memory
 
 __all__ = ["CONFIDENCES", "LEAST", "MASKS", "POSITIONS", "NpzCloud"]
 
@@ -31,6 +32,7 @@ CONFIDENCES = ("world_points_conf", "conf", "confs", "confidence")
 LEAST = 1.5
 """Least confidence that counts: these networks give 1 where they know nothing, and 3 to 30 on
 surfaces."""
+_STRAIGHTEN = "Save the array row by row: numpy.ascontiguousarray."
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,13 @@ class _Member:
         name: Its name, without ".npy".
         shape: Its shape.
         dtype: Its type.
+        turned: Whether it is stored column by column (Fortran's order), and so read whole.
     """
 
     name: str
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
+    turned: bool = False
 
     @property
     def rows(self) -> int:
@@ -136,9 +140,9 @@ def _members(path: Path) -> dict[str, _Member]:
                 if name.endswith(".npy"):
                     with archive.open(name) as file:
                         shape, fortran, dtype = _header(file)
-                    if not (fortran and len(shape) > 1) and not dtype.hasobject:
+                    if not dtype.hasobject:
                         key = name.removesuffix(".npy")
-                        members[key] = _Member(key, shape, dtype)
+                        members[key] = _Member(key, shape, dtype, fortran and len(shape) > 1)
     except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError) as error:
         raise _damaged(path, error) from None
     return members
@@ -153,6 +157,12 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 def _parts(path: Path, member: _Member, size: int) -> Iterator[np.ndarray]:
     """The values of an array in order, flat, ``size`` at a time."""
     left = int(np.prod(member.shape, dtype=np.int64))
+    if member.turned:
+        check_memory(2 * left * member.dtype.itemsize, 1, "bytes", fix=_STRAIGHTEN)
+        for values in _parts(path, replace(member, turned=False), max(left, 1)):
+            straight = values.reshape(member.shape, order="F").ravel()
+            yield from (straight[start : start + size] for start in range(0, left, size))
+        return
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{member.name}.npy") as file:
             _header(file)

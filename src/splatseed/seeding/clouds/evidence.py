@@ -40,6 +40,8 @@ RAY_CELL = 4
 """Side in pixels of the cells in which rays are free."""
 THROUGH = 0.1
 """A point is clearly nearer by this share of the depth."""
+FITS = 0.03
+"""Share of the depth within which a scene's own point lies on a cloud's surface."""
 BLOCK = 1 << 20
 NO_VIEW = np.float32(0.0)
 
@@ -168,7 +170,7 @@ def surface_agreement(
 
     Returns:
         Of the points that are seen where the cloud has a surface, the share that lies within
-        ``THROUGH`` of its depth; and the number of these points.
+        ``FITS`` of its depth; and the number of these points.
     """
     close = total = 0
     for view, surface, xyz in zip(views, surfaces, seen, strict=True):
@@ -176,7 +178,7 @@ def surface_agreement(
         there = surface[rows, cols]
         known = np.isfinite(there)
         total += int(np.count_nonzero(known))
-        close += int(np.count_nonzero(np.abs(depth[known] / there[known] - 1.0) <= THROUGH))
+        close += int(np.count_nonzero(np.abs(depth[known] / there[known] - 1.0) <= FITS))
     return (close / total if total else 0.0), total
 
 

@@ -27,6 +27,9 @@ BYTES_EACH = 320
 """Bytes per voxel, at most: 45 here, the others where voxels are looked at, thinned and written."""
 CHUNKS, BLOCK = 64, 512
 UNSEEN = -(1 << 15)
+ASIDE = 0.381966
+"""Where voxels begin along each axis: walls at round coordinates would lie on their sides, and
+rounding put their points into either."""
 FINEST = 20
 """Halvings of the first points' extent that make the first side of even voxels."""
 
@@ -276,7 +279,7 @@ def _key(point, level, coarser):  # type: ignore[no-untyped-def]  # Numba's type
     per_side = np.exp2(-np.float64(level + coarser))
     key = scramble(np.uint64(np.int64(level) + 4096))
     for axis in range(3):
-        key = scramble(key ^ np.uint64(np.int64(np.floor(point[axis] * per_side))))
+        key = scramble(key ^ np.uint64(np.int64(np.floor((point[axis] + ASIDE) * per_side))))
     return key
 
 

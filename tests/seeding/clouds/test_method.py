@@ -1,0 +1,139 @@
+"""The method ``cloud`` on a made room: surfaces are known, ghosts are planted."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+import splatseed as ss
+from splatseed.errors import ParameterError, PointCloudError
+from splatseed.seeding.clouds.method import Cloud
+from splatseed.similarity import Similarity
+from splatseed.upsample.registry import SOURCE_CODES
+
+CLOUD, COVER = SOURCE_CODES["cloud"], SOURCE_CODES["cover"]
+NUM, GHOSTS = 150_000, 3_000
+MOVE = Similarity(2.5, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([5e5, 5e6, 90.0]))
+
+
+@pytest.fixture(scope="module")
+def scan(room_capture):
+    """Points on the surfaces in their colours, and magenta ghosts in front of them."""
+    rng = np.random.default_rng(5)
+    parts, textures = room_capture.room.surfaces.parts, room_capture.room.textures
+    share = np.array([part.area for part in parts])
+    counts = rng.multinomial(NUM, share / share.sum())
+    xyz = [part.sample(count, rng) for part, count in zip(parts, counts, strict=True)]
+    rgb = [178 * texture(each) for texture, each in zip(textures, xyz, strict=True)]
+    ghosts = rng.uniform((-1.3, -1.3, 0.2), (1.3, 1.3, 1.3), (GHOSTS, 3))
+    ghosts[::2] = (0.6, -0.6, 0.9) + 0.05 * rng.normal(size=(GHOSTS // 2, 3))
+    xyz = np.concatenate([*xyz, ghosts]) + 0.001 * rng.normal(size=(NUM + GHOSTS, 3))
+    rgb = np.concatenate([*rgb, np.tile((220, 20, 220), (GHOSTS, 1))])
+    return xyz, np.clip(rgb, 0, 255).astype(np.uint8)
+
+
+def written(folder, scan, name="scan.npz", **arrays):
+    np.savez(folder / name, xyz=scan[0], rgb=scan[1], **arrays)
+    return folder / name
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory, scan):
+    return written(tmp_path_factory.mktemp("scan"), scan)
+
+
+@pytest.fixture(scope="module")
+def seeds(room, path):
+    notes = []
+    return ss.upsample(room, Cloud().of(path), note=notes.append), notes
+
+
+def test_originals_come_first_then_points_on_surfaces(room, room_capture, seeds):
+    cloud = seeds[0]
+    np.testing.assert_array_equal(cloud.xyz[: len(room.points)], room.points.xyz)
+    new = cloud.select(cloud.source == CLOUD)
+    assert len(room.points) + len(new) == len(cloud)
+    off = np.abs(room_capture.surfaces.distance(new.xyz.astype(float)))
+    assert np.median(off) < 0.004 and np.mean(off > 0.05) < 0.002
+
+
+def test_ghosts_go_and_what_they_hid_stays(scan, seeds):
+    new = seeds[0].select(seeds[0].source == CLOUD)
+    near = np.linalg.norm(new.xyz - (0.6, -0.6, 0.9), axis=1) < 0.1
+    assert np.count_nonzero(near) <= 3
+    assert any("have another colour" in note and "lie alone" in note for note in seeds[1])
+
+
+def test_a_grid_far_away_and_another_scale_lose_nothing(room, scan, seeds, tmp_path):
+    moved = written(tmp_path, (MOVE.points(scan[0]), scan[1]))
+    again = ss.upsample(room, Cloud().of(moved, transform=MOVE.inverse))
+    first = seeds[0]
+    assert abs(len(again) - len(first)) < 0.002 * len(first)  # rounding may cross a voxel's side
+    from scipy.spatial import KDTree
+
+    assert np.quantile(KDTree(first.xyz).query(again.xyz)[0], 0.99) < 1e-4
+
+
+def test_the_number_of_threads_does_not_matter(room, path, seeds):
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        again = ss.upsample(room, Cloud().of(path))
+    finally:
+        numba.set_num_threads(threads)
+    np.testing.assert_array_equal(again.xyz, seeds[0].xyz)
+    np.testing.assert_array_equal(again.rgb, seeds[0].rgb)
+
+
+def test_colours_from_photographs_where_the_cloud_has_none(room, scan, tmp_path):
+    np.savez(tmp_path / "bare.npz", xyz=scan[0][:NUM])
+    bare = ss.upsample(room, Cloud(clean=False).of(tmp_path / "bare.npz"))
+    new = bare.select(bare.source == CLOUD)
+    own = ss.upsample(
+        room, Cloud(clean=False, recolor=True).of(written(tmp_path, (scan[0][:NUM], scan[1][:NUM])))
+    )
+    np.testing.assert_array_equal(new.rgb, own.rgb[own.source == CLOUD])
+    assert new.rgb.std() > 10
+
+
+def test_beside_cover_and_a_budget(room, path):
+    both = ss.upsample(room, "cover", beside=Cloud().of(path), budget="8k")
+    assert len(both) == 8000
+    assert {0, CLOUD} <= set(both.source)
+    alone = ss.upsample(room, "cover")
+    assert np.count_nonzero(both.source == COVER) < np.count_nonzero(alone.source == COVER)
+
+
+def refused(room, path, match, **options):
+    with pytest.raises(PointCloudError, match=match):
+        ss.upsample(room, Cloud().of(path, **options))
+
+
+def test_what_is_elsewhere_is_refused(room, scan, tmp_path):
+    far = written(tmp_path, (scan[0] + (1e6, 0, 0), scan[1]))
+    refused(room, far, "none of 153,000.*--align.*--transform")
+    turned = written(tmp_path, (0.7 * scan[0][:, [2, 0, 1]] + (0.4, -1, 0.5), scan[1]))
+    refused(room, turned, "of another place")
+
+
+def test_nothing_but_nan_is_refused(room, tmp_path):
+    np.savez(tmp_path / "nan.npz", xyz=np.full((9, 3), np.nan))
+    refused(room, tmp_path / "nan.npz", "9 that are not finite")
+    np.savez(tmp_path / "none.npz", xyz=np.zeros((0, 3)))
+    refused(room, tmp_path / "none.npz", "found none")
+
+
+def test_a_corner_is_told(room, scan, tmp_path):
+    corner = (scan[0] > (0.2, 0.2, 0)).all(axis=1)
+    notes = []
+    path = written(tmp_path, (scan[0][corner], scan[1][corner]))
+    ss.upsample(room, Cloud().of(path), note=notes.append)
+    assert any("covers" in note and "--method auto" in note for note in notes)
+
+
+def test_without_a_file_or_cameras(room, path):
+    with pytest.raises(ParameterError, match="--cloud FILE"):
+        ss.upsample(room, "cloud")
+    with pytest.raises(ParameterError, match="a scene with cameras"):
+        ss.upsample(room.points, Cloud().of(path))
