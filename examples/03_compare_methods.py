@@ -17,7 +17,7 @@ from splatseed.synthetic import SHAPES, Surface
 NUM_POINTS = 2000
 NOISE = 0.1
 """Of the originals, in units of their spacing."""
-NEED_PHOTOGRAPHS = ("depth", "stereo", "cover", "auto")
+NEED_PHOTOGRAPHS = ("depth", "stereo", "cover", "auto", "cloud")
 
 
 def noisy_cloud(surface: Surface, rng: np.random.Generator) -> ss.PointCloud:

@@ -2,7 +2,7 @@
 
 >>> import splatseed as ss
 >>> sorted(ss.METHODS)[:3]
-['auto', 'cover', 'depth']
+['auto', 'cloud', 'cover']
 """
 
 from splatseed.camera import Camera

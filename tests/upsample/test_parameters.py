@@ -170,7 +170,7 @@ def test_the_paper_profile_has_the_papers_values(method, values):
 def test_a_third_party_adds_methods_and_takes_none_over(wavy):
     assert METHODS["copies"] is Copies
     assert METHODS["mls"] is not Copies
-    names = [*BUILT_IN, *PHOTOGRAPH_METHODS, "copies"]
+    names = [*BUILT_IN, *PHOTOGRAPH_METHODS, "cloud", "copies"]
     assert list(METHODS) == names
     assert len(METHODS) == len(names)
     assert set(ss.upsample(wavy, "copies").source) == {0, 255}

@@ -22,7 +22,7 @@ RESOLUTION = 1e-4
 def offset_of(scene: Scene) -> Float64[np.ndarray, " 3"]:
     """The middle of the cameras, in whole units."""
     centers = np.array([image.camera.center for image in scene.images])
-    return np.rint(centers.mean(axis=0))
+    return np.asarray(np.rint(centers.mean(axis=0)))
 
 
 def recentred(scene: Scene, offset: Float64[np.ndarray, " 3"]) -> Scene:

@@ -1,4 +1,4 @@
-"""``splatseed upsample --cloud``: flags that belong together, frames, reports, one-line refusals."""
+"""``splatseed upsample --cloud``: flags, frames, reports, one-line refusals."""
 
 from __future__ import annotations
 
@@ -46,10 +46,13 @@ def test_a_scan_in_the_scenes_frame(splatseed, room, scan, tmp_path):
     )
     assert run.code == 0, run.err
     seeds = load_scene(out).points
-    assert len(seeds) == 1500 and CLOUD in seeds.source
-    assert "cloud)" in run.out and "120,000 points were read" in run.err + run.out
+    assert len(seeds) == 1500
+    assert CLOUD in seeds.source
+    assert "cloud)" in run.out
+    assert "120,000 points were read" in run.err + run.out
     told = json.loads((out / "splatseed.json").read_text())
-    assert told["method"] == "cloud" and len(told["cloud"]["files"]) == 2
+    assert told["method"] == "cloud"
+    assert len(told["cloud"]["files"]) == 2
 
 
 @pytest.mark.parametrize("name", ["t.txt", "t.json", "dataparser_transforms.json"])
@@ -83,7 +86,8 @@ def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, tmp_path):
     np.savez(tmp_path / "far.npz", xyz=xyz + grid)
     words = ("upsample", tmp_path / "far", "--cloud", tmp_path / "far.npz", "-o", tmp_path / "out")
     refused = splatseed(*words)
-    assert refused.code == 2 and "--recenter" in refused.err
+    assert refused.code == 2
+    assert "--recenter" in refused.err
     run = splatseed(*words, "--recenter", "--overwrite")
     assert run.code == 0, run.err
     offset = np.array(json.loads((tmp_path / "out" / "recenter.json").read_text())["offset"])
@@ -121,6 +125,7 @@ def test_refusals_are_one_line_and_leave_nothing(
 ):
     words = [{"SCAN": scan, "MOVED": moved}.get(word, word) for word in words]
     run = splatseed("upsample", room, *words, "-o", tmp_path / "out")
-    assert run.code == 2 and says in run.err
+    assert run.code == 2
+    assert says in run.err
     assert len([line for line in run.err.splitlines() if line.startswith("error")]) == 1
     assert not (tmp_path / "out").exists()

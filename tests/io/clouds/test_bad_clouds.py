@@ -17,7 +17,8 @@ def drain(path):
 def refused(path, match, error=SceneFormatError):
     with pytest.raises(error, match=match) as caught:
         drain(path)
-    assert path.name in str(caught.value) and "\n" not in str(caught.value)
+    assert path.name in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("keep", [0.2, 0.6, 0.98])
@@ -99,7 +100,7 @@ def test_other_names_and_no_file(tmp_path):
 
 
 def test_a_missing_package_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr("splatseed.requirements.find_spec", lambda name: None)
+    monkeypatch.setattr("splatseed.requirements.find_spec", lambda _: None)
     (tmp_path / "a.laz").write_bytes(b"LASF")
     with pytest.raises(MissingDependencyError, match=r"pip install 'laspy"):
         open_cloud(tmp_path / "a.laz")

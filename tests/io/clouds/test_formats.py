@@ -64,7 +64,8 @@ def test_las_with_intensity_alone_is_grey(tmp_path, points):
     grey = whole(path)[1]
     assert open_cloud(path).colors == "intensity"
     assert (grey == grey[:, :1]).all()
-    assert grey[0, 0] == 0 and grey[-1, 0] == 255
+    assert grey[0, 0] == 0
+    assert grey[-1, 0] == 255
     assert (np.diff(grey[:, 0].astype(int)) >= 0).all()
 
 
@@ -123,9 +124,9 @@ def test_ply_properties_in_any_order(tmp_path, points):
         rows[axis] = xyz[:, i]
     for i, name in enumerate(("red", "green", "blue")):
         rows[name] = rgb[:, i]
-    kinds = {"u1": "uchar", ">f8": "double", ">f4": "float"}
-    lines = [f"property {kinds[str(rows.dtype[n]).replace('float64', '>f8').replace('uint8', 'u1')]} {n}"
-             for n in rows.dtype.names]  # fmt: skip
+    kinds = {"u1": "uchar", "f8": "double", "f4": "float"}
+    named = ((name, rows.dtype[name].str[1:]) for name in rows.dtype.names)
+    lines = [f"property {kinds[kind]} {name}" for name, kind in named]
     head = "\n".join(["ply", "format binary_big_endian 1.0", f"element vertex {NUM}", *lines])
     (tmp_path / "a.ply").write_bytes(f"{head}\nend_header\n".encode() + rows.tobytes())
     check(tmp_path / "a.ply", xyz, rgb)
@@ -142,11 +143,10 @@ def pcd_header(kind, packed):
 
 
 def literal_lzf(data):
-    """LZF without any references, and then one run of references."""
-    out = b"".join(
+    """LZF without any references."""
+    return b"".join(
         bytes([len(p) - 1]) + p for p in (data[i : i + 32] for i in range(0, len(data), 32))
     )
-    return out
 
 
 def test_pcd_binary_ascii_and_compressed(tmp_path, points):

@@ -65,7 +65,8 @@ def test_a_cloud_that_is_shifted_scaled_and_turned(made):
     assert np.linalg.norm(back - made.dense, axis=1).max() < 0.005  # metres
     turn = found.scene_from_cloud.rotation @ MOVE.rotation
     assert np.degrees(np.arccos(min(1.0, (np.trace(turn) - 1) / 2))) < 0.1
-    assert found.share > 0.5 and found.likeness > 0.5
+    assert found.share > 0.5
+    assert found.likeness > 0.5
     assert found.error < 0.003 * found.extent
     np.testing.assert_allclose(
         np.array(found.report["matrix"])[:3] @ np.append(MOVE.translation, 1.0),

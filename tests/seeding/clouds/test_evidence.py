@@ -72,5 +72,7 @@ def test_rays_to_tracked_points_are_free(wall):
         tracked.append((center + 2 * (ghost[0].astype(float) - center))[None])
     rays = FreeRays.of(VIEWS, [*tracked, np.empty((0, 3))])
     found = find_evidence(VIEWS, xyz, surfaces, cell, rays, silent)
-    assert found.through[-1] == 3 and found.confirmed[-1] == 0
-    assert found.confirmed[:-1].max() == 1 and found.through[:-1].max() == 0
+    assert found.through[-1] == 3
+    assert found.confirmed[-1] == 0
+    assert found.confirmed[:-1].max() == 1
+    assert found.through[:-1].max() == 0

@@ -54,7 +54,8 @@ def test_voxels_hold_the_means_of_their_points(points):
     voxels = Voxels(VIEWS, 3.0, 4096)
     voxels.add(xyz, rgb)
     mean, color, count = reference(xyz, rgb, 3.0)
-    assert len(voxels) == len(mean) and voxels.coarser == 0
+    assert len(voxels) == len(mean)
+    assert voxels.coarser == 0
     np.testing.assert_allclose(voxels.xyz, mean, atol=1e-5)
     assert np.abs(voxels.rgb - color).max() <= 1
     np.testing.assert_array_equal(voxels.count, count)
@@ -81,7 +82,8 @@ def test_millions_of_duplicates_are_one_voxel():
     voxels = Voxels(VIEWS, 2.0, 64)
     for _ in range(4):
         voxels.add(np.tile([[0.0, 0.0, 3.0]], (250_000, 1)), np.full((250_000, 3), 9, np.uint8))
-    assert len(voxels) == 1 and voxels.count[0] == 1_000_000
+    assert len(voxels) == 1
+    assert voxels.count[0] == 1_000_000
     np.testing.assert_allclose(voxels.xyz[0], (0, 0, 3))
 
 

@@ -160,7 +160,7 @@ def _read(
     from pye57 import libe57  # noqa: PLC0415  (an optional package)
 
     room = min(size, max(scan.count, 1))
-    arrays = {name: np.empty(room, _dtype(name)) for name in scan.fields}
+    arrays: dict[str, np.ndarray] = {name: np.empty(room, _dtype(name)) for name in scan.fields}
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in arrays.items():
         buffers.append(libe57.SourceDestBuffer(file.image, name, array, room, True, True))

@@ -7,6 +7,8 @@ the last byte the distance back, minus 1.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from splatseed.kernels.jit import inline
@@ -17,14 +19,15 @@ __all__ = ["decompress"]
 def decompress(packed: bytes, size: int) -> bytes | None:
     """The ``size`` bytes that a block holds; None if it does not hold exactly so many."""
     out = np.empty(size, np.uint8)
-    return out.tobytes() if _decompress(np.frombuffer(packed, np.uint8), out) else None
+    decode: Any = _decompress
+    return out.tobytes() if decode(np.frombuffer(packed, np.uint8), out) else None
 
 
 @inline
 def _decompress(packed, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202  (Numba infers)
     i, o, num, size = 0, 0, len(packed), len(out)
     while i < num:
-        c = np.int64(packed[i])
+        c = int(packed[i])
         i += 1
         if c < 32:
             length = c + 1
@@ -36,11 +39,11 @@ def _decompress(packed, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, A
         else:
             length = (c >> 5) + 2
             if length == 9 and i < num:
-                length += np.int64(packed[i])
+                length += int(packed[i])
                 i += 1
             if i >= num:
                 return False
-            back = o - ((c & 31) << 8) - np.int64(packed[i]) - 1
+            back = o - ((c & 31) << 8) - int(packed[i]) - 1
             i += 1
             if back < 0 or o + length > size:
                 return False

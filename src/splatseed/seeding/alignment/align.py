@@ -37,8 +37,8 @@ ROUNDS = (
     (12, 800, 12, 0.1, 0.02, 0.02),
     (3, MOST_MARKS, 30, 0.04, 0.005, 0.01),
 )
-"""Stages: alignments, marks, rounds of ICP, the first and the last reach, and within how much of the cloud marks
-count, in extents."""
+"""Stages: alignments, marks, rounds of ICP, the first and the last reach, and within how much of
+the cloud marks count, in extents."""
 CLOSE = 0.01
 SHARE = 0.5
 """Least share of marks on the cloud: 0.75 in a good one (room0), 0.33 of a handheld depth camera's
