@@ -90,6 +90,12 @@ def test_another_command_or_a_changed_input_is_refused(sheet, tiles):
         tiles(moved, "linear", LINEAR)
 
 
+def test_less_memory_than_the_tiles_were_cut_for_is_refused(sheet, tiles):
+    tiles(sheet, "linear", LINEAR, most=130)
+    with pytest.raises(ParameterError, match=r"tiles of 130 points.*found enough for 60\. Pass"):
+        tiles(sheet, "linear", LINEAR, most=60)
+
+
 def test_a_damaged_note_is_one_line(sheet, tiles):
     tiles(sheet, "linear", LINEAR)
     note = tiles.path / "job.json"

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int32, Int64
+from jaxtyping import Bool, Float64, Int32, Int64
 from scipy.spatial import cKDTree
 
 from splatseed.progress import in_threads, silent
@@ -116,11 +116,10 @@ def find_neighborhood(store: TileStore, tile: int, k: int) -> Neighborhood:
     open_ = _beyond_walls(own.xyz[order], reach, store.walls[tile])
     search = _start(tree, own, own.select(order[open_]), order[open_], k)
     _search_tiles(store, search, tile)
-    around = Points.union([own, *search.met])
-    ring = _others(around, search.rank, own)
+    ring = _others(own, search.met, search.rank, own)
     further = _start(tree, own, ring, np.full(len(ring), -1), k)
     _search_tiles(store, further, tile)
-    rim = _others(Points.union([around, *further.met]), further.rank, own, ring)
+    rim = _others(own, [*search.met, *further.met], further.rank, own, ring)
     idx = np.empty((len(own) + len(ring), k), np.int32)
     idx[: len(own)] = inner
     idx[open_] = _rows(search.rank, own, row_of, ring, rim)
@@ -225,12 +224,25 @@ def _gap(
     return np.nan_to_num(np.sqrt((away**2).sum(axis=1)), nan=np.inf)
 
 
-def _others(around: Points, wanted: Int64[np.ndarray, "q k"], *known: Points) -> Points:
-    """The points of some ranks that are not known yet, by rank; ``around`` has them all."""
+def _others(
+    own: Points, met: list[Points], wanted: Int64[np.ndarray, "q k"], *known: Points
+) -> Points:
+    """The points of some ranks that are not known yet, by rank; they are among those met."""
     ranks = np.unique(wanted)
     for points in known:
-        ranks = np.setdiff1d(ranks, points.rank, assume_unique=True)
-    return around.select(np.searchsorted(around.rank, ranks))
+        ranks = ranks[~_among(points.rank, ranks)[1]]
+    pool = Points.union([own.select(np.arange(0)), *met])
+    return pool.select(np.searchsorted(pool.rank, ranks))
+
+
+def _among(
+    ordered: Int64[np.ndarray, " n"], rank: Int64[np.ndarray, "..."]
+) -> tuple[Int64[np.ndarray, "..."], Bool[np.ndarray, "..."]]:
+    """The places of some ranks among ascending ones, and whether they are there."""
+    if not len(ordered):
+        return np.zeros(rank.shape, np.int64), np.zeros(rank.shape, bool)
+    place = np.minimum(np.searchsorted(ordered, rank), len(ordered) - 1)
+    return place, ordered[place] == rank
 
 
 def _rows(
@@ -241,7 +253,10 @@ def _rows(
     rim: Points,
 ) -> Int32[np.ndarray, "q k"]:
     """The rows of some ranks."""
-    ranks = np.concatenate([own.rank, ring.rank, rim.rank])
-    rows = np.concatenate([row_of, np.arange(len(own), len(ranks), dtype=np.int32)])
-    order = np.argsort(ranks, kind="stable")
-    return np.asarray(rows[order[np.searchsorted(ranks[order], rank)]])
+    rows = np.empty(rank.shape, np.int32)
+    first = 0
+    for points in (own, ring, rim):
+        place, there = _among(points.rank, rank)
+        rows[there] = row_of[place[there]] if points is own else first + place[there]
+        first += len(points)
+    return rows

@@ -160,6 +160,12 @@ def make_tiled(
     if work.facts("split") is None:
         split(work, plan.tile_points, plan.at_once, progress)
     facts, store = work.facts("split") or {}, TileStore(work)
+    if facts["most"] > plan.tile_points and store.counts.max() > plan.tile_points:
+        raise ParameterError(
+            f"memory for tiles of {facts['most']:,} points, as they were cut",
+            found=f"enough for {plan.tile_points:,}",
+            fix=f"Pass the --memory of the first time, or remove {work.path} to begin anew.",
+        )
     num_new = planned_size(store.count, request.ratio, request.num_points) - store.count
     if num_new and isinstance(request.method, NearestMethod):
         _make(work, store, request.method, num_new, request.seed, tasks, progress)

@@ -67,6 +67,7 @@ def split(work: WorkFolder, most: int, at_once: int, progress: Progress) -> None
         "split",
         {
             "points": n,
+            "most": max(most, int(counts.max())),
             "non_finite": non_finite,
             "repeats": rows.count - non_finite - n,
             "center": (center / n).tolist(),
