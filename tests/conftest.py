@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+
+from splatseed.io import load_scene
+from splatseed.scene import Scene
+from splatseed.synthetic import make_capture, write_capture
+
+from .command_line import Run, exit_code
 
 SCENES = Path(os.environ.get("SPLATSEED_SCENES", Path(__file__).parents[2] / "shared" / "scenes"))
 
@@ -34,3 +41,34 @@ def scenes() -> Path:
     if not SCENES.is_dir():
         pytest.skip(f"real captures not found at {SCENES}; set SPLATSEED_SCENES to their folder")
     return SCENES
+
+
+@pytest.fixture(scope="session")
+def room_path(tmp_path_factory) -> Path:
+    """A COLMAP scene of the demo's room: 9 views of 96 x 72. Not to be written to."""
+    capture = make_capture(0, num_views=9, width=96, height=72)
+    return write_capture(capture, tmp_path_factory.mktemp("room") / "room")
+
+
+@pytest.fixture(scope="session")
+def room(room_path) -> Scene:
+    """The same in memory."""
+    return load_scene(room_path)
+
+
+@pytest.fixture(scope="session")
+def larger_room_path(tmp_path_factory) -> Path:
+    """The room in 12 views of 120 x 90, with about 460 points. Not to be written to."""
+    capture = make_capture(0, num_views=12, width=120, height=90)
+    return write_capture(capture, tmp_path_factory.mktemp("room") / "room")
+
+
+@pytest.fixture
+def splatseed(capsys) -> Callable[..., Run]:
+    """Runs ``splatseed WORDS...`` here; only SystemExit may come out of it."""
+
+    def run(*words: object) -> Run:
+        capsys.readouterr()
+        return Run(exit_code(*words), *capsys.readouterr())
+
+    return run

@@ -82,14 +82,14 @@ def measure_peer(path: str, clock: Clock) -> dict[str, Any]:
     workload = Workload.load(Path(path))
     inputs, weights = _inputs(workload), _weights(workload)
     _passes(Stopwatch(), rasterization, inputs, weights)
-    found, images = {}, []
+    best, images = {}, []
     for name, function in (("peer", rasterize), ("ours", rasterization)):
         passes = [_passes(Stopwatch(clock), function, inputs, weights) for _ in range(PEER_REPEATS)]
-        found[name] = {way: min(seconds[way] for seconds, _ in passes) for way in STAGES}
+        best[name] = {way: min(seconds[way] for seconds, _ in passes) for way in STAGES}
         info = passes[0][1]
         images.append(info["image"])
     gap = float((images[0] - images[1]).abs().max())
-    return {**found, "gap": gap, "pairs": _pairs(info)}
+    return {**best, "gap": gap, "pairs": _pairs(info)}
 
 
 def _weights(workload: Workload) -> Tensor:
@@ -167,11 +167,11 @@ def measured_runs(path: Path, settings: Settings) -> list[Run]:
             codes["AVX2"] = {**avx2, "NUMBA_CACHE_DIR": cache}
         for code, environment in codes.items():
             for threads in THREADS:
-                found = call(
+                times = call(
                     "benchmarks.rendering.render:measure", threads=threads, environment=environment,
                     path=str(path), repeats=settings.repeats, clock=settings.clock,
                 )  # fmt: skip
-                runs.append(Run(code, threads, found["pairs"], found["seconds"]))
+                runs.append(Run(code, threads, times["pairs"], times["seconds"]))
     return runs
 
 
@@ -227,7 +227,7 @@ def print_peer(settings: Settings) -> None:
     workload = make_workload(settings.peer_num, *settings.peer_size)
     with tempfile.TemporaryDirectory() as folder:
         workload.save(Path(folder) / "scene.npz")
-        found = call(
+        measured = call(
             "benchmarks.rendering.render:measure_peer",
             threads=THREADS[-1],
             environment=thread_settings(THREADS[-1], awake=True),  # PyTorch's many small loops
@@ -237,11 +237,11 @@ def print_peer(settings: Settings) -> None:
     names = {"peer": "PyTorch, tile by tile", "ours": "splatseed"}
     rows = []
     for name, text in names.items():
-        times = [f"{1e3 * found[name][way]:.0f}" for way in ("forward", "backward")]
-        rows.append([text, *times, f"{_total(found['peer']) / _total(found[name]):.0f}x"])
-    print(f"### Peer: {_describe(workload, found['pairs'])}, {THREADS[-1]} threads\n")
+        times = [f"{1e3 * measured[name][way]:.0f}" for way in ("forward", "backward")]
+        rows.append([text, *times, f"{_total(measured['peer']) / _total(measured[name]):.0f}x"])
+    print(f"### Peer: {_describe(workload, measured['pairs'])}, {THREADS[-1]} threads\n")
     print(f"{table(['rasteriser', 'forward, ms', 'backward, ms', 'peer over it'], rows)}\n")
-    print(f"Their images differ by at most {found['gap']:.1e}.\n")
+    print(f"Their images differ by at most {measured['gap']:.1e}.\n")
 
 
 def _total(seconds: Mapping[str, float]) -> float:

@@ -87,12 +87,12 @@ def _numpy_cells(view: View, xyz: np.ndarray) -> np.ndarray:
 
 def best_seconds(work: Callable[[], object], repeats: int) -> tuple[float, float]:
     """Wall and processor seconds of the quickest of some runs."""
-    found = []
+    runs = []
     for _ in range(repeats):
         wall, cpu = time.perf_counter(), time.process_time()
         work()
-        found.append((time.perf_counter() - wall, time.process_time() - cpu))
-    return min(found)
+        runs.append((time.perf_counter() - wall, time.process_time() - cpu))
+    return min(runs)
 
 
 def print_speed(settings: Settings) -> None:

@@ -56,14 +56,14 @@ class Hole:
 
     def sectors(self, num_witnesses: int) -> float:
         """The rule of ``cover``, asking some of the other views."""
-        found, _ = guess.guess_depths(
+        depths, _ = guess.guess_depths(
             self.quartiles,
             np.array([self.cell[0] * self.quartiles.shape[1] + self.cell[1]]),
             guess.world_from_grid(self.view, CELL),
             self.witnesses,
             np.arange(num_witnesses),
         )
-        return float(found[0])
+        return float(depths[0])
 
 
 def _nearest(depths: np.ndarray, cell: tuple[int, int], num: int) -> np.ndarray:

@@ -100,11 +100,11 @@ def cells(truth: Truth | Room, xyz: np.ndarray, share: float) -> list[str]:
     """A row: what is left, how much of it is judged, and its errors."""
     judged = truth.judges(xyz)
     error = truth.distance(xyz[judged])
-    found = [f"{share:.0%}", f"{judged.mean():.0%}" if len(xyz) else ""]
+    shares = [f"{share:.0%}", f"{judged.mean():.0%}" if len(xyz) else ""]
     if not len(error):
-        return [*found, "", "", "", ""]
+        return [*shares, "", "", "", ""]
     tail = [f"{1000 * np.median(error):.1f}", f"{1000 * np.percentile(error, 90):.0f}"]
-    return [*found, *tail, f"{(error > FINE).mean():.0%}", f"{(error > FAR).mean():.2%}"]
+    return [*shares, *tail, f"{(error > FINE).mean():.0%}", f"{(error > FAR).mean():.2%}"]
 
 
 HEADER = ["left", "judged", "error, mm", "its 90%", "over 1 cm", "off"]
@@ -179,21 +179,19 @@ def thresholds(truth: Truth | Room, held: Held) -> list[list[str]]:
 
 def print_speed(settings: Settings) -> None:
     """A hundred views, stage by stage."""
-    found = call(
+    run = call(
         "benchmarks.seeds.verify:whole_run",
         threads=THREADS,
         folder=str(prepare_views(settings.cache)),
         points=settings.points,
         repeats=settings.repeats,
     )
-    rows = [[stage, f"{wall:.2f}", f"{cpu:.2f}"] for stage, (wall, cpu) in found["stages"].items()]
+    rows = [[stage, f"{wall:.2f}", f"{cpu:.2f}"] for stage, (wall, cpu) in run["stages"].items()]
     print("### Time\n")
+    print(table([f"{settings.points:,} points, {run['views']} views", "best s", "its CPU s"], rows))
     print(
-        table([f"{settings.points:,} points, {found['views']} views", "best s", "its CPU s"], rows)
-    )
-    print(
-        f"\n{found['originals']:,} originals; {found['left']:,} points are left. Peak memory "
-        f"{found['peak'] / 2**30:.2f} GiB, {found['before'] / 2**30:.2f} before verify. "
+        f"\n{run['originals']:,} originals; {run['left']:,} points are left. Peak memory "
+        f"{run['peak'] / 2**30:.2f} GiB, {run['before'] / 2**30:.2f} before verify. "
         f"Target: {TARGET} on {THREADS} cores.\n",
         flush=True,
     )

@@ -113,10 +113,10 @@ def scores_of(arm: Arm, function: str, **arguments: Any) -> dict[str, dict[str, 
             apply_edits(Path(folder) / "splatseed", arm.edits)
             environment["PYTHONPATH"] = folder
         settings = dict(arm.settings)
-        found = call(
+        scores = call(
             function, threads=THREADS, environment=environment, settings=settings, **arguments
         )
-    return dict(found)
+    return dict(scores)
 
 
 def apply_edits(package: Path, edits: Sequence[Edit]) -> None:

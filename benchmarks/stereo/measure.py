@@ -75,11 +75,11 @@ def print_speed(_: Settings) -> None:
     codes: dict[str, Any] = {"the processor's best": None}
     if avx2 := avx2_environment():
         codes = {"AVX-512": None, "AVX2": avx2}
-    found = {}
+    seconds_of = {}
     with tempfile.TemporaryDirectory() as folder:
         for code, environment in codes.items():
             variables = {**(environment or {}), "NUMBA_CACHE_DIR": folder}
-            found[code] = call(
+            seconds_of[code] = call(
                 "benchmarks.stereo.speed:hypothesis_seconds",
                 threads=1,
                 environment=variables,
@@ -88,34 +88,34 @@ def print_speed(_: Settings) -> None:
     rows = [
         [code, *(f"{1e6 * each[name]:.2f}" for name in ("planes", "sweep", "peer")),
          f"{each['peer'] / each['planes']:.1f}x", f"{each['peer'] / each['sweep']:.1f}x"]
-        for code, each in found.items()
+        for code, each in seconds_of.items()
     ]  # fmt: skip
     header = ["instructions", "planes, us", "in a sweep, us", "scalar loop, us"]
     header += ["loop over planes", "loop over sweep"]
     print("### A hypothesis: five sources of 25 samples, one thread\n")
     print(table(header, rows))
     target = f"{HYPOTHESIS_TARGET} us against {PEER_TARGET}; AVX2 {AVX2_TARGET} times slower"
-    print(f"\nTargets: {target}. Costs differ by at most {found[code]['gap']:.0e}.\n")
+    print(f"\nTargets: {target}. Costs differ by at most {seconds_of[code]['gap']:.0e}.\n")
 
 
 def print_whole(settings: Settings) -> None:
     """A hundred views, stage by stage."""
     folder = prepare_views(settings.cache)
-    found = call(
+    run = call(
         "benchmarks.stereo.speed:whole_run",
         threads=THREADS,
         folder=str(folder),
         clock=settings.clock,
         threads_used=THREADS,
     )
-    total = sum(seconds for stage, seconds in found["stages"].items() if stage != "read images")
-    rows = [[stage, f"{seconds:.1f}"] for stage, seconds in found["stages"].items()]
+    total = sum(seconds for stage, seconds in run["stages"].items() if stage != "read images")
+    rows = [[stage, f"{seconds:.1f}"] for stage, seconds in run["stages"].items()]
     rows += [["all but reading", f"{total:.1f}"]]
     print(f"### {NUM_VIEWS} views of 800 x 600, every 4th pixel, {THREADS} threads\n")
     print(table(["stage", "seconds"], rows))
-    peak = found["peak"] / 2**30
+    peak = run["peak"] / 2**30
     print(
-        f"\n{found['seeds']:,} seeds; peak memory {peak:.2f} GiB. Target: {WHOLE_TARGET}.\n",
+        f"\n{run['seeds']:,} seeds; peak memory {peak:.2f} GiB. Target: {WHOLE_TARGET}.\n",
         flush=True,
     )
 
@@ -174,7 +174,7 @@ def print_bare(settings: Settings) -> None:
     prepare(names, settings.cache)
     arguments = {"names": names, "cache": str(settings.cache), "limit": settings.limit}
     for_each = {"SfM's points": "", "no points": "depths", "depth maps": "points"}
-    found = {
+    scores_of_start = {
         label: scores_of(
             ARMS["stereo"], "benchmarks.stereo.truth:score_all", without=without, **arguments
         )
@@ -182,7 +182,9 @@ def print_bare(settings: Settings) -> None:
     }
     header = ["begun from", "kept", "within 1%", "within 5%", "reached", "CPU s"]
     for name in names:
-        rows = [[label, *Score(**scores[name]).cells()] for label, scores in found.items()]
+        rows = [
+            [label, *Score(**scores[name]).cells()] for label, scores in scores_of_start.items()
+        ]
         print(f"{table([f'{name}: {header[0]}', *header[1:]], rows)}\n", flush=True)
 
 
@@ -195,12 +197,12 @@ def _print_arms(
     arguments: dict[str, Any],
 ) -> None:
     """A table a scene, a row an arm."""
-    found = {
+    scores_of_arm = {
         arm: scores_of({**ARMS, **FOLIAGE}[arm], function, names=list(names), **arguments)
         for arm in arms
     }
     for name in names:
-        rows = [[arm, *score(**scores[name]).cells()] for arm, scores in found.items()]
+        rows = [[arm, *score(**scores[name]).cells()] for arm, scores in scores_of_arm.items()]
         print(f"{table([name, *header], rows)}\n", flush=True)
 
 

@@ -20,7 +20,7 @@ from benchmarks.stereo.peer import costs_of_planes
 import splatseed as ss
 from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.fusion import fuse
-from splatseed.stereo.patchmatch import Pictures, begin, sweep
+from splatseed.stereo.patchmatch import QuadImages, begin, sweep
 from splatseed.stereo.quads import make_quads
 from splatseed.stereo.settings import StereoSettings
 from splatseed.synthetic import make_capture, write_capture
@@ -50,30 +50,30 @@ def prepare_views(cache: Path) -> Path:
 def hypothesis_seconds(peer_rows: int) -> dict[str, float]:
     """Seconds of a hypothesis: alone, in a sweep, and of the peer, on the grid's first rows."""
     images, warps, guesses = _workload()
-    pictures = _pictures(images, warps)
+    quad_images = _quad_images(images, warps)
     shape = guesses.shape[2:]
     planes, costs = np.zeros((3, *shape), np.float32), np.empty(shape, np.float32)
     few = np.ascontiguousarray(guesses[:, :, :peer_rows])
-    found = np.empty((PLANES, peer_rows, shape[1]), np.float32)
+    peer_costs = np.empty((PLANES, peer_rows, shape[1]), np.float32)
     seconds = {
-        "planes": _best(lambda: begin(pictures, guesses, planes, costs)) / guesses[:, 0].size,
-        "sweep": _best(lambda: _sweeps(pictures, planes, costs)) / guesses[:, 0].size,
+        "planes": _best(lambda: begin(quad_images, guesses, planes, costs)) / guesses[:, 0].size,
+        "sweep": _best(lambda: _sweeps(quad_images, planes, costs)) / guesses[:, 0].size,
         "peer": _best(
-            lambda: costs_of_planes(images[0], images[1:], warps, GRID, few, found), 2
-        ) / found.size,
+            lambda: costs_of_planes(images[0], images[1:], warps, GRID, few, peer_costs), 2
+        ) / peer_costs.size,
     }  # fmt: skip
-    begin(pictures, guesses[:1].copy(), planes, costs)
-    gap = np.abs(costs[:peer_rows] - found[0])
+    begin(quad_images, guesses[:1].copy(), planes, costs)
+    gap = np.abs(costs[:peer_rows] - peer_costs[0])
     return {**seconds, "gap": float(gap[np.isfinite(gap)].max())}
 
 
-def _sweeps(pictures: Pictures, planes: np.ndarray, costs: np.ndarray) -> None:
+def _sweeps(quad_images: QuadImages, planes: np.ndarray, costs: np.ndarray) -> None:
     for color in range(2):
-        sweep(pictures, color, 1, np.uint64(1), planes, costs)
+        sweep(quad_images, color, 1, np.uint64(1), planes, costs)
 
 
 def _workload() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Grey pictures uint8 [6, H, W], warps [5, 3, 4], planes float32 [11, 3, h, w]."""
+    """Grey images uint8 [6, H, W], warps [5, 3, 4], planes float32 [11, 3, h, w]."""
     rng = np.random.default_rng(0)
     row, column = np.indices((HEIGHT, WIDTH)).reshape(2, -1).astype(float)
     images = [
@@ -93,11 +93,11 @@ def _workload() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (255 * np.clip(images, 0, 1)).astype(np.uint8), warps, guesses
 
 
-def _pictures(images: np.ndarray, warps: np.ndarray) -> Pictures:
+def _quad_images(images: np.ndarray, warps: np.ndarray) -> QuadImages:
     size = np.array([WIDTH, HEIGHT], np.int64)
     quads = [make_quads(image).ravel() for image in images]
     packed = np.array([[*warp[:, :3].ravel(), *warp[:, 3]] for warp in warps], np.float32)
-    return Pictures(
+    return QuadImages(
         quads[0], size, np.concatenate(quads[1:]), np.tile(size, (SOURCES, 1)),
         np.arange(SOURCES + 1) * WIDTH * HEIGHT, packed, GRID, FOCAL,
         np.array([0.5 / DEPTHS[1], 2 / DEPTHS[0]], np.float32),

@@ -161,11 +161,11 @@ def _map_shares(stereo: Stereo, scene: Scene) -> tuple[float, float, float]:
     """Of all pixels those kept; of these those within 1% and 5% of the truth."""
     errors, pixels, kept = [], 0, 0
     for i in range(len(stereo.views)):
-        found = stereo.map(i)
-        known = np.isfinite(found.depth)
+        depth_map = stereo.map(i)
+        known = np.isfinite(depth_map.depth)
         pixels, kept = pixels + known.size, kept + known.sum()
-        truth = scene.depths.read(found.name).values
-        errors.append(relative_error(found.depth, truth)[known])
+        truth = scene.depths.read(depth_map.name).values
+        errors.append(relative_error(depth_map.depth, truth)[known])
     error = np.concatenate(errors)
     error = error[np.isfinite(error)]
     return float(kept / pixels), float((error < 0.01).mean()), float((error < 0.05).mean())

@@ -99,7 +99,7 @@ def _run(verb: str, words: list[str]) -> None:
         )
     except KeyboardInterrupt as stop:
         ERR.print("\ninterrupted; nothing was left half-written")
-        from splatseed.process.interruption import exit_code  # noqa: PLC0415  (as late as can be)
+        from splatseed.process.interruption import exit_code  # noqa: PLC0415  (as late as possible)
 
         sys.exit(TERMINATED if isinstance(stop, _Termination) else exit_code())
 

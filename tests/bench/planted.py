@@ -58,7 +58,7 @@ def rows(
     """All runs of a plan, done; every scene has its level, every repeat its own, every run
     noise."""
     rng = np.random.default_rng(seed)
-    found = []
+    finished = []
     for strategy in strategies:
         for i, scene in enumerate(scenes):
             level = 24.0 + i + 0.05 * rng.standard_normal(repeats)
@@ -68,5 +68,5 @@ def rows(
                     count = 5000 if strategy == "mcmc" else int(5000 * math.sqrt(ratio))
                     made = result(float(psnr), num_gaussians=count, early=0.1 if gain > 0 else 0.0)
                     run = spec(scene, method, ratio, strategy=strategy, repeat=repeat, **changes)
-                    found.append(RunRow(run, "done", made, started=0.0, finished=25.0))
-    return found
+                    finished.append(RunRow(run, "done", made, started=0.0, finished=25.0))
+    return finished

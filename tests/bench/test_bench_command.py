@@ -11,6 +11,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from functools import partial
 
 import pytest
 
@@ -22,7 +23,6 @@ from splatseed.bench.planning.plan import PlannedScene
 from splatseed.bench.planning.plan_file import plan_text, read_plan
 from splatseed.bench.running import folder as folder_module
 from splatseed.bench.running.ledger import Ledger
-from splatseed.cli import main
 from splatseed.io import load_scene
 from splatseed.synthetic import make_capture
 
@@ -43,18 +43,9 @@ def plan_path(small_plan, tmp_path):
 
 
 @pytest.fixture
-def bench(capsys):
+def bench(splatseed):
     """Runs ``splatseed bench WORDS...`` here; its exit code, stdout and stderr."""
-
-    def run(*words):
-        code = 0
-        try:
-            main(["bench", *map(str, words)])
-        except SystemExit as stop:
-            code = stop.code
-        return code, *capsys.readouterr()
-
-    return run
+    return partial(splatseed, "bench")
 
 
 def _begin(*words):

@@ -44,9 +44,9 @@ def _runs(*psnr, repeat=0):
 
 
 def test_the_baseline_stays_whatever_it_scores():
-    found = {SFM: _runs(20.0), GROW: _runs(23.0), AUTO: _runs(22.0), MLS: _runs(21.0)}
-    assert best_arms(found, 2) == (GROW, SFM)
-    assert best_arms(found, 4) == (GROW, AUTO, MLS, SFM)
+    results = {SFM: _runs(20.0), GROW: _runs(23.0), AUTO: _runs(22.0), MLS: _runs(21.0)}
+    assert best_arms(results, 2) == (GROW, SFM)
+    assert best_arms(results, 4) == (GROW, AUTO, MLS, SFM)
 
 
 def test_a_verdict_is_paired_by_view():
@@ -131,7 +131,7 @@ def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     here["most"] = 1
     with pytest.raises(SystemExit):
         main(words)
-    assert "the same command goes on" in capsys.readouterr().out
+    assert "repeat the command to continue" in capsys.readouterr().out
     here["most"] = 99
     main(words)
     out = capsys.readouterr().out

@@ -49,14 +49,14 @@ def test_neither_test_views_nor_held_out_views_are_trained_on(bench, captures, m
 
     prepare_run = bench.baseline_arms.prepare_run
     monkeypatch.setattr(bench.baseline_arms, "prepare_run", watch)
-    found = bench.baseline_arms.train(str(captures / "fern"), "default", 5, 1, 0, 900)
+    scores = bench.baseline_arms.train(str(captures / "fern"), "default", 5, 1, 0, 900)
     names = sorted(image.name for image in load_scene(captures / "fern").images)
     test = set(names[::8])
     rest = [name for name in names if name not in test]
     assert seen == {"held out": set(rest[::8]), "train": set(rest) - set(rest[::8])}
-    assert 0 < found["gaussians"] <= 900
-    assert 3 < found["psnr"] < 40
-    assert 0 < found["ssim"] < 1
+    assert 0 < scores["gaussians"] <= 900
+    assert 3 < scores["psnr"] < 40
+    assert 0 < scores["ssim"] < 1
 
 
 def test_what_is_in_the_ledger_is_not_run_again(bench, captures, monkeypatch, tmp_path, capsys):

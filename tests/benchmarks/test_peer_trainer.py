@@ -267,9 +267,9 @@ def test_both_trainers_get_the_same_settings(bench):
     peer_trainer = bench.peer_trainer
     settings = peer_trainer.Settings(Path(), max_steps=50, cap_max=900, data_factor=3)
     for arm in peer_trainer.ARMS:
-        found = peer_trainer.train_settings(arm, 4, settings)
+        chosen = peer_trainer.train_settings(arm, 4, settings)
         expected = 900 if "mcmc" in arm else None
-        assert (found["cap_max"], found["max_steps"], found["seed"]) == (expected, 50, 4)
+        assert (chosen["cap_max"], chosen["max_steps"], chosen["seed"]) == (expected, 50, 4)
         held = dataclasses.replace(settings, cap_default=True)
         assert peer_trainer.train_settings(arm, 4, held)["cap_max"] == 900
 
@@ -290,9 +290,9 @@ def test_a_run_that_fails_does_not_cost_the_others(bench, monkeypatch, capsys):
     settings = bench.peer_trainer.Settings(
         Path(), repeats=2, arms=("gsplat-default", "splatseed-default")
     )
-    found = bench.peer_trainer.compare(Path(), settings)
-    assert found["gsplat-default"] == [{"psnr": 1.0}]
-    assert found["splatseed-default"] == [{"psnr": 0.0}, {"psnr": 1.0}]
+    results = bench.peer_trainer.compare(Path(), settings)
+    assert results["gsplat-default"] == [{"psnr": 1.0}]
+    assert results["splatseed-default"] == [{"psnr": 0.0}, {"psnr": 1.0}]
     assert "SKIPPED gsplat-default, seed 0: expected a run" in capsys.readouterr().out
 
 

@@ -96,7 +96,7 @@ def _pairs_of_pixel(means2d, inverse, opacities, depths, drawn, pixel):
 
 
 def test_the_peer_in_pytorch_draws_the_same_picture_with_the_same_gradients(bench, workload):
-    found = {}
+    renders = {}
     for name, rasterize in (
         ("peer", bench.torch_rasterizer.rasterize),
         ("ours", bench.render.rasterization),
@@ -107,20 +107,20 @@ def test_the_peer_in_pytorch_draws_the_same_picture_with_the_same_gradients(benc
         (torch.cat([image, alphas], dim=-1) * weights).sum().backward()
         leaves = {key: inputs[key] for key in ("means", "quats", "scales", "opacities")}
         leaves |= {"sh0": inputs["colors"][0], "shN": inputs["colors"][1]}
-        found[name] = {key: leaf.grad for key, leaf in leaves.items()} | {"image": image.detach()}
-    for key, ours in found["ours"].items():
-        gap = (ours - found["peer"][key]).abs() / ours.abs().max()
+        renders[name] = {key: leaf.grad for key, leaf in leaves.items()} | {"image": image.detach()}
+    for key, ours in renders["ours"].items():
+        gap = (ours - renders["peer"][key]).abs() / ours.abs().max()
         # In single precision a pixel or two fall on the other side of a cut-off.
         assert (gap > 1e-4).float().mean() < 2e-3, key
 
 
 def test_a_render_is_measured_stage_by_stage(bench, scene_file):
-    found = bench.render.measure(scene_file, 2, "wall")
-    seconds = found["seconds"]
+    measured = bench.render.measure(scene_file, 2, "wall")
+    seconds = measured["seconds"]
     rests = {"rest", "rest backward", "forward", "backward"}
     assert set(seconds) == {*bench.stopwatch.RENDER_STAGES} | rests
     assert all(value > 0 for value in seconds.values())
-    run = bench.render.Run("this", 1, found["pairs"], seconds)
+    run = bench.render.Run("this", 1, measured["pairs"], seconds)
     assert 20 < run.pairs / (64 * 48) < 80
     assert run.rate("blend kernel") > run.rate("blend kernel", "blend layout")
     assert run.milliseconds("whole", "forward") > run.milliseconds("blend kernel", "forward")
@@ -130,13 +130,13 @@ def test_a_render_is_measured_stage_by_stage(bench, scene_file):
 def test_a_training_step_is_measured_part_by_part(bench, scene_file, clock):
     if clock == "cpu" and sys.platform != "linux":
         pytest.skip("threads have clocks of their own on Linux")
-    found = bench.train_step.measure(scene_file, 3, clock)
-    assert len(found["laps"]) == 3
+    measured = bench.train_step.measure(scene_file, 3, clock)
+    assert len(measured["laps"]) == 3
     stages = {stage for pair in bench.train_step.PARTS.values() for stage in pair if stage}
-    for lap in found["laps"]:
+    for lap in measured["laps"]:
         assert set(lap) == stages | {"whole"}
         assert sum(lap[stage] for stage in stages) == pytest.approx(lap["whole"])
-    assert 20 < found["pairs"] < 80
+    assert 20 < measured["pairs"] < 80
 
 
 def test_time_counts_once_and_functions_are_put_back(bench, monkeypatch):

@@ -38,9 +38,9 @@ def test_a_planted_scale_of_every_image_is_found(kind, tracked, exact, make_maps
     scene = with_outliers(exact.replace(depths=maps))
     if not tracked:
         scene = scene.replace(tracks=None)
-    found = align(scene, max_residual_ratio=None)
-    assert list(found) == [image.name for image in exact.images]
-    for alignment, scale in zip(found.values(), SCALES, strict=True):
+    alignments = align(scene, max_residual_ratio=None)
+    assert list(alignments) == [image.name for image in exact.images]
+    for alignment, scale in zip(alignments.values(), SCALES, strict=True):
         assert alignment.scale == pytest.approx(scale, rel=0.005)
         assert (alignment.shift, alignment.rejected) == (0.0, None)
         assert 0 < alignment.residual < 0.05
@@ -66,9 +66,9 @@ def test_a_point_takes_the_pixel_it_falls_into(exact):
     corner = np.stack([column, row], axis=1)
     for inside in (0.01, 0.3, 0.7, 0.99):
         xyz = image.camera.unproject(corner + inside, values[row, column])
-        found = align_one(values, image.camera, xyz)
-        assert (found.num_points, found.rejected) == (200, None)
-        assert found.residual < 1e-6
+        alignment = align_one(values, image.camera, xyz)
+        assert (alignment.num_points, alignment.rejected) == (200, None)
+        assert alignment.residual < 1e-6
         for dx, dy in ((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0), (0.0, -0.5)):
             if not (0 < inside + dx < 1 and 0 < inside + dy < 1):
                 off = image.camera.unproject(corner + inside + (dx, dy), values[row, column])
@@ -91,8 +91,8 @@ def test_images_are_left_out_for_a_reason(exact, make_maps):
             return z * np.random.default_rng(0).uniform(0.9, 1.1, z.shape)
         return z
 
-    found = list(align(exact.replace(depths=make_maps("z", change))).values())
-    reasons = [alignment.rejected for alignment in found]
+    alignments = list(align(exact.replace(depths=make_maps("z", change))).values())
+    reasons = [alignment.rejected for alignment in alignments]
     assert reasons[0] == "the map has no depth at any pixel"
     assert "SfM points see depth; 20 are needed" in reasons[1]
     assert "at half of the SfM points" in reasons[2]
@@ -105,11 +105,11 @@ def test_images_are_left_out_for_a_reason(exact, make_maps):
 
 
 def test_depth_given_for_its_inverse_is_refused(exact, make_maps):
-    found = align(exact.replace(depths=make_maps("inverse")))
-    assert all("rise with depth" in alignment.rejected for alignment in found.values())
-    found = align(exact.replace(depths=make_maps("z", lambda z, _: 1 / z))).values()
+    alignments = align(exact.replace(depths=make_maps("inverse")))
+    assert all("rise with depth" in alignment.rejected for alignment in alignments.values())
+    alignments = align(exact.replace(depths=make_maps("z", lambda z, _: 1 / z))).values()
     good = align(exact).values()
-    assert np.median([a.residual for a in found]) > 10 * np.median([a.residual for a in good])
+    assert np.median([a.residual for a in alignments]) > 10 * np.median([a.residual for a in good])
 
 
 def test_only_images_with_a_map_are_named(exact, make_maps):
@@ -121,8 +121,8 @@ def test_only_images_with_a_map_are_named(exact, make_maps):
 
 def test_a_smaller_map_is_read_in_its_own_pixels(exact, make_maps):
     maps = make_maps("z", lambda z, _: z[::2, ::2])
-    found = align(exact.replace(depths=maps)).values()
-    assert all(a.scale == pytest.approx(1.0, rel=0.01) and not a.rejected for a in found)
+    alignments = align(exact.replace(depths=maps)).values()
+    assert all(a.scale == pytest.approx(1.0, rel=0.01) and not a.rejected for a in alignments)
 
 
 def test_a_map_of_another_shape_is_an_error(exact, make_maps):

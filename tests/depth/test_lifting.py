@@ -73,8 +73,8 @@ def test_equation_9_is_a_loop_over_pixels(exact, rng):
     scale = 1.7
     for unit_ray in (False, True):
         planar = PlanarDepth.of(depth, camera, scale, 0.0, unit_ray=unit_ray)
-        found = lift_pixels(pixel, planar.at(pixel), camera, np.empty((50, 3), np.float32))
-        for number, point in zip(pixel.tolist(), found, strict=True):
+        lifted = lift_pixels(pixel, planar.at(pixel), camera, np.empty((50, 3), np.float32))
+        for number, point in zip(pixel.tolist(), lifted, strict=True):
             v, u = number // 160 + 0.5, number % 160 + 0.5
             ray = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K) @ [u, v, 1.0]
             if unit_ray:

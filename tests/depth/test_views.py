@@ -109,8 +109,8 @@ def test_a_view_of_another_color_confirms_nothing():
     own = reduced(camera, wall(camera))
     for change, agrees in ((30, 1), (60, 0)):
         other = reduced(camera, wall(camera), GRAY + np.uint8(change))
-        found = find_support(POINTS[:1], own, [other], Settings())
-        assert (found.agreeing[0], found.seen_through[0]) == (agrees, False)
+        support = find_support(POINTS[:1], own, [other], Settings())
+        assert (support.agreeing[0], support.seen_through[0]) == (agrees, False)
         assert find_support(POINTS[:1], own, [other], Settings(color_tolerance=None)).agreeing[0]
 
 
@@ -157,8 +157,8 @@ def test_maps_are_scaled_to_agree():
         view(camera, np.where(np.arange(WIDTH) < 20, 0.7, 1.0) * wall(camera), factor=factor)
         for camera, factor in zip(cameras, factors, strict=True)
     ]
-    found = harmonize(views, choose_neighbors(views, 6, silent), silent)
-    left = np.log(found * factors)
+    corrections = harmonize(views, choose_neighbors(views, 6, silent), silent)
+    left = np.log(corrections * factors)
     assert np.abs(left - left.mean()).max() < 0.01 < np.abs(np.log(factors)).max()
     assert abs(left.mean()) < 0.02
 
@@ -166,8 +166,8 @@ def test_maps_are_scaled_to_agree():
 def test_maps_without_overlap_are_left_alone():
     cameras = [camera_at(100.0 * i) for i in range(3)]
     views = [view(camera, wall(camera), factor=1.1) for camera in cameras]
-    found = harmonize(views, choose_neighbors(views, 2, silent), silent)
-    np.testing.assert_allclose(found, 1.0, rtol=1e-12)
+    factors = harmonize(views, choose_neighbors(views, 2, silent), silent)
+    np.testing.assert_allclose(factors, 1.0, rtol=1e-12)
 
 
 def test_planar_depth_knows_every_kind():

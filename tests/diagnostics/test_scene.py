@@ -36,11 +36,13 @@ def test_counts_spacing_and_bounds(rng):
     xyz = rng.normal(size=(200, 3)).astype(np.float32)
     xyz[10:15] = xyz[0]
     scene = _scene(np.concatenate([xyz, [[np.nan, 0, 0], [0, np.inf, 0]]]))
-    found = cloud_statistics(scene)
-    assert (found.num_points, found.non_finite, found.duplicates) == (202, 2, 5)
-    np.testing.assert_allclose(found.spacing, np.percentile(_brute_spacing(xyz), SHARES), rtol=1e-6)
-    np.testing.assert_array_equal(found.low, xyz.min(axis=0))
-    np.testing.assert_array_equal(found.high, xyz.max(axis=0))
+    statistics = cloud_statistics(scene)
+    assert (statistics.num_points, statistics.non_finite, statistics.duplicates) == (202, 2, 5)
+    np.testing.assert_allclose(
+        statistics.spacing, np.percentile(_brute_spacing(xyz), SHARES), rtol=1e-6
+    )
+    np.testing.assert_array_equal(statistics.low, xyz.min(axis=0))
+    np.testing.assert_array_equal(statistics.high, xyz.max(axis=0))
 
 
 def test_a_point_far_from_a_cluster_is_isolated(rng):
@@ -59,23 +61,23 @@ def test_all_points_count_whatever_made_them(rng):
 
 @pytest.mark.parametrize("far", [1.0, 1e3, 5e6])
 def test_resolution_is_the_step_to_the_next_float32(far):
-    found = cloud_statistics(_scene([[0, 0, 0], [0, -far, 0]]))
+    statistics = cloud_statistics(_scene([[0, 0, 0], [0, -far, 0]]))
     next_one = np.nextafter(np.float32(far), np.float32(np.inf))
-    assert found.resolution == float(next_one) - far
+    assert statistics.resolution == float(next_one) - far
 
 
 @pytest.mark.parametrize("xyz", [np.zeros((0, 3)), np.full((3, 3), np.nan)])
 def test_clouds_of_nothing_have_no_measures(xyz):
-    found = cloud_statistics(_scene(xyz))
-    assert (found.num_points, found.non_finite) == (len(xyz), len(xyz))
-    assert np.isnan([*found.spacing, *found.low, *found.high]).all()
+    statistics = cloud_statistics(_scene(xyz))
+    assert (statistics.num_points, statistics.non_finite) == (len(xyz), len(xyz))
+    assert np.isnan([*statistics.spacing, *statistics.low, *statistics.high]).all()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_few_points(count):
-    found = cloud_statistics(_scene(np.arange(3.0 * count)))
-    assert found.num_points == count
-    assert np.isnan(found.spacing).all() == (count == 1)
+    statistics = cloud_statistics(_scene(np.arange(3.0 * count)))
+    assert statistics.num_points == count
+    assert np.isnan(statistics.spacing).all() == (count == 1)
 
 
 def test_tracks(rng):
@@ -84,14 +86,14 @@ def test_tracks(rng):
     offsets = np.concatenate([[0], np.cumsum(lengths)])
     seen = np.zeros(offsets[-1], np.uint32)
     xyz = rng.random((40, 3))
-    found = track_statistics(
+    statistics = track_statistics(
         _scene(xyz, tracks=Tracks(np.arange(40), xyz, errors, offsets, seen, seen))
     )
     known = [error for error in errors if error >= 0]
-    assert found.mean_length == pytest.approx(sum(lengths) / 40)
-    assert found.mean_error == pytest.approx(sum(known) / len(known))
-    np.testing.assert_allclose(found.length, np.percentile(lengths, SHARES))
-    np.testing.assert_allclose(found.error, np.percentile(known, SHARES))
+    assert statistics.mean_length == pytest.approx(sum(lengths) / 40)
+    assert statistics.mean_error == pytest.approx(sum(known) / len(known))
+    np.testing.assert_allclose(statistics.length, np.percentile(lengths, SHARES))
+    np.testing.assert_allclose(statistics.error, np.percentile(known, SHARES))
     assert track_statistics(_scene(xyz)) is None
 
 
@@ -115,11 +117,11 @@ def _brute_empty(xyz, size, cell):
 def test_empty_regions(size, rng):
     xyz = rng.normal(size=(300, 3)).astype(np.float32)  # half of them behind the camera
     turned = Image("b.png", 2, _image("", size).intrinsics, np.array([0.0, 1, 0, 0]), np.zeros(3))
-    found = empty_regions(_scene(xyz, images=(_image("a.png", size), turned)))
+    regions = empty_regions(_scene(xyz, images=(_image("a.png", size), turned)))
     shares = [_brute_empty(xyz, size, 10), _brute_empty(xyz * [1, -1, -1], size, 10)]
-    assert found.mean == pytest.approx(np.mean(shares))
-    assert found.worst == pytest.approx(max(shares))
-    assert found.worst_name == ["a.png", "b.png"][int(np.argmax(shares))]
+    assert regions.mean == pytest.approx(np.mean(shares))
+    assert regions.worst == pytest.approx(max(shares))
+    assert regions.worst_name == ["a.png", "b.png"][int(np.argmax(shares))]
 
 
 def test_no_regions_without_images_or_points(rng):

@@ -33,7 +33,7 @@ def _blocks(page):
 
 def _commands():
     """The words of each whole command in a page's blocks, after ``splatseed``."""
-    for page in (*PAGES, ROOT / "benchmarks/README.md"):
+    for page in (*PAGES, *sorted((ROOT / "benchmarks").rglob("*.md"))):
         for line in "".join(_blocks(page)).replace("\\\n", " ").splitlines():
             words = shlex.split(line.partition(">")[0], comments=True)
             if words and Path(words[0]).name == "splatseed" and OWN_METHOD not in words:

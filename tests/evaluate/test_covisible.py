@@ -65,7 +65,7 @@ def test_what_no_training_view_shows_is_left_out(scene):
     assert np.allclose(turned[0].camera.center, train[0].camera.center, atol=1e-6), flip
     grids = find_covisible(scene.replace(images=(*turned, *test)), 8)
     before = find_covisible(scene, 8)
-    share = lambda found: np.mean([grid.mean() for grid in found.values()])
+    share = lambda by_view: np.mean([grid.mean() for grid in by_view.values()])
     assert share(grids) < 0.5 * share(before)
 
 

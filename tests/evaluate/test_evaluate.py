@@ -28,7 +28,6 @@ from splatseed.evaluate.model import frame_of_scene, gaussian_renderer
 from splatseed.io import load_scene
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.ply import write_gaussians
-from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.view import View
 
 
@@ -244,9 +243,8 @@ def test_a_file_that_is_no_weights_is_refused(content, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    path = tmp_path_factory.mktemp("room") / "room"
-    return write_capture(make_capture(0, num_views=12, width=120, height=90), path)
+def room(larger_room_path):
+    return larger_room_path
 
 
 @pytest.fixture(scope="module")

@@ -18,13 +18,11 @@ from splatseed.io import load_scene, write_scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.ply import write_gaussians
-from splatseed.synthetic import make_capture, write_capture
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    path = tmp_path_factory.mktemp("room") / "room"
-    return write_capture(make_capture(0, num_views=12, width=120, height=90), path)
+def room(larger_room_path):
+    return larger_room_path
 
 
 @pytest.fixture(scope="module")
@@ -107,8 +105,8 @@ def test_nerfstudios_transform_begins_at_colmaps_world(room, tmp_path):
     file = tmp_path / "dataparser_transforms.json"
     file.write_text(json.dumps({"transform": unscaled, "scale": 0.5}))
     wanted = turned.points(load_scene(room).points.xyz)
-    found = find_transform(str(file), scene).points(scene.points.xyz)
-    np.testing.assert_allclose(found, wanted, atol=1e-5)
+    moved = find_transform(str(file), scene).points(scene.points.xyz)
+    np.testing.assert_allclose(moved, wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -147,8 +145,8 @@ def test_few_large_gaussians_are_still_a_model(room, gaussians, tmp_path):
 
 def test_a_fit_gives_the_similarity_back(rng, other):
     xyz = rng.normal(size=(9, 3))
-    found = fit_similarity(xyz, other.points(xyz))
-    np.testing.assert_allclose(found.matrix, other.matrix, atol=1e-12)
+    fitted = fit_similarity(xyz, other.points(xyz))
+    np.testing.assert_allclose(fitted.matrix, other.matrix, atol=1e-12)
     np.testing.assert_allclose(similarity_of(other.matrix).matrix, other.matrix, atol=1e-12)
     line = np.outer(np.arange(5.0), rng.normal(size=3))
     assert fit_similarity(line, other.points(line)) is None

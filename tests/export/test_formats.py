@@ -56,25 +56,25 @@ def _unit(quats):
     return quats / np.linalg.norm(quats, axis=1, keepdims=True)
 
 
-def _assert_close(found, truth, limits):
+def _assert_close(model, truth, limits):
     """Whatever order the Gaussians came back in: positions tell which is which."""
-    nearest = np.argmin(((found.means[:, None] - truth.means[None]) ** 2).sum(axis=2), axis=1)
+    nearest = np.argmin(((model.means[:, None] - truth.means[None]) ** 2).sum(axis=2), axis=1)
     assert sorted(nearest) == list(range(len(truth)))
-    dots = np.abs((_unit(found.quats) * _unit(truth.quats[nearest])).sum(axis=1))
+    dots = np.abs((_unit(model.quats) * _unit(truth.quats[nearest])).sum(axis=1))
     degrees = np.rad2deg(2 * np.arccos(np.clip(dots, 0, 1)))
-    opacity, true_opacity = (1 / (1 + np.exp(-g.opacities)) for g in (found, truth))
+    opacity, true_opacity = (1 / (1 + np.exp(-g.opacities)) for g in (model, truth))
     errors = (
-        np.abs(found.means - truth.means[nearest]).max(),
-        np.abs(found.scales - truth.scales[nearest]).max(),
+        np.abs(model.means - truth.means[nearest]).max(),
+        np.abs(model.scales - truth.scales[nearest]).max(),
         degrees.max() - 0.09,  # what single precision makes of equal rotations
         np.abs(opacity - true_opacity[nearest]).max(),
-        np.abs(found.sh0 - truth.sh0[nearest]).max(),
+        np.abs(model.sh0 - truth.sh0[nearest]).max(),
     )
     assert all(np.array(errors) <= limits[:5]), errors
     if limits[5] is None:
-        assert found.shN.shape[1] == 0
+        assert model.shN.shape[1] == 0
     else:
-        assert np.abs(found.shN - truth.shN[nearest]).max(initial=0) <= limits[5]
+        assert np.abs(model.shN - truth.shN[nearest]).max(initial=0) <= limits[5]
 
 
 @pytest.mark.parametrize("rest", [0, 3, 8, 15])
@@ -82,9 +82,9 @@ def _assert_close(found, truth, limits):
 def test_a_model_comes_back_but_for_fine_detail(suffix, rest, tmp_path):
     truth = _gaussians(rest=rest)
     write_model(tmp_path / f"m{suffix}", truth)
-    found = read_model(tmp_path / f"m{suffix}")
-    assert all(array.dtype == np.float32 for array in found.arrays().values())
-    _assert_close(found, truth, LIMITS[suffix])
+    model = read_model(tmp_path / f"m{suffix}")
+    assert all(array.dtype == np.float32 for array in model.arrays().values())
+    _assert_close(model, truth, LIMITS[suffix])
 
 
 def test_a_ply_comes_back_whole(tmp_path):
@@ -101,9 +101,9 @@ def test_one_gaussian_and_equal_ones_are_models_too(suffix, tmp_path):
     assert len(read_model(tmp_path / f"one{suffix}")) == 1
     same = Gaussians(**{name: np.repeat(a, 300, axis=0) for name, a in one.arrays().items()})
     write_model(tmp_path / f"same{suffix}", same)
-    found = read_model(tmp_path / f"same{suffix}")
-    assert len(found) == 300
-    np.testing.assert_allclose(found.means, same.means, atol=1e-3)
+    model = read_model(tmp_path / f"same{suffix}")
+    assert len(model) == 300
+    np.testing.assert_allclose(model.means, same.means, atol=1e-3)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -126,8 +126,8 @@ def test_a_far_off_world_keeps_its_place(suffix, tmp_path):
     near = _gaussians()
     far = Gaussians(**{**near.arrays(), "means": near.means + np.float32(1e4)})
     write_model(tmp_path / f"m{suffix}", far)
-    found = read_model(tmp_path / f"m{suffix}")
-    np.testing.assert_allclose(np.sort(found.means, axis=0), np.sort(far.means, axis=0), atol=0.02)
+    model = read_model(tmp_path / f"m{suffix}")
+    np.testing.assert_allclose(np.sort(model.means, axis=0), np.sort(far.means, axis=0), atol=0.02)
 
 
 def test_opacities_of_0_and_1_stay_finite(tmp_path):
@@ -135,9 +135,9 @@ def test_opacities_of_0_and_1_stay_finite(tmp_path):
     sure = Gaussians(**{**model.arrays(), "opacities": np.full(700, np.inf, np.float32)})
     for suffix in PACKED:
         write_model(tmp_path / f"m{suffix}", sure)
-        found = read_model(tmp_path / f"m{suffix}").opacities
-        assert np.isfinite(found).all()
-        assert (found > 5).all()
+        opacities = read_model(tmp_path / f"m{suffix}").opacities
+        assert np.isfinite(opacities).all()
+        assert (opacities > 5).all()
 
 
 @given(st.integers(0, 2**32 - 1))

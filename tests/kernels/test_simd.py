@@ -227,25 +227,25 @@ def test_aligned_arrays(size: int) -> None:
 
 def test_exp_is_accurate_where_it_is_used() -> None:
     x = np.linspace(-0.7, 0.0, 16 * 40_000, dtype=np.float32)
-    found = np.empty_like(x)
-    _exp(x, found)
+    values = np.empty_like(x)
+    _exp(x, values)
     exact = np.exp(8.0 * x.astype(np.float64))
-    assert np.abs(found / exact - 1.0).max() <= 3e-6
-    assert found.max() <= 1.0
+    assert np.abs(values / exact - 1.0).max() <= 3e-6
+    assert values.max() <= 1.0
 
 
 def test_exp_never_brings_alpha_past_its_opacity() -> None:
     """At the centre of a Gaussian: within 1e-6 of 1, from below."""
-    found = applied(_exp, np.zeros(LANES, np.float32))
-    assert ((found <= 1.0) & (found >= 1.0 - 1e-6)).all()
+    values = applied(_exp, np.zeros(LANES, np.float32))
+    assert ((values <= 1.0) & (values >= 1.0 - 1e-6)).all()
 
 
 def test_negative_magnitude_is_never_positive(lanes) -> None:
     for a, _, _ in lanes:
         expected = -np.abs(a)
-        found = applied(_negative_magnitude, a)
-        np.testing.assert_array_equal(found, expected)
-        np.testing.assert_array_equal(np.signbit(found), np.signbit(expected))
+        values = applied(_negative_magnitude, a)
+        np.testing.assert_array_equal(values, expected)
+        np.testing.assert_array_equal(np.signbit(values), np.signbit(expected))
 
 
 def test_load_and_store_at_any_offset(rng) -> None:

@@ -96,17 +96,17 @@ def test_a_cache_that_names_what_is_gone_is_passed_over(tiny):
 
 
 def test_a_file_reaches_what_it_imports_directly_and_by_way_of_others(tiny):
-    found = reached_files(tiny / "kernels.py", "tiny.kernels")
-    ours = {path.stem for path in found if path.parent == tiny}
+    reached = reached_files(tiny / "kernels.py", "tiny.kernels")
+    ours = {path.stem for path in reached if path.parent == tiny}
     assert ours == {"kernels", "middle", "__init__", "numbers"}
-    assert found - set(tiny.iterdir()) == {
+    assert reached - set(tiny.iterdir()) == {
         SOURCE / f"kernels/{name}.py" for name in ("jit", "sources", "compilation")
     }
 
 
 def test_kernels_reach_the_files_whose_functions_they_call():
-    found = reached_files(SOURCE / "render" / "harmonics.py", "splatseed.render.harmonics")
-    names = {path.relative_to(SOURCE).as_posix() for path in found}
+    reached = reached_files(SOURCE / "render" / "harmonics.py", "splatseed.render.harmonics")
+    names = {path.relative_to(SOURCE).as_posix() for path in reached}
     assert {"kernels/simd.py", "kernels/shuffles.py", "kernels/jit.py"} <= names
     assert "cli.py" not in names
 

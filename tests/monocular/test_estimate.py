@@ -60,11 +60,11 @@ def test_every_image_gets_a_map_that_the_reader_finds(room_path, network, tmp_pa
     depths = find_depths(scene, tmp_path / "maps")
     assert set(depths) == {image.name for image in scene.images}
     for image in scene.images:
-        found = depths.read(image.name)
-        assert found.kind == "inverse"
+        depth_map = depths.read(image.name)
+        assert depth_map.kind == "inverse"
         with PilImage.open(scene.source.image_dir / image.name) as picture:
             expected = np.asarray(picture.convert("RGB")).mean(axis=2) + 1
-        np.testing.assert_allclose(found.values, expected, rtol=1e-6)
+        np.testing.assert_allclose(depth_map.values, expected, rtol=1e-6)
     assert ("check images", 1.0) in stages
     assert stages[-1] == ("predict depth", 1.0)
 
@@ -94,8 +94,8 @@ def test_large_images_are_reduced_and_small_ones_left(room_path, network, tmp_pa
     scene = load_scene(room_path)
     estimate_depths(scene, network, tmp_path / "maps", max_size=48)
     assert {shape for batch in network.asked for shape in batch} == {(36, 48)}
-    found = find_depths(scene, tmp_path / "maps").read(scene.images[0].name)
-    assert found.camera(scene.images[0].camera).width == 48
+    depth_map = find_depths(scene, tmp_path / "maps").read(scene.images[0].name)
+    assert depth_map.camera(scene.images[0].camera).width == 48
 
 
 def test_subfolders_and_foreign_suffixes_keep_their_names(own_path, network, tmp_path):

@@ -63,8 +63,8 @@ def test_predictions_are_those_of_transformers_at_the_photographs_size(name, sav
     network = transformers.AutoModelForDepthEstimation.from_pretrained(saved(name))
     with torch.no_grad():
         outputs = network(**processor(photographs, return_tensors="pt"))
-    found = load_network(str(saved(name)), device="cpu")(photographs)
-    for depth, expected in zip(found, outputs.predicted_depth, strict=True):
+    predicted = load_network(str(saved(name)), device="cpu")(photographs)
+    for depth, expected in zip(predicted, outputs.predicted_depth, strict=True):
         assert depth.dtype == np.float32
         np.testing.assert_allclose(depth, _scaled(expected, (60, 90)), atol=1e-5)
         assert np.ptp(depth) > 0.01  # not an empty comparison
@@ -225,8 +225,8 @@ def test_weights_that_dpt_never_uses_may_be_missing(saved, tmp_path, photographs
     kept = {key: value for key, value in weights.items() if not key.startswith(unused)}
     assert len(kept) < len(weights)
     save_file(kept, folder / "model.safetensors")
-    found = load_network(str(folder), device="cpu")(photographs)
-    assert np.array_equal(found, load_network(str(saved("dpt")), device="cpu")(photographs))
+    predicted = load_network(str(folder), device="cpu")(photographs)
+    assert np.array_equal(predicted, load_network(str(saved("dpt")), device="cpu")(photographs))
 
 
 @pytest.mark.usefixtures("offline")

@@ -47,9 +47,9 @@ def test_values_are_those_of_the_formula(form, count, rng, tmp_path):
     network = load_network(
         str(path), kind="z", device="cpu", preparation=Preparation(input_size=28)
     )
-    found = network(images)
-    assert len(found) == count
-    for depth, image in zip(found, images, strict=True):
+    predicted = network(images)
+    assert len(predicted) == count
+    for depth, image in zip(predicted, images, strict=True):
         assert depth.dtype == np.float32
         np.testing.assert_allclose(depth, _expected(image), atol=0.05 if form.get("half") else 1e-4)
 
@@ -83,8 +83,8 @@ def test_what_lies_beside_the_file_or_above_it_is_used(rng, tmp_path):
     assert network.meaning.kind == "z"
     np.testing.assert_allclose(network([image])[0], _expected(image, 0.5, 0.25), atol=1e-4)
     said = Preparation(mean=(0.0, 0.0, 0.0))
-    found = load_network(str(path), device="cpu", preparation=said)([image])[0]
-    np.testing.assert_allclose(found, _expected(image, 0.0, 0.25), atol=1e-4)
+    predicted = load_network(str(path), device="cpu", preparation=said)([image])[0]
+    np.testing.assert_allclose(predicted, _expected(image, 0.0, 0.25), atol=1e-4)
 
 
 def test_a_processor_without_colours_is_believed(rng, tmp_path):
@@ -92,8 +92,8 @@ def test_a_processor_without_colours_is_believed(rng, tmp_path):
     processor = {"do_normalize": False, "size": 14, "image_mean": [0.5] * 3}
     (tmp_path / "preprocessor_config.json").write_text(json.dumps(processor))
     image = rng.integers(0, 256, (14, 14, 3), dtype=np.uint8)
-    (found,) = load_network(str(path), kind="z", device="cpu")([image])
-    np.testing.assert_allclose(found, _expected(image, 0.0, 1.0), atol=1e-4)
+    (predicted,) = load_network(str(path), kind="z", device="cpu")([image])
+    np.testing.assert_allclose(predicted, _expected(image, 0.0, 1.0), atol=1e-4)
 
 
 @settings(deadline=None, max_examples=60)
@@ -142,8 +142,8 @@ def test_an_exported_network_predicts_what_the_original_does(saved, photographs,
     given = (torch.zeros(1, 3, 56, 84),)
     torch.onnx.export(OneTensor(), given, tmp_path / "a.onnx", dynamo=False, opset_version=17)
     exported = load_network(str(tmp_path / "a.onnx"), kind="inverse", device="cpu")
-    for found, expected in zip(exported(photographs), original(photographs), strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-4)
+    for predicted, expected in zip(exported(photographs), original(photographs), strict=True):
+        np.testing.assert_allclose(predicted, expected, atol=1e-4)
         assert np.ptp(expected) > 0.1
 
 

@@ -135,9 +135,9 @@ def gradients(
     loss = (image * torch.tensor(weights.normal(size=tuple(image.shape)), dtype=dtype)).sum()
     loss = loss + (alpha * torch.tensor(weights.normal(size=tuple(alpha.shape)), dtype=dtype)).sum()
     loss.backward()
-    found = {
+    by_name = {
         name: torch.zeros_like(inputs[name]) if inputs[name].grad is None else inputs[name].grad
         for name in of
         if inputs.get(name) is not None
     }
-    return image.detach(), alpha.detach(), found
+    return image.detach(), alpha.detach(), by_name

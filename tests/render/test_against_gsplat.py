@@ -97,12 +97,12 @@ def test_harmonics(rng, degree: int) -> None:
     weights = torch.tensor(rng.normal(size=(200, 3)))
     ours = [torch.tensor(each, dtype=torch.float32).requires_grad_() for each in arrays]
     slow = [each.detach().double().requires_grad_() for each in ours]
-    found = Harmonics.apply(*ours, None, torch.ones(200, 2, dtype=torch.int32), degree)
+    colors = Harmonics.apply(*ours, None, torch.ones(200, 2, dtype=torch.int32), degree)
     harmonics = _spherical_harmonics(degree, slow[0] - slow[1], slow[2])
     expected = torch.clamp_min(harmonics + 0.5, 0.0)
     assert bool((expected == 0).any())
-    torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=1e-6)
-    (found * weights.float()).sum().backward()
+    torch.testing.assert_close(colors.double(), expected, rtol=1e-6, atol=1e-6)
+    (colors * weights.float()).sum().backward()
     (expected * weights).sum().backward()
     for mine, theirs, tolerance in zip(ours, slow, (1e-5, 1e-4, 1e-6), strict=True):
         grad = torch.zeros_like(theirs) if theirs.grad is None else theirs.grad
@@ -115,8 +115,8 @@ def test_coefficients_that_take_no_part_do_not_matter(rng, coefficients: int) ->
     broken, few = {**scene, "colors": scene["colors"].clone()}, dict(scene)
     broken["colors"][:, 4:] = torch.nan
     few["colors"] = scene["colors"][:, :4]
-    found, expected = (rasterization(**each, sh_degree=1)[0] for each in (broken, few))
-    assert torch.equal(found, expected)
+    rendered, expected = (rasterization(**each, sh_degree=1)[0] for each in (broken, few))
+    assert torch.equal(rendered, expected)
     broken["colors"].requires_grad_()
     rasterization(**broken, sh_degree=1)[0].sum().backward()
     gradient = broken["colors"].grad
@@ -147,16 +147,16 @@ def wall(opacity: float, depth: float = 2.0, count: int = 1) -> dict[str, Any]:
 @pytest.mark.parametrize(("opacity", "alpha"), [(0.0, 0), (0.0039, 0), (0.00393, 0.00393),
                                                 (0.5, 0.5), (1.0, 0.999)])  # fmt: skip
 def test_alpha_is_cut_at_one_255th_and_held_at_0_999(opacity: float, alpha: float) -> None:
-    found = rasterization(**wall(opacity))[1]
-    assert np.allclose(found.numpy(), alpha, rtol=2e-5, atol=0)
+    alphas = rasterization(**wall(opacity))[1]
+    assert np.allclose(alphas.numpy(), alpha, rtol=2e-5, atol=0)
 
 
 @pytest.mark.parametrize(("opacity", "blended"), [(0.901, 3), (0.95, 3), (0.98, 2), (0.5, 13)])
 def test_blending_ends_before_a_ten_thousandth_passes(opacity: float, blended: int) -> None:
     """The Gaussian that would bring T to 1e-4 or less is left out."""
     assert (1 - opacity) ** blended > 1e-4 > (1 - opacity) ** (blended + 1)
-    found = rasterization(**wall(opacity, count=20))[1]
-    assert np.allclose(1 - found.numpy(), (1 - opacity) ** blended, rtol=2e-2)
+    alphas = rasterization(**wall(opacity, count=20))[1]
+    assert np.allclose(1 - alphas.numpy(), (1 - opacity) ** blended, rtol=2e-2)
 
 
 @pytest.mark.parametrize(("depth", "visible"), [(-1.0, False), (0.009, False), (0.011, True),

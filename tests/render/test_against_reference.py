@@ -48,11 +48,11 @@ def assert_same(ours: Tensor, theirs: Tensor, what: str, tolerance: float = 1e-4
 def assert_agrees(scene: dict[str, Any], **options: Any) -> tuple[Tensor, Tensor]:
     """Compare; return the reference's image and alpha, for tests to check that they are not
     empty."""
-    image, alpha, found = gradients(scene, **options)
+    image, alpha, grads = gradients(scene, **options)
     slow_image, slow_alpha, expected = gradients(scene, slow=True, **options)
     assert_same(image, slow_image, "image")
     assert_same(alpha, slow_alpha, "alpha")
-    for name, each in found.items():
+    for name, each in grads.items():
         assert_same(each, expected[name], f"gradient of {name}")
     return slow_image, slow_alpha
 
@@ -83,14 +83,14 @@ def test_coefficients_of_each_camera(rng) -> None:
 def test_a_render_may_be_changed_in_place(rng) -> None:
     scene = random_scene(rng)
     scene["means"].requires_grad_()
-    found = []
+    grads = []
     for change in (torch.sqrt, torch.sqrt_):
         image, _, _ = rasterization(**scene)
         change(image).sum().backward()
-        found.append(scene["means"].grad.clone())
+        grads.append(scene["means"].grad.clone())
         scene["means"].grad = None
-    assert torch.equal(*found)
-    assert float(found[0].abs().sum()) > 0
+    assert torch.equal(*grads)
+    assert float(grads[0].abs().sum()) > 0
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2])
@@ -177,11 +177,11 @@ def _gradients_of_2d_means(scene: dict[str, Any], *, packed: bool) -> tuple[Tens
     info["means2d"].retain_grad()
     _weighted(image, alpha).backward()
     shape = (2, len(means), 2)
-    found = info["means2d"].grad, info["means2d"].absgrad
+    grads = info["means2d"].grad, info["means2d"].absgrad
     if not packed:
-        return *found, (info["radii"] > 0).all(dim=-1)
+        return *grads, (info["radii"] > 0).all(dim=-1)
     rows = info["camera_ids"], info["gaussian_ids"]
-    dense = [torch.zeros(shape).index_put(rows, each) for each in found]
+    dense = [torch.zeros(shape).index_put(rows, each) for each in grads]
     return *dense, torch.zeros(shape[:2], dtype=torch.bool).index_put(rows, torch.tensor(True))
 
 
@@ -267,12 +267,12 @@ STEPS = {"means": 2e-3, "quats": 2e-3, "scales": 1e-3, "opacities": 2e-3, "color
 def test_central_differences(name: str) -> None:
     """Our own float32 gradients against our own images, wide enough to see over rounding."""
     scene = _smooth_scene()
-    _, _, found = gradients(scene)
+    _, _, grads = gradients(scene)
     for index in np.ndindex(*scene[name].shape[:-1], min(scene[name].shape[-1], 4)):
         losses = [_loss(scene, name, index, sign * STEPS[name]) for sign in (-2, -1, 1, 2)]
         slope = (losses[0] - 8 * losses[1] + 8 * losses[2] - losses[3]) / (12 * STEPS[name])
-        largest = float(found[name].abs().max())
-        assert abs(slope - float(found[name][index])) <= 2e-3 * largest, (name, index)
+        largest = float(grads[name].abs().max())
+        assert abs(slope - float(grads[name][index])) <= 2e-3 * largest, (name, index)
 
 
 def _loss(scene: dict[str, Any], name: str, index: tuple[int, ...], step: float) -> float:
@@ -303,13 +303,13 @@ def test_stages_follow_one_another() -> None:
 def test_depth_rises_with_distance() -> None:
     """Expected depth of an opaque wall is its distance, whatever the mode calls it."""
     depths = [1.5, 2.0, 4.0]
-    found = []
+    rendered = []
     for depth in depths:
         wall = random_scene(np.random.default_rng(0), 1, size=(8, 8))
         wall["viewmats"], wall["backgrounds"] = torch.eye(4)[None], None
         wall["means"] = torch.tensor([[0.0, 0.0, depth]])
         wall["scales"] = torch.full((1, 3), 50.0)
         wall["opacities"] = torch.tensor([0.99])
-        found.append(float(rasterization(**wall, render_mode="ED")[0][0, 4, 4, 0]))
-    assert np.allclose(found, depths, rtol=1e-5)
-    assert all(near < far for near, far in pairwise(found))
+        rendered.append(float(rasterization(**wall, render_mode="ED")[0][0, 4, 4, 0]))
+    assert np.allclose(rendered, depths, rtol=1e-5)
+    assert all(near < far for near, far in pairwise(rendered))

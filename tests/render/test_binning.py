@@ -53,11 +53,11 @@ def touched(view: View, slack: float) -> np.ndarray:
 def listed(lists: TileLists, view: View) -> np.ndarray:
     """The same, of the lists."""
     columns, rows = -(-view[3] // TILE), -(-view[4] // TILE)
-    found = np.zeros((len(view[2]), rows * columns), int)
+    counts = np.zeros((len(view[2]), rows * columns), int)
     tiles = np.repeat(np.arange(rows * columns), np.diff(lists.tile_start))
-    np.add.at(found, (lists.listed_rank, tiles), 1)
-    assert found.max(initial=0) <= 1, "a Gaussian is listed twice in a tile"
-    return found.reshape(-1, rows, columns).astype(bool)
+    np.add.at(counts, (lists.listed_rank, tiles), 1)
+    assert counts.max(initial=0) <= 1, "a Gaussian is listed twice in a tile"
+    return counts.reshape(-1, rows, columns).astype(bool)
 
 
 def assert_one_row_a_span(lists: TileLists, columns: int) -> None:
@@ -85,11 +85,11 @@ def test_no_pair_is_missing_and_few_are_in_vain(rng, size: tuple[int, int]) -> N
     view = random_view(rng, 300, *size)
     lists = lists_of(*view)
     assert_consistent(lists, view)
-    found, needed = listed(lists, view), touched(view, -1e-4)
+    counts, needed = listed(lists, view), touched(view, -1e-4)
     assert needed.any()
-    assert not (needed & ~found).any()
+    assert not (needed & ~counts).any()
     # Exact in the rectangle of pixel centres, not at the centres: an ellipse may pass between them.
-    assert found.sum() <= 1.15 * touched(view, 1e-4).sum() + 10
+    assert counts.sum() <= 1.15 * touched(view, 1e-4).sum() + 10
 
 
 def test_far_fewer_than_the_square_of_three_sigmas(rng) -> None:

@@ -45,11 +45,11 @@ def test_freshly_compiled_and_loaded_from_the_cache(expected: str, tmp_path: Pat
 
 def _in_new_process(cache: Path) -> str:
     script = Path(__file__).with_name("digest.py")
-    found = subprocess.run(
+    run = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, check=True,
         env={**os.environ, "NUMBA_CACHE_DIR": str(cache)},
     )  # fmt: skip
-    name, value = found.stdout.split()
+    name, value = run.stdout.split()
     assert name == "digest"
     return value
 

@@ -30,10 +30,10 @@ def test_agrees_with_gsplat(golden: dict[str, np.ndarray]) -> None:
     names = sorted({key.partition("/")[0] for key in golden})
     assert names
     for name in names:
-        found = _run(_part(golden, f"{name}/inputs/"), json.loads(str(golden[f"{name}/options"])))
+        ours = _run(_part(golden, f"{name}/inputs/"), json.loads(str(golden[f"{name}/options"])))
         for key, expected in _part(golden, f"{name}/outputs/").items():
             largest = max(float(np.abs(expected).max()), 1e-12)
-            assert np.abs(found[key] - expected).max() <= TOLERANCE * largest, (name, key)
+            assert np.abs(ours[key] - expected).max() <= TOLERANCE * largest, (name, key)
 
 
 def _part(golden: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

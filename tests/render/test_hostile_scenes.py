@@ -32,12 +32,12 @@ QUICK = settings(
 @st.composite
 def replacements(draw: st.DrawFn, broken: bool) -> list[tuple[str, int, int, float]]:
     """Numbers to put into a scene: (parameter, Gaussian, component, value)."""
-    found = []
+    changes = []
     for _ in range(draw(st.integers(1, 8))):
         name = draw(st.sampled_from(PER_GAUSSIAN))
         value = draw(BROKEN if broken else EXTREME[name])
-        found.append((name, draw(st.integers(0, 11)), draw(st.integers(0, 3)), value))
-    return found
+        changes.append((name, draw(st.integers(0, 11)), draw(st.integers(0, 3)), value))
+    return changes
 
 
 def with_replacements(scene: dict[str, Any], changes: list[tuple[str, int, int, float]]) -> None:
@@ -55,10 +55,10 @@ def scene_of(seed: int, options: int) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def assert_finite(scene: dict[str, Any], **options: Any) -> None:
-    image, alpha, found = gradients(scene, **options)
+    image, alpha, grads = gradients(scene, **options)
     assert image.isfinite().all()
     assert ((alpha >= 0) & (alpha <= 1)).all()
-    for name, each in found.items():
+    for name, each in grads.items():
         assert each.isfinite().all(), name
 
 
@@ -82,13 +82,13 @@ def test_broken_gaussians_are_as_if_absent(
     broken = sorted({gaussian for _, gaussian, _, _ in changes})
     kept = [i for i in range(12) if i not in broken]
     without = {**scene, **{name: scene[name][kept] for name in PER_GAUSSIAN}}
-    image, alpha, found = gradients(scene, **chosen)
+    image, alpha, grads = gradients(scene, **chosen)
     expected_image, expected_alpha, expected = gradients(without, **chosen)
     assert torch.equal(image, expected_image)
     assert torch.equal(alpha, expected_alpha)
     for name in PER_GAUSSIAN:
-        assert torch.equal(found[name][kept], expected[name]), name
-        assert not found[name][broken].any(), name
+        assert torch.equal(grads[name][kept], expected[name]), name
+        assert not grads[name][broken].any(), name
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -98,29 +98,29 @@ def test_broken_coefficients(seed: int, degree: int) -> None:
     scene["colors"][3, 2, 1] = np.nan
     kept = [i for i in range(12) if i != 3]
     without = {**scene, **{name: scene[name][kept] for name in PER_GAUSSIAN}}
-    found, expected = (rasterization(**s, sh_degree=degree)[0] for s in (scene, without))
-    assert torch.equal(found, expected)
+    rendered, expected = (rasterization(**s, sh_degree=degree)[0] for s in (scene, without))
+    assert torch.equal(rendered, expected)
 
 
 def test_zero_gaussians() -> None:
     scene = random_scene(np.random.default_rng(0), 3)
     nothing = {**scene, **{name: scene[name][:0] for name in PER_GAUSSIAN}}
     for options in ({}, {"packed": False}, {"render_mode": "RGB+ED"}):
-        image, alpha, found = gradients(nothing, **options)
+        image, alpha, grads = gradients(nothing, **options)
         assert not alpha.any()
         assert torch.equal(image[..., :3], scene["backgrounds"][:, None, None].expand_as(
             image[..., :3]))  # fmt: skip
-        assert found["means"].shape == (0, 3)
+        assert grads["means"].shape == (0, 3)
 
 
 @pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "ED"}])
 def test_none_visible(options: dict[str, Any]) -> None:
     scene = random_scene(np.random.default_rng(0), 20)
     scene["viewmats"][:, 2, 3] = -10.0
-    image, alpha, found = gradients(scene, **options)
+    image, alpha, grads = gradients(scene, **options)
     assert not alpha.any()
     assert image.isfinite().all()
-    assert not any(found[name].any() for name in (*PER_GAUSSIAN, "viewmats"))
+    assert not any(grads[name].any() for name in (*PER_GAUSSIAN, "viewmats"))
 
 
 def test_on_the_near_plane_and_around_the_camera() -> None:
@@ -150,12 +150,12 @@ def test_a_giant_covers_everything_and_takes_little_memory(scale: float) -> None
     scene.update(opacities=torch.tensor([0.5]), viewmats=torch.eye(4)[None])
     assert_finite(scene)
     tracemalloc.start()
-    _, alpha, found = gradients(scene)
+    _, alpha, grads = gradients(scene)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert np.allclose(alpha.numpy(), 0.5, atol=1e-5)
     assert peak < 50e6  # a thousand tiles of 64 pixels are 6 MB of image and gradient
-    assert found["opacities"].isfinite().all()
+    assert grads["opacities"].isfinite().all()
 
 
 def test_memory_grows_with_pairs_not_with_gaussians_times_pixels() -> None:
@@ -198,6 +198,6 @@ def test_inputs_need_not_be_contiguous(rng) -> None:
     strided["colors"] = torch.cat([scene["colors"], scene["colors"]], dim=1)[:, :3]
     strided["quats"] = scene["quats"].flip(1).contiguous().flip(1)
     strided["viewmats"] = scene["viewmats"].mT.contiguous().mT
-    expected, found = gradients(scene), gradients(strided)
-    assert torch.equal(expected[0], found[0])
-    assert all(torch.equal(expected[2][name], found[2][name]) for name in found[2])
+    expected, rendered = gradients(scene), gradients(strided)
+    assert torch.equal(expected[0], rendered[0])
+    assert all(torch.equal(expected[2][name], rendered[2][name]) for name in rendered[2])

@@ -43,9 +43,9 @@ def theirs(info: dict[str, Any]) -> dict[str, Tensor]:
     return dict(zip(LISTS, (*lists, offsets), strict=True))
 
 
-def assert_same(found: Tensor, expected: Tensor) -> None:
-    assert found.dtype == expected.dtype
-    assert torch.equal(found, expected)
+def assert_same(ours: Tensor, expected: Tensor) -> None:
+    assert ours.dtype == expected.dtype
+    assert torch.equal(ours, expected)
 
 
 @pytest.mark.parametrize("cameras", [1, 3])
@@ -86,19 +86,19 @@ def test_boxes_of_all_sizes_and_places(seed: int) -> None:
     expected = _isect_tiles(
         means2d, radii.int(), depths, grid.size, grid.columns, grid.rows
     )  # fmt: skip
-    found = intersect(
+    lists = intersect(
         means2d.view(-1, 2), radii.int().view(-1, 2), depths.flatten(),
         torch.arange(2).repeat_interleave(40), grid,
     )  # fmt: skip
-    assert_same(found.tiles_per_gauss, expected[0].flatten())
-    assert_same(found.isect_ids, expected[1])
-    assert_same(found.flatten_ids, expected[2])
+    assert_same(lists.tiles_per_gauss, expected[0].flatten())
+    assert_same(lists.isect_ids, expected[1])
+    assert_same(lists.flatten_ids, expected[2])
 
 
 def test_equal_depths_stay_in_order() -> None:
     means2d, radii = torch.full((9, 2), 8.0), torch.ones((9, 2), dtype=torch.int32)
-    found = intersect(means2d, radii, torch.ones(9), torch.zeros(9).long(), Grid(1, 16, 16, 16))
-    assert found.flatten_ids.tolist() == list(range(9))
+    lists = intersect(means2d, radii, torch.ones(9), torch.zeros(9).long(), Grid(1, 16, 16, 16))
+    assert lists.flatten_ids.tolist() == list(range(9))
 
 
 @pytest.mark.parametrize("packed", [True, False])
@@ -170,10 +170,10 @@ def test_a_step_of_training_makes_no_lists(made: list[None]) -> None:
 )
 def test_whatever_hands_out_a_list_makes_it(read: Any, made: list[None]) -> None:
     info = info_of(scene_of(1))
-    found = read(info)
-    assert isinstance(found, Tensor)
-    assert torch.equal(found, info_of(scene_of(1))["flatten_ids"])
-    assert len(info.get("isect_ids")) == len(found)
+    entry = read(info)
+    assert isinstance(entry, Tensor)
+    assert torch.equal(entry, info_of(scene_of(1))["flatten_ids"])
+    assert len(info.get("isect_ids")) == len(entry)
     assert len(made) == 2
 
 

@@ -27,13 +27,13 @@ def test_records_hold_ellipses_and_leave_those_that_are(rng) -> None:
     a, c = np.exp(rng.uniform(-20, 2, (2, 3000)))
     b = rng.choice([-1, 1], 3000) * np.sqrt(a * c) * (1 + rng.choice([-1e-3, 0, 1e-7, 1e-3], 3000))
     conics = np.stack([a, b, c], axis=1).astype(np.float32)
-    found = _records(conics)[:, 2:5].astype(np.float64) * [-16, -8, -16]
+    recorded = _records(conics)[:, 2:5].astype(np.float64) * [-16, -8, -16]
     exact = conics.astype(np.float64)
-    given, kept = (m[:, 0] * m[:, 2] - m[:, 1] ** 2 for m in (exact, found))
+    given, kept = (m[:, 0] * m[:, 2] - m[:, 1] ** 2 for m in (exact, recorded))
     assert (given < 0).sum() > 500
     assert (kept >= 0).all()
-    np.testing.assert_array_equal(found[given >= 0], exact[given >= 0])
-    np.testing.assert_allclose(found, exact, rtol=2e-3)
+    np.testing.assert_array_equal(recorded[given >= 0], exact[given >= 0])
+    np.testing.assert_allclose(recorded, exact, rtol=2e-3)
 
 
 @pytest.mark.parametrize("shape", [(8, 8, 3), (13, 9, 3), (5, 22, 2), (16, 7, 1)])

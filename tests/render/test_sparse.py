@@ -37,27 +37,27 @@ def test_values_are_the_dense_ones_and_indices_the_seen(
 ) -> None:
     scene = partly_seen(cameras)
     *picture, dense = gradients(scene, **options)
-    *same, found = gradients(scene, sparse_grad=True, **options)
+    *same, grads = gradients(scene, sparse_grad=True, **options)
     assert all(torch.equal(a, b) for a, b in zip(picture, same, strict=True))
     rows = seen(scene, **options)
     assert 10 < len(rows) < 70
     for name in SPARSE:
-        assert found[name].layout == torch.sparse_coo
-        assert found[name].shape == dense[name].shape
-        each = found[name].coalesce()
+        assert grads[name].layout == torch.sparse_coo
+        assert grads[name].shape == dense[name].shape
+        each = grads[name].coalesce()
         assert torch.equal(each.indices(), rows[None])
         assert torch.equal(each.to_dense(), dense[name])
     for name in OTHERS:
-        assert torch.equal(found[name], dense[name])
+        assert torch.equal(grads[name], dense[name])
 
 
 def test_directions_of_harmonics_make_the_gradient_of_means_dense() -> None:
     scene = partly_seen(2, coefficients=4)
     dense = gradients(scene, sh_degree=1)[2]
-    found = gradients(scene, sh_degree=1, sparse_grad=True)[2]
-    assert [found[name].is_sparse for name in SPARSE] == [False, True, True]
+    grads = gradients(scene, sh_degree=1, sparse_grad=True)[2]
+    assert [grads[name].is_sparse for name in SPARSE] == [False, True, True]
     for name in SPARSE:
-        torch.testing.assert_close(found[name].to_dense(), dense[name])
+        torch.testing.assert_close(grads[name].to_dense(), dense[name])
 
 
 @pytest.mark.parametrize("cameras", [1, 2])

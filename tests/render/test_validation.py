@@ -133,8 +133,8 @@ except MissingDependencyError as error:
 
 
 def test_without_torch_the_error_says_what_to_install() -> None:
-    found = subprocess.run(
+    run = subprocess.run(
         [sys.executable, "-c", WITHOUT_TORCH], capture_output=True, text=True, check=True
     )
-    assert found.stdout.count("\n") == 1
-    assert "pip install 'torch>=2.4'" in found.stdout
+    assert run.stdout.count("\n") == 1
+    assert "pip install 'torch>=2.4'" in run.stdout

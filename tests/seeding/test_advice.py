@@ -19,8 +19,8 @@ BONSAI = Measured(108_040, 292, 106_400, empty=0.1)
 def test_points_that_fill_the_budget_are_left_as_they_are():
     said = advise(BONSAI, most_seeds=18_655)
     assert said.method == AS_IT_IS
-    assert "no room" in said.reasons[0]
     assert "108,040" in said.reasons[0]
+    assert "no room" in said.reasons[1]
     assert said.sentence == "leave the points as they are"
 
 
@@ -31,6 +31,14 @@ def test_room_is_filled_from_the_photographs():
     assert "40%" in said.reasons[1]
     assert advise(FERN, most_seeds=7_000).method == AS_IT_IS
     assert advise(FERN, most_seeds=7_000, room=1.1).method == "auto"
+
+
+def test_growth_needs_no_seeds_but_where_there_are_no_points():
+    said = advise(FERN, most_seeds=30_000, strategy="grow")
+    assert said.method == AS_IT_IS
+    assert "stereo" in said.reasons[1]
+    assert advise(FERN, most_seeds=30_000, strategy="mcmc").method == "auto"
+    assert advise(replace(FERN, num_points=0), 30_000, strategy="grow").method == "auto"
 
 
 def test_where_stereo_finds_little_and_nothing_is_empty_nothing_is_done():

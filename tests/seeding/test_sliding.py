@@ -7,7 +7,7 @@ import pytest
 
 from splatseed.seeding.sliding import FLOOR, OFFSETS, REACH, REFINEMENTS, slide
 from splatseed.seeding.verify import TEXTURE
-from splatseed.stereo.patchmatch import Pictures
+from splatseed.stereo.patchmatch import QuadImages
 from splatseed.stereo.quads import make_quads
 
 from ..stereo.references import (
@@ -38,7 +38,7 @@ def images(rng):
 
 @pytest.fixture
 def warps():
-    """Cameras to the side: at inverse depth 1 the pictures above lie on each other."""
+    """Cameras to the side: at inverse depth 1 the images above lie on each other."""
     return [np.hstack([np.eye(3), [[-shift], [0.0], [0.0]]]) for shift in (8.0, -9.0, 14.0)]
 
 
@@ -54,13 +54,13 @@ def points(rng):
 def run(images, warps, uv, planes, reach):
     quads = [make_quads(image).ravel() for image in images]
     packed = np.array([[*warp[:, :3].ravel(), *warp[:, 3]] for warp in warps], np.float32)
-    pictures = Pictures(
+    quad_images = QuadImages(
         quads[0], np.array([WIDTH, HEIGHT], np.int64), np.concatenate(quads[1:]),
         np.array([[WIDTH, HEIGHT]] * len(warps), np.int64),
         np.cumsum([0, *map(len, quads[1:])]), packed, 1, 1.0, np.array([0.0, np.inf], np.float32),
     )  # fmt: skip
     moves, costs, variances = np.full((3, len(uv)), np.nan, np.float32)
-    slide(pictures, uv, planes, reach, moves, costs, variances)
+    slide(quad_images, uv, planes, reach, moves, costs, variances)
     return moves, costs, variances
 
 

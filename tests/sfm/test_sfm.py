@@ -101,9 +101,9 @@ def add_noise_images(folder: Path, num: int) -> None:
         PilImage.fromarray(texture).save(folder / f"other{i}.png")
 
 
-def aligned_error(found: np.ndarray, true: np.ndarray) -> float:
+def aligned_error(centers: np.ndarray, true: np.ndarray) -> float:
     """RMS distance [scene units] of camera centres after the best similarity transform."""
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    a, b = centers - centers.mean(axis=0), true - true.mean(axis=0)
     u, s, vt = np.linalg.svd(b.T @ a)
     flip = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     scale = np.trace(np.diag(s) @ flip) / (a**2).sum()
@@ -132,9 +132,11 @@ def test_reconstruct_finds_the_cameras(posed: Scene, photos: Path, tmp_path: Pat
     stored = np.mean([point.error for point in model.points3D.values()])
     assert stored == pytest.approx(report.mean_reprojection_error)
     assert stored < 1.0
-    found = np.array([model.find_image_with_name(i.name).projection_center() for i in posed.images])
+    centers = np.array(
+        [model.find_image_with_name(i.name).projection_center() for i in posed.images]
+    )
     true = np.array([image.camera.center for image in posed.images])
-    assert aligned_error(found, true) < 0.05  # the cameras are 4 from the corner
+    assert aligned_error(centers, true) < 0.05  # the cameras are 4 from the corner
 
     stages = list(dict.fromkeys(stage for stage, _ in seen))
     assert stages == ["features", "matching", "mapping", "undistortion"] == list(report.seconds)

@@ -112,14 +112,14 @@ def true_normals(surfaces: Surface, camera: Camera) -> np.ndarray:
     return (normals @ camera.cam_from_world[:3, :3].T).reshape(camera.height, camera.width, 3)
 
 
-def relative_error(surfaces: Surface, found: StereoMap) -> np.ndarray:
+def relative_error(surfaces: Surface, stereo_map: StereoMap) -> np.ndarray:
     """Of the depths that a map has, against the truth, [M]."""
-    known = np.isfinite(found.depth)
-    return np.abs(found.depth[known] / true_depth(surfaces, found.camera)[known] - 1.0)
+    known = np.isfinite(stereo_map.depth)
+    return np.abs(stereo_map.depth[known] / true_depth(surfaces, stereo_map.camera)[known] - 1.0)
 
 
-def degrees_off(surfaces: Surface, found: StereoMap) -> np.ndarray:
+def degrees_off(surfaces: Surface, stereo_map: StereoMap) -> np.ndarray:
     """Angles between the normals of a map and the true ones, [M]."""
-    known = np.isfinite(found.depth)
-    cosine = (found.normal * true_normals(surfaces, found.camera)).sum(axis=-1)[known]
+    known = np.isfinite(stereo_map.depth)
+    cosine = (stereo_map.normal * true_normals(surfaces, stereo_map.camera)).sum(axis=-1)[known]
     return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

@@ -46,16 +46,16 @@ WARPS = {
 @pytest.mark.parametrize("warp", WARPS.values(), ids=WARPS)
 def test_it_is_the_loop(warp, maps):
     (planes, costs), (other, other_costs) = maps
-    found = asked(maps, warp)
+    bits = asked(maps, warp)
     for row, column in np.ndindex(costs.shape):
         off = agrees(
             planes, GRID, row, column, warp, np.where(other_costs > MAX_COST, np.nan, other)
         )
         expected = costs[row, column] <= MAX_COST and off <= TOLERANCE
         if abs(off - TOLERANCE) > 1e-5:
-            assert found[row, column] == expected
+            assert bits[row, column] == expected
     if warp is not WARPS["behind"]:
-        assert 0.2 < found.mean() < 0.9
+        assert 0.2 < bits.mean() < 0.9
 
 
 def test_a_map_confirms_itself_where_it_is_good(maps):

@@ -75,14 +75,14 @@ def test_weights_and_likeness_are_those_of_the_formula(rough, places):
 def test_cost_is_that_of_the_formula(num, rough, rng, places, planes):
     image, others = rough(*SIZE[::-1]), [rough(25 + 3 * i, 45 - 2 * i) for i in range(num)]
     warps = make_warps(rng, num)
-    found = costs(image, others, warps, places, planes)
+    ours = costs(image, others, warps, places, planes)
     for lane, (u, v) in enumerate(places.T.astype(float)):
         each = [
             cost_in(image, other, warp, u, v, planes[:, lane])
             for other, warp in zip(others, warps, strict=True)
         ]
-        assert found[lane] == pytest.approx(best_of(each), abs=2e-3)
-    assert np.ptp(found) > 0.1  # the loop above compared different things
+        assert ours[lane] == pytest.approx(best_of(each), abs=2e-3)
+    assert np.ptp(ours) > 0.1  # the loop above compared different things
 
 
 def test_the_same_picture_at_the_same_place_costs_nothing(rough, places, planes):
@@ -105,8 +105,8 @@ def test_the_negative_costs_most(rough, places, planes):
 def test_without_texture_nothing_is_like_anything(level, rough, places, planes):
     image, grey = rough(*SIZE[::-1]), np.full(SIZE[::-1], level, np.uint8)
     for first, second in [(image, grey), (grey, image), (grey, grey)]:
-        found = costs(first, [second], [IDENTITY], places, planes)
-        np.testing.assert_allclose(found, 1.0, atol=5e-3)
+        ours = costs(first, [second], [IDENTITY], places, planes)
+        np.testing.assert_allclose(ours, 1.0, atol=5e-3)
 
 
 def test_a_view_that_does_not_hold_the_point_says_nothing(rough, places, planes):
@@ -116,5 +116,5 @@ def test_a_view_that_does_not_hold_the_point_says_nothing(rough, places, planes)
     at_camera = np.zeros((3, 4))
     for warp in (behind, beside, at_camera):
         assert (costs(image, [image], [warp], places, planes) == UNSEEN).all()
-    found = costs(image, [image, image, image], [behind, IDENTITY, IDENTITY], places, planes)
-    assert found.max() < 0.02  # the best two count
+    ours = costs(image, [image, image, image], [behind, IDENTITY, IDENTITY], places, planes)
+    assert ours.max() < 0.02  # the best two count

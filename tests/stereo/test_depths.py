@@ -37,9 +37,12 @@ def maps_of(planted):
 
 
 def test_a_tilted_plane(plane):
-    for found in maps_of(plane):
-        error, angle = relative_error(plane.surfaces, found), degrees_off(plane.surfaces, found)
-        assert found.known_share > 0.7
+    for stereo_map in maps_of(plane):
+        error, angle = (
+            relative_error(plane.surfaces, stereo_map),
+            degrees_off(plane.surfaces, stereo_map),
+        )
+        assert stereo_map.known_share > 0.7
         assert (error < 0.01).mean() > 0.95
         assert np.median(error) < 0.003
         assert np.median(angle) < 6
@@ -47,35 +50,40 @@ def test_a_tilted_plane(plane):
 
 
 def test_a_ball_before_a_wall(ball):
-    for found in maps_of(ball):
-        error, angle = relative_error(ball.surfaces, found), degrees_off(ball.surfaces, found)
-        assert found.known_share > 0.55
+    for stereo_map in maps_of(ball):
+        error, angle = (
+            relative_error(ball.surfaces, stereo_map),
+            degrees_off(ball.surfaces, stereo_map),
+        )
+        assert stereo_map.known_share > 0.55
         assert (error < 0.01).mean() > 0.9
         assert np.median(angle) < 10
 
 
 def test_a_map_says_where_it_is_and_what_it_knows(ball):
-    for image, found in zip(ball.scene.images, maps_of(ball), strict=True):
-        known = np.isfinite(found.depth)
-        assert found.name == image.name
+    for image, stereo_map in zip(ball.scene.images, maps_of(ball), strict=True):
+        known = np.isfinite(stereo_map.depth)
+        assert stereo_map.name == image.name
         assert known.shape == (HEIGHT // SETTINGS.grid, WIDTH // SETTINGS.grid)
-        assert (found.camera.height, found.camera.width) == known.shape
-        np.testing.assert_array_equal(np.isfinite(found.normal).all(axis=-1), known)
-        np.testing.assert_array_equal(found.confidence > 0, known)
-        assert (np.bitwise_count(found.agreeing[known]) >= SETTINGS.min_agreeing).all()
-        assert not found.agreeing[~known].any()
-        assert set(found.sources) == {other.name for other in ball.scene.images} - {found.name}
+        assert (stereo_map.camera.height, stereo_map.camera.width) == known.shape
+        np.testing.assert_array_equal(np.isfinite(stereo_map.normal).all(axis=-1), known)
+        np.testing.assert_array_equal(stereo_map.confidence > 0, known)
+        assert (np.bitwise_count(stereo_map.agreeing[known]) >= SETTINGS.min_agreeing).all()
+        assert not stereo_map.agreeing[~known].any()
+        assert set(stereo_map.sources) == {other.name for other in ball.scene.images} - {
+            stereo_map.name
+        }
         rays = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in known.shape[::-1])), axis=-1)
         rays = np.concatenate([rays, np.ones((*known.shape, 1))], axis=-1)
-        towards = (rays @ np.linalg.inv(found.camera.K).T * found.normal).sum(axis=-1)
+        towards = (rays @ np.linalg.inv(stereo_map.camera.K).T * stereo_map.normal).sum(axis=-1)
         assert (towards[known] < 0).all()
 
 
 def test_confidence_is_higher_where_depth_is_right(ball):
     right, confidence = [], []
-    for found in maps_of(ball):
-        right.append(relative_error(ball.surfaces, found) < 0.005)
-        confidence.append(found.confidence[np.isfinite(found.depth)])
+    for stereo_map in maps_of(ball):
+        right.append(relative_error(ball.surfaces, stereo_map) < 0.005)
+        confidence.append(stereo_map.confidence[np.isfinite(stereo_map.depth)])
     right, confidence = np.concatenate(right), np.concatenate(confidence)
     assert confidence[right].mean() > confidence[~right].mean()
 
@@ -94,17 +102,17 @@ def test_the_same_bytes_on_any_number_of_threads(ball, monkeypatch):
 
 
 def test_another_seed_gives_other_bytes_as_good(plane):
-    found = stereo_depths(plane.scene, SETTINGS, seed=1)[0]
-    assert found.depth.tobytes() != maps_of(plane)[0].depth.tobytes()
-    assert (relative_error(plane.surfaces, found) < 0.01).mean() > 0.95
+    stereo_map = stereo_depths(plane.scene, SETTINGS, seed=1)[0]
+    assert stereo_map.depth.tobytes() != maps_of(plane)[0].depth.tobytes()
+    assert (relative_error(plane.surfaces, stereo_map) < 0.01).mean() > 0.95
 
 
 def test_two_views_confirm_each_other(tmp_path):
     surfaces = tilted_plane()
     scene = photograph(tmp_path, surfaces, arc((-4.0, 4.0)))
-    for found in stereo_depths(scene, SETTINGS):
-        assert found.known_share > 0.5
-        assert (relative_error(surfaces, found) < 0.01).mean() > 0.9
+    for stereo_map in stereo_depths(scene, SETTINGS):
+        assert stereo_map.known_share > 0.5
+        assert (relative_error(surfaces, stereo_map) < 0.01).mean() > 0.9
 
 
 @pytest.mark.parametrize("num", [0, 1])
@@ -117,32 +125,32 @@ def test_stereo_takes_two(num, tmp_path):
 def test_views_that_see_nothing_of_each_other_keep_nothing(tmp_path):
     front, back = arc((0.0, 180.0))
     scene = photograph(tmp_path, tilted_plane(0.0), [front, back])
-    for found in stereo_depths(scene, SETTINGS):
-        assert found.known_share == 0.0
-        assert not found.confidence.any()
+    for stereo_map in stereo_depths(scene, SETTINGS):
+        assert stereo_map.known_share == 0.0
+        assert not stereo_map.confidence.any()
 
 
 def test_grey_walls_get_no_invented_depth(tmp_path):
     scene = photograph(tmp_path, tilted_plane(), arc(), texture=GREY)
-    for found in stereo_depths(scene, SETTINGS):
-        assert found.known_share < 0.02
+    for stereo_map in stereo_depths(scene, SETTINGS):
+        assert stereo_map.known_share < 0.02
 
 
 def test_views_of_different_sizes_and_lenses(tmp_path):
     surfaces = tilted_plane()
     cameras = [*arc((0.0, 8.0)), *arc((-8.0, 14.0), (70, 90), 80.0), *arc((-14.0,), (120, 64), 120)]
     scene = photograph(tmp_path, surfaces, cameras)
-    for found, camera in zip(stereo_depths(scene, SETTINGS), cameras, strict=True):
-        assert found.depth.shape == (camera.height // 2, camera.width // 2)
-        assert found.known_share > 0.5
-        assert (relative_error(surfaces, found) < 0.01).mean() > 0.9
+    for stereo_map, camera in zip(stereo_depths(scene, SETTINGS), cameras, strict=True):
+        assert stereo_map.depth.shape == (camera.height // 2, camera.width // 2)
+        assert stereo_map.known_share > 0.5
+        assert (relative_error(surfaces, stereo_map) < 0.01).mean() > 0.9
 
 
 def test_a_view_smaller_than_its_grid_has_an_empty_map(tmp_path):
     cameras = [*arc((0.0, 6.0)), *arc((-6.0,), (20, 16), 20.0)]
     scene = photograph(tmp_path, tilted_plane(), cameras)
     maps = stereo_depths(scene, StereoSettings(grid=20))
-    assert [found.depth.shape for found in maps] == [(4, 4), (4, 4), (0, 1)]
+    assert [stereo_map.depth.shape for stereo_map in maps] == [(4, 4), (4, 4), (0, 1)]
 
 
 @pytest.mark.parametrize("shift", [0.0, -50.0])
@@ -153,21 +161,22 @@ def test_points_at_and_behind_the_cameras(shift, tmp_path):
     xyz = scene.points.xyz.copy()
     xyz[:30] = scene.images[0].camera.center + np.array([0, 0, shift], np.float32)
     moved = scene.replace(points=PointCloud(xyz, scene.points.rgb))
-    for found in stereo_depths(moved, SETTINGS):
-        assert found.known_share > 0.5
-        assert (relative_error(surfaces, found) < 0.01).mean() > 0.9
+    for stereo_map in stereo_depths(moved, SETTINGS):
+        assert stereo_map.known_share > 0.5
+        assert (relative_error(surfaces, stereo_map) < 0.01).mean() > 0.9
 
 
 def test_the_yardstick_itself(plane):
     """The truth of the made plane, by its equation: normal . x = 0."""
-    for found in maps_of(plane):
-        depth = true_depth(plane.surfaces, found.camera)
+    for stereo_map in maps_of(plane):
+        depth = true_depth(plane.surfaces, stereo_map.camera)
         row, column = np.indices(depth.shape).reshape(2, -1)
         uv = np.stack([column, row], axis=1) + 0.5
-        xyz = found.camera.unproject(uv, depth.ravel())
-        normals = true_normals(plane.surfaces, found.camera).reshape(-1, 3)
+        xyz = stereo_map.camera.unproject(uv, depth.ravel())
+        normals = true_normals(plane.surfaces, stereo_map.camera).reshape(-1, 3)
         assert (
-            np.abs((xyz * (normals @ found.camera.cam_from_world[:3, :3])).sum(axis=1)).max() < 1e-6
+            np.abs((xyz * (normals @ stereo_map.camera.cam_from_world[:3, :3])).sum(axis=1)).max()
+            < 1e-6
         )
 
 

@@ -51,15 +51,18 @@ def test_every_kept_pixel_has_a_seed_near_it(seeds, ball):
     one."""
     stereo, xyz = ball.stereo, seeds.xyz.astype(float)
     for i in range(len(stereo.views)):
-        found = stereo.map(i)
+        stereo_map = stereo.map(i)
         row, column = np.nonzero(stereo.kept(i))
-        points = found.camera.unproject(
-            np.stack([column, row], axis=1) + 0.5, found.depth[row, column]
+        points = stereo_map.camera.unproject(
+            np.stack([column, row], axis=1) + 0.5, stereo_map.depth[row, column]
         )
         gap = np.linalg.norm(points[:, None] - xyz, axis=2).min(axis=1)
         # A cell's diagonal across the line of sight, and as much along it.
         assert (
-            np.quantile(gap / (CELL * found.depth[row, column] / stereo.views[i].K[0, 0]), 0.99) < 3
+            np.quantile(
+                gap / (CELL * stereo_map.depth[row, column] / stereo.views[i].K[0, 0]), 0.99
+            )
+            < 3
         )
 
 

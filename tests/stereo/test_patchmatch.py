@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatseed.stereo.matching import other_from_view
-from splatseed.stereo.patchmatch import STEEPEST, Pictures, begin, sweep
+from splatseed.stereo.patchmatch import STEEPEST, QuadImages, begin, sweep
 from splatseed.stereo.quads import make_quads
 
 from .references import best_of, cost_in
@@ -30,11 +30,11 @@ def warps():
 
 
 @pytest.fixture
-def pictures(images, warps) -> Pictures:
+def quad_images(images, warps) -> QuadImages:
     height, width = images[0].shape
     quads = [make_quads(image).ravel() for image in images]
     packed = np.array([[*warp[:, :3].ravel(), *warp[:, 3]] for warp in warps], np.float32)
-    return Pictures(
+    return QuadImages(
         quads[0], np.array([width, height], np.int64), np.concatenate(quads[1:]),
         np.array([[width, height]] * 2, np.int64), np.cumsum([0, *map(len, quads[1:])]), packed,
         GRID, FOCAL, BOUNDS,
@@ -42,12 +42,12 @@ def pictures(images, warps) -> Pictures:
 
 
 @pytest.fixture
-def state(pictures, rng):
+def state(quad_images, rng):
     """Planes drawn between the bounds, and their costs."""
     guesses = np.zeros((2, 3, ROWS, COLUMNS), np.float32)
     guesses[:, 0] = rng.uniform(*BOUNDS, (2, ROWS, COLUMNS))
     planes, costs = np.zeros(guesses.shape[1:], np.float32), np.empty((ROWS, COLUMNS), np.float32)
-    begin(pictures, guesses, planes, costs)
+    begin(quad_images, guesses, planes, costs)
     return guesses, planes, costs
 
 
@@ -68,12 +68,12 @@ def test_the_best_guess_is_taken(images, warps, state):
         assert planes[0, row, column] in guesses[:, 0, row, column]
 
 
-def test_sweeps_lower_costs_and_keep_to_the_bounds(images, warps, pictures, state):
+def test_sweeps_lower_costs_and_keep_to_the_bounds(images, warps, quad_images, state):
     _, planes, costs = state
     before = costs.copy()
     for number in range(2):
         for color in range(2):
-            sweep(pictures, color, number, KEY, planes, costs)
+            sweep(quad_images, color, number, KEY, planes, costs)
     assert (costs <= before).all()
     assert costs.mean() < 0.9 * before.mean()
     w, slope = planes[0], np.hypot(planes[1], planes[2])
@@ -85,22 +85,22 @@ def test_sweeps_lower_costs_and_keep_to_the_bounds(images, warps, pictures, stat
 
 
 @pytest.mark.parametrize("color", [0, 1])
-def test_a_half_sweep_changes_one_colour_only(color, pictures, state):
+def test_a_half_sweep_changes_one_colour_only(color, quad_images, state):
     _, planes, costs = state
     before = planes.copy()
-    sweep(pictures, color, 0, KEY, planes, costs)
+    sweep(quad_images, color, 0, KEY, planes, costs)
     changed = (planes != before).any(axis=0)
     visited = np.indices(costs.shape).sum(axis=0) % 2 == color
     assert not changed[~visited].any()
     assert changed[visited].mean() > 0.5
 
 
-def test_random_numbers_come_from_the_key(pictures, state):
+def test_random_numbers_come_from_the_key(quad_images, state):
     _, planes, costs = state
     runs = []
     for key in (KEY, KEY, np.uint64(7)):
         mine = planes.copy()
-        sweep(pictures, 0, 0, key, mine, costs.copy())
+        sweep(quad_images, 0, 0, key, mine, costs.copy())
         runs.append(mine)
     np.testing.assert_array_equal(runs[0], runs[1])
     assert (runs[0] != runs[2]).any()

@@ -35,17 +35,17 @@ def bare(scene: Scene) -> Scene:
 
 
 def test_a_glimpse_finds_points_on_the_surface(ball):
-    found = glimpse(load_views(ball.scene, ball.scene.images), 0, silent)
-    assert len(found.xyz) > 100
-    assert np.quantile(ball.surfaces.distance(found.xyz), 0.8) < 0.06
+    points = glimpse(load_views(ball.scene, ball.scene.images), 0, silent)
+    assert len(points.xyz) > 100
+    assert np.quantile(ball.surfaces.distance(points.xyz), 0.8) < 0.06
 
 
 @pytest.mark.parametrize("planted", ["plane", "ball"])
 def test_maps_are_as_good_as_with_points(planted, request):
     made = request.getfixturevalue(planted)
-    for i, found in enumerate(stereo_depths(bare(made.scene), SETTINGS)):
-        assert found.known_share > 0.85 * made.stereo.map(i).known_share
-        assert (relative_error(made.surfaces, found) < 0.01).mean() > 0.85
+    for i, stereo_map in enumerate(stereo_depths(bare(made.scene), SETTINGS)):
+        assert stereo_map.known_share > 0.85 * made.stereo.map(i).known_share
+        assert (relative_error(made.surfaces, stereo_map) < 0.01).mean() > 0.85
 
 
 def test_any_unit_of_length(plane):
@@ -54,33 +54,33 @@ def test_any_unit_of_length(plane):
         dataclasses.replace(i, translation=1000 * i.translation) for i in plane.scene.images
     )
     big = stereo_depths(bare(plane.scene).replace(images=images), SETTINGS)
-    for i, found in enumerate(big):
+    for i, stereo_map in enumerate(big):
         truth = true_depth(plane.surfaces, plane.stereo.map(i).camera)
-        error = np.abs(found.depth / 1000 / truth - 1.0)[np.isfinite(found.depth)]
-        assert found.known_share > 0.6
+        error = np.abs(stereo_map.depth / 1000 / truth - 1.0)[np.isfinite(stereo_map.depth)]
+        assert stereo_map.known_share > 0.6
         assert (error < 0.01).mean() > 0.85
 
 
 def test_two_views(tmp_path):
     surfaces = tilted_plane()
     scene = bare(photograph(tmp_path, surfaces, arc((-4.0, 4.0))))
-    for found in stereo_depths(scene, SETTINGS):
-        assert found.known_share > 0.4
-        assert (relative_error(surfaces, found) < 0.01).mean() > 0.8
+    for stereo_map in stereo_depths(scene, SETTINGS):
+        assert stereo_map.known_share > 0.4
+        assert (relative_error(surfaces, stereo_map) < 0.01).mean() > 0.8
 
 
 @pytest.mark.parametrize("angles", [(0.0, 180.0), (0.0, 0.0, 0.0)])
 def test_views_that_cannot_tell_depth_say_nothing(angles, tmp_path):
     """Back to back, or from one place."""
     scene = bare(photograph(tmp_path, tilted_plane(0.0), arc(angles)))
-    for found in stereo_depths(scene, SETTINGS):
-        assert found.known_share == 0.0
+    for stereo_map in stereo_depths(scene, SETTINGS):
+        assert stereo_map.known_share == 0.0
 
 
 def test_grey_walls_say_nothing(tmp_path):
     scene = bare(photograph(tmp_path, tilted_plane(), arc(), texture=GREY))
-    for found in stereo_depths(scene, SETTINGS):
-        assert found.known_share < 0.02
+    for stereo_map in stereo_depths(scene, SETTINGS):
+        assert stereo_map.known_share < 0.02
 
 
 @pytest.mark.parametrize("kind", ["z", "ray", "inverse"])
@@ -96,18 +96,18 @@ def test_depth_maps_stand_in_for_points(kind, plane):
             )
         maps[image.name] = DepthMap(depth.astype(np.float32), kind)
     del maps[plane.scene.images[1].name]
-    found = known_visibility(bare(plane.scene).replace(depths=maps))
+    visibility = known_visibility(bare(plane.scene).replace(depths=maps))
     if kind == "inverse":
-        assert not len(found.xyz)  # its unit is nobody's
+        assert not len(visibility.xyz)  # its unit is nobody's
     else:
-        assert len(found.xyz) == 4 * SAMPLES**2
-        assert plane.surfaces.distance(found.xyz).max() < 1e-4
+        assert len(visibility.xyz) == 4 * SAMPLES**2
+        assert plane.surfaces.distance(visibility.xyz).max() < 1e-4
 
 
 def test_points_are_taken_where_there_are_some(plane):
     maps = Maps({plane.scene.images[0].name: DepthMap(np.ones((80, 96), np.float32))})
-    found = known_visibility(plane.scene.replace(depths=maps))
-    np.testing.assert_array_equal(found.xyz, find_visibility(plane.scene).xyz)
+    visibility = known_visibility(plane.scene.replace(depths=maps))
+    np.testing.assert_array_equal(visibility.xyz, find_visibility(plane.scene).xyz)
 
 
 def test_pairs_by_pose_look_the_same_way_from_another_place():

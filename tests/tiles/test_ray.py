@@ -46,7 +46,8 @@ class DyingTasks(RayTasks):
 def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(
     sheet, tiles, tmp_path, monkeypatch
 ):
-    monkeypatch.setenv("RAY_TMPDIR", tempfile.mkdtemp(dir="/tmp"))  # sockets' names must be short
+    monkeypatch.setenv("RAY_TMPDIR", tempfile.mkdtemp(dir="/tmp"))  # names of sockets must be short
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # or workers wait for every other process
     flag = tmp_path / "killed"
     with ray_cluster(None):
         xyz, _ = tiles(sheet, "linear", configure("linear"), most=250, tasks=DyingTasks(flag))

@@ -7,22 +7,18 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
 from splatseed import requirements
-from splatseed.cli import main
 from splatseed.commands.train import Options
 from splatseed.errors import MissingDependencyError
 from splatseed.train.record.config import resumed_settings
 
+from ..command_line import exit_code
 
-def _run(*words):
-    try:
-        main(["train", *map(str, words)])
-    except SystemExit as stop:
-        return stop.code
-    return 0
+_run = partial(exit_code, "train")
 
 
 @pytest.mark.slow
@@ -124,8 +120,10 @@ def test_bad_words_end_in_one_line(room_path, tmp_path, capsys, words, said):
 
 
 def test_missing_packages_are_named_with_the_command(monkeypatch):
-    found = importlib.util.find_spec
-    monkeypatch.setattr(requirements, "find_spec", lambda name: None if name == "gsplat" else found)
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(
+        requirements, "find_spec", lambda name: None if name == "gsplat" else find_spec
+    )
     with pytest.raises(MissingDependencyError, match=r"pip install 'gsplat>=1.5.3,<1.6'"):
         requirements.require("torch", "gsplat")
 

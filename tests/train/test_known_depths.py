@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, strategies as st
 
+from splatseed.camera import Intrinsics
 from splatseed.io import load_scene
 from splatseed.progress import silent
+from splatseed.scene import Image
 from splatseed.splat.frame import TrainingFrame
 from splatseed.stereo.depths import find_stereo
 from splatseed.synthetic import make_capture, write_capture
@@ -15,6 +20,7 @@ from splatseed.train.known_depths import known_depths
 from splatseed.train.run import prepare_run
 from splatseed.train.seeds import seeded
 from splatseed.train.settings import TrainSettings
+from splatseed.train.stereo_size import PER_RENDERED, stereo_size
 
 FRAME = TrainingFrame(np.array([1.0, 2.0, 3.0]), 0.25)
 GROW = TrainSettings(strategy="grow", max_steps=60)
@@ -88,3 +94,35 @@ def test_seeding_hands_on_what_stereo_found(scene):
     stereo = seeded(scene, asked, lambda _: None, silent)[1]
     assert stereo is not None
     assert [view.name for view in stereo.views] == [image.name for image in scene.split(8)[0]]
+
+
+@given(
+    steps=st.integers(1, 100_000),
+    count=st.integers(1, 400),
+    width=st.integers(64, 4000),
+    factor=st.integers(1, 8),
+)
+def test_comparing_takes_a_part_of_training_unless_it_is_at_the_trained_size(
+    steps, count, width, factor
+):
+    lens = Intrinsics(1, "PINHOLE", width, width * 3 // 4, (width, width, width / 2, width / 3))
+    images = [Image(f"{i}.png", i + 1, lens, np.array([1.0, 0, 0, 0]), np.zeros(3)) for i in
+              range(count)]  # fmt: skip
+    asked = TrainSettings(strategy="grow", max_steps=steps, data_factor=factor)
+    size = stereo_size(images, asked)
+    assert 64 <= size <= 800
+    assert stereo_size(images, dataclasses.replace(asked, max_steps=steps + 1)) >= size
+    side = min(size, width)
+    compared = count * side * side * 3 / 4
+    rendered = steps * (width / factor) ** 2 * 3 / 4
+    assert compared <= 1.05 * PER_RENDERED * rendered or size <= max(64, width // factor)
+
+
+def test_a_short_run_of_many_photographs_compares_them_at_the_trained_size(scene):
+    short = TrainSettings(strategy="grow", max_steps=1, data_factor=2)
+    full = known_depths(scene, FRAME, GROW, CPU)
+    half = known_depths(scene, FRAME, short, CPU)
+    for name, depth in half.items():
+        assert depth.shape == tuple(n // 2 for n in full[name].shape)
+    assert half
+    assert stereo_size([], short) == 800

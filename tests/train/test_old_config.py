@@ -4,27 +4,24 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 
 import pytest
 import torch
 
-from splatseed.cli import main
 from splatseed.io import load_scene
 from splatseed.train.record.config import make_config, resumed_settings
 from splatseed.train.seeds import usable_seeds
 from splatseed.train.settings import TrainSettings
+
+from ..command_line import exit_code
 
 NEWER = ("placing", "seed_sizes", "seed_normals", "seed_colors", "seeding")
 """Settings that version 0.1.0 did not have."""
 STEPS = 3
 
 
-def _run(*words):
-    try:
-        main(["train", *map(str, words)])
-    except SystemExit as stop:
-        return stop.code
-    return 0
+_run = partial(exit_code, "train")
 
 
 @pytest.fixture

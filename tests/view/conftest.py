@@ -1,4 +1,4 @@
-"""A small room on disk, and a run of it."""
+"""The larger room's path, and a run of it."""
 
 from __future__ import annotations
 
@@ -12,15 +12,13 @@ pytest.importorskip("torch", reason="rendering needs PyTorch")
 from splatseed.io import load_scene
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.ply import write_gaussians
-from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.settings import TrainSettings
 
 
 @pytest.fixture(scope="session")
-def room(tmp_path_factory):
-    """A COLMAP scene: 12 images of 120 x 90, about 460 points. Not to be written to."""
-    path = tmp_path_factory.mktemp("room") / "room"
-    return write_capture(make_capture(0, num_views=12, width=120, height=90), path)
+def room(larger_room_path):
+    """The path of the larger room."""
+    return larger_room_path
 
 
 @pytest.fixture(scope="session")

@@ -59,9 +59,9 @@ def screenshot(page, path=None):
 def waits_for(condition, seconds=30.0):
     """Whether something comes true in time."""
     until = time.monotonic() + seconds
-    while not (found := condition()) and time.monotonic() < until:
+    while not (answer := condition()) and time.monotonic() < until:
         time.sleep(0.1)
-    return found
+    return answer
 
 
 def text(page):

@@ -10,22 +10,11 @@ import pytest
 torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
 
-from splatseed.cli import main
 from splatseed.io import load_scene
 from splatseed.similarity import Similarity
 from splatseed.splat.ply import read_gaussians
 from splatseed.view.renderer import ModelRenderer, model_frame
 from splatseed.views.view import poses_of
-
-
-def _run(capsys, *words):
-    capsys.readouterr()
-    code = 0
-    try:
-        main([str(word) for word in words])
-    except SystemExit as stop:
-        code = int(stop.code or 0)
-    return code, capsys.readouterr()
 
 
 def _frames(path):
@@ -37,33 +26,32 @@ def _frames(path):
     return np.stack(frames), facts["fps"]
 
 
-def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, capsys):
+def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, splatseed):
     out = tmp_path / "deep/flight.mp4"
-    code, said = _run(capsys, "flight", run_folder, "-o", out, "--seconds", 0.5, "--fps", 12)
-    assert (code, said.err) == (0, "")
+    said = splatseed("flight", run_folder, "-o", out, "--seconds", 0.5, "--fps", 12)
+    assert (said.code, said.err) == (0, "")
     frames, fps = _frames(out)
     assert (frames.shape, fps) == ((6, 90, 120, 3), 12)
     assert frames.mean() > 20
     assert np.abs(np.diff(frames.astype(int), axis=0)).mean() > 0.5  # it moves
 
 
-def test_two_models_are_split_and_odd_sizes_become_even(run_folder, tmp_path, capsys):
+def test_two_models_are_split_and_odd_sizes_become_even(run_folder, tmp_path, splatseed):
     out = tmp_path / "flight.mp4"
     words = ("--orbit", "--seconds", 0.3, "--fps", 10, "--size", "101x75")
     ply = run_folder / "point_cloud.ply"
-    code, said = _run(capsys, "flight", run_folder, "-o", out, "--compare", ply, *words)
-    assert code == 0, said.err
+    said = splatseed("flight", run_folder, "-o", out, "--compare", ply, *words)
+    assert said.code == 0, said.err
     frames, _ = _frames(out)
     assert frames.shape == (3, 76, 100, 3)
     assert (frames[:, 10:60, 49:51].mean(axis=(0, 2, 3)) > 150).all()  # the line between them
 
 
-def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, capsys):
+def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, splatseed):
     frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 60}
     (tmp_path / "p.json").write_text(json.dumps({"camera_path": 4 * [frame], "fps": 8}))
     out = tmp_path / "flight.mkv"
-    code, said = _run(
-        capsys,
+    said = splatseed(
         "flight",
         run_folder,
         "-o",
@@ -74,12 +62,14 @@ def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, capsys
         "none",
         "--depth",
     )
-    assert code == 0, said.err
+    assert said.code == 0, said.err
     frames, fps = _frames(out)
     assert (len(frames), fps) == (4, 8)
 
 
-def test_a_path_through_nerfstudios_world_needs_its_transform(room, run_folder, tmp_path, capsys):
+def test_a_path_through_nerfstudios_world_needs_its_transform(
+    room, run_folder, tmp_path, splatseed
+):
     """Turned, moved and scaled: as it is, it leads past the model; with the transform it does
     not."""
     turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
@@ -96,11 +86,11 @@ def test_a_path_through_nerfstudios_world_needs_its_transform(room, run_folder, 
     path = tmp_path / "path.json"
     path.write_text(json.dumps({"camera_path": frames, "fps": 8}))
     words = ("flight", run_folder, "-o", tmp_path / "flight.mp4", "--path", path)
-    code, said = _run(capsys, *words)
-    assert code == 2
+    said = splatseed(*words)
+    assert said.code == 2
     assert "--transform" in said.err
-    code, said = _run(capsys, *words, "--transform", tmp_path / "dataparser_transforms.json")
-    assert code == 0, said.err
+    said = splatseed(*words, "--transform", tmp_path / "dataparser_transforms.json")
+    assert said.code == 0, said.err
     gaussians = read_gaussians(run_folder / "point_cloud.ply")
     wanted = ModelRenderer(gaussians, model_frame(gaussians, None)).color(
         poses_of([load_scene(room).images[3]])[0]
@@ -123,16 +113,16 @@ def test_a_path_through_nerfstudios_world_needs_its_transform(room, run_folder, 
         (("-o", "x" * 300 + ".mp4", "--seconds", "0.1"), "name too long"),
     ],
 )
-def test_bad_input_is_one_line(words, said, run_folder, tmp_path, monkeypatch, capsys):
+def test_bad_input_is_one_line(words, said, run_folder, tmp_path, monkeypatch, splatseed):
     monkeypatch.chdir(tmp_path)
-    code, heard = _run(capsys, "flight", run_folder, *words)
-    assert code == 2
+    heard = splatseed("flight", run_folder, *words)
+    assert heard.code == 2
     assert said in heard.err
     assert heard.err.count("\n") == 1
     assert not list(tmp_path.glob("*.mp4"))
 
 
-def test_a_scene_is_no_model(room, tmp_path, capsys):
-    code, heard = _run(capsys, "flight", room, "-o", tmp_path / "a.mp4")
-    assert code == 2
+def test_a_scene_is_no_model(room, tmp_path, splatseed):
+    heard = splatseed("flight", room, "-o", tmp_path / "a.mp4")
+    assert heard.code == 2
     assert "no run" in heard.err

@@ -129,14 +129,14 @@ def test_a_click_of_the_mouse_on_a_camera_flies_there(room, tmp_path):
 
 def _camera_in_sight(session):
     """The nearest image beside the controls, its frustum, and where on the page its middle is."""
-    canvas, found = session._canvas(1.0), []
+    canvas, in_sight = session._canvas(1.0), []
     for image, handle in session._cameras:
         camera = image.camera
         ahead = camera.world_from_cam[:3, 2] * handle.scale / session._entry.frame.scale
         u, v, depth = canvas.K @ (canvas.cam_from_world @ [*(camera.center + ahead), 1])[:3]
         if depth > 0 and 50 < u / depth < 350 and 160 < v / depth < 550:
-            found.append((depth, image, handle, (u / depth, v / depth)))
-    return min(found, key=lambda each: each[0])[1:]
+            in_sight.append((depth, image, handle, (u / depth, v / depth)))
+    return min(in_sight, key=lambda each: each[0])[1:]
 
 
 @needs_browser

@@ -39,8 +39,8 @@ def test_it_is_the_loop(capture):
     for i, mine in enumerate(chosen):
         worths = np.array([0.0 if j == i else worth(seen, xyz, centers, i, j) for j in range(8)])
         best = np.sort(worths)[::-1][:4]
-        found = [worths[j] if j >= 0 else 0.0 for j in mine]
-        np.testing.assert_allclose(found, best, atol=1e-9)
+        ours = [worths[j] if j >= 0 else 0.0 for j in mine]
+        np.testing.assert_allclose(ours, best, atol=1e-9)
 
 
 def test_nobody_is_paired_without_a_common_point():

@@ -40,8 +40,8 @@ CountOrNone = Annotated[
 class Options:
     """Score a trained model on the test views of its scene: PSNR, SSIM, LPIPS.
 
-    PSNR is told twice: over all pixels, and over those that at least two training views see, by
-    the scene's points or its own depth maps; errors elsewhere tell of luck.
+    PSNR is given twice: over all pixels, and over those that at least two training views see, by
+    the scene's points or its own depth maps; errors elsewhere are a matter of luck.
     """
 
     model: Annotated[Path, tyro.conf.Positional]

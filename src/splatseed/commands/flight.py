@@ -56,7 +56,7 @@ class Options:
         tyro.conf.arg(metavar="FILE|gsplat|none", help_behavior_hint="(default: the same world)"),
     ] = None
     """From the model's world to the path's: the dataparser_transforms.json of nerfstudio's run, or
-    what else evaluate --transform takes."""
+    anything else that evaluate --transform takes."""
     orbit: bool = False
     """Circle around what the cameras look at instead."""
     compare: PathOrNone = None

@@ -128,5 +128,5 @@ def _summarise(options: Options, report: SfmReport) -> None:
         shown = ", ".join(report.unregistered[:NAMES_SHOWN])
         more = len(report.unregistered) - NAMES_SHOWN
         print_note(f"without a pose: {shown}" + (f" and {more} more" if more > 0 else ""))
-    command = f"splatseed upsample {quoted(options.output)} --method mls --ratio 8 -o OUT --preview"
+    command = f"splatseed upsample {quoted(options.output)} -o OUT --preview"
     print_commands("next", [("", command)])

@@ -88,7 +88,7 @@ class Options:
     """Strategies to try."""
     jobs: Annotated[int | None, _number(int, "one per GPU, else 1")] = None
     """Runs at a time."""
-    threads: Annotated[int | None, _number(int, "the cores shared out")] = None
+    threads: Annotated[int | None, _number(int, "an equal share of the cores")] = None
     """Threads of each run on the CPU."""
     backend: Backend = "auto"
     """Where to train; auto takes a GPU if PyTorch sees one."""
@@ -270,7 +270,7 @@ def _report(study: _Study, rungs: Sequence[Rung]) -> None:
     """Print the verdict of the longest finished runs, and the command that follows from it."""
     said = _verdict(study, rungs)
     if said is None:
-        print_note("Nothing can be said yet: the same command goes on.")
+        print_note("Nothing can be said yet: repeat the command to continue.")
         return
     rows = [(arm.label, arm.strategy, f"{psnr:.2f}") for arm, psnr in said.ranking]
     views = f"{said.views} validation views, {said.steps:,} steps"

@@ -1,11 +1,8 @@
 """Which other views to ask about a view's points.
 
 Notation: V views, S sample points of each. A view *covers* a sample of another, with a weight by
-the angle between the two cameras' rays to it: little where the rays nearly coincide, because a
-sensor errs alike from one place, and none from 90 degrees on, where the other side of a surface is
-seen. Promise: neighbours are chosen one after another, each for the samples that the ones before
-cover least; first a shortlist by frames alone, then ``num`` of it by what each sees there according
-to its map.
+the angle between the two cameras' rays to it. Promise: neighbours are chosen one after another,
+each for the samples that the ones before cover least.
 """
 
 from __future__ import annotations
@@ -64,6 +61,7 @@ def choose_neighbors(
     matrices = np.stack([grid.grid_from_world for grid in grids])
     sizes = np.array([grid.z.shape for grid in grids])
     centers = np.stack([views[k].camera.center for k in usable.tolist()])
+    # First a shortlist by frames alone, then ``num`` of it by what each sees according to its map.
     shortlist = np.full((len(usable), SHORTLIST * num), -1)
     _shortlist(samples, matrices, sizes, centers, shortlist)
 
@@ -154,5 +152,6 @@ def _nearest(point, m):  # type: ignore[no-untyped-def]  # Numba's types
 @inline
 def _angle_weight(point, first, second):  # type: ignore[no-untyped-def]  # Numba's types
     """Small where the rays coincide, rising to 1, and 0 where they are 90 degrees apart."""
+    # From one place a sensor errs alike; from 90 degrees on, the other side of a surface is seen.
     cosine = cosine_between(point, first, second)
     return min(max((1.0 - cosine) / FULL, LEAST), 1.0) * min(max(2.0 * cosine, 0.0), 1.0)

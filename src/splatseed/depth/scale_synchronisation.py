@@ -2,14 +2,9 @@
 
 Notation: V views; depth of view i is multiplied by exp(g_i). A pair (i, j) that sees the same
 places has a = median log(d_j / z_ij), where z_ij is the depth in view j of candidates of view i,
-and d_j the depth of view j itself there. Then to first order
-
-    g_j - g_i = -a, to within the spread of the samples, and
-    g_i = 0, to within the image's residual,
-
-the latter by its SfM points. Promise: the most probable g under these, with Huber's weights, solved
-twice, the second time from where the first left the maps. Pairs move maps only relative to each
-other: the common scale remains that of the SfM points. Nothing is random.
+and d_j the depth of view j itself there. Promise: the most probable g by pairs and SfM points
+together, with Huber's weights. Pairs move maps only relative to each other: the common scale
+remains that of the SfM points. Nothing is random.
 
 SfM points of one image err together: on 7-Scenes red kitchen, where one sensor's scale is the same
 for all frames, scales fitted to one image at a time are off by 4% (standard deviation), and by up
@@ -65,7 +60,7 @@ def harmonize(
     residuals = np.array([view.alignment.residual for view in views])
     sigma = np.maximum(np.where(np.isfinite(residuals), residuals, OTHER_SURFACE), LEAST_RESIDUAL)
     g = np.zeros(len(views))
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS):  # again from where the first solution leaves the maps
         g = _solve(_compare_all(views, neighbors, g, progress), g, sigma)
     return np.asarray(np.exp(g))
 
@@ -108,13 +103,15 @@ def _solve(
     rows = np.concatenate([row, row, num_pairs + np.arange(num)])
     columns = np.concatenate([i, j, np.arange(num)])
     values = np.concatenate([-ones, ones, np.ones(num)])
+    # To first order g_j - g_i = -a to within the spread of the samples, and, by the SfM points of
+    # image i, g_i = 0 to within its residual.
     A = csc_matrix((values, (rows, columns)), shape=(num_pairs + num, num))
     target = np.concatenate([before[j] - before[i] - pairs[:, 2], np.zeros(num)])
     sigma = np.concatenate([pairs[:, 3], anchor_sigma])
     g = before
     for _ in range(STEPS):
         r = np.abs(A @ g - target) / sigma
-        weight = np.minimum(1.0, HUBER / np.maximum(r, HUBER)) / sigma**2
+        weight = np.minimum(1.0, HUBER / np.maximum(r, HUBER)) / sigma**2  # Huber's
         weighted = A.multiply(weight[:, None]).tocsc()
         g, last = np.atleast_1d(spsolve((A.T @ weighted).tocsc(), weighted.T @ target)), g
         if np.abs(g - last).max() < CONVERGED:

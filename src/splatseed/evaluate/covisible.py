@@ -24,7 +24,7 @@ from splatseed.depthmap import DepthMap, DepthMaps
 from splatseed.errors import SceneFormatError
 from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
-from splatseed.scene import Scene
+from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world, grid_of
 from splatseed.views.view import View, data_factor, poses_of
 
@@ -66,7 +66,7 @@ def find_covisible(
         return {}
     train, test = (_frames(part, maps) for part in scene.split(test_every))
     views = [*train, *test]
-    found: dict[str, Bool[np.ndarray, "rows cols"]] = {}
+    by_view: dict[str, Bool[np.ndarray, "rows cols"]] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         depths = []
         for grid in pool.map(lambda view: _depths(view, xyz, maps), views):
@@ -77,9 +77,9 @@ def find_covisible(
             lambda view, grid: _covisible(view, grid, seen), test, depths[len(train) :]
         )
         for view, grid in zip(test, grids, strict=True):
-            found[view.name] = grid
-            progress(STAGE, 0.5 + 0.5 * len(found) / len(test))
-    return found
+            by_view[view.name] = grid
+            progress(STAGE, 0.5 + 0.5 * len(by_view) / len(test))
+    return by_view
 
 
 def pixel_masks(grids: Grids, views: Sequence[View]) -> dict[str, Bool[np.ndarray, "H W"]]:
@@ -104,7 +104,7 @@ def _cell(view: View) -> float:
     return max(max(view.width, view.height) / CELLS, LEAST_CELL)
 
 
-def _frames(images: Sequence, maps: DepthMaps | None) -> list[View]:  # type: ignore[type-arg]
+def _frames(images: Sequence[Image], maps: DepthMaps | None) -> list[View]:
     """The images' frames at the size that cells are stated for; with depth maps, those with one."""
     known = [image for image in images if maps is None or image.name in maps]
     return list(poses_of(known, data_factor(known, MAX_SIZE))) if known else []
@@ -123,21 +123,21 @@ def _depths(
     return _filled(np.nan_to_num(values[np.ix_(i, j)], nan=np.inf))
 
 
-def _planar(found: DepthMap, view: View) -> Float32[np.ndarray, "H W"]:
+def _planar(depth_map: DepthMap, view: View) -> Float32[np.ndarray, "H W"]:
     """A depth map's planar depth."""
-    if found.kind == "z":
-        return found.values
-    if found.kind != "ray":
+    if depth_map.kind == "z":
+        return depth_map.values
+    if depth_map.kind != "ray":
         raise SceneFormatError(
             "depth maps of planar depth or of distance along the ray",
-            found=f"{found.kind} for {view.name}",
+            found=f"{depth_map.kind} for {view.name}",
             fix="Convert them.",
         )
-    height, width = found.values.shape
+    height, width = depth_map.values.shape
     K = np.diag([width / view.width, height / view.height, 1.0]) @ view.K
     v, u = np.indices((height, width)) + 0.5
     along = np.hypot(np.hypot((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]), 1.0)
-    return np.asarray(found.values / along, np.float32)
+    return np.asarray(depth_map.values / along, np.float32)
 
 
 def _filled(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:

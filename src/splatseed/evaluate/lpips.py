@@ -32,7 +32,7 @@ __all__ = ["LPIPS_NETS", "Backbone", "Conv", "Lpips", "LpipsNet", "load_lpips"]
 
 LpipsNet = Literal["vgg", "alex"]
 
-# What each channel of an image in [-1, 1] has taken away and is divided by, from the metric's code.
+# Each channel of an image in [-1, 1] becomes (value - SHIFT) / SCALE, as in the metric's code.
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
 EPSILON = 1e-8
@@ -188,9 +188,9 @@ def _weights_path(backbone: Backbone, given: Path | None) -> Path:
 def _read_state(path: Path) -> Mapping[str, Tensor]:
     """A file of tensors by name; nothing else that it may hold is run."""
     try:
-        with warnings.catch_warnings(action="ignore"):  # of what a foreign file might be
+        with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
             state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # noqa: BLE001  (of a damaged file, PyTorch raises what it likes)
+    except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
         raise _misfit(path, f"a file that PyTorch cannot read ({type(error).__name__})") from None
     if not isinstance(state, Mapping):
         raise _misfit(path, f"a {type(state).__name__}")
@@ -199,8 +199,8 @@ def _read_state(path: Path) -> Mapping[str, Tensor]:
 
 def _read_heads(net: LpipsNet) -> tuple[Tensor, ...]:
     """The w_l that torchmetrics ships, [1, C_l, 1, 1] each."""
-    found = find_spec("torchmetrics")
-    places = found.submodule_search_locations if found else None
+    spec = find_spec("torchmetrics")
+    places = spec.submodule_search_locations if spec else None
     package = Path(places[0]) if places else Path()
     state = _read_state(package / "functional" / "image" / "lpips_models" / f"{net}.pth")
     stages = range(len(LPIPS_NETS[net].stages))

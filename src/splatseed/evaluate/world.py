@@ -89,11 +89,11 @@ def check_world(
         SceneFormatError: It is in another world.
     """
     apart = _measure(scene, gaussians)
-    if apart is None or (found := apart(given)) <= DOUBTFUL:
+    if apart is None or (ratio := apart(given)) <= DOUBTFUL:
         return
     candidates = _candidates(path, scene)
-    word = next((word for word, world in candidates if apart(world) < found / CLOSER), None)
-    if word is None and found <= APART:
+    word = next((word for word, world in candidates if apart(world) < ratio / CLOSER), None)
+    if word is None and ratio <= APART:
         return
     fix = (
         f"They fit with --transform {word}."
@@ -103,7 +103,7 @@ def check_world(
     )
     raise SceneFormatError(
         f"the Gaussians of {path} in the world of the scene, where its points are",
-        found=f"points {found:.0f} times as far from the nearest Gaussian as Gaussians from each "
+        found=f"points {ratio:.0f} times as far from the nearest Gaussian as Gaussians from each "
         "other: another frame, or another scene",
         fix=fix,
     )

@@ -1,9 +1,7 @@
 """PlayCanvas's compressed PLY: 16 bytes per Gaussian, and one per further colour coefficient.
 
-Notation: a *chunk* is 256 Gaussians with the bounds of their positions, log-scales and colours;
-relative to them a vector takes 11, 10 and 11 bits; a rotation takes 2 bits for the index of its
-largest component and 10 for each other one; a colour 8 bits per channel, and the opacity 8; a
-coefficient c in [-4, 4] is the byte (c / 8 + 1/2) 256.
+Notation: a *chunk* is 256 Gaussians with the bounds of their positions, log-scales and colours, to
+which their values are relative.
 Source: the format's description in PlayCanvas's splat-transform and engine.
 """
 
@@ -57,12 +55,15 @@ def encode(gaussians: Gaussians) -> bytes:
     )
     largest, three = smallest_three(gaussians.quats[order])
     packed = np.empty((count, 4), "<u4")
-    packed[:, 0] = _pack(units[0], VECTOR_BITS)
+    packed[:, 0] = _pack(units[0], VECTOR_BITS)  # positions: 11, 10 and 11 bits
+    # Rotations: 2 bits for the index of the largest component, 10 for each other one.
     turn = _pack(three * np.float32(np.sqrt(0.5)) + np.float32(0.5), THREE_BITS)
     packed[:, 1] = (largest.astype(np.uint32) << 30) | turn
     packed[:, 2] = _pack(units[1], VECTOR_BITS)
+    # 8 bits for each of red, green, blue and the opacity.
     packed[:, 3] = _pack(units[2], COLOR_BITS) | opacity_bytes(gaussians.opacities[order])
     coefficients = gaussians.shN[order].transpose(0, 2, 1).reshape(count, rest)
+    # A coefficient c in [-4, 4] is the byte (c / 8 + 1/2) 256.
     sh = np.clip((coefficients / SH_RANGE + 0.5) * 256, 0, 255).astype(np.uint8)
     bounds = np.hstack(tables).astype("<f4")
     return b"".join(

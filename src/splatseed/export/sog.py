@@ -1,10 +1,8 @@
 """PlayCanvas's SOG, version 2: a .zip of lossless WebP pictures and ``meta.json``.
 
-Notation: each picture has one pixel per Gaussian; a position p is stored as sign(p) log(1 + |p|) in
-16 bits between its bounds, with low and high bytes in two pictures; a rotation as its three smaller
-components in RGB and 252 + the index of the largest in A; scales and first colour coefficients as
-bytes of a codebook each; further coefficients as an index into a palette, whose entries are bytes
-of a third codebook, 64 entries per row. Source: the format's specification by PlayCanvas.
+Notation: each picture has one pixel per Gaussian; a *codebook* is 256 numbers that bytes stand for,
+a *palette* a table of coefficients that Gaussians share. Source: the format's specification by
+PlayCanvas.
 """
 
 from __future__ import annotations
@@ -56,12 +54,13 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> bytes:
     order = morton_order(gaussians.means)
     low, high, positions = _encoded_positions(gaussians.means[order])
     largest, three = smallest_three(gaussians.quats[order])
+    # The three smaller components in RGB, 252 + the index of the largest in A.
     quats = np.column_stack([_byte(three * np.sqrt(0.5) * 255 + 127.5), QUAT_MARK + largest])
     scales, sh0 = codebook(gaussians.scales), codebook(gaussians.sh0)
     colors = codes(gaussians.sh0[order, 0], sh0)
     opacity = opacity_bytes(gaussians.opacities[order])
     pictures = {
-        "means_l.webp": _grid(positions & 255),
+        "means_l.webp": _grid(positions & 255),  # 16 bits: low bytes, then high ones
         "means_u.webp": _grid(positions >> 8),
         "quats.webp": _grid(quats),
         "scales.webp": _grid(codes(gaussians.scales[order], scales)),
@@ -142,6 +141,7 @@ def _decoded(path: Path, content: Callable[[str], bytes]) -> Gaussians:
 def _encoded_positions(
     means: Float32[np.ndarray, "N 3"],
 ) -> tuple[list[float], list[float], Int64[np.ndarray, "N 3"]]:
+    # sign(p) log(1 + |p|): finer steps near the middle of the scene
     curved = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = curved.min(axis=0), curved.max(axis=0)
     extent = np.where(high > low, high - low, 1)
@@ -166,6 +166,7 @@ def _encoded_harmonics(
     entries, labels = palette(shN.reshape(count, -1), levels, progress)
     centers = codebook(entries)
     table = codes(entries, centers).reshape(len(entries), rest, 3)
+    # Entries are bytes of a third codebook, 64 entries per row.
     rows = -(-len(entries) // PER_ROW)
     picture = np.full((rows * PER_ROW, rest, 4), 255, np.uint8)
     picture[: len(table), :, :3] = table

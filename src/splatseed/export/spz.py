@@ -1,11 +1,8 @@
 """Niantic's .spz: quantised attributes one after another, gzipped (versions 1 to 3) or in zstd (4).
 
-Notation: the file's axes are right, up, back (RUB), ours right, down, front: y and z change sign. A
-position takes 24 bits per component in units of 2^-f, where f is *fractional_bits*; a log-scale s
-is the byte 16 (s + 10); a first colour coefficient c is the byte 255 (0.15 c + 1/2), a further one
-128 c + 128. A rotation is its xyz with w >= 0, one byte each (version 2), or 2 bits for the index
-of the largest component and a sign and 9 bits for each other one (3 and 4). Source: nianticlabs/spz
-(load-spz.cc, splat-types.h).
+Notation: the file's axes are right, up, back (RUB), ours right, down, front: y and z change sign. f
+is the number of *fractional_bits*. The form of each attribute stands beside the line that encodes
+it. Source: nianticlabs/spz (load-spz.cc, splat-types.h).
 """
 
 from __future__ import annotations
@@ -78,13 +75,14 @@ def encode(gaussians: Gaussians) -> bytes:
     rest = gaussians.shN.shape[1]
     farthest = float(np.abs(gaussians.means).max())
     bits = int(np.clip(np.floor(np.log2(MOST / max(farthest, 1e-9))), 0, MOST_FRACTIONAL_BITS))
+    # A position in units of 2^-f; a coefficient c beyond the first as 128 c + 128.
     fixed = np.rint(gaussians.means[order] * AXES * np.float64(2**bits)).astype("<i4")
     sh = np.rint(gaussians.shN[order] * SH_AXES[:rest, None] * 128 + 128)
     parts = [
-        fixed.view(np.uint8).reshape(-1, 4)[:, :3],
+        fixed.view(np.uint8).reshape(-1, 4)[:, :3],  # 24 bits a component
         opacity_bytes(gaussians.opacities[order]),
-        _byte(gaussians.sh0[order, 0] * COLOR + 127.5),
-        _byte((gaussians.scales[order] + 10) * 16),
+        _byte(gaussians.sh0[order, 0] * COLOR + 127.5),  # 255 (0.15 c + 1/2)
+        _byte((gaussians.scales[order] + 10) * 16),  # of log-scales
         _packed_quats(gaussians.quats[order] * np.append(np.float32(1), AXES)).view(np.uint8),
         _byte(np.floor((sh + STEP // 2) / STEP) * STEP),
     ]
@@ -137,10 +135,11 @@ def _packed_quats(quats: Float32[np.ndarray, "N 4"]) -> np.ndarray:
 
 
 def _quats(raw: UInt8[np.ndarray, "N B"], version: int) -> Float32[np.ndarray, "N 4"]:
-    if version < 3:
+    if version < 3:  # a byte for each of x, y, z; w >= 0 follows
         xyz = raw / np.float32(127.5) - 1
         w = np.sqrt(np.maximum(1 - (xyz**2).sum(axis=1, keepdims=True), 0))
         return np.hstack([w, xyz]).astype(np.float32)
+    # 2 bits for the index of the largest component; a sign and 9 bits for each other one.
     packed = np.ascontiguousarray(raw).view("<u4")[:, 0]
     fields = np.stack([(packed >> shift) & 1023 for shift in (20, 10, 0)], axis=1)
     size = (fields & NINE_BITS) / np.float32(NINE_BITS * np.sqrt(2))
@@ -150,7 +149,7 @@ def _quats(raw: UInt8[np.ndarray, "N B"], version: int) -> Float32[np.ndarray, "
 
 
 def _positions(raw: UInt8[np.ndarray, "N B"], header: _Header) -> Float32[np.ndarray, "N 3"]:
-    if header.version == 1:
+    if header.version == 1:  # half floats
         return np.ascontiguousarray(raw).view("<f2").astype(np.float32)
     digits = raw.reshape(-1, 3, 3).astype(np.int32)
     fixed: Int64[np.ndarray, "N 3"] = digits[..., 0] | digits[..., 1] << 8 | digits[..., 2] << 16

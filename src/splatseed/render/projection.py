@@ -356,7 +356,7 @@ def _block_vjp(block, pose, lens, eps2d, gradients, sums):
 
 @always_inline
 def _covariance_vjp(block, lane, P0, P1, eps2d):
-    """D covariance (xx, xy, yy), from d conic and d compensation."""
+    """The gradient of the covariance (xx, xy, yy), from d conic and d compensation."""
     raw_xx, xy, raw_yy = _dot(P0, P0), _dot(P0, P1), _dot(P1, P1)
     xx, yy = raw_xx + eps2d, raw_yy + eps2d
     over = 1.0 / (xx * yy - xy * xy)
@@ -379,7 +379,7 @@ def _covariance_vjp(block, lane, P0, P1, eps2d):
 
 @always_inline
 def _rotation_vjp(quat, dR):
-    """D quaternion from d R, before the projection onto unit quaternions."""
+    """The gradient of the quaternion from d R, before its projection onto unit quaternions."""
     w, x, y, z = quat
     (d00, d01, d02), (d10, d11, d12), (d20, d21, d22) = dR
     skew_x, skew_y, skew_z = d21 - d12, d02 - d20, d10 - d01
@@ -394,7 +394,7 @@ def _rotation_vjp(quat, dR):
 
 @always_inline
 def _place_vjp(block, lane, x, y, z, lens, J, dJ):
-    """D (x, y, z) in camera axes, from d J, d mean2d and d depth."""
+    """The gradient of (x, y, z) in camera axes, from d J, d mean2d and d depth."""
     _, _, _, _, low_x, high_x, low_y, high_y = lens
     over = 1.0 / z
     x_z, y_z = x * over, y * over

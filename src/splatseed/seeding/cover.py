@@ -8,7 +8,7 @@ of all views is used.
 Promise: a cover seed is a guess and says so by its confidence; the same seed gives the same bytes
 on any number of cores: views are processed one after another.
 
-benchmarks/README.md says how the rule was chosen.
+benchmarks/seeds/README.md says how the rule was chosen.
 """
 
 from __future__ import annotations

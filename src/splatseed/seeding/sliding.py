@@ -9,7 +9,7 @@ Among the t, the one with the smallest
     (cost(t) + FLOOR) (1 + t^2)
 
 wins: a clearly low cost may move a point, small differences between high costs may not. Promise: a
-point's result depends on itself and the pictures, not on its neighbours in the list.
+point's result depends on itself and the photographs, not on its neighbours in the list.
 """
 
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -37,11 +37,11 @@ _FLOOR, _NOISE, _ONE = (np.float32(each) for each in (FLOOR, NOISE, 1.0))
 
 
 @inline
-def slide(pictures, uv, planes, reach, moves, costs, variances):
+def slide(quad_images, uv, planes, reach, moves, costs, variances):
     """The best offset of each point.
 
     Args:
-        pictures: ``stereo.patchmatch.Pictures``; its grid and bounds are not used.
+        quad_images: ``stereo.patchmatch.QuadImages``; its grid and bounds are not used.
         uv: Pixels of the points, float32 [M, 2].
         planes: w, gx, gy through each, float32 [M, 3].
         reach: h / (n X), float32 [M], magnitude below 1 / REACH.
@@ -56,10 +56,10 @@ def slide(pictures, uv, planes, reach, moves, costs, variances):
     for first in range(0, len(uv), LANES):
         _fill_lanes(first, uv, planes, reach, places, own, state)
         prepare_window(
-            pictures.quads, pictures.size[0], pictures.size[1], places[0], places[1],
+            quad_images.quads, quad_images.size[0], quad_images.size[1], places[0], places[1],
             window[0], window[1],
         )  # fmt: skip
-        _search(pictures, places, window, own, tried, state)
+        _search(quad_images, places, window, own, tried, state)
         for lane in range(min(LANES, len(uv) - first)):
             moves[first + lane], costs[first + lane] = state[3, lane], state[4, lane]
             variances[first + lane] = _variance(window, lane)
@@ -77,22 +77,22 @@ def _fill_lanes(first, uv, planes, reach, places, own, state):
 
 
 @inline
-def _search(pictures, places, window, own, tried, state):
+def _search(quad_images, places, window, own, tried, state):
     """Try evenly spaced offsets, then ever closer ones around the best."""
     step = np.float32(2.0 * REACH / (OFFSETS - 1))
     for k in range(OFFSETS):
         state[0, :] = step * np.float32(k - OFFSETS // 2)
-        _try(pictures, places, window, own, tried, state)
+        _try(quad_images, places, window, own, tried, state)
     for _ in range(REFINEMENTS):
         step *= np.float32(0.5)
         state[5, :] = state[3, :]
         for side in range(2):
             state[0, :] = state[5, :] + (step if side else -step)
-            _try(pictures, places, window, own, tried, state)
+            _try(quad_images, places, window, own, tried, state)
 
 
 @inline
-def _try(pictures, places, window, own, tried, state):
+def _try(quad_images, places, window, own, tried, state):
     """Accept the offsets tried where they are better."""
     for lane in range(LANES):
         # w(t) = w / (1 + t h / (n X)), and likewise its slopes
@@ -100,7 +100,7 @@ def _try(pictures, places, window, own, tried, state):
         for part in range(3):
             tried[part * LANES + lane] = scale * own[part, lane]
     best_cost(
-        pictures.sources, pictures.sizes, pictures.offsets, pictures.warps,
+        quad_images.sources, quad_images.sizes, quad_images.offsets, quad_images.warps,
         places[0], places[1], tried, window[0], window[1], state[1],
     )  # fmt: skip
     for lane in range(LANES):

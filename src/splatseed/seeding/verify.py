@@ -21,7 +21,7 @@ from splatseed.scene import Image
 from splatseed.seeding.judges import choose_judges
 from splatseed.seeding.sliding import slide
 from splatseed.seeding.surroundings import Surroundings, survey
-from splatseed.stereo.matching import make_pictures
+from splatseed.stereo.matching import make_quad_images
 from splatseed.stereo.quads import grey_image
 from splatseed.upsample.method import NewPoints
 from splatseed.views.pairs import choose_sources
@@ -157,10 +157,10 @@ def _judge(
     uv, planes, reach = _planes(view, world, around.normals[point], around.spacing[point])
     moves, costs, variances = (np.empty(len(mine), np.float32) for _ in range(3))
     anything = np.array([0.0, np.inf], np.float32)
-    pictures = make_pictures(
+    quad_images = make_quad_images(
         view, greys[i], [views[j] for j in others], [greys[j] for j in others], 1, anything
     )
-    slide(pictures, uv, planes, reach, moves, costs, variances)
+    slide(quad_images, uv, planes, reach, moves, costs, variances)
     if view.mask is not None:
         column, row = uv.astype(np.int64).T
         costs[~view.mask[row, column]] = np.inf

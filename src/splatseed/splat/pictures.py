@@ -24,7 +24,7 @@ WHITE = 255
 def beside_photograph(
     photograph: UInt8[np.ndarray, "H W 3"], render: Float32[np.ndarray, "H W 3"]
 ) -> UInt8[np.ndarray, "H V 3"]:
-    """Truth, render and error map in a row.
+    """Photograph, render and error map in a row.
 
     Args:
         photograph: The view as captured.

@@ -15,14 +15,14 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, in_threads
 from splatseed.stereo.consistency import confirm
-from splatseed.stereo.patchmatch import Pictures, begin, sweep
+from splatseed.stereo.patchmatch import QuadImages, begin, sweep
 from splatseed.stereo.quads import grey_image, make_quads
 from splatseed.stereo.result import Stereo
 from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import Hints, first_planes
 from splatseed.views.view import View
 
-__all__ = ["check_stereo_memory", "make_pictures", "match_views", "other_from_view"]
+__all__ = ["check_stereo_memory", "make_quad_images", "match_views", "other_from_view"]
 
 BYTES_A_DEPTH = 3 * 4 + 4 + 1
 """A view's planes, costs, and agreement bits."""
@@ -102,13 +102,13 @@ def _match(
     planes, costs = np.full((3, *shape), np.nan, np.float32), np.full(shape, np.inf, np.float32)
     if not others or hints is None or not costs.size:
         return planes, costs
-    pictures = make_pictures(
+    quad_images = make_quad_images(
         view, greys[i], [views[j] for j in others], [greys[j] for j in others], grid, hints.bounds
     )
-    begin(pictures, first_planes(hints, shape, grid, rng), planes, costs)
+    begin(quad_images, first_planes(hints, shape, grid, rng), planes, costs)
     for number in range(settings.sweeps):
         for color in range(2):
-            sweep(pictures, color, number, rng.integers(1 << 63, dtype=np.uint64), planes, costs)
+            sweep(quad_images, color, number, rng.integers(1 << 63, dtype=np.uint64), planes, costs)
     if view.mask is not None:
         costs[~_blocks_known(view.mask, grid)] = np.inf
     return planes, costs
@@ -121,14 +121,14 @@ def _blocks_known(mask: Bool[np.ndarray, "H W"], grid: int) -> Bool[np.ndarray, 
     return np.asarray(blocks.all(axis=(1, 3)))
 
 
-def make_pictures(
+def make_quad_images(
     view: View,
     grey: Grey,
     others: Sequence[View],
     greys: Sequence[Grey],
     grid: int,
     bounds: Float32[np.ndarray, " 2"],
-) -> Pictures:
+) -> QuadImages:
     """A view and its sources, as kernels take them.
 
     Args:
@@ -146,7 +146,7 @@ def make_pictures(
     warps = [other_from_view(view, other) for other in others]
     packed = [np.concatenate([warp[:, :3].ravel(), warp[:, 3]]) for warp in warps]
     sizes = np.array([(other.width, other.height) for other in others], np.int64)
-    return Pictures(
+    return QuadImages(
         make_quads(grey).ravel(), np.array([view.width, view.height], np.int64),
         sources, sizes, offsets, np.array(packed, np.float32), grid, float(view.K[0, 0]), bounds,
     )  # fmt: skip

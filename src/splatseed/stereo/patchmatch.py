@@ -4,7 +4,7 @@ Notation: planes (w, gx, gy) float32 [3, h, w] are the inverse depth at a grid p
 per pixel; costs float32 [h, w]. Grid point (i, j) lies at pixel ((j + 0.5) g, (i + 0.5) g). Points
 are red and black as on a chequerboard; a half sweep visits the points of one colour, sixteen of a
 row at a time, and reads only the other colour.
-Promise: the planes depend only on the pictures, the start and ``key``: random numbers are hashed
+Promise: the planes depend only on the photographs, the start and ``key``: random numbers are hashed
 from the key and the point, so the order of work is irrelevant.
 Source: PatchMatch stereo (Bleyer et al. 2011), in the chequerboard order of Gipuma (Galliani et al.
 2015), with the best of each arm as in ACMH (Xu and Tao 2019).
@@ -23,7 +23,7 @@ from splatseed.kernels.jit import always_inline, inline
 from splatseed.kernels.simd import LANES
 from splatseed.stereo.cost import SAMPLES, best_cost, prepare_window
 
-__all__ = ["Pictures", "begin", "sweep"]
+__all__ = ["QuadImages", "begin", "sweep"]
 
 ARM = 11
 """How far a plane may propagate in one visit, in grid points."""
@@ -38,7 +38,7 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_A, _MIX_B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 
-class Pictures(NamedTuple):
+class QuadImages(NamedTuple):
     """A view and its sources, as kernels take them."""
 
     quads: Int32[np.ndarray, " P"]
@@ -60,11 +60,11 @@ class Pictures(NamedTuple):
 
 
 @inline
-def begin(pictures, guesses, planes, costs):
+def begin(quad_images, guesses, planes, costs):
     """The best of K given planes at each point.
 
     Args:
-        pictures: ``Pictures``.
+        quad_images: ``QuadImages``.
         guesses: float32 [K, 3, h, w].
         planes: Filled, float32 [3, h, w].
         costs: Filled, float32 [h, w].
@@ -75,20 +75,20 @@ def begin(pictures, guesses, planes, costs):
     for row in range(height):
         for first in range(0, width, LANES):
             _fill_lanes(first, 1, width, lanes)
-            _look(pictures, row, lanes, places, window)
+            _look(quad_images, row, lanes, places, window)
             for k in range(len(guesses)):
                 for lane in range(LANES):
                     for part in range(3):
                         tried[part * LANES + lane] = guesses[k, part, row, lanes[lane]]
-                _try(pictures, row, lanes, places, window, tried, trial_costs, planes, costs)
+                _try(quad_images, row, lanes, places, window, tried, trial_costs, planes, costs)
 
 
 @inline
-def sweep(pictures, color, number, key, planes, costs):
+def sweep(quad_images, color, number, key, planes, costs):
     """Visit the points of one colour.
 
     Args:
-        pictures: ``Pictures``.
+        quad_images: ``QuadImages``.
         color: 0 or 1.
         number: The sweep's number, from 0.
         key: uint64, what random numbers are hashed from.
@@ -100,14 +100,14 @@ def sweep(pictures, color, number, key, planes, costs):
     for row in range(height):
         for first in range((row + color) % 2, width, 2 * LANES):
             _fill_lanes(first, 2, width, lanes)
-            _look(pictures, row, lanes, places, window)
+            _look(quad_images, row, lanes, places, window)
             for way in range(8):
-                _propagate(pictures.grid, way, row, lanes, planes, costs, tried)
-                _try(pictures, row, lanes, places, window, tried, trial_costs, planes, costs)
+                _propagate(quad_images.grid, way, row, lanes, planes, costs, tried)
+                _try(quad_images, row, lanes, places, window, tried, trial_costs, planes, costs)
             for k in range(REFINEMENTS):
                 change = 0.5 ** (number + k)
-                _perturb(pictures, row, lanes, change, key + np.uint64(k), planes, tried)
-                _try(pictures, row, lanes, places, window, tried, trial_costs, planes, costs)
+                _perturb(quad_images, row, lanes, change, key + np.uint64(k), planes, tried)
+                _try(quad_images, row, lanes, places, window, tried, trial_costs, planes, costs)
 
 
 @inline
@@ -131,37 +131,37 @@ def _fill_lanes(first, step, width, lanes):
 
 
 @inline
-def _look(pictures, row, lanes, places, window):
+def _look(quad_images, row, lanes, places, window):
     """Prepare the windows around the points of sixteen lanes."""
     for lane in range(LANES):
-        places[0, lane] = (lanes[lane] + 0.5) * pictures.grid
-        places[1, lane] = (row + 0.5) * pictures.grid
-    width, height = pictures.size[0], pictures.size[1]
-    prepare_window(pictures.quads, width, height, places[0], places[1], window[0], window[1])
+        places[0, lane] = (lanes[lane] + 0.5) * quad_images.grid
+        places[1, lane] = (row + 0.5) * quad_images.grid
+    width, height = quad_images.size[0], quad_images.size[1]
+    prepare_window(quad_images.quads, width, height, places[0], places[1], window[0], window[1])
 
 
 @inline
-def _try(pictures, row, lanes, places, window, tried, trial_costs, planes, costs):
+def _try(quad_images, row, lanes, places, window, tried, trial_costs, planes, costs):
     """Accept the planes tried where they cost less."""
     best_cost(
-        pictures.sources, pictures.sizes, pictures.offsets, pictures.warps,
+        quad_images.sources, quad_images.sizes, quad_images.offsets, quad_images.warps,
         places[0], places[1], tried, window[0], window[1], trial_costs,
     )  # fmt: skip
     for lane in range(LANES):
         column = lanes[lane]
-        if trial_costs[lane] < costs[row, column] and _allowed(pictures, tried, lane):
+        if trial_costs[lane] < costs[row, column] and _allowed(quad_images, tried, lane):
             costs[row, column] = trial_costs[lane]
             for part in range(3):
                 planes[part, row, column] = tried[part * LANES + lane]
 
 
 @always_inline
-def _allowed(pictures, tried, lane):
+def _allowed(quad_images, tried, lane):
     """Whether a plane lies within the bounds and is not too steep."""
     w, gx, gy = tried[lane], tried[LANES + lane], tried[2 * LANES + lane]
-    if not pictures.bounds[0] <= w <= pictures.bounds[1]:
+    if not quad_images.bounds[0] <= w <= quad_images.bounds[1]:
         return False
-    limit = STEEPEST * w / pictures.focal
+    limit = STEEPEST * w / quad_images.focal
     return gx * gx + gy * gy <= limit * limit
 
 
@@ -195,14 +195,14 @@ def _direction(way):
 
 
 @inline
-def _perturb(pictures, row, lanes, share, key, planes, tried):
+def _perturb(quad_images, row, lanes, share, key, planes, tried):
     """The points' own planes, perturbed at random: in depth, or in slope as well."""
     width = planes.shape[2]
     for lane in range(LANES):
         column = lanes[lane]
         number = np.uint64(row * width + column) * np.uint64(4)
         w = planes[0, row, column] * (1.0 + DEPTH_CHANGE * share * _random(key, number))
-        slope = SLOPE_CHANGE * share * w / pictures.focal
+        slope = SLOPE_CHANGE * share * w / quad_images.focal
         tried[lane] = w
         tried[LANES + lane] = planes[1, row, column] + slope * _random(key, number + np.uint64(1))
         tried[2 * LANES + lane] = planes[2, row, column] + slope * _random(

@@ -1,11 +1,8 @@
 """Points for a scene that has none: from its depth maps, or from a glimpse at small photographs.
 
-Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, in two steps. First some
-views are compared with neighbours chosen by pose, over every depth at which the parallax is less
-than the photograph's width; half of the good pixels are nearer than the resulting *middle* depth.
-Then all views are compared with the views that see such depths at a good angle, and what others
-confirm becomes points. Promise: as for all of stereo, one seed gives one result; points that no
-photographs confirm are not made up.
+Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, in two steps: a few views
+over every depth, then all views over the depths that those saw. Promise: as for all of stereo, one
+seed gives one result; points that no photographs confirm are not made up.
 """
 
 from __future__ import annotations
@@ -37,7 +34,7 @@ LOOK = StereoSettings(grid=2, sweeps=6, tolerance=0.03, max_cost=0.4)
 CELL = 4.0
 """Pixels of the small photographs between points."""
 LOOKED_AT = 24
-"""Number of views that determine the middle depths of all."""
+"""Number of views that are looked at first, for the depths of all."""
 GOOD = 0.15
 """Highest cost of a pixel that counts there."""
 LEAST_MOVE = 0.2
@@ -68,7 +65,9 @@ def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
         progress: Told how far it is.
     """
     small = [_small(view) for view in views]
+    # A few views, compared with neighbours chosen by pose, show which depths there are.
     spread = _spread_of_depth(small, seed, progress)
+    # All views are compared with those that see such depths at a good angle.
     xyz, seen = _imagined_points(small, spread)
     centers = np.stack([_camera(view).center for view in small])
     sources = choose_sources(seen, xyz, centers, LOOK.num_witnesses)

@@ -69,7 +69,7 @@ class Capture:
             num: How many.
             rng: Draws them.
             bare: Whether the bare wall is included. It has no points to upsample, so it would
-                outweigh everything else, and a method that strews points at random would win.
+                outweigh everything else, and a method that scatters points at random would win.
         """
         surfaces = self.surfaces if bare else self.room.without(BARE)
         batches: list[np.ndarray] = []

@@ -24,6 +24,7 @@ from splatseed.splat.frame import TrainingFrame
 from splatseed.stereo.of_scene import stereo_depths
 from splatseed.stereo.result import Stereo
 from splatseed.train.settings import TrainSettings
+from splatseed.train.stereo_size import stereo_size
 
 __all__ = ["known_depths", "seconds_of"]
 
@@ -65,9 +66,9 @@ def known_depths(
         if stereo:
             maps = tuple(stereo.map(i) for i in range(len(stereo.views)))
         else:
-            maps = stereo_depths(
-                scene.replace(images=images), seed=settings.seed, progress=progress
-            )
+            compared = scene.replace(images=images)
+            size = stereo_size(images, settings)
+            maps = stereo_depths(compared, seed=settings.seed, progress=progress, max_size=size)
         known = {each.name: each.depth for each in maps}
         _write(kept, known, time.perf_counter() - start)
     share = np.mean([np.isfinite(depth).mean() for depth in known.values()])

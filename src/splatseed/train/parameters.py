@@ -9,6 +9,7 @@ or removes Gaussians treats them like the rest.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Mapping
 
 import numpy as np
@@ -83,11 +84,24 @@ def yardsticks(params: Parameters) -> Float[Tensor, "#N"]:
     return lengths
 
 
+class _Adam(torch.optim.Adam):
+    """Adam whose methods do not import torch.compile, a fifth of what it takes to start training.
+
+    PyTorch 2.13 imports it at their first call, to exempt them from being compiled.
+    """
+
+    step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
+    add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
+    zero_grad = inspect.unwrap(torch.optim.Adam.zero_grad)
+    state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
+    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
+
+
 def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
     """One Adam per parameter, with the schedule's learning rates."""
     betas = (ADAM_BETA1, schedule.beta2)
     return {
-        name: torch.optim.Adam(
+        name: _Adam(
             [{"params": [value]}],
             lr=schedule.learning_rates[name],
             betas=betas,

@@ -7,9 +7,10 @@ where it stopped, with its original settings; results are in the scene's world.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
@@ -44,6 +45,7 @@ from splatseed.views.view import View, load_split, poses_of
 
 __all__ = ["Render", "RunOptions", "Score", "TrainingRun", "prepare_run"]
 
+KnownDepths: TypeAlias = Mapping[str, Float[Tensor, "h w"]]
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
 Score: TypeAlias = Callable[[Render, Sequence[View]], EvalResult]
 """Scores renders against views, as ``evaluate.evaluate_views`` does."""
@@ -115,27 +117,23 @@ def prepare_run(
     config = make_config(scene, seeds, settings, device)
     if begun:
         check_same_seeds(folder.config, begun, config)
-    factor, every, cache = settings.data_factor, settings.test_every, options.cache_dir
     views = load_split(
         scene,
-        data_factor=factor,
-        test_every=every,
+        data_factor=settings.data_factor,
+        test_every=settings.test_every,
         min_side=WINDOW,  # smaller views have no SSIM
-        cache_dir=cache,
+        cache_dir=options.cache_dir,
         progress=progress,
     )
     frame, strays = training_frame(views[0]), stray_views(views[0])
     for name in strays:
         note(stray_note(name))
     near = [frame.view(view) for view in views[0] if view.name not in strays]
-    start = time.perf_counter()
-    depths = known_depths(
-        scene, frame, settings, device, stereo=stereo, kept=options.depths, note=note,
-        progress=progress,
-    )  # fmt: skip
-    seconds = time.perf_counter() - start
-    if depths:
-        seconds = 0.0 if options.seeding_knew else seconds_of(options.depths, seconds)
+    depths, seconds = _timed_depths(
+        partial(known_depths, scene, frame, settings, device, stereo=stereo, note=note),
+        options,
+        progress,
+    )
     strategy = make_strategy(settings, device, depths)
     state = _state(folder if begun else None, seeds, frame, near, settings, strategy, device)
     if not begun:
@@ -143,13 +141,29 @@ def prepare_run(
         folder.begin(config)
     if state.step:
         note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
-    board = Board(folder.tensorboard, state.step) if options.tensorboard else None
-    if board:
-        folder.claim([folder.tensorboard])
+    board = _board(folder, state.step) if options.tensorboard else None
     run = TrainingRun(folder, settings, frame, state, views, board)
     progress("compile", 0.0)
     run.trainer.warm_up()
     return run
+
+
+def _timed_depths(
+    find: Callable[..., KnownDepths], options: RunOptions, progress: Progress
+) -> tuple[KnownDepths, float]:
+    """The depth that growth needs, and the seconds that finding it counts for in this run."""
+    start = time.perf_counter()
+    depths = find(kept=options.depths, progress=progress)
+    seconds = time.perf_counter() - start
+    if depths:
+        seconds = 0.0 if options.seeding_knew else seconds_of(options.depths, seconds)
+    return depths, seconds
+
+
+def _board(folder: RunFolder, step: int) -> Board:
+    board = Board(folder.tensorboard, step)
+    folder.claim([folder.tensorboard])
+    return board
 
 
 class TrainingRun:

@@ -5,7 +5,7 @@ of steps of the run at hand. Lengths, and so the rates of positions, are in *yar
 Gaussian's near depth (``near_depths``) in splatseed's conventions, the cameras' extent in 3DGS's.
 Promise: a full run of splatseed's differs from 3DGS's in the yardstick, the bound on initial sizes
 and MCMC's start; these and each departure in short runs were chosen on held-out training views: see
-benchmarks/README.md.
+benchmarks/training/README.md.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.train.settings import AS_3DGS, TrainSettings
+from splatseed.train.stereo_size import stereo_size
 from splatseed.views.view import View
 
 if TYPE_CHECKING:
@@ -63,9 +64,10 @@ def seeded(
 
     start = time.perf_counter()
     part = SEEDS_SHARE.get(settings.densification, 1.0)
+    size = stereo_size(scene.split(settings.test_every)[0], settings)
     cloud = upsample(
         scene,
-        Remembering(hold_out=settings.test_every),
+        Remembering(hold_out=settings.test_every, max_size=size),
         budget=None if settings.cap is None else max(2, round(part * settings.cap)),
         progress=progress,
         note=note,

@@ -117,7 +117,7 @@ class Trainer:
         return render.detach(), photograph
 
     def _average(self, steps_done: int) -> None:
-        """Take the Gaussians into their mean at the end of a run, and end with it."""
+        """Average the Gaussians over the end of a run; the last step leaves their mean."""
         begin, state = self.settings.schedule.mean_from, self.state
         if begin is not None and steps_done > begin:
             add_to_mean(state.mean, state.params)
@@ -149,7 +149,7 @@ class Trainer:
         return round(sum(psnrs) / len(psnrs), 4), round(sum(ssims) / len(ssims), 5)
 
     def _is_due(self, times: int) -> bool:
-        """Whether something that happens so many times in a run happens after this step."""
+        """Whether something that happens ``times`` times in a run is due after this step."""
         step, last = self.state.step, self.settings.max_steps
         return step * times // last > (step - 1) * times // last
 

@@ -79,7 +79,7 @@ def _open_run(folder: RunFolder, scene_path: Path | None) -> Shown:
         raise SceneNotFoundError(
             f"{folder.path} to be a finished run of splatseed train",
             found="a run that has not finished",
-            fix=f"Go on with it: splatseed train SCENE -o {folder.path} --resume.",
+            fix=f"Continue it: splatseed train SCENE -o {folder.path} --resume.",
         )
     config, scene = folder.read_config(), None
     named = scene_path or config.get("scene")

@@ -17,7 +17,7 @@ __all__ = ["VIDEO_SUFFIXES", "check_video_name", "even_size", "write_video"]
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov")
 """File name suffixes that can be written, all holding H.264."""
 QUALITY = 8
-"""Of 10."""
+"""imageio-ffmpeg's quality, 0 to 10."""
 
 
 def check_video_name(path: Path) -> None:

@@ -87,7 +87,7 @@ class Viewer:
         self._most_points = most_points
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
-        # A browser may disconnect at any moment; that it misses the rest is no news.
+        # A browser may disconnect at any moment: no warning that it missed the rest.
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")
         with redirect_stdout(io.StringIO()):  # viser prints its own address
             self.server: Any = viser.ViserServer(

@@ -1,9 +1,7 @@
 """Which views to compare each view with: those that see the same places from another side.
 
 Notation: V views, P points. The *worth* of a pair is the sum, over the points that both see, of a
-weight by the angle between their two rays: 0 where the rays nearly coincide, as depth then hardly
-moves a point in the photographs; full between ``FULL`` and ``WIDE`` degrees; and falling beyond, as
-a surface then looks different.
+weight by the angle between their two rays.
 Promise: the pairs depend on poses and visibility only, not on threads or the order of points.
 """
 
@@ -112,6 +110,8 @@ def _weight(point, first, second):  # type: ignore[no-untyped-def]  # Numba's ty
     """The weight of a point by the angle between its rays to two cameras."""
     cosine = cosine_between(point, first, second)
     angle = np.degrees(np.arccos(min(max(cosine, -1.0), 1.0)))
+    # Where the rays nearly coincide, depth hardly moves a point in the photographs.
     rising = min(max((angle - LEAST) / (FULL - LEAST), 0.0), 1.0)
+    # Beyond WIDE degrees a surface looks different.
     falling = min(max((MOST - angle) / (MOST - WIDE), 0.0), 1.0)
     return rising * falling

@@ -22,22 +22,22 @@ BETTER = {**GAINS, ("mls", 8): 0.8}
 """In which mls 8x gains 0.3 dB more than in ``GAINS``."""
 
 
-def change(found, scene, variant):
-    return next(c.difference for c in found.changes if (c.scene, c.arm[1]) == (scene, variant))
+def change(comparison, scene, variant):
+    return next(c.difference for c in comparison.changes if (c.scene, c.arm[1]) == (scene, variant))
 
 
-def mean(found, variant):
-    return next(c.difference for c in found.means if c.arm[1] == variant)
+def mean(comparison, variant):
+    return next(c.difference for c in comparison.means if c.arm[1] == variant)
 
 
 def test_a_planted_change_is_found_and_nothing_else():
-    found = compare(rows(), rows(gains=BETTER, seed=1, version="0.2.0"))
-    assert found.settings == (("version", "0.1.0", "0.2.0"),)
-    assert change(found, "fox", MLS8).mean == pytest.approx(0.3, abs=0.12)
-    assert mean(found, MLS8).verdict == "better"
-    marked = [row[1].text for row in change_table(found).rows if row[-1].mark == "*"]
+    comparison = compare(rows(), rows(gains=BETTER, seed=1, version="0.2.0"))
+    assert comparison.settings == (("version", "0.1.0", "0.2.0"),)
+    assert change(comparison, "fox", MLS8).mean == pytest.approx(0.3, abs=0.12)
+    assert mean(comparison, MLS8).verdict == "better"
+    marked = [row[1].text for row in change_table(comparison).rows if row[-1].mark == "*"]
     assert marked == ["mls 8x"]
-    others = [c.difference.verdict for c in found.means if c.arm[1] != MLS8]
+    others = [c.difference.verdict for c in comparison.means if c.arm[1] != MLS8]
     assert set(others) == {"within noise"}
 
 
@@ -57,40 +57,40 @@ def test_no_change_is_claimed_at_most_at_the_stated_rate():
     """Repeats have effects of their own here, which all arms of a scene share."""
     claimed = 0
     for seed in range(100):
-        found = compare(rows(seed=seed), rows(seed=1000 + seed))
-        claimed += any(c.difference.verdict != "within noise" for c in found.means)
+        comparison = compare(rows(seed=seed), rows(seed=1000 + seed))
+        claimed += any(c.difference.verdict != "within noise" for c in comparison.means)
     assert claimed <= 15
 
 
 def test_equal_ledgers_have_equal_runs():
-    found = compare(rows(), rows())
-    assert found.same_runs == len(rows())
-    assert not found.settings
-    assert {c.difference.mean for c in found.changes} == {0.0}
+    comparison = compare(rows(), rows())
+    assert comparison.same_runs == len(rows())
+    assert not comparison.settings
+    assert {c.difference.mean for c in comparison.changes} == {0.0}
 
 
 def test_what_only_one_has():
     some = [r for r in rows() if r.spec.scene != "fox" and r.spec.arm.label != "mls 4x"]
-    found = compare(some, [r for r in rows() if r.spec.arm.label != "random 8x"])
-    assert {place[1:] for place in found.only_b} >= {("fox", MLS8)}
-    assert {place[2].label for place in found.only_a} == {"random 8x"}
-    shown = {tuple(cell.text for cell in row) for row in only_table(found).rows}
+    comparison = compare(some, [r for r in rows() if r.spec.arm.label != "random 8x"])
+    assert {place[1:] for place in comparison.only_b} >= {("fox", MLS8)}
+    assert {place[2].label for place in comparison.only_a} == {"random 8x"}
+    shown = {tuple(cell.text for cell in row) for row in only_table(comparison).rows}
     assert ("A", "none", "bonsai", "random 8x") in shown
     assert ("B", "none", "fox", "mls 4x") in shown
 
 
 def test_single_runs_claim_nothing():
-    found = compare(rows(repeats=1), rows(repeats=1, seed=1))
-    assert {c.difference.verdict for c in found.changes} == {"unknown"}
-    assert math.isnan(found.means[0].difference.se)
-    assert "(1 run)" in change_table(found).rows[0][2].text
+    comparison = compare(rows(repeats=1), rows(repeats=1, seed=1))
+    assert {c.difference.verdict for c in comparison.changes} == {"unknown"}
+    assert math.isnan(comparison.means[0].difference.se)
+    assert "(1 run)" in change_table(comparison).rows[0][2].text
 
 
 def test_of_several_sets_those_that_fit_are_compared():
     both = [*rows(max_steps=2000, scenes=("fox",)), *rows()]
-    found = compare(both, rows(max_steps=2000, seed=3))
-    assert not found.settings
-    assert {c.scene for c in found.changes} == {"fox"}
+    comparison = compare(both, rows(max_steps=2000, seed=3))
+    assert not comparison.settings
+    assert {c.scene for c in comparison.changes} == {"fox"}
     assert settings_table(compare(rows(), rows(max_steps=2000))).rows[0][1].text == "1000"
 
 
@@ -106,11 +106,11 @@ def test_nothing_finished_is_nothing_to_compare():
     assert compare(rows(), []) is None
 
 
-def bench(folder, found):
+def bench(folder, finished):
     folder.mkdir()
     ledger = Ledger.open(folder / LEDGER)
-    ledger.add([row.spec for row in found])
-    for row in found:
+    ledger.add([row.spec for row in finished])
+    for row in finished:
         ledger.finish(row.spec.key, row.result)
     return str(folder)
 

@@ -37,18 +37,18 @@ def shape(name, rng, n=4000):
 
 @pytest.mark.parametrize(("name", "most"), [("plane", "planarity"), ("line", "linearity")])
 def test_a_plane_is_planar_and_a_line_linear(rng, name, most):
-    found = describe(Scene(cloud(shape(name, rng))))
-    values = {k: getattr(found, k) for k in ("planarity", "linearity", "scattering")}
+    described = describe(Scene(cloud(shape(name, rng))))
+    values = {k: getattr(described, k) for k in ("planarity", "linearity", "scattering")}
     assert max(values, key=values.get) == most
-    assert found.scattering == pytest.approx(0, abs=1e-6)
-    assert found.curvature == pytest.approx(0, abs=1e-6)
-    assert found.planarity + found.linearity + found.scattering == pytest.approx(1)
+    assert described.scattering == pytest.approx(0, abs=1e-6)
+    assert described.curvature == pytest.approx(0, abs=1e-6)
+    assert described.planarity + described.linearity + described.scattering == pytest.approx(1)
 
 
 def test_a_ball_scatters(rng):
-    found = describe(Scene(cloud(shape("ball", rng))))
-    assert found.scattering > 0.25
-    assert found.curvature > 0.12
+    described = describe(Scene(cloud(shape("ball", rng))))
+    assert described.scattering > 0.25
+    assert described.curvature > 0.12
 
 
 def test_local_shape_against_a_slow_reference(rng):
@@ -58,8 +58,8 @@ def test_local_shape_against_a_slow_reference(rng):
         near = xyz[np.argsort(np.linalg.norm(xyz - point, axis=1))[:17]]
         l3, l2, l1 = np.linalg.eigvalsh(np.cov(near.T, bias=True))
         total.append(((l2 - l3) / l1, (l1 - l2) / l1, l3 / l1, l3 / (l1 + l2 + l3)))
-    found = describe(Scene(cloud(xyz)))
-    values = (found.planarity, found.linearity, found.scattering, found.curvature)
+    described = describe(Scene(cloud(xyz)))
+    values = (described.planarity, described.linearity, described.scattering, described.curvature)
     assert values == pytest.approx(np.mean(total, axis=0), rel=1e-5)
 
 
@@ -96,24 +96,24 @@ def view(folder, xyz, pixels, name="a.png"):
 def test_gaps_and_empty_area_are_those_of_the_views(tmp_path, rng):
     xyz = plane(rng, 500)
     flat = np.full((48, 64, 3), 128, np.uint8)
-    found = describe(view(tmp_path, xyz, flat))
+    described = describe(view(tmp_path, xyz, flat))
     distance = np.linalg.norm(xyz[:, None] - xyz[None], axis=2)
     spacing = np.sort(distance, axis=1)[:, 1:7].mean(axis=1)
     # All is 4 away: f h / z over the longer side.
-    assert found.gap == pytest.approx(np.median(spacing) * 60 / 4 / 64, rel=1e-3)
-    assert 0.4 < found.empty < 0.8  # the square fills 30 x 30 of 64 x 48 pixels
-    assert found.texture == 0
+    assert described.gap == pytest.approx(np.median(spacing) * 60 / 4 / 64, rel=1e-3)
+    assert 0.4 < described.empty < 0.8  # the square fills 30 x 30 of 64 x 48 pixels
+    assert described.texture == 0
     half = describe(view(tmp_path, xyz[xyz[:, 0] > 0], flat))
-    assert half.empty > found.empty
+    assert half.empty > described.empty
 
 
 def test_texture_is_the_mean_gradient(tmp_path, rng):
     ramp = np.ascontiguousarray(np.broadcast_to(np.arange(64)[None, :, None] * 4, (48, 64, 3)))
-    found = describe(view(tmp_path, plane(rng, 50), ramp.astype(np.uint8)))
+    described = describe(view(tmp_path, plane(rng, 50), ramp.astype(np.uint8)))
     # 64 pixels are made 320: a fifth of 4 / 255 a pixel.
-    assert found.texture == pytest.approx(4 / 5 / 255, rel=0.1)
+    assert described.texture == pytest.approx(4 / 5 / 255, rel=0.1)
     noise = rng.integers(0, 255, (48, 64, 3)).astype(np.uint8)
-    assert describe(view(tmp_path, plane(rng, 50), noise)).texture > 3 * found.texture
+    assert describe(view(tmp_path, plane(rng, 50), noise)).texture > 3 * described.texture
 
 
 def test_points_that_were_added_are_not_described(rng):
@@ -125,8 +125,8 @@ def test_points_that_were_added_are_not_described(rng):
 
 
 def test_bare_clouds_have_no_pictures_and_few_points_are_refused(rng):
-    found = describe(Scene(cloud(plane(rng, 30))))
-    assert all(math.isnan(each) for each in (found.gap, found.empty, found.texture))
+    described = describe(Scene(cloud(plane(rng, 30))))
+    assert all(math.isnan(each) for each in (described.gap, described.empty, described.texture))
     with pytest.raises(PointCloudError, match="at least 4"):
         describe(Scene(cloud(np.ones((20, 3)))))
 
@@ -135,9 +135,9 @@ def test_kept_descriptors_come_back(tmp_path):
     kept = {"ab": Descriptors(0.1, 0.2, 0.3, 0.4, math.nan, 0.6, 0.7, math.nan)}
     path = tmp_path / "descriptors.json"
     write_descriptors(path, kept)
-    found = read_descriptors(path)
-    assert found["ab"].planarity == 0.1
-    assert math.isnan(found["ab"].texture)
+    read = read_descriptors(path)
+    assert read["ab"].planarity == 0.1
+    assert math.isnan(read["ab"].texture)
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"schema": 9, "scenes": {}}', '{"schema": 1}',

@@ -22,14 +22,14 @@ from ..planted import result, rows
 
 def _study(noise=0.02, **changes):
     """Two strategies of one number of Gaussians: ``grow`` has 0.3 dB more, its seeds take 4 s."""
-    found = []
+    finished = []
     for row in rows(strategies=("default", "grow"), noise=noise, seed=3, **changes):
         arm = dataclasses.replace(row.spec.arm, budget="5000", ratio=row.spec.arm.ratio)
         run = dataclasses.replace(row.spec, arm=arm)
         more = 0.3 if arm.strategy == "grow" else 0.0
         made = result(row.result.psnr + more, upsample_seconds=0.0 if arm.method == "sfm" else 4.0)
-        found.append(RunRow(run, "done", made, started=0.0, finished=25.0))
-    (study,) = studies(found)
+        finished.append(RunRow(run, "done", made, started=0.0, finished=25.0))
+    (study,) = studies(finished)
     return study
 
 
@@ -37,16 +37,16 @@ def test_every_arm_stands_beside_one_baseline():
     study = _study()
     base = baseline_of(study)
     assert base.label == "sfm + default"
-    found = {each.arm.label: each for each in compared_arms(study)}
-    assert len(found) == 10
+    by_label = {each.arm.label: each for each in compared_arms(study)}
+    assert len(by_label) == 10
     # levels differ by strategy in what is planted, so only gains within one are known
-    within = found["mls 8x + default"]
+    within = by_label["mls 8x + default"]
     assert within.gain.mean == pytest.approx(0.5, abs=0.05)
     assert within.gain.verdict == "better"
     assert within.covisible_gain.mean == pytest.approx(within.gain.mean)
     assert (within.runs, within.scenes) == (12, study.scenes)
     assert within.num_gaussians == 5000
-    assert found["random 8x + default"].gain.mean == pytest.approx(-0.4, abs=0.05)
+    assert by_label["random 8x + default"].gain.mean == pytest.approx(-0.4, abs=0.05)
     assert [each.gain.mean for each in compared_arms(study)] == sorted(
         (each.gain.mean for each in compared_arms(study)), reverse=True
     )
@@ -54,11 +54,11 @@ def test_every_arm_stands_beside_one_baseline():
 
 def test_time_counts_seeding():
     study = _study(noise=0.0)
-    found = {each.arm.label: each for each in compared_arms(study)}
-    base = found["sfm + default"]
+    by_label = {each.arm.label: each for each in compared_arms(study)}
+    base = by_label["sfm + default"]
     assert base.sooner.mean == pytest.approx(0.0)
     assert base.gain_in_time.mean == pytest.approx(0.0)
-    slower = found["mls 8x + default"]
+    slower = by_label["mls 8x + default"]
     assert slower.seeding == 4.0
     assert slower.gain_in_time.mean < slower.gain.mean
     assert slower.reached == slower.runs

@@ -36,11 +36,11 @@ def random_scene(rng):
 def plant(rng, count, slope):
     """Scenes whose gain from mls grows with planarity, all else at random."""
     described = {f"scene{i:02}": random_scene(rng) for i in range(count)}
-    found = []
+    finished = []
     for i, (scene, each) in enumerate(described.items()):
         own = {**METHODS, ("mls", 8): slope * each.planarity}
-        found += rows(scenes=(scene,), gains=own, repeats=2, seed=i, noise=0.02)
-    (study,) = studies(found)
+        finished += rows(scenes=(scene,), gains=own, repeats=2, seed=i, noise=0.02)
+    (study,) = studies(finished)
     return gains(study, "none"), described
 
 
@@ -64,12 +64,12 @@ def test_many_scenes_are_scipys_approximation(rng):
 
 
 def test_a_planted_guideline_is_found(rng):
-    found = guidelines(*plant(rng, 14, 2.0))
-    first = found[0]
+    derived = guidelines(*plant(rng, 14, 2.0))
+    first = derived[0]
     assert (first.descriptor, first.method, first.supported) == ("planarity", "mls", True)
     assert first.sentence == "Scenes with more planarity gain more from mls."
     assert first.agree >= 12
-    assert verdict(found).startswith("Supported by 14 scenes")
+    assert verdict(derived).startswith("Supported by 14 scenes")
 
 
 def test_chance_is_not_called_support(rng):
@@ -78,9 +78,9 @@ def test_chance_is_not_called_support(rng):
 
 
 def test_few_scenes_say_that_they_are_few(rng):
-    found = guidelines(*plant(rng, 5, 2.0))
-    assert not any(each.supported for each in found)
-    said = verdict(found)
+    derived = guidelines(*plant(rng, 5, 2.0))
+    assert not any(each.supported for each in derived)
+    said = verdict(derived)
     assert "supports no guideline" in said
     assert "only from 6 scenes on, and here there are 5" in said
     assert "No guideline can be looked for" in verdict(guidelines(*plant(rng, 2, 2.0)))
@@ -96,22 +96,22 @@ def test_fewest_scenes_is_where_a_perfect_order_counts(comparisons):
 
 
 def test_scenes_without_descriptors_are_left_out(rng):
-    found, described = plant(rng, 6, 2.0)
+    gained, described = plant(rng, 6, 2.0)
     del described["scene00"]
     described["scene01"] = Descriptors(math.nan, *[0.5] * 7)
-    counts = {each.descriptor: each.scenes for each in guidelines(found, described)}
+    counts = {each.descriptor: each.scenes for each in guidelines(gained, described)}
     assert (counts["planarity"], counts["texture"]) == (4, 5)
-    assert guidelines(found, {}) == ()
+    assert guidelines(gained, {}) == ()
 
 
 def test_tables_of_guidelines_scenes_and_winners(rng):
-    found, described = plant(rng, 4, 2.0)
-    table = guideline_table(guidelines(found, described), "none")
+    gained, described = plant(rng, 4, 2.0)
+    table = guideline_table(guidelines(gained, described), "none")
     assert len(table.rows) == 10
     assert "supports no guideline" in to_markdown(table)
     del described["scene00"]
     assert len(scene_table(described).rows) == 3
-    winners = winner_table(found, described)
+    winners = winner_table(gained, described)
     assert {row[1].text for row in winners.rows} <= {"mls 8x", "linear 8x", "sfm"}
     assert winners.rows[0][4].value is None
     assert guideline_table((), "none").rows == ()

@@ -33,12 +33,12 @@ def plant(rng, *, scenes, arms, repeats, gain=0.0, noise=0.06, spread=0.0):
 
 def test_two_arms_are_scipys_paired_t_test(rng):
     values = plant(rng, scenes=1, arms=2, repeats=5)[0]
-    found = paired_differences(values)[0]
+    ours = paired_differences(values)[0]
     expected = stats.ttest_rel(values[1], values[0])
-    assert found.p == pytest.approx(expected.pvalue, rel=1e-9)
-    assert found.se == pytest.approx(stats.sem(values[1] - values[0]))
-    assert found.df == 4
-    assert found.interval() == pytest.approx(tuple(expected.confidence_interval(0.95)))
+    assert ours.p == pytest.approx(expected.pvalue, rel=1e-9)
+    assert ours.se == pytest.approx(stats.sem(values[1] - values[0]))
+    assert ours.df == 4
+    assert ours.interval() == pytest.approx(tuple(expected.confidence_interval(0.95)))
 
 
 def test_noise_is_that_of_the_analysis_of_variance(rng):
@@ -63,9 +63,9 @@ def test_missing_runs_are_left_out(rng):
 
 
 def test_one_repeat_claims_nothing(rng):
-    found = adjusted(paired_differences(plant(rng, scenes=1, arms=3, repeats=1)[0]))
-    assert all(each.verdict == "unknown" and math.isnan(each.se) for each in found)
-    assert all(math.isnan(bound) for bound in found[0].interval())
+    differences = adjusted(paired_differences(plant(rng, scenes=1, arms=3, repeats=1)[0]))
+    assert all(each.verdict == "unknown" and math.isnan(each.se) for each in differences)
+    assert all(math.isnan(bound) for bound in differences[0].interval())
 
 
 def test_runs_without_any_noise():
@@ -76,9 +76,9 @@ def test_runs_without_any_noise():
 
 def test_over_scenes_is_scipys_one_sample_t_test(rng):
     means = rng.standard_normal(7)
-    found, expected = over_scenes(means), stats.ttest_1samp(means, 0.0)
-    assert found.p == pytest.approx(expected.pvalue)
-    assert found.df == 6
+    ours, expected = over_scenes(means), stats.ttest_1samp(means, 0.0)
+    assert ours.p == pytest.approx(expected.pvalue)
+    assert ours.df == 6
     assert math.isnan(over_scenes([0.3]).p)
 
 
@@ -90,10 +90,10 @@ def test_these_scenes_is_welchs_test(rng):
         difference(-float(b.mean()), stats.sem(b), 5, 6),
     ]
     expected = stats.ttest_ind(a, b, equal_var=False)
-    found = these_scenes(parts)
-    assert found.p == pytest.approx(expected.pvalue)
-    assert found.df == pytest.approx(expected.df)
-    assert 2 * found.mean == pytest.approx(a.mean() - b.mean())
+    ours = these_scenes(parts)
+    assert ours.p == pytest.approx(expected.pvalue)
+    assert ours.df == pytest.approx(expected.df)
+    assert 2 * ours.mean == pytest.approx(a.mean() - b.mean())
 
 
 def test_holm_step_by_step(rng):
@@ -134,15 +134,15 @@ SIMULATIONS = 300
 
 def rates(rng, judged, **planted):
     """How often each family claims anything that ``judged`` picks of it."""
-    found = [claims(plant(rng, **planted)) for _ in range(SIMULATIONS)]
-    return [np.mean([judged(family) for family in each]) for each in zip(*found, strict=True)]
+    claimed = [claims(plant(rng, **planted)) for _ in range(SIMULATIONS)]
+    return [np.mean([judged(family) for family in each]) for each in zip(*claimed, strict=True)]
 
 
 def test_a_null_is_claimed_at_most_at_the_stated_rate(rng):
     """5% of tables may claim anything at all; 300 tables stray by 1.3 points, hence 9% is 3
     sigma."""
-    found = rates(rng, any, scenes=5, arms=6, repeats=3)
-    assert max(found) < 0.09
+    claimed = rates(rng, any, scenes=5, arms=6, repeats=3)
+    assert max(claimed) < 0.09
 
 
 def test_gains_that_only_vary_by_scene_are_not_claimed_for_scenes_like_these(rng):

@@ -35,8 +35,8 @@ from ..planted import GAINS, SCENES, result, rows, spec
 MLS8 = Variant("mls", ratio=8.0)
 
 
-def one(found):
-    (study,) = studies(found)
+def one(finished):
+    (study,) = studies(finished)
     return study
 
 
@@ -70,9 +70,9 @@ def test_the_papers_three_mean_gains():
 
 
 def test_cells_are_means_and_standard_errors_over_repeats():
-    found = rows(scenes=("fox",))
-    (table,) = psnr_tables(one(found), "none")
-    values = [r.result.psnr for r in found if r.spec.arm.label == "mls 8x"]
+    finished = rows(scenes=("fox",))
+    (table,) = psnr_tables(one(finished), "none")
+    values = [r.result.psnr for r in finished if r.spec.arm.label == "mls 8x"]
     cell = column(table, "mls 8x")["fox"]
     assert cell.value == pytest.approx(np.mean(values))
     assert cell.se == pytest.approx(np.std(values, ddof=1) / math.sqrt(3))
@@ -128,38 +128,38 @@ def test_planted_gains_come_back():
 
 
 def test_one_repeat_says_so():
-    found = one(rows(repeats=1))
-    shown = to_markdown(psnr_tables(found, "none")[0])
+    study = one(rows(repeats=1))
+    shown = to_markdown(psnr_tables(study, "none")[0])
     assert shown.count("(1 run)") == 2 * 5 + 1  # and in the notes
     assert "**2" not in shown
-    verdicts = {each.verdict for each in gains(found, "none").on_scene.values()}
+    verdicts = {each.verdict for each in gains(study, "none").on_scene.values()}
     assert verdicts == {"unknown"}
-    assert gains(found, "none").on_like[MLS8].verdict == "better"  # the scenes agree
+    assert gains(study, "none").on_like[MLS8].verdict == "better"  # the scenes agree
 
 
 def test_a_single_run_makes_tables_all_the_same():
-    found = one(rows(scenes=("fox",), gains={(SFM, 1): 0.0}, repeats=1))
-    (table,) = psnr_tables(found, "none")
+    study = one(rows(scenes=("fox",), gains={(SFM, 1): 0.0}, repeats=1))
+    (table,) = psnr_tables(study, "none")
     assert table.header == ("scene", "sfm")
     for make in (gain_table, cost_table, convergence_table):
-        assert to_csv(make(found, "none"))
+        assert to_csv(make(study, "none"))
     for make in (ratio_table, strategy_table, equal_count_table, mean_gain_table):
-        assert to_markdown(make(found))
+        assert to_markdown(make(study))
 
 
 def test_runs_without_a_baseline_gain_nothing():
-    found = one([r for r in rows() if r.spec.arm.method != SFM or r.spec.scene != "fox"])
-    assert gains(found, "none").scenes == ("bonsai", "room0", "treehill")
-    (own,) = [table for table in psnr_tables(found, "none") if "scenes" in table.name]
+    study = one([r for r in rows() if r.spec.arm.method != SFM or r.spec.scene != "fox"])
+    assert gains(study, "none").scenes == ("bonsai", "room0", "treehill")
+    (own,) = [table for table in psnr_tables(study, "none") if "scenes" in table.name]
     assert column(own, "sfm")["fox"] == Cell()
     assert column(own, "mls 8x")["fox"].value is not None
 
 
 def test_infinite_scores_are_set_aside():
     perfect = RunRow(spec("fox", "mls", 8, repeat=3), "done", result(math.inf))
-    found = one([*rows(), perfect])
-    assert found.not_finite == ("fox, mls 8x, none, 3",)
-    assert 3 not in found.cell("none", "fox", MLS8)
+    study = one([*rows(), perfect])
+    assert study.not_finite == ("fox, mls 8x, none, 3",)
+    assert 3 not in study.cell("none", "fox", MLS8)
 
 
 def test_runs_of_other_settings_are_never_paired():
@@ -183,18 +183,18 @@ def test_a_scene_that_changed_is_another_scene():
 def test_parameters_and_profiles_are_variants_of_their_own():
     k = rows(scenes=("fox",), gains={("mls", 8): 0.1}, parameters={"k": 12})
     paper = rows(scenes=("fox",), gains={("mls", 8): 0.1}, profile="paper")
-    found = one([*rows(scenes=("fox",)), *k, *paper])
-    labels = [variant.label for variant in found.variants]
+    study = one([*rows(scenes=("fox",)), *k, *paper])
+    labels = [variant.label for variant in study.variants]
     assert labels == ["linear 8x", "mls 4x", "mls 8x", "mls 8x k=12", "mls 8x (paper)", "random 8x"]
 
 
 def test_what_a_plan_always_asks_of_depth_is_no_part_of_its_name():
     held = rows(scenes=("fox",), gains={("depth", 4): 0.1}, parameters={"hold_out": 8})
     other = rows(scenes=("fox",), gains={("depth", 4): 0.1}, parameters={"hold_out": 4})
-    found = one([*rows(scenes=("fox",), repeats=2), *held, *other])
-    labels = [variant.label for variant in found.variants if variant.method == "depth"]
+    study = one([*rows(scenes=("fox",), repeats=2), *held, *other])
+    labels = [variant.label for variant in study.variants if variant.method == "depth"]
     assert labels == ["depth 4x", "depth 4x hold_out=4"]
-    assert found.description.endswith("splatseed 0.1.0, 2 to 3 repeats")
+    assert study.description.endswith("splatseed 0.1.0, 2 to 3 repeats")
 
 
 def test_costs_are_means_over_scenes_and_the_papers_stand_beside():
@@ -237,27 +237,27 @@ def test_convergence_counts_those_that_never_arrive():
 
 
 def test_equal_counts_are_looked_up():
-    found = one(rows(strategies=("mcmc", "none")))
-    assert {row[0].text for row in equal_count_table(found).rows} == {"mcmc"}
+    study = one(rows(strategies=("mcmc", "none")))
+    assert {row[0].text for row in equal_count_table(study).rows} == {"mcmc"}
     none = equal_count_table(one(rows(strategies=("none",))))
     assert not none.rows
     assert "None qualifies" in none.notes[0]
 
 
 def test_gains_by_ratio_and_by_strategy():
-    found = one(rows(strategies=("default", "none")))
-    ratios = ratio_table(found)
+    study = one(rows(strategies=("default", "none")))
+    ratios = ratio_table(study)
     assert ratios.header == ("strategy", "method", "4x", "8x")
     row = next(row for row in ratios.rows if [c.text for c in row[:2]] == ["none", "mls"])
     assert [cell.value for cell in row[2:]] == pytest.approx([0.2, 0.5], abs=0.05)
-    assert column(strategy_table(found), "default")["linear 8x"].value == pytest.approx(
+    assert column(strategy_table(study), "default")["linear 8x"].value == pytest.approx(
         0.3, abs=0.05
     )
 
 
 def test_the_fair_mean_is_of_variants_that_all_scenes_have():
-    found = mean_gains({"a": {MLS8: 1.0, Variant("depth"): 9.0}, "b": {MLS8: 0.5}})
-    assert (found.over_all, found.best, found.per_scene) == (0.75, "mls 8x", 0.75)
+    means = mean_gains({"a": {MLS8: 1.0, Variant("depth"): 9.0}, "b": {MLS8: 0.5}})
+    assert (means.over_all, means.best, means.per_scene) == (0.75, "mls 8x", 0.75)
     assert mean_gains({"a": {MLS8: 1.0}, "b": {}}) is None
     assert mean_gains({}) is None
 

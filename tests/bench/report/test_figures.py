@@ -68,7 +68,7 @@ def test_of_many_variants_the_highest_ratios_are_shown():
 
 
 def test_curves_of_unlike_tests_meet_where_both_were_taken():
-    found = rows(scenes=("fox",), repeats=2)
-    shorter = dataclasses.replace(found[0].result, curve=found[0].result.curve[::2])
-    found[0] = dataclasses.replace(found[0], result=shorter)
-    assert curve_figure(studies(found)[0], "none", "steps") is not None
+    finished = rows(scenes=("fox",), repeats=2)
+    shorter = dataclasses.replace(finished[0].result, curve=finished[0].result.curve[::2])
+    finished[0] = dataclasses.replace(finished[0], result=shorter)
+    assert curve_figure(studies(finished)[0], "none", "steps") is not None

@@ -36,12 +36,12 @@ from ..planted import GAINS, result, rows, spec
 GONE = {"scene_path": "gone"}
 
 
-def write_ledger(bench, found):
+def write_ledger(bench, finished):
     """A benchmark's folder with these rows."""
     bench.mkdir(exist_ok=True)
     ledger = Ledger.open(bench / LEDGER)
-    ledger.add([row.spec for row in found])
-    for row in found:
+    ledger.add([row.spec for row in finished])
+    for row in finished:
         if row.status == "done":
             ledger.finish(row.spec.key, row.result)
         elif row.status == "failed":
@@ -75,12 +75,12 @@ class Outline(HTMLParser):
 
 
 def outline(bench):
-    found = Outline((bench / REPORT).read_text("utf-8"))
-    assert not found.open
-    assert len(set(found.ids)) == len(found.ids)
-    assert all(each.startswith(("data:", "#")) for each in found.addresses)
-    assert {each[1:] for each in found.addresses if each[0] == "#"} <= set(found.ids)
-    return found
+    page = Outline((bench / REPORT).read_text("utf-8"))
+    assert not page.open
+    assert len(set(page.ids)) == len(page.ids)
+    assert all(each.startswith(("data:", "#")) for each in page.addresses)
+    assert {each[1:] for each in page.addresses if each[0] == "#"} <= set(page.ids)
+    return page
 
 
 def text_of(bench):
@@ -90,9 +90,9 @@ def text_of(bench):
 def test_a_whole_ledger(tmp_path):
     bench = write_ledger(tmp_path / "b", rows(strategies=("default", "none"), **GONE))
     report = write_report(bench)
-    found = outline(bench)
+    page = outline(bench)
     assert {"summary", "scores", "gains", "convergence", "cost", "guidelines", "setup"} <= set(
-        found.ids
+        page.ids
     )
     names = {path.name for path in (bench / "tables").iterdir()}
     assert {f"{name}.{kind}" for name in ("table1_none", "table2_default", "table3_none",
@@ -119,10 +119,10 @@ def test_3dgs_conventions_are_strategies_of_their_own(tmp_path):
 
 
 def test_a_partial_ledger_says_what_is_missing(tmp_path):
-    found = [dataclasses.replace(r, status="pending", result=None) if i % 5 == 2 else r
+    finished = [dataclasses.replace(r, status="pending", result=None) if i % 5 == 2 else r
              for i, r in enumerate(rows(**GONE))]  # fmt: skip
-    found[0] = RunRow(found[0].spec, "failed", error="expected a <b>cat</b>; found a dog")
-    write_report(write_ledger(tmp_path / "b", found))
+    finished[0] = RunRow(finished[0].spec, "failed", error="expected a <b>cat</b>; found a dog")
+    write_report(write_ledger(tmp_path / "b", finished))
     said = text_of(tmp_path / "b")
     assert "Failed runs: 1" in said
     assert "expected a <b>cat</b>; found a dog" in said  # as text: tags were escaped
@@ -242,7 +242,7 @@ def capture(tmp_path_factory):
 def with_capture(bench, capture, **changes):
     """A ledger of runs on the capture, with the pictures that runs keep."""
     path, digest = capture
-    found = [
+    finished = [
         dataclasses.replace(
             row, spec=dataclasses.replace(row.spec, scene_digest=digest, scene_path=str(path))
         )
@@ -250,14 +250,14 @@ def with_capture(bench, capture, **changes):
     ]
     rng = np.random.default_rng(0)
     truth = rng.integers(0, 255, (30, 40, 3), np.uint8)
-    for row in found:
+    for row in finished:
         folder = kept_folder(bench, row.spec.key) / "renders"
         folder.mkdir(parents=True)
         for name in ("view0.png", "view1.png"):
             noise = 40 * rng.standard_normal(truth.shape)
             render = np.clip(truth + noise, 0, 255).astype(np.float32) / 255
             write_picture(folder / name, beside_photograph(truth, render))
-    return write_ledger(bench, found)
+    return write_ledger(bench, finished)
 
 
 def test_seeds_and_views_are_shown(tmp_path, capture):

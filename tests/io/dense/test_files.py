@@ -47,9 +47,9 @@ def _records(agreeing, image_idxs):
     """Literally as COLMAP's patch match lists them."""
     records = []
     for row, column in np.ndindex(*agreeing.shape):
-        found = [idx for k, idx in enumerate(image_idxs) if agreeing[row, column] >> k & 1]
-        if found:
-            records += [column, row, len(found), *found]
+        confirming = [idx for k, idx in enumerate(image_idxs) if agreeing[row, column] >> k & 1]
+        if confirming:
+            records += [column, row, len(confirming), *confirming]
     return records
 
 

@@ -184,13 +184,13 @@ def test_distorted_photographs_come_without_their_distortion(bent_room, room, ma
     for straight, lens, image in zip(room.images, bent_room.images, scene.images, strict=True):
         np.testing.assert_allclose(image.camera.K, straight.camera.K)
         np.testing.assert_allclose(image.observations.xy, straight.observations.xy, atol=1e-6)
-        found, bent, truth = (
+        undistorted, bent, truth = (
             np.asarray(PilImage.open(each.source.image_dir / image.name).convert("RGB"))
             for each in (scene, bent_room, room)
         )
         expected, _ = undistort(bent, lens.intrinsics, image.camera.K)
-        np.testing.assert_array_equal(found, expected)
-        error, before = (np.abs(each.astype(int) - truth).mean() for each in (found, bent))
+        np.testing.assert_array_equal(undistorted, expected)
+        error, before = (np.abs(each.astype(int) - truth).mean() for each in (undistorted, bent))
         assert error < 0.8 * before  # two interpolations blur
 
 

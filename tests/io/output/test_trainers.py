@@ -46,14 +46,14 @@ def ply_parts(path: Path):
 def records(path: Path, head: str, tail):
     """The records of a COLMAP file, one by one; ``tail`` says how many bytes follow a head."""
     data, offset = path.read_bytes(), 8
-    found = []
+    records_read = []
     for _ in range(struct.unpack_from("<Q", data)[0]):
         values = struct.unpack_from(head, data, offset)
         offset += struct.calcsize(head)
         size = tail(values, data, offset)
-        found.append((values, data[offset : offset + size]))
+        records_read.append((values, data[offset : offset + size]))
         offset += size
-    return found, len(data) - offset
+    return records_read, len(data) - offset
 
 
 def points_of(folder):

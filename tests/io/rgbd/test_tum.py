@@ -147,8 +147,8 @@ def test_opposite_signs_of_a_quaternion_are_the_same_rotation(capture):
         (repr(START + 0.004), 0, 0, 0, -x, -y, -z, -w),
     ]
     write_list(capture / "groundtruth.txt", rows)
-    found = load_tum(capture).images[0].quat
-    np.testing.assert_allclose(np.abs(found @ [w, -x, -y, -z]), 1, atol=1e-12)
+    quat = load_tum(capture).images[0].quat
+    np.testing.assert_allclose(np.abs(quat @ [w, -x, -y, -z]), 1, atol=1e-12)
 
 
 def test_lost_poses_are_skipped(capture):
@@ -236,16 +236,16 @@ def test_undistorted_map_has_the_value_that_the_lens_saw_along_each_ray():
     camera = Intrinsics(1, "PINHOLE", 600, 440, (520.0, 515.0, 300.0, 225.0))
     row, column = np.mgrid[:480, :640].astype(np.float32)
     values = column + 1000 * row  # which pixel it is
-    found = Undistortion(LENS, {"a.png": camera}).apply("a.png", values)
-    assert found.shape == (440, 600)
-    assert found.dtype == np.float32
+    undistorted = Undistortion(LENS, {"a.png": camera}).apply("a.png", values)
+    assert undistorted.shape == (440, 600)
+    assert undistorted.dtype == np.float32
     for u, v in [(0, 0), (300, 225), (10, 400), (599, 439), (450, 100)]:
         ray = np.array([(u + 0.5 - 300) / 520, (v + 0.5 - 225) / 515])
         x, y = np.floor(image_points(LENS, ray))
         expected = x + 1000 * y if 0 <= x < 640 and 0 <= y < 480 else np.nan
-        np.testing.assert_equal(found[v, u], np.float32(expected))
+        np.testing.assert_equal(undistorted[v, u], np.float32(expected))
     half = Undistortion(LENS, {"a.png": camera}).apply("a.png", values[::2, ::2])
-    np.testing.assert_array_equal(half[225, 300] % 1000 // 2, found[225, 300] % 1000 // 2)
+    np.testing.assert_array_equal(half[225, 300] % 1000 // 2, undistorted[225, 300] % 1000 // 2)
 
 
 def test_maps_are_undistorted_with_their_photographs(capture, tmp_path):
@@ -297,12 +297,12 @@ def replica_as_tum(scenes, tmp_path_factory) -> Path:
 
 
 def test_real_frames_are_the_same_in_both_layouts(replica_as_tum, scenes):
-    expected, found = load_rgbd(scenes / "replica/room0"), load_tum(replica_as_tum)
-    assert len(found.images) == 3
-    for theirs, ours in zip(expected.images, found.images, strict=False):
+    expected, as_tum = load_rgbd(scenes / "replica/room0"), load_tum(replica_as_tum)
+    assert len(as_tum.images) == 3
+    for theirs, ours in zip(expected.images, as_tum.images, strict=False):
         np.testing.assert_allclose(ours.camera.K, theirs.camera.K)
         np.testing.assert_allclose(
             ours.camera.cam_from_world, theirs.camera.cam_from_world, atol=1e-9
         )
-        maps = expected.depths.read(theirs.name), found.depths.read(ours.name)
+        maps = expected.depths.read(theirs.name), as_tum.depths.read(ours.name)
         np.testing.assert_allclose(maps[1].values, maps[0].values, atol=1.1e-4)

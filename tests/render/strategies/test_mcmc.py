@@ -81,9 +81,9 @@ def test_it_is_gsplats_own_class_in_all_else() -> None:
     assert vars(ours) == vars(theirs)
     with mcmc_on_cpu():
         expected = train(theirs)
-    found = train(ours)
-    assert found[0] == expected[0]
-    assert all(torch.equal(found[1][name], expected[1][name]) for name in found[1])
+    trained = train(ours)
+    assert trained[0] == expected[0]
+    assert all(torch.equal(trained[1][name], expected[1][name]) for name in trained[1])
 
 
 WITHOUT_GSPLAT = """
@@ -101,10 +101,10 @@ for ask in (lambda: render.MCMCStrategy, render.mcmc_on_cpu().__enter__):
 
 
 def test_without_gsplat_only_the_strategy_is_missing() -> None:
-    found = subprocess.run(
+    run = subprocess.run(
         [sys.executable, "-c", WITHOUT_GSPLAT], capture_output=True, text=True, check=True
     )
-    assert found.stdout.count("pip install 'gsplat>=1.5.3,<1.6'") == 2
+    assert run.stdout.count("pip install 'gsplat>=1.5.3,<1.6'") == 2
 
 
 def test_rendering_does_not_import_gsplat() -> None:

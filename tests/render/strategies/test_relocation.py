@@ -103,5 +103,5 @@ def test_cuda_tensors_go_to_gsplats_functions(monkeypatch):
     monkeypatch.setattr(gsplat, "quat_scale_to_covar_preci", lambda *given: ("turned", *given))
     on_cuda = SimpleNamespace(is_cuda=True)
     assert compute_relocation(on_cuda, 1, 2, 3) == ("moved", on_cuda, 1, 2, 3)
-    found = covariances(on_cuda, 1, compute_covar=True, compute_preci=False, triu=True)
-    assert found == ("turned", on_cuda, 1, True, False, True)
+    matrices = covariances(on_cuda, 1, compute_covar=True, compute_preci=False, triu=True)
+    assert matrices == ("turned", on_cuda, 1, True, False, True)

@@ -176,24 +176,24 @@ def _changed_content(a: Study, b: Study) -> tuple[str, ...]:
     return tuple(sorted(s for s in first.keys() & second.keys() if first[s] != second[s]))
 
 
-def settings_table(found: Comparison) -> Table:
+def settings_table(comparison: Comparison) -> Table:
     """The settings that differ.
 
     Args:
-        found: The comparison.
+        comparison: The comparison.
     """
-    rows = tuple(tuple(words(each) for each in row) for row in found.settings)
+    rows = tuple(tuple(words(each) for each in row) for row in comparison.settings)
     return Table("settings", "Settings that differ", ("setting", "A", "B"), rows)
 
 
-def change_table(found: Comparison) -> Table:
+def change_table(comparison: Comparison) -> Table:
     """All changes: a row per arm, a column per scene, the mean last.
 
     Args:
-        found: The comparison.
+        comparison: The comparison.
     """
-    scenes = sorted({change.scene for change in found.changes})
-    by_place = {(change.arm, change.scene): change.difference for change in found.changes}
+    scenes = sorted({change.scene for change in comparison.changes})
+    by_place = {(change.arm, change.scene): change.difference for change in comparison.changes}
     rows = tuple(
         (
             words(mean.arm[0]),
@@ -201,7 +201,7 @@ def change_table(found: Comparison) -> Table:
             *(_cell(by_place.get((mean.arm, scene))) for scene in scenes),
             _cell(mean.difference),
         )
-        for mean in found.means
+        for mean in comparison.means
     )
     note = (
         "PSNR in B less that in A, dB ± standard error. *: more than noise (Welch's test, "
@@ -228,13 +228,15 @@ def _cell(change: Difference | None) -> Cell:
     )
 
 
-def only_table(found: Comparison) -> Table:
+def only_table(comparison: Comparison) -> Table:
     """What only one of the ledgers has.
 
     Args:
-        found: The comparison.
+        comparison: The comparison.
     """
-    rows = [("A", place) for place in found.only_a] + [("B", place) for place in found.only_b]
+    rows = [("A", place) for place in comparison.only_a] + [
+        ("B", place) for place in comparison.only_b
+    ]
     return Table(
         "only_one",
         "What only one of them has",

@@ -30,12 +30,12 @@ def ratio_table(study: Study) -> Table:
     ratios = sorted({variant.ratio for variant in study.variants})
     rows = []
     for strategy in study.strategies:
-        found = gains(study, strategy)
+        gained = gains(study, strategy)
         by_method: dict[str, dict[float, Variant]] = {}
-        for variant in found.variants:
+        for variant in gained.variants:
             by_method.setdefault(replace(variant, ratio=0.0).label, {})[variant.ratio] = variant
         for method, at in by_method.items():
-            cells = [gain_cell(found.on_these[at[r]]) if r in at else Cell() for r in ratios]
+            cells = [gain_cell(gained.on_these[at[r]]) if r in at else Cell() for r in ratios]
             rows.append((words(strategy), words(method), *cells))
     return Table(
         "gain_by_ratio",
@@ -58,18 +58,20 @@ def strategy_table(study: Study) -> Table:
     Args:
         study: The study.
     """
-    found: dict[str, Gains] = {strategy: gains(study, strategy) for strategy in study.strategies}
+    by_strategy: dict[str, Gains] = {
+        strategy: gains(study, strategy) for strategy in study.strategies
+    }
     rows = [
         (
             words(variant.label),
-            *(gain_cell(each.on_these.get(variant)) for each in found.values()),
+            *(gain_cell(each.on_these.get(variant)) for each in by_strategy.values()),
         )
         for variant in study.variants
     ]
     return Table(
         "gain_by_strategy",
         "Gain over sfm in PSNR by strategy, mean over these scenes",
-        ("method", *found),
+        ("method", *by_strategy),
         tuple(rows),
         (
             NOTE
@@ -88,11 +90,11 @@ def equal_count_table(study: Study) -> Table:
     """
     rows = []
     for strategy in study.strategies:
-        found = gains(study, strategy)
-        for variant in found.variants:
+        gained = gains(study, strategy)
+        for variant in gained.variants:
             counts = [
                 (base.num_gaussians, own.num_gaussians)
-                for scene in found.scenes
+                for scene in gained.scenes
                 for base, own in study.pairs(strategy, scene, variant)
             ]
             if all(abs(own - base) <= EQUAL * base for base, own in counts):
@@ -101,8 +103,8 @@ def equal_count_table(study: Study) -> Table:
                         words(strategy),
                         words(variant.label),
                         number(fmean(own for _, own in counts), 0),
-                        gain_cell(found.on_these[variant]),
-                        gain_cell(found.on_like[variant]),
+                        gain_cell(gained.on_these[variant]),
+                        gain_cell(gained.on_like[variant]),
                     )
                 )
     return Table(

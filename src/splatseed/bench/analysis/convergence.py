@@ -120,14 +120,14 @@ def _times(
     study: Study, strategy: StrategyName, scene: str, variant: Variant
 ) -> list[tuple[Reached, Reached | None]]:
     """When baseline and variant reach the baseline's last PSNR, for each repeat that has both."""
-    found = []
+    times = []
     for base, other in study.pairs(strategy, scene, variant):
         if not base.curve or not other.curve or not math.isfinite(base.curve[-1].psnr):
             continue
         first = reach(base, base.curve[-1].psnr)
         if first is not None:
-            found.append((first, reach(other, base.curve[-1].psnr)))
-    return found
+            times.append((first, reach(other, base.curve[-1].psnr)))
+    return times
 
 
 def _mean(scenes: Sequence[Sequence[float]]) -> float | None:
@@ -148,14 +148,14 @@ def convergence_table(study: Study, strategy: StrategyName) -> Table:
         strategy: One of its strategies.
     """
     variants = [
-        (variant, found)
+        (variant, timing)
         for variant in study.variants_of(strategy)
-        if (found := speed(study, strategy, variant)) is not None
+        if (timing := speed(study, strategy, variant)) is not None
     ]
-    steps = adjusted([found.log_steps for _, found in variants])
-    seconds = adjusted([found.log_seconds for _, found in variants])
+    steps = adjusted([timing.log_steps for _, timing in variants])
+    seconds = adjusted([timing.log_seconds for _, timing in variants])
     rows = [
-        _row(variant, found, steps[i], seconds[i]) for i, (variant, found) in enumerate(variants)
+        _row(variant, timing, steps[i], seconds[i]) for i, (variant, timing) in enumerate(variants)
     ]
     return Table(
         f"convergence_{strategy}",
@@ -181,16 +181,16 @@ NOTE = (
 
 
 def _row(
-    variant: Variant, found: Speed, steps: Difference | None, seconds: Difference | None
+    variant: Variant, timing: Speed, steps: Difference | None, seconds: Difference | None
 ) -> tuple[Cell, ...]:
     return (
         words(variant.label),
-        words(f"{found.reached} of {found.pairs}"),
-        number(found.steps, 0),
-        number(found.base_steps, 0),
+        words(f"{timing.reached} of {timing.pairs}"),
+        number(timing.steps, 0),
+        number(timing.base_steps, 0),
         _ratio(steps),
-        number(found.seconds, 1),
-        number(found.base_seconds, 1),
+        number(timing.seconds, 1),
+        number(timing.base_seconds, 1),
         _ratio(seconds),
     )
 

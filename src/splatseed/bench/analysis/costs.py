@@ -22,8 +22,8 @@ __all__ = ["cost_table", "mean_of", "quality_table"]
 QUALITY_NOTE = (
     "Means over the scenes that a method and sfm both have: compare methods of equally many "
     "scenes. Co-visible PSNR is over the pixels that at least two training views see. PSNR and "
-    "SSIM are better when higher, LPIPS when lower. What is noise, the tables of "
-    "gains say."
+    "SSIM are better when higher, LPIPS when lower. The tables of gains say what "
+    "is noise."
 )
 
 Measure = Callable[[RunResult], float]

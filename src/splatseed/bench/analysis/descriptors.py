@@ -117,16 +117,16 @@ def _variances(
     xyz: Float64[np.ndarray, "n 3"], idx: np.ndarray, progress: Progress
 ) -> Float64[np.ndarray, "n 3"]:
     """Variances of every row and its neighbours along their principal axes, greatest first."""
-    found = np.empty((len(xyz), 3))
+    variances = np.empty((len(xyz), 3))
 
     def work(start: int, stop: int) -> None:
         around = np.concatenate([xyz[start:stop, None], xyz[idx[start:stop]]], axis=1)
         around = around - around.mean(axis=1, keepdims=True)
         covariance = np.einsum("nki,nkj->nij", around, around) / around.shape[1]
-        found[start:stop] = np.linalg.eigvalsh(covariance)[:, ::-1]
+        variances[start:stop] = np.linalg.eigvalsh(covariance)[:, ::-1]
 
     in_threads(work, len(xyz), BLOCK, "describe points", progress)
-    return np.maximum(found, 0.0)  # rounding makes a plane's least variance negative
+    return np.maximum(variances, 0.0)  # rounding makes a plane's least variance negative
 
 
 def _gap(scene: Scene, cloud: PreparedCloud, spacing: Float64[np.ndarray, " n"]) -> float:
@@ -200,19 +200,19 @@ def read_descriptors(path: Path) -> dict[str, Descriptors]:
     return {}
 
 
-def write_descriptors(path: Path, found: Mapping[str, Descriptors]) -> None:
+def write_descriptors(path: Path, described: Mapping[str, Descriptors]) -> None:
     """Store descriptors by the scenes' fingerprints, so that they need not be recomputed.
 
     Args:
         path: The file.
-        found: Descriptors by fingerprint.
+        described: Descriptors by fingerprint.
 
     Raises:
         OutputError: The file cannot be written.
     """
     scenes = {
         digest: {k: None if np.isnan(v) else v for k, v in asdict(each).items()}
-        for digest, each in sorted(found.items())
+        for digest, each in sorted(described.items())
     }
     with atomic_file(path) as partial:
         text = json.dumps({"schema": SCHEMA, "scenes": scenes}, indent=2, allow_nan=False)

@@ -66,10 +66,10 @@ class Gains:
 
     def means(self) -> dict[str, dict[Variant, float]]:
         """Mean gains by scene and variant."""
-        found: dict[str, dict[Variant, float]] = {scene: {} for scene in self.scenes}
+        by_scene: dict[str, dict[Variant, float]] = {scene: {} for scene in self.scenes}
         for (scene, variant), each in self.on_scene.items():
-            found[scene][variant] = each.mean
-        return found
+            by_scene[scene][variant] = each.mean
+        return by_scene
 
 
 @dataclass(frozen=True)
@@ -118,20 +118,20 @@ def gains(study: Study, strategy: StrategyName) -> Gains:
         study: The study.
         strategy: One of its strategies.
     """
-    found: dict[tuple[str, Variant], Difference] = {}
+    on_scene: dict[tuple[str, Variant], Difference] = {}
     for scene in study.scenes_of(strategy):
         arms, values = scores(study, strategy, scene)
         for variant, each in zip(arms[1:], paired_differences(values), strict=True):
             if each is not None:
-                found[scene, variant] = each
-    scenes = tuple(s for s in study.scenes if any(s == scene for scene, _ in found))
-    variants = tuple(v for v in study.variants if any(v == variant for _, variant in found))
-    by_variant = {v: [each for (_, of), each in found.items() if of == v] for v in variants}
+                on_scene[scene, variant] = each
+    scenes = tuple(s for s in study.scenes if any(s == scene for scene, _ in on_scene))
+    variants = tuple(v for v in study.variants if any(v == variant for _, variant in on_scene))
+    by_variant = {v: [each for (_, of), each in on_scene.items() if of == v] for v in variants}
     return Gains(
         strategy,
         scenes,
         variants,
-        _adjusted(found),
+        _adjusted(on_scene),
         _adjusted({v: these_scenes(each) for v, each in by_variant.items()}),
         _adjusted({v: over_scenes([one.mean for one in each]) for v, each in by_variant.items()}),
     )
@@ -163,22 +163,22 @@ def clear_best(study: Study, strategy: StrategyName, scene: str) -> bool:
     return float(2 * t.sf((high - low) / se, df)) * (len(values) - 1) <= LEVEL
 
 
-def mean_gains(found: Mapping[str, Mapping[Variant, float]]) -> MeanGains | None:
+def mean_gains(by_scene: Mapping[str, Mapping[Variant, float]]) -> MeanGains | None:
     """The three means of gains.
 
     Args:
-        found: Gains in dB by scene and variant. Variants that some scene lacks are left out.
+        by_scene: Gains in dB by scene and variant. Variants that some scene lacks are left out.
 
     Returns:
         None where no variant is left.
     """
-    if not found:
+    if not by_scene:
         return None
-    everywhere = set.intersection(*(set(each) for each in found.values()))
+    everywhere = set.intersection(*(set(each) for each in by_scene.values()))
     variants = sorted(everywhere, key=lambda each: each.order)
     if not variants:
         return None
-    table = np.array([[row[variant] for variant in variants] for row in found.values()])
+    table = np.array([[row[variant] for variant in variants] for row in by_scene.values()])
     means = table.mean(axis=0)
     best = int(means.argmax())
     return MeanGains(

@@ -39,8 +39,8 @@ SCENE_NOTE = (
     "without points; texture: the mean gradient of grey values at 320 pixels."
 )
 WINNER_NOTE = (
-    "The best is chosen by the scores that it has, so that its gain flatters; within noise: it "
-    "may as well be any other."
+    "The best is chosen by its own scores, so its gain flatters; within noise: any other may be "
+    "as good."
 )
 
 
@@ -78,14 +78,14 @@ class Guideline:
         return f"Scenes with more {DESCRIPTIONS[self.descriptor]} gain {more} from {self.method}."
 
 
-def guidelines(found: Gains, described: Mapping[str, Descriptors]) -> tuple[Guideline, ...]:
+def guidelines(gained: Gains, described: Mapping[str, Descriptors]) -> tuple[Guideline, ...]:
     """All guidelines of a strategy, the likeliest first.
 
     Args:
-        found: The gains under the strategy.
+        gained: The gains under the strategy.
         described: Descriptors by scene; scenes without are left out.
     """
-    by_method = _by_method(found)
+    by_method = _by_method(gained)
     looked_at = [
         each
         for field in fields(Descriptors)
@@ -97,13 +97,13 @@ def guidelines(found: Gains, described: Mapping[str, Descriptors]) -> tuple[Guid
     return tuple(sorted(known, key=lambda each: (each.p, -abs(each.rho))))
 
 
-def _by_method(found: Gains) -> dict[str, dict[str, float]]:
+def _by_method(gained: Gains) -> dict[str, dict[str, float]]:
     """Each method's gain by scene, dB: the mean over its variants that all of its scenes have."""
     methods: dict[str, dict[str, float]] = {}
-    for name in dict.fromkeys(replace(v, ratio=0.0).label for v in found.variants):
-        variants = [v for v in found.variants if replace(v, ratio=0.0).label == name]
-        scenes = [s for s in found.scenes if all((s, v) in found.on_scene for v in variants)]
-        methods[name] = {s: fmean(found.on_scene[s, v].mean for v in variants) for s in scenes}
+    for name in dict.fromkeys(replace(v, ratio=0.0).label for v in gained.variants):
+        variants = [v for v in gained.variants if replace(v, ratio=0.0).label == name]
+        scenes = [s for s in gained.scenes if all((s, v) in gained.on_scene for v in variants)]
+        methods[name] = {s: fmean(gained.on_scene[s, v].mean for v in variants) for s in scenes}
     return methods
 
 
@@ -161,37 +161,37 @@ def fewest_scenes(comparisons: int) -> int:
     return scenes
 
 
-def verdict(found: Sequence[Guideline]) -> str:
+def verdict(derived: Sequence[Guideline]) -> str:
     """The conclusion, in a sentence or two.
 
     Args:
-        found: All guidelines of a strategy.
+        derived: All guidelines of a strategy.
     """
-    if not found:
+    if not derived:
         return (
             f"No guideline can be looked for: that takes at least {FEWEST} scenes with gains and "
             "with descriptors."
         )
-    scenes = max(each.scenes for each in found)
-    supported = [each for each in found if each.supported]
+    scenes = max(each.scenes for each in derived)
+    supported = [each for each in derived if each.supported]
     if supported:
         said = " ".join(each.sentence for each in supported)
-        return f"Supported by {scenes} scenes, after {len(found)} were looked at: {said}"
-    fewest = fewest_scenes(len(found))
+        return f"Supported by {scenes} scenes, after {len(derived)} were looked at: {said}"
+    fewest = fewest_scenes(len(derived))
     why = (
-        f" It could hardly be otherwise: with {len(found)} of them looked at, even a perfect order "
-        f"of scenes is evidence only from {fewest} scenes on, and here there are {scenes}."
+        f" It could hardly be otherwise: with {len(derived)} of them looked at, even a perfect "
+        f"order of scenes is evidence only from {fewest} scenes on, and here there are {scenes}."
         if scenes < fewest
         else ""
     )
     return f"The data of these {scenes} scenes supports no guideline.{why}"
 
 
-def guideline_table(found: Sequence[Guideline], strategy: str, most: int = 10) -> Table:
+def guideline_table(derived: Sequence[Guideline], strategy: str, most: int = 10) -> Table:
     """The likeliest guidelines with their evidence.
 
     Args:
-        found: All guidelines of the strategy, likeliest first.
+        derived: All guidelines of the strategy, likeliest first.
         strategy: The strategy.
         most: How many to list.
     """
@@ -204,20 +204,20 @@ def guideline_table(found: Sequence[Guideline], strategy: str, most: int = 10) -
             number(each.adjusted, 3),
             words("yes" if each.supported else "no", bold=each.supported),
         )
-        for each in found[:most]
+        for each in derived[:most]
     )
     note = (
-        f"The {len(rows)} likeliest of {len(found)} that were looked at (each descriptor with each "
-        "method, whose gain is the mean over its ratios). Scenes agree when they are on the same "
-        "side of both medians as the correlation says. p is of Spearman's rank correlation, exact "
-        f"up to {EXACT} scenes; supported is what is at most 5% after Holm."
+        f"The {len(rows)} likeliest of {len(derived)} that were looked at (each descriptor with "
+        "each method, whose gain is the mean over its ratios). Scenes agree when they are on the "
+        "same side of both medians as the correlation says. p is of Spearman's rank correlation, "
+        f"exact up to {EXACT} scenes; supported is what is at most 5% after Holm."
     )
     return Table(
         f"guidelines_{strategy}",
         f"Guidelines, strategy {strategy}",
         ("guideline", "scenes that agree", "rho", "p", "p after Holm", "supported"),
         rows,
-        (verdict(found), note),
+        (verdict(derived), note),
     )
 
 
@@ -240,17 +240,17 @@ def scene_table(described: Mapping[str, Descriptors]) -> Table:
     )
 
 
-def winner_table(found: Gains, described: Mapping[str, Descriptors]) -> Table:
+def winner_table(gained: Gains, described: Mapping[str, Descriptors]) -> Table:
     """Which method won on each scene, beside what kind of scene it is.
 
     Args:
-        found: The gains under the strategy.
+        gained: The gains under the strategy.
         described: Descriptors by scene.
     """
     rows = []
-    for scene in found.scenes:
-        best = found.best(scene)
-        gain = None if best is None else found.on_scene[scene, best]
+    for scene in gained.scenes:
+        best = gained.best(scene)
+        gain = None if best is None else gained.on_scene[scene, best]
         won = "sfm" if best is None else best.label
         sure = "" if gain is None else gain.verdict.replace("unknown", "1 run")
         kind = described.get(scene)
@@ -258,8 +258,8 @@ def winner_table(found: Gains, described: Mapping[str, Descriptors]) -> Table:
         mean = Cell() if gain is None else Cell(gain.mean, gain.se, 3, signed=True)
         rows.append((words(scene), words(won), mean, words(sure), *(number(v, 3) for v in values)))
     return Table(
-        f"winners_{found.strategy}",
-        f"What gained most on each scene, strategy {found.strategy}",
+        f"winners_{gained.strategy}",
+        f"What gained most on each scene, strategy {gained.strategy}",
         (
             "scene",
             "best",

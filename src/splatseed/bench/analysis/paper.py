@@ -93,8 +93,8 @@ def dataset_of(scene: str) -> PaperDataset | None:
     Args:
         scene: The scene's name.
     """
-    found = (paper_dataset(key) for key in DATASETS)
-    return next((each for each in found if scene in each.psnr), None)
+    datasets = (paper_dataset(key) for key in DATASETS)
+    return next((each for each in datasets if scene in each.psnr), None)
 
 
 def _read(name: str) -> list[dict[str, str]]:

@@ -50,9 +50,9 @@ GAIN_NOTE = (
 )
 MEAN_NOTE = (
     "dB over sfm. All variants together: what a variant picked blindly gives. Best single "
-    "variant: a little flattering, as it is chosen by the scores that it is of. Best of each "
-    "scene: chosen on the very test views that it is scored on, so that noise counts as gain; not "
-    "a gain that anybody can have. Variants that some scene lacks are left out."
+    "variant: a little flattering, as it is chosen by its own scores. Best of each scene: chosen "
+    "on the very test views that it is scored on, so that noise counts as gain; not a gain that "
+    "anybody can have. Variants that some scene lacks are left out."
 )
 TABLE_NAMES = {"mipnerf360": "table1", "replica": "table2", "": "table_scenes"}
 
@@ -64,28 +64,28 @@ def psnr_tables(study: Study, strategy: StrategyName) -> tuple[Table, ...]:
         study: The study.
         strategy: One of its strategies.
     """
-    found = gains(study, strategy)
+    gained = gains(study, strategy)
     groups: dict[str, list[str]] = {}
     for scene in study.scenes_of(strategy):
         dataset = dataset_of(scene)
         groups.setdefault("" if dataset is None else dataset.key, []).append(scene)
     return tuple(
-        _psnr_table(study, found, key, groups[key]) for key in (*DATASETS, "") if key in groups
+        _psnr_table(study, gained, key, groups[key]) for key in (*DATASETS, "") if key in groups
     )
 
 
-def _psnr_table(study: Study, found: Gains, key: str, scenes: Sequence[str]) -> Table:
-    variants = study.variants_of(found.strategy)
+def _psnr_table(study: Study, gained: Gains, key: str, scenes: Sequence[str]) -> Table:
+    variants = study.variants_of(gained.strategy)
     rows: list[tuple[Cell, ...]] = []
     for scene in scenes:
-        rows.append(_our_row(study, found, scene, variants))
+        rows.append(_our_row(study, gained, scene, variants))
         dataset = dataset_of(scene)
         if dataset is not None:
             rows.append(_paper_row(dataset, scene, variants))
     known = paper_dataset(key).title if key else "other scenes"
     return Table(
-        f"{TABLE_NAMES[key]}_{found.strategy}",
-        f"PSNR, {known}, strategy {found.strategy}",
+        f"{TABLE_NAMES[key]}_{gained.strategy}",
+        f"PSNR, {known}, strategy {gained.strategy}",
         ("scene", BASELINE.label, *(each.label for each in variants)),
         tuple(rows),
         (MARKS, f"Ours: {study.description}.", *_paper_notes(study, key)),
@@ -103,21 +103,21 @@ def _paper_notes(study: Study, key: str) -> tuple[str, ...]:
 
 
 def _our_row(
-    study: Study, found: Gains, scene: str, variants: Sequence[Variant]
+    study: Study, gained: Gains, scene: str, variants: Sequence[Variant]
 ) -> tuple[Cell, ...]:
-    best = found.best(scene)
-    clear = clear_best(study, found.strategy, scene)
+    best = gained.best(scene)
+    clear = clear_best(study, gained.strategy, scene)
 
     def cell(variant: Variant) -> Cell:
-        gain = found.on_scene.get((scene, variant))
+        gain = gained.on_scene.get((scene, variant))
         verdict = "unknown" if gain is None else gain.verdict
         bold = variant == best and verdict == "better"
         mark = NOISE if verdict == "within noise" else CLEAR if bold and clear else ""
-        return _runs_cell(study.cell(found.strategy, scene, variant), mark=mark, bold=bold)
+        return _runs_cell(study.cell(gained.strategy, scene, variant), mark=mark, bold=bold)
 
-    known = [found.on_scene[scene, v].verdict for v in variants if (scene, v) in found.on_scene]
+    known = [gained.on_scene[scene, v].verdict for v in variants if (scene, v) in gained.on_scene]
     as_it_is = bool(known) and set(known) == {"worse"}
-    base = _runs_cell(study.cell(found.strategy, scene, BASELINE), bold=as_it_is)
+    base = _runs_cell(study.cell(gained.strategy, scene, BASELINE), bold=as_it_is)
     return (words(scene), base, *map(cell, variants))
 
 
@@ -159,41 +159,41 @@ def gain_table(study: Study, strategy: StrategyName) -> Table:
         study: The study.
         strategy: One of its strategies.
     """
-    found = gains(study, strategy)
+    gained = gains(study, strategy)
 
     def row(name: str, gain: Callable[[Variant], Cell]) -> tuple[Cell, ...]:
-        return (words(name), *(gain(each) for each in found.variants))
+        return (words(name), *(gain(each) for each in gained.variants))
 
     rows = [
-        row(scene, lambda v, scene=scene: gain_cell(found.on_scene.get((scene, v))))  # type: ignore[misc]  # mypy cannot infer a lambda's default
-        for scene in found.scenes
+        row(scene, lambda v, scene=scene: gain_cell(gained.on_scene.get((scene, v))))  # type: ignore[misc]  # mypy cannot infer a lambda's default
+        for scene in gained.scenes
     ]
-    rows.append(row("mean, these scenes", lambda v: gain_cell(found.on_these[v])))
-    if len(found.scenes) > 1:
-        rows.append(row("mean, scenes like these", lambda v: gain_cell(found.on_like[v])))
-    rows += [_soft(row(name, cells)) for name, cells in _paper_gains(found)]
+    rows.append(row("mean, these scenes", lambda v: gain_cell(gained.on_these[v])))
+    if len(gained.scenes) > 1:
+        rows.append(row("mean, scenes like these", lambda v: gain_cell(gained.on_like[v])))
+    rows += [_soft(row(name, cells)) for name, cells in _paper_gains(gained)]
     return Table(
         f"gains_{strategy}",
         f"Gain over sfm in PSNR, strategy {strategy}",
-        ("scene", *(each.label for each in found.variants)),
+        ("scene", *(each.label for each in gained.variants)),
         tuple(rows),
         (GAIN_NOTE, f"{study.description}."),
     )
 
 
-def _paper_gains(found: Gains) -> list[tuple[str, Callable[[Variant], Cell]]]:
+def _paper_gains(gained: Gains) -> list[tuple[str, Callable[[Variant], Cell]]]:
     """The paper's mean gains over the scenes that ours are of, for each dataset."""
     rows: list[tuple[str, Callable[[Variant], Cell]]] = []
     for key in DATASETS:
         dataset = paper_dataset(key)
-        scenes = [scene for scene in found.scenes if scene in dataset.psnr]
+        scenes = [scene for scene in gained.scenes if scene in dataset.psnr]
         if not scenes:
             continue
 
         def cell(v: Variant, dataset: PaperDataset = dataset, scenes: list[str] = scenes) -> Cell:
             return number(_paper_mean(dataset, scenes, v), 3, signed=True)
 
-        if any(cell(variant).value is not None for variant in found.variants):
+        if any(cell(variant).value is not None for variant in gained.variants):
             name = f"paper, {len(scenes)} of {len(dataset.psnr)} {dataset.title} scenes"
             rows.append((name, cell))
     return rows

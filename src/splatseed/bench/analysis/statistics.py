@@ -1,24 +1,9 @@
 """Whether a difference is more than noise.
 
 Notation: ``values`` [A, R] are one scene's scores, arm by repeat, NaN where there is no run; row 0
-is the baseline. A *difference* is between two arms, paired by repeat. Three things are told apart:
-
-* On **one scene**: the mean over repeats of paired differences. With two or three repeats each pair
-of
-  arms alone says little of the noise, so it is estimated from all arms of the scene together: what
-  is
-  left when every arm and every repeat has its own mean (the analysis of variance of a randomised
-  block design; Montgomery, Design and Analysis of Experiments, ch. 4). For two arms this is the
-  paired t-test. It takes all arms to be equally noisy: one of six at twice the noise of the rest is
-  claimed falsely in 12% of tests rather than 5, the others in 3%.
-* On **these scenes**: the mean over scenes of the former. Its noise is the scenes' own, added up,
-with
-  degrees of freedom after Welch and Satterthwaite. It says what training again on the same scenes
-  gives.
-* On **scenes like these**: the same mean, but repeats are averaged within a scene first and the
-t-test is
-  over scenes. Repeats of one scene are not independent evidence about another, so counting every
-  run as a sample would find gains that are not there.
+is the baseline. A *difference* is between two arms, paired by repeat. Three means of differences
+answer three questions: on one scene (``paired_differences``), on these scenes if trained again
+(``these_scenes``), and on scenes like these (``over_scenes``).
 
 Promise: p values are two-sided; over a family of comparisons they are adjusted after Holm (1979),
 which bounds the chance of any false claim in it; where nothing can be said, p is NaN and no claim
@@ -108,7 +93,9 @@ def difference(mean: float, se: float, df: float, n: int) -> Difference:
 
 
 def paired_differences(values: Float[np.ndarray, "A R"]) -> tuple[Difference | None, ...]:
-    """What each arm of a scene gains over row 0.
+    """What each arm of a scene gains over row 0: the mean over repeats of paired differences.
+
+    For two arms this is the paired t-test; with more, all of them tell of the noise.
 
     Args:
         values: Scores by arm and repeat, NaN where there is no run, [A, R].
@@ -131,6 +118,12 @@ def _paired(differences: Float[np.ndarray, " R"], noise: float, df: float) -> Di
 def pooled_noise(values: Float[np.ndarray, "A R"]) -> tuple[float, int]:
     """Standard deviation of a score about its arm's and its repeat's mean, and degrees of freedom.
 
+    With two or three repeats a pair of arms alone says little about the noise, so it is estimated
+    from all arms of the scene together: what is left when every arm and every repeat has its own
+    mean (the analysis of variance of a randomised block design; Montgomery, Design and Analysis of
+    Experiments, ch. 4). That assumes that all arms are equally noisy: of six, one at twice the
+    noise of the rest is falsely claimed in 12% of tests rather than 5, the others in 3%.
+
     Args:
         values: Scores by arm and repeat, NaN where there is no run, [A, R].
 
@@ -152,7 +145,9 @@ def pooled_noise(values: Float[np.ndarray, "A R"]) -> tuple[float, int]:
 
 
 def these_scenes(scenes: Sequence[Difference]) -> Difference:
-    """The mean of differences on several scenes, for these scenes alone.
+    """The mean of differences on several scenes: what training again on the same scenes gives.
+
+    Its noise is the scenes' own, added up.
 
     Args:
         scenes: One per scene, at least one.
@@ -171,6 +166,9 @@ def these_scenes(scenes: Sequence[Difference]) -> Difference:
 
 def over_scenes(means: Sequence[float] | Float64[np.ndarray, " S"]) -> Difference:
     """The mean of differences over scenes, for scenes like these: a one-sample t-test.
+
+    Repeats of one scene are not independent evidence about another: counting every run as a sample
+    would find gains that are not there. So repeats are averaged within a scene first.
 
     Args:
         means: Each scene's mean difference over its repeats, [S], at least one.

@@ -102,8 +102,8 @@ class Study:
     @cached_property
     def strategies(self) -> tuple[StrategyName, ...]:
         """The strategies that have runs."""
-        found = {strategy for strategy, _, _ in self.cells}
-        return tuple(name for name in STRATEGIES if name in found)
+        present = {strategy for strategy, _, _ in self.cells}
+        return tuple(name for name in STRATEGIES if name in present)
 
     @cached_property
     def scenes(self) -> tuple[str, ...]:
@@ -113,18 +113,18 @@ class Study:
     @cached_property
     def variants(self) -> tuple[Variant, ...]:
         """All variants but the baseline, in the order of the methods."""
-        found = {variant for _, _, variant in self.cells} - {BASELINE}
-        return tuple(sorted(found, key=lambda each: each.order))
+        present = {variant for _, _, variant in self.cells} - {BASELINE}
+        return tuple(sorted(present, key=lambda each: each.order))
 
     def variants_of(self, strategy: StrategyName) -> tuple[Variant, ...]:
         """Those but the baseline that were run under a strategy."""
-        found = {variant for used, _, variant in self.cells if used == strategy}
-        return tuple(each for each in self.variants if each in found)
+        present = {variant for used, _, variant in self.cells if used == strategy}
+        return tuple(each for each in self.variants if each in present)
 
     def scenes_of(self, strategy: StrategyName) -> tuple[str, ...]:
         """Those that were run under a strategy."""
-        found = {scene for used, scene, _ in self.cells if used == strategy}
-        return tuple(each for each in self.scenes if each in found)
+        present = {scene for used, scene, _ in self.cells if used == strategy}
+        return tuple(each for each in self.scenes if each in present)
 
     def cell(self, strategy: StrategyName, scene: str, variant: Variant) -> Cell:
         """The results by repeat; empty where there are none."""
@@ -211,8 +211,10 @@ def studies(rows: Iterable[RunRow]) -> tuple[Study, ...]:
     for row in rows:
         if row.status == "done" and row.result is not None:
             groups[tuple(_common(row.spec).items())].append(row)
-    found = [_study(dict(key), part) for key, group in groups.items() for part in _by_factor(group)]
-    return tuple(sorted(found, key=lambda study: -sum(map(len, study.cells.values()))))
+    grouped = [
+        _study(dict(key), part) for key, group in groups.items() for part in _by_factor(group)
+    ]
+    return tuple(sorted(grouped, key=lambda study: -sum(map(len, study.cells.values()))))
 
 
 def _common(spec: RunSpec) -> dict[str, object]:
@@ -224,7 +226,7 @@ def _common(spec: RunSpec) -> dict[str, object]:
 
 
 def _by_factor(rows: Sequence[RunRow]) -> list[list[RunRow]]:
-    """The rows as one group, or one a ``data_factor`` where a scene has several."""
+    """The rows as one group, or one per ``data_factor`` where a scene has several."""
     factors: dict[str, set[int]] = defaultdict(set)
     groups: dict[int, list[RunRow]] = defaultdict(list)
     for row in rows:
@@ -262,9 +264,9 @@ def _scene_labels(rows: Sequence[RunRow]) -> dict[tuple[str, str], str]:
     for row in rows:
         digests[row.spec.scene].add(row.spec.scene_digest)
     return {
-        (name, digest): name if len(found) == 1 else f"{name} ({digest[:4]})"
-        for name, found in digests.items()
-        for digest in found
+        (name, digest): name if len(known) == 1 else f"{name} ({digest[:4]})"
+        for name, known in digests.items()
+        for digest in known
     }
 
 
@@ -274,10 +276,10 @@ def _depth_variants(rows: Sequence[RunRow]) -> dict[str, Variant]:
     for row in rows:
         maps[row.spec.scene_digest].add(row.spec.depth_digest)
     several = any(len(each - {""}) > 1 for each in maps.values())
-    found = {}
+    variants = {}
     for row in rows:
         variant, digest = variant_of(row.spec), row.spec.depth_digest
         if several and digest and variant != BASELINE:
             variant = replace(variant, parameters=(*variant.parameters, f"maps={digest[:4]}"))
-        found[row.spec.key] = variant
-    return found
+        variants[row.spec.key] = variant
+    return variants

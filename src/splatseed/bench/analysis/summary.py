@@ -27,11 +27,11 @@ def summary(study: Study, strategy: StrategyName) -> tuple[str, ...]:
         study: The study.
         strategy: One of its strategies.
     """
-    found = gains(study, strategy)
-    if not found.variants:
+    gained = gains(study, strategy)
+    if not gained.variants:
         return (f"Strategy {strategy}: nothing can be compared with {BASELINE.label} yet.",)
-    best = max(found.variants, key=lambda each: found.on_these[each].mean)
-    said = [_answer(found, best), _by_scene(found, best), _elsewhere(found, best)]
+    best = max(gained.variants, key=lambda each: gained.on_these[each].mean)
+    said = [_answer(gained, best), _by_scene(gained, best), _elsewhere(gained, best)]
     return tuple(each for each in (*said, _cost(study, strategy, best)) if each)
 
 
@@ -41,25 +41,25 @@ def decibels(gain: Difference) -> str:
     return f"{gain.mean:+.2f}{spread} dB"
 
 
-def _answer(found: Gains, best: Variant) -> str:
+def _answer(gained: Gains, best: Variant) -> str:
     """Whether any variant gains, and which gains most."""
-    scenes = _count(len(found.scenes), "scene")
-    lead = f"Strategy {found.strategy}, {scenes}:"
-    top = found.on_these[best]
+    scenes = _count(len(gained.scenes), "scene")
+    lead = f"Strategy {gained.strategy}, {scenes}:"
+    top = gained.on_these[best]
     if top.verdict == "unknown":
         return (
             f"{lead} with one run of each nothing is known of the noise, so no gain can be claimed."
             f" The highest is that of {best.label}, {decibels(top)}."
         )
-    better, worse = (_those(found, verdict) for verdict in ("better", "worse"))
-    of = f"of {_count(len(found.variants), 'variant')}"
+    better, worse = (_those(gained, verdict) for verdict in ("better", "worse"))
+    of = f"of {_count(len(gained.variants), 'variant')}"
     if better:
         most = f"{best.label} most ({decibels(top)})"
         text = f"{lead} yes, {len(better)} {of} gain more than noise, {most}."
     else:
         text = (
             f"{lead} no gain beyond noise was found among "
-            f"{_count(len(found.variants), 'variant')}; the"
+            f"{_count(len(gained.variants), 'variant')}; the"
             f" highest is that of {best.label}, {decibels(top)}."
         )
     loses = (
@@ -68,13 +68,13 @@ def _answer(found: Gains, best: Variant) -> str:
     return text + loses
 
 
-def _those(found: Gains, verdict: Verdict) -> list[str]:
-    return [each.label for each in found.variants if found.on_these[each].verdict == verdict]
+def _those(gained: Gains, verdict: Verdict) -> list[str]:
+    return [each.label for each in gained.variants if gained.on_these[each].verdict == verdict]
 
 
-def _by_scene(found: Gains, best: Variant) -> str:
+def _by_scene(gained: Gains, best: Variant) -> str:
     """On how many scenes the best variant gains and loses."""
-    known = [d for s in found.scenes if (d := found.on_scene.get((s, best))) is not None]
+    known = [d for s in gained.scenes if (d := gained.on_scene.get((s, best))) is not None]
     if len(known) < 2 or all(each.verdict == "unknown" for each in known):
         return ""
     kinds: tuple[Verdict, ...] = ("better", "worse", "within noise")
@@ -85,11 +85,11 @@ def _by_scene(found: Gains, best: Variant) -> str:
     )
 
 
-def _elsewhere(found: Gains, best: Variant) -> str:
+def _elsewhere(gained: Gains, best: Variant) -> str:
     """Whether the gain can be expected on other scenes."""
-    like = found.on_like[best]
+    like = gained.on_like[best]
     if like.verdict == "unknown":
-        return "One scene says nothing of others."
+        return "One scene says nothing about others."
     low, high = like.interval()
     span = f"95% interval {low:+.2f} to {high:+.2f} dB"
     if like.verdict == "within noise":
@@ -113,7 +113,7 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
         return text
     if sooner.log_steps is None or sooner.log_seconds is None:
         part = f"{sooner.reached} of {sooner.pairs} runs"
-        return f"{text} {part} become as good as {BASELINE.label} is in the end."
+        return f"{text} {part} reach {BASELINE.label}'s final PSNR."
     return f"{text} {_when_as_good(sooner.log_steps, sooner.log_seconds)}"
 
 
@@ -121,17 +121,12 @@ def _when_as_good(steps: Difference, seconds: Difference) -> str:
     """How soon it reaches the baseline's final result; a single pair's NaN counts as unsure."""
     base = BASELINE.label
     if not any(each.p <= LEVEL for each in (steps, seconds)):
-        return (
-            f"Whether it is sooner as good as {base} becomes in the end cannot be told from noise."
-        )
+        return f"Whether it reaches {base}'s final PSNR sooner cannot be told from noise."
     parts = [
         f"{math.exp(each.mean):.0%} of the {unit}" + ("" if each.p <= LEVEL else " (may be chance)")
         for each, unit in ((steps, "steps"), (seconds, "seconds"))
     ]
-    return (
-        f"To become as good as {base} is in the end it takes {parts[0]} and {parts[1]} that "
-        f"{base} takes."
-    )
+    return f"To reach {base}'s final PSNR it takes {parts[0]} and {parts[1]} that {base} takes."
 
 
 def _pairs(

@@ -74,9 +74,9 @@ def depth_digest(maps: DepthMaps, progress: Progress = silent) -> str:
     """
 
     def of_map(name: str) -> bytes:
-        found = maps.read(name)
-        digest = hashlib.blake2b(f"{name}\n{found.kind}\n".encode(), digest_size=SIZE)
-        _update(digest, (found.values,))
+        depth_map = maps.read(name)
+        digest = hashlib.blake2b(f"{name}\n{depth_map.kind}\n".encode(), digest_size=SIZE)
+        _update(digest, (depth_map.values,))
         return digest.digest()
 
     digest = hashlib.blake2b(digest_size=SIZE)

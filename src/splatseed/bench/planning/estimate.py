@@ -33,19 +33,19 @@ TESTS = 21
 RENDER_SHARE = 0.3
 """Fraction of a step's time that rendering takes."""
 LIKELY_RATIO = 3.0
-"""Seeds to every original, of methods that look at photographs."""
+"""Seeds per original, for methods that look at photographs."""
 PICTURES = 3
 BYTES_A_PIXEL = 2.0
 """Bytes of a PNG of a photograph, its render and its error, per pixel."""
 SMALL_FILES = 60_000
 SECONDS_A_VIEW = 0.8
-"""Of methods that compare photographs with each other."""
+"""Seconds per view of methods that compare photographs with each other."""
 SECONDS_A_POINT = 5e-6
-"""Of methods that interpolate, for each point of the scene and each new one."""
+"""Seconds of methods that interpolate, per point of the scene and per new one."""
 LEAST = 0.05
 """Seconds below which a part counts for nothing, and its factor would be noise."""
 SWEEPS = 3
-"""Of median polish: enough for two kinds of names."""
+"""Sweeps of the median polish: enough for two kinds of names."""
 
 
 @dataclass(frozen=True)
@@ -133,30 +133,36 @@ class Estimator:
         }
         self._growth = _measured_growth(done)
         trained = [row for row in done if row.result and not row.result.twin]
-        self._seeding = _Factors(
-            [
-                (_by_method(row.spec), took / said)
-                for row in done
-                for took, said in [(_seed_seconds(row), self._modelled_seeding(row.spec))]
-                if took > LEAST and said > 0
-            ],
-            level=False,
-        )
-        self._training = _Factors(
-            [
-                (_by_strategy(row.spec), took / said)
-                for row in trained
-                for took, said in [(self._stepping(row), self._modelled_training(*_of(row)))]
-            ]
-        )
-        self._around = _Factors(
-            [
-                (_by_scene(row.spec), took / said)
-                for row in ([row for row in trained if not _shares(row.spec)] or trained)
-                for took, said in [(_seconds_around(row), self._modelled_around(*_of(row)))]
-                if took > LEAST
-            ]
-        )
+        self._seeding = _Factors(self._seeding_factors(done), level=False)
+        self._training = _Factors(self._training_factors(trained))
+        alone = [row for row in trained if not _shares(row.spec)]
+        self._around = _Factors(self._around_factors(alone or trained))
+
+    def _seeding_factors(self, rows: Sequence[RunRow]) -> list[tuple[Names, float]]:
+        """The factors of making seeds, by names."""
+        return [
+            (_by_method(row.spec), took / said)
+            for row in rows
+            for took, said in [(_seed_seconds(row), self._modelled_seeding(row.spec))]
+            if took > LEAST and said > 0
+        ]
+
+    def _training_factors(self, rows: Sequence[RunRow]) -> list[tuple[Names, float]]:
+        """The factors of the steps, by names."""
+        return [
+            (_by_strategy(row.spec), took / said)
+            for row in rows
+            for took, said in [(self._stepping(row), self._modelled_training(*_of(row)))]
+        ]
+
+    def _around_factors(self, rows: Sequence[RunRow]) -> list[tuple[Names, float]]:
+        """The factors of what is around the steps, by names."""
+        return [
+            (_by_scene(row.spec), took / said)
+            for row in rows
+            for took, said in [(_seconds_around(row), self._modelled_around(*_of(row)))]
+            if took > LEAST
+        ]
 
     def seconds(self, spec: RunSpec) -> float:
         """Of a run, from its start to its end."""
@@ -173,19 +179,21 @@ class Estimator:
         Args:
             specs: In the order in which they are run.
         """
-        known, found = set(self._known), {}
+        known, seconds = set(self._known), {}
         for spec in specs:
             shared = _shared(spec)
-            found[spec.key] = self.seconds(spec)
+            seconds[spec.key] = self.seconds(spec)
             if ("seeds", *shared) in known:
-                found[spec.key] -= self._seeding.of(_by_method(spec)) * self._modelled_seeding(spec)
+                seconds[spec.key] -= self._seeding.of(_by_method(spec)) * self._modelled_seeding(
+                    spec
+                )
             if self._compares(spec):
                 if ("depths", *shared[::2]) in known:
-                    found[spec.key] -= self._looking(spec)
+                    seconds[spec.key] -= self._looking(spec)
                 known.add(("depths", *shared[::2]))
             if _makes(spec):
                 known.add(("seeds", *shared))
-        return found
+        return seconds
 
     def is_twin(self, spec: RunSpec) -> bool:
         """Whether a run will reuse the training of one that begins with the same seeds."""
@@ -286,14 +294,14 @@ PHOTOGRAPHS = frozenset({AUTO, COVER})
 COMPARING = ("stereo", AUTO)
 """Methods whose time tells how long comparing photographs takes."""
 LEAST_STEPPING = 0.3
-"""Of training's time, what steps take at least."""
+"""Least share of training's time that the steps take."""
 COVERING = 0.1
 """What looking for gaps takes, as a share of comparing photographs."""
 FILLING = frozenset({SFM, *PHOTOGRAPHS, "linear", "triangle", "spline", "mls", "voronoi", "random",
                      "depth"})  # fmt: skip
 """Methods that add nothing where the originals fill the budget."""
 READING = 3.0
-"""Seconds of a run whose training is reused, besides its seeds."""
+"""Seconds that a run takes besides its seeds if its training is reused."""
 
 
 def _densification(spec: RunSpec) -> Densification:
@@ -311,7 +319,7 @@ def _shares(spec: RunSpec) -> bool:
 
 
 def _shared(spec: RunSpec) -> tuple[object, ...]:
-    """What runs of the same seeds have in common; every other word of it, of the same depth."""
+    """What runs with the same seeds share; without the method, what runs with the same depth do."""
     return spec.scene_digest, spec.arm.method, spec.repeat
 
 
@@ -359,5 +367,5 @@ def _seconds_around(row: RunRow) -> float:
 
 
 def _bytes_each(settings: TrainSettings) -> int:
-    """Of a Gaussian's numbers: place, scale, rotation, opacity, colours."""
+    """Bytes of a Gaussian: place, scale, rotation, opacity, colours."""
     return 4 * (3 + 3 + 4 + 1 + 3 * (settings.sh_degree + 1) ** 2)

@@ -104,8 +104,8 @@ class Plan:
             _check_distinct("budgets", self.budgets)
             if self.training.cap_max is not None:
                 raise _out_of_range("budgets or cap_max", "one of them", "both")
-        if self.long_side is not None and self.long_side < LEAST_SIDE:
-            raise _out_of_range("long_side", f"of {LEAST_SIDE} or more", self.long_side)
+        if self.long_side is not None:
+            self._check_long_side(self.long_side)
         for ratio in self.ratios:
             if not 1 < ratio < math.inf:
                 raise _out_of_range("ratios", "above 1 (points in all, per original)", ratio)
@@ -117,6 +117,12 @@ class Plan:
         for method in self.parameters:
             _check_choices("parameters", (method,), tuple(METHODS))
             configure(method, **self.parameters[method])
+
+    def _check_long_side(self, long_side: int) -> None:
+        if long_side < LEAST_SIDE:
+            raise _out_of_range("long_side", f"of {LEAST_SIDE} or more", long_side)
+        if self.training.data_factor != 1:
+            raise _out_of_range("long_side or data_factor", "one of them", "both")
 
     def parameters_of(self, method: str) -> Mapping[str, Any]:
         """Differences from the profile; no method sees the held-out test photographs."""
@@ -229,7 +235,7 @@ def _budget(given: object) -> str:
 
 
 def _scene_arms(plan: Plan, scenes: Sequence[SceneFacts]) -> list[tuple[SceneFacts, Arm]]:
-    found = [
+    pairs = [
         (scene, arm)
         for scene in scenes
         for strategy in plan.strategies
@@ -237,8 +243,8 @@ def _scene_arms(plan: Plan, scenes: Sequence[SceneFacts]) -> list[tuple[SceneFac
         if arm.method != DEPTH or scene.depth_digest
     ]
     if plan.budgets:  # runs that come to the same seeds as sfm's take over their training
-        found.sort(key=lambda pair: pair[1].method != SFM)
-    return found
+        pairs.sort(key=lambda pair: pair[1].method != SFM)
+    return pairs
 
 
 def _check_choices(name: str, given: Sequence[str], known: Sequence[str]) -> None:

@@ -32,11 +32,11 @@ def seed_specs(study: Study, scene: str) -> dict[Variant, RunSpec]:
         study: The study.
         scene: One of its scenes.
     """
-    found: dict[Variant, RunSpec] = {}
+    specs: dict[Variant, RunSpec] = {}
     for row in sorted(study.rows[scene], key=lambda row: row.spec.repeat):
-        found.setdefault(study.variant_of_key[row.spec.key], row.spec)
-    shown = shown_variants(sorted(found.keys() - {BASELINE}, key=lambda each: each.order))
-    return {variant: found[variant] for variant in shown[:MOST]}
+        specs.setdefault(study.variant_of_key[row.spec.key], row.spec)
+    shown = shown_variants(sorted(specs.keys() - {BASELINE}, key=lambda each: each.order))
+    return {variant: specs[variant] for variant in shown[:MOST]}
 
 
 def open_unchanged(specs: Sequence[RunSpec]) -> Scene:

@@ -38,22 +38,22 @@ LATE = 0.25
 
 
 def seconds_figure(study: Study) -> Plot | None:
-    """Test PSNR over seconds of seeding and training, a panel a scene; None without curves.
+    """Test PSNR over seconds of seeding and training, a panel per scene; None without curves.
 
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
+    base, compared = baseline_of(study), compared_arms(study)
     scenes = [s for s in study.scenes if base and _curve(_runs(study, base, s))]
-    if base is None or len(found) < 2 or not scenes:
+    if base is None or len(compared) < 2 or not scenes:
         return None
-    arms = _shown(found, base)
+    arms = _shown(compared, base)
     figure, axes = panels(len(scenes))
     for scene, each in zip(scenes, axes, strict=True):
         _draw_scene(each, study, scene, arms, base)
     legend_of(figure, [(arm.label, _line(arm, base)) for arm in arms])
-    left = len(found) - len(arms)
-    more = f" Of {len(found)} arms, those with the highest mean gain." if left else ""
+    left = len(compared) - len(arms)
+    more = f" Of {len(compared)} arms, those with the highest mean gain." if left else ""
     return Plot(
         "psnr_seconds_arms",
         "Test PSNR (dB) over wall seconds, those of making the seeds included; mean over "
@@ -62,9 +62,9 @@ def seconds_figure(study: Study) -> Plot | None:
     )
 
 
-def _shown(found: Sequence[Compared], base: Arm) -> list[Arm]:
+def _shown(compared: Sequence[Compared], base: Arm) -> list[Arm]:
     """The baseline, and the arms with the highest gain."""
-    best = [each.arm for each in found if each.arm != base]
+    best = [each.arm for each in compared if each.arm != base]
     return [base, *best[: MANY - 1]]
 
 
@@ -121,8 +121,8 @@ def arm_figure(study: Study) -> Plot | None:
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
-    others = [each for each in found if each.arm != base]
+    base, compared = baseline_of(study), compared_arms(study)
+    others = [each for each in compared if each.arm != base]
     if base is None or not others:
         return None
     figure = new_figure(7.2, 1.2 + 0.24 * len(others))

@@ -142,20 +142,20 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
         study: The study.
         strategy: One of its strategies.
     """
-    found = gains(study, strategy)
-    if not found.on_scene:
+    gained = gains(study, strategy)
+    if not gained.on_scene:
         return None
-    variants = shown_variants(found.variants)
-    names = [*found.scenes, "mean, these scenes"]
+    variants = shown_variants(gained.variants)
+    names = [*gained.scenes, "mean, these scenes"]
     figure = new_figure(7.2, 1.1 + 0.15 * len(names) * (len(variants) + 1.5))
     axes = figure.subplots()
     for row, name in enumerate(names):
         for variant, place in zip(variants, _places(row, len(variants)), strict=True):
-            gain = _gain_of(found, name, variant)
+            gain = _gain_of(gained, name, variant)
             if gain is not None:
                 _dot(axes, gain, place, variant, across=True)
     axes.axvline(0.0, color=COLORS["sfm"], linewidth=1)
-    axes.axhline(len(found.scenes) - 0.5, color="#bbbbbb", linewidth=0.8)
+    axes.axhline(len(gained.scenes) - 0.5, color="#bbbbbb", linewidth=0.8)
     labels = [plain(name) for name in names]
     axes.set_yticks(range(len(names)), labels, family=font_families())
     axes.set_ylim(len(names) - 0.5, -0.5)
@@ -166,7 +166,7 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
         f"gain_by_scene_{strategy}",
         f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and 95% interval (of "
         "each comparison alone, not adjusted for their "
-        f"number).{_left_out(variants, found.variants)}",
+        f"number).{_left_out(variants, gained.variants)}",
         png(figure),
     )
 
@@ -180,10 +180,10 @@ def _left_out(shown: Sequence[Variant], variants: Sequence[Variant]) -> str:
     return "" if len(shown) == len(variants) else " Of each method, the highest ratio."
 
 
-def _gain_of(found: Gains, name: str, variant: Variant) -> Difference | None:
-    if name in found.scenes:
-        return found.on_scene.get((name, variant))
-    return found.on_these[variant]
+def _gain_of(gained: Gains, name: str, variant: Variant) -> Difference | None:
+    if name in gained.scenes:
+        return gained.on_scene.get((name, variant))
+    return gained.on_these[variant]
 
 
 def _dot(
@@ -208,13 +208,13 @@ def ratio_figure(study: Study) -> Plot | None:
         return None
     figure, parts = panels(len(study.strategies))
     for strategy, axes in zip(study.strategies, parts, strict=True):
-        found = gains(study, strategy)
-        for line in _lines(variant for variant in found.variants if variant.ratio):
-            means = [found.on_these[variant].mean for variant in line]
+        gained = gains(study, strategy)
+        for line in _lines(variant for variant in gained.variants if variant.ratio):
+            means = [gained.on_these[variant].mean for variant in line]
             axes.plot([variant.ratio for variant in line], means, **_line(line[0]), linewidth=1.3)
             for variant in line:
-                _dot(axes, found.on_these[variant], variant.ratio, variant)
-        ratios = sorted({variant.ratio for variant in found.variants} - {0.0})
+                _dot(axes, gained.on_these[variant], variant.ratio, variant)
+        ratios = sorted({variant.ratio for variant in gained.variants} - {0.0})
         axes.set_xscale("log", base=2)
         axes.set_xticks(ratios, [f"{ratio:g}x" for ratio in ratios])
         axes.set_xticks([], minor=True)
@@ -252,10 +252,10 @@ def strategy_figure(study: Study) -> Plot | None:
     axes = figure.subplots()
     variants = shown_variants(study.variants)
     for column, strategy in enumerate(study.strategies):
-        found = gains(study, strategy)
+        gained = gains(study, strategy)
         for variant, place in zip(variants, _places(column, len(variants)), strict=True):
-            if variant in found.on_these:
-                _dot(axes, found.on_these[variant], place, variant)
+            if variant in gained.on_these:
+                _dot(axes, gained.on_these[variant], place, variant)
     axes.axhline(0.0, color=COLORS["sfm"], linewidth=1)
     axes.set_xticks(range(len(study.strategies)), study.strategies)
     axes.set_ylabel("gain over sfm, dB")

@@ -107,7 +107,7 @@ def _setup(rows: Sequence[RunRow], sessions: Sequence[Mapping[str, Any]]) -> Ite
 
 
 def _facts(session: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What is known of a call: whatever it is, flat and in words."""
+    """What is recorded of a call, as names and texts."""
     told = []
     for name, value in session.items():
         if name == "started" and isinstance(value, float | int):

@@ -67,7 +67,7 @@ def scene_pictures(
     Raises:
         OutputError: Descriptors cannot be kept.
     """
-    found = Pictures()
+    pictures = Pictures()
     kept = read_descriptors(bench / KEPT_DESCRIPTORS)
     drawn = _drawn(bench)
     for scene in study.scenes:
@@ -75,38 +75,40 @@ def scene_pictures(
         anyone = study.rows[scene][0].spec
         key = _key(anyone, specs)
         if anyone.scene_digest in kept:
-            found.described[scene] = kept[anyone.scene_digest]
+            pictures.described[scene] = kept[anyone.scene_digest]
         if key in drawn:
-            found.clouds[scene] = drawn[key]
-        if from_scenes and (scene not in found.described or (specs and scene not in found.clouds)):
-            _look(found, scene, anyone, specs, bench, progress)
-        if scene in found.clouds:
-            found.files[scene] = f"clouds_{safe_name(scene)}_{key[:6]}"
-            found.keys[found.files[scene]] = key
-        if scene in found.described:
-            kept[anyone.scene_digest] = found.described[scene]
+            pictures.clouds[scene] = drawn[key]
+        if from_scenes and (
+            scene not in pictures.described or (specs and scene not in pictures.clouds)
+        ):
+            _look(pictures, scene, anyone, specs, bench, progress)
+        if scene in pictures.clouds:
+            pictures.files[scene] = f"clouds_{safe_name(scene)}_{key[:6]}"
+            pictures.keys[pictures.files[scene]] = key
+        if scene in pictures.described:
+            kept[anyone.scene_digest] = pictures.described[scene]
     if kept:
         write_descriptors(bench / KEPT_DESCRIPTORS, kept)
-    return found
+    return pictures
 
 
 def _look(
-    found: Pictures,
+    pictures: Pictures,
     scene: str,
     anyone: RunSpec,
     specs: Mapping[Variant, RunSpec],
     bench: Path,
     progress: Progress,
 ) -> None:
-    """Open a scene for what is not known of it."""
+    """Open a scene for what is not cached."""
     try:
         opened = open_unchanged([*specs.values(), anyone])
-        if scene not in found.described:
-            found.described[scene] = describe(opened, progress)
-        if specs and scene not in found.clouds:
-            found.clouds[scene] = cloud_picture(opened, specs, progress, bench)
+        if scene not in pictures.described:
+            pictures.described[scene] = describe(opened, progress)
+        if specs and scene not in pictures.clouds:
+            pictures.clouds[scene] = cloud_picture(opened, specs, progress, bench)
     except SplatseedError as error:
-        found.notes.append(f"{scene}: its points are not shown or described: {error}")
+        pictures.notes.append(f"{scene}: its points are not shown or described: {error}")
 
 
 def _key(anyone: RunSpec, specs: Mapping[Variant, RunSpec]) -> str:

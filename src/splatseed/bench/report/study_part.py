@@ -144,10 +144,10 @@ def _convergence(study: Study) -> Iterable[Table | Plot | None]:
 
 def _guidelines(study: Study, described: Mapping[str, Descriptors]) -> Iterable[Table | str]:
     for strategy in study.strategies if study.variants else ():
-        found = gains(study, strategy)
-        derived = guidelines(found, described)
+        gained = gains(study, strategy)
+        derived = guidelines(gained, described)
         yield f"Strategy {strategy}: {verdict(derived)}"
-        yield winner_table(found, described)
+        yield winner_table(gained, described)
         if derived:
             yield guideline_table(derived, strategy)
     if study.settings["budget"]:

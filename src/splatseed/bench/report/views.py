@@ -55,16 +55,16 @@ def compared_views(study: Study, strategy: StrategyName, bench: Path) -> Iterato
         strategy: One of its strategies.
         bench: The benchmark's folder.
     """
-    found = gains(study, strategy)
+    gained = gains(study, strategy)
     most = VIEWS if len(study.strategies) == 1 else 1
-    for scene in found.scenes:
-        best = found.top(scene)
+    for scene in gained.scenes:
+        best = gained.top(scene)
         if best is None:
             continue
         folders = _folders(study, strategy, scene, best, bench)
         if folders is None:
             continue
-        gain = found.on_scene[scene, best].mean
+        gain = gained.on_scene[scene, best].mean
         for name in _common(*folders)[:most]:
             pictures = _pictures(folders[0] / name, folders[1] / name, best)
             if pictures is not None:
@@ -101,15 +101,15 @@ def _pictures(base: Path, own: Path, best: Variant) -> tuple[dict[str, bytes], f
         return None
     if parts[0] is None or parts[1] is None or parts[0][0].shape != parts[1][0].shape:
         return None
-    (truth, base_render, base_error), (_, own_render, own_error) = parts[0], parts[1]
+    (photograph, base_render, base_error), (_, own_render, own_error) = parts[0], parts[1]
     shown = {
         BASELINE.label: base_render,
         best.label: own_render,
-        "photograph": truth,
+        "photograph": photograph,
         f"error of {BASELINE.label}": base_error,
         f"error of {best.label}": own_error,
     }
-    height, width = truth.shape[:2]
+    height, width = photograph.shape[:2]
     return {label: jpeg(pixels) for label, pixels in shown.items()}, width / height
 
 

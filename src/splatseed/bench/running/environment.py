@@ -32,7 +32,7 @@ def describe_environment(words: Sequence[str]) -> dict[str, Any]:
         "cores": os.cpu_count(),
         "memory_bytes": _memory(),
         "python": platform.python_version(),
-        "versions": {name: found for name in PACKAGES if (found := package_version(name))},
+        "versions": {name: version for name in PACKAGES if (version := package_version(name))},
     }
 
 

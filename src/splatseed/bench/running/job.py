@@ -37,6 +37,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
 from splatseed.seeding.upsampling import DEFAULT_METHOD
+from splatseed.train.stereo_size import stereo_size
 from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
@@ -172,9 +173,10 @@ def _prepare(
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (PyTorch)
 
     every = spec.training.test_every
+    size = stereo_size(scene.split(every)[0], spec.settings)
     ways: dict[str, Any] = {
         "cache_dir": user_cache_dir(),
-        "depths": bench / DEPTHS / f"{spec.scene_digest}_{every}_{spec.repeat}.npz",
+        "depths": bench / DEPTHS / f"{spec.scene_digest}_{every}_{size}_{spec.repeat}.npz",
         "seeding_knew": spec.arm.method == DEFAULT_METHOD and not is_full(scene, spec),
     }
     try:
@@ -232,13 +234,13 @@ def _covisible(spec: RunSpec, target: Path, views: Sequence[View], progress: Pro
     return pixel_masks(grids, views)
 
 
-def _result(found: TrainingResult, run: TrainingRun, upsample_seconds: float) -> RunResult:
+def _result(trained: TrainingResult, run: TrainingRun, upsample_seconds: float) -> RunResult:
     return RunResult(
-        scores=found.scores,
-        curve=tuple(point for point in found.curve if math.isfinite(point.psnr)),
-        num_seeds=found.num_seeds,
+        scores=trained.scores,
+        curve=tuple(point for point in trained.curve if math.isfinite(point.psnr)),
+        num_seeds=trained.num_seeds,
         upsample_seconds=upsample_seconds,
-        train_seconds=found.train_seconds,
+        train_seconds=trained.train_seconds,
         peak_bytes=peak_bytes(),
         device=run.device,
         peak_gpu_bytes=run.peak_gpu_bytes,

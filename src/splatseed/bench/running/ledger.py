@@ -219,14 +219,14 @@ class Ledger:
             OutputError: The ledger cannot be read.
         """
         with self._transaction() as db:
-            found = db.execute(
+            records = db.execute(
                 "SELECT spec, status, result, error, attempts, worker, started, finished"
                 " FROM runs ORDER BY position"
             ).fetchall()
         try:
             return [
                 RunRow(RunSpec.from_json(spec), status, _result(result), *rest)
-                for spec, status, result, *rest in found
+                for spec, status, result, *rest in records
             ]
         except (ValueError, KeyError, TypeError) as error:
             raise SceneFormatError(
@@ -252,8 +252,8 @@ class Ledger:
             OutputError: The ledger cannot be read.
         """
         with self._transaction() as db:
-            found = db.execute("SELECT started, facts FROM sessions ORDER BY id").fetchall()
-        return [{**json.loads(facts), "started": started} for started, facts in found]
+            records = db.execute("SELECT started, facts FROM sessions ORDER BY id").fetchall()
+        return [{**json.loads(facts), "started": started} for started, facts in records]
 
     @contextmanager
     def _transaction(self) -> Iterator[sqlite3.Connection]:

@@ -182,5 +182,5 @@ def _check_node(spec: RunSpec) -> None:
 def _files(target: Path) -> dict[str, bytes]:
     """The files of a folder except its manifest, which is written anew."""
     paths: Sequence[Path] = [path for path in target.rglob("*") if path.is_file()]
-    found = {path.relative_to(target).as_posix(): path.read_bytes() for path in paths}
-    return {name: content for name, content in found.items() if name != MANIFEST}
+    contents = {path.relative_to(target).as_posix(): path.read_bytes() for path in paths}
+    return {name: content for name, content in contents.items() if name != MANIFEST}

@@ -131,7 +131,7 @@ def _compilation() -> Iterator[list[float]]:
             running.append(time.perf_counter())
             return
         begun = running.pop()
-        if not running:  # else it is a part of the one that it came into
+        if not running:  # else it is nested in another, which counts it
             spans.append(time.perf_counter() - begun)
 
     with watched(watch):

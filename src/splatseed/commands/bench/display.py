@@ -87,7 +87,7 @@ class RunDisplay(Watcher):
         with self._lock:
             self._end(spec)
             self._ended -= 1
-            self._say(f"{describe(spec)}: {reason}; to be taken up again", count=False)
+            self._say(f"{describe(spec)}: {reason}; to be resumed", count=False)
 
     def stopping(self, words: str) -> None:
         """Report what the user is waiting for."""

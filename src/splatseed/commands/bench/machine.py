@@ -101,12 +101,12 @@ def check_machine(machine: Machine, seeds: int) -> None:
 
 
 def _local_machine(options: Options, backend: Backend) -> Machine:
-    found: Backend = "cpu"
+    chosen: Backend = "cpu"
     if backend == "cuda" or (backend == "auto" and _has_driver()):
         from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch, which takes seconds)
 
-        found = "cuda" if pick_device(backend).type == "cuda" else "cpu"
-    gpus = _gpus() if found == "cuda" else []
+        chosen = "cuda" if pick_device(backend).type == "cuda" else "cpu"
+    gpus = _gpus() if chosen == "cuda" else []
     jobs = options.jobs or max(len(gpus), 1)
     threads = options.threads or max(1, cores() // jobs)
     environments = [slot_environment(threads, _gpu_of(slot, gpus)) for slot in range(jobs)]
@@ -116,7 +116,7 @@ def _local_machine(options: Options, backend: Backend) -> Machine:
     ) -> bool:
         return LocalExecutor(ledger, bench, environments, how, watcher).run(keys)
 
-    return Machine("this machine", found, jobs, threads, run, is_local=True)
+    return Machine("this machine", chosen, jobs, threads, run, is_local=True)
 
 
 def _has_driver() -> bool:
@@ -145,9 +145,9 @@ def _gpu_of(slot: int, gpus: Sequence[str]) -> str:
 def _ray_machine(options: Options, backend: Backend, cluster: Cluster) -> Machine:
     from splatseed.bench.running.ray_cluster import RayExecutor  # noqa: PLC0415  (an extra)
 
-    found: Backend = "cuda" if backend == "cuda" or cluster.has_gpus else "cpu"
-    found = "cpu" if backend == "cpu" else found
-    share = cluster.share(options.threads, gpu=found == "cuda")
+    chosen: Backend = "cuda" if backend == "cuda" or cluster.has_gpus else "cpu"
+    chosen = "cpu" if backend == "cpu" else chosen
+    share = cluster.share(options.threads, gpu=chosen == "cuda")
     jobs = min(options.jobs or cluster.capacity(share), cluster.capacity(share))
 
     def run(
@@ -158,4 +158,4 @@ def _ray_machine(options: Options, backend: Backend, cluster: Cluster) -> Machin
         )
         return executor.run(keys)
 
-    return Machine("Ray", found, jobs, share.threads, run)
+    return Machine("Ray", chosen, jobs, share.threads, run)

@@ -115,7 +115,7 @@ class Options:
     """Processes on this machine, or tasks on a Ray cluster (extra cluster)."""
     jobs: Annotated[int | None, _one(int, "one per GPU, else 1; ray: what fits")] = None
     """Runs at a time."""
-    threads: Annotated[int | None, _one(int, "the cores shared out")] = None
+    threads: Annotated[int | None, _one(int, "an equal share of the cores")] = None
     """Threads of each run on the CPU."""
     address: Annotated[str | None, _one(str, "a cluster on this machine alone")] = None
     """The Ray cluster's, such as auto on its head node."""
@@ -239,9 +239,9 @@ def _with_depth(
     """The scenes with their folders of depth maps."""
     if len(folders) == 1 and any((folders[0] / scene.label).is_dir() for scene in scenes):
         below = [folders[0] / scene.label for scene in scenes]
-        found = [str(folder) if folder.is_dir() else "" for folder in below]
+        depths = [str(folder) if folder.is_dir() else "" for folder in below]
     elif len(folders) == len(scenes):
-        found = [str(folder) for folder in folders]
+        depths = [str(folder) for folder in folders]
     else:
         raise ParameterError(
             f"--depth with a folder for each of {len(scenes)} scenes, or one with subfolders of "
@@ -250,5 +250,5 @@ def _with_depth(
             fix="See --dry-run for the scenes and their order.",
         )
     return tuple(
-        dataclasses.replace(scene, depth=depth) for scene, depth in zip(scenes, found, strict=True)
+        dataclasses.replace(scene, depth=depth) for scene, depth in zip(scenes, depths, strict=True)
     )

@@ -56,18 +56,18 @@ def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progres
         SceneFormatError: A file of one is not what its format promises.
     """
     notes = [f"not there: {', '.join(asked.missing)}"] if asked.missing else []
-    found: list[tuple[PlannedScene, SceneFacts]] = []
+    present: list[tuple[PlannedScene, SceneFacts]] = []
     for scene in asked.plan.scenes:
         try:
-            found.append((scene, _survey(scene, asked.plan, made, progress)))
+            present.append((scene, _survey(scene, asked.plan, made, progress)))
         except SceneNotFoundError as error:
             if not asked.lenient:
                 raise
             notes.append(f"{scene.label} is left out: {error}")
-    if not found:
+    if not present:
         raise SceneNotFoundError("scenes to run", found="; ".join(notes), fix="See above.")
-    plan = dataclasses.replace(asked.plan, scenes=tuple(scene for scene, _ in found))
-    scenes = [facts for _, facts in found]
+    plan = dataclasses.replace(asked.plan, scenes=tuple(scene for scene, _ in present))
+    scenes = [facts for _, facts in present]
     runs = plan_runs(plan, scenes, backend, package_version("splatseed"))
     return Prepared(plan, scenes, runs, [*notes, *_notes(plan, scenes)])
 

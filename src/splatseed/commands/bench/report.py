@@ -99,18 +99,18 @@ def run_compare(arguments: list[str]) -> None:
     options = parse_options(CompareOptions, "bench compare", arguments)
     if options.output is not None:
         check_output(options.output, kind="bench compare", protect=(options.a, options.b))
-    found = compare(_rows(options.a), _rows(options.b))
-    if found is None:
+    comparison = compare(_rows(options.a), _rows(options.b))
+    if comparison is None:
         raise SceneNotFoundError(
             f"finished runs in both {options.a} and {options.b}",
             found="none in one of them",
             fix="Let splatseed bench finish some.",
         )
-    tables = [settings_table(found), change_table(found), only_table(found)]
+    tables = [settings_table(comparison), change_table(comparison), only_table(comparison)]
     for table in tables:
         if table.rows:
             _print_table(table)
-    for note in _notes(found, tables):
+    for note in _notes(comparison, tables):
         print_note(note)
     if options.output is not None:
         for table in tables:
@@ -129,14 +129,14 @@ def _print_table(table: Table) -> None:
         OUT.print(note, style="dim")
 
 
-def _notes(found: Comparison, tables: Iterable[Table]) -> Iterable[str]:
+def _notes(comparison: Comparison, tables: Iterable[Table]) -> Iterable[str]:
     """Further notes on the two."""
     settings, changes, _ = tables
     if not settings.rows:
         yield "All settings are the same."
     if not changes.rows:
         yield "They have no scene and method in common."
-    if found.same_runs:
-        yield f"{found.same_runs} runs are in both, with the same key and score."
-    for scene in found.content:
+    if comparison.same_runs:
+        yield f"{comparison.same_runs} runs are in both, with the same key and score."
+    for scene in comparison.content:
         yield f"{scene} is not the same in both: its points, cameras or photographs differ."

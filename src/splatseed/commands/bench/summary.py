@@ -31,7 +31,7 @@ def print_summary(bench: Path, rows: Sequence[RunRow]) -> None:
         shown = [(describe(row.spec), row.error) for row in failed[:FAILURES_SHOWN]]
         print_pairs(f"failed: {len(failed)}", shown)
         where = kept_folder(bench, failed[0].spec.key) / ERROR
-        print_note(f"The whole of the first error: {where}")
+        print_note(f"The first error in full: {where}")
     _print_next(bench, rows, len(failed))
 
 
@@ -91,10 +91,10 @@ def _print_next(bench: Path, rows: Collection[RunRow], failed: int) -> None:
     left = sum(row.status == "pending" for row in rows)
     elsewhere = sum(row.status == "running" for row in rows)
     if elsewhere:
-        print_note(f"{elsewhere} runs are with another process, or were when it was last seen.")
+        print_note(f"Another process has {elsewhere} runs, or had when it was last seen.")
     commands = []
     if left or elsewhere:
         commands.append((f"the other {left + elsewhere} runs", f"splatseed bench -o {name}"))
     if failed:
-        commands.append(("try again what failed", f"splatseed bench -o {name} --retry-failed"))
+        commands.append(("retry what failed", f"splatseed bench -o {name} --retry-failed"))
     print_commands("next", [*commands, ("tables and pictures", f"splatseed bench report {name}")])

@@ -72,7 +72,7 @@ def provenance(options: Options, packages: Sequence[str]) -> dict[str, object]:
 
 def _maps(scene: Scene, options: Options, clock: StageClock) -> tuple[StereoMap, ...]:
     """The maps, by stereo's own defaults where an option is left out."""
-    from splatseed.stereo import stereo_depths  # noqa: PLC0415  (as little loads as can be)
+    from splatseed.stereo import stereo_depths  # noqa: PLC0415  (loads little)
 
     names = ("max_size", "grid", "seed")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}

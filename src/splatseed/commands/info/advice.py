@@ -91,10 +91,10 @@ def advice_for(
             is room for new points.
     """
     measured = measure(scene, empty)
-    said = advise(measured, planned.most_seeds)
+    said = advise(measured, planned.most_seeds, strategy=planned.strategy)
     if progress is not None and said.method == "auto" and measured.num_points:
         measured = replace(measured, agreement=stereo_agreement(scene, progress=progress))
-        said = advise(measured, planned.most_seeds)
+        said = advise(measured, planned.most_seeds, strategy=planned.strategy)
     return said, measured
 
 
@@ -157,7 +157,7 @@ def run_advice(arguments: list[str]) -> None:
         advice, measured = advice_for(scene, planned, empty, clock)
     print_pairs(str(options.scene), advice_rows(advice, measured, planned))
     OUT.print(
-        "\nThe rules rest on runs of a few scenes (docs/methods.md); splatseed tune asks this "
+        "\nThe rules rest on runs of a few scenes (docs/methods.md); splatseed tune tests this "
         "very scene.",
         soft_wrap=True,
     )

@@ -78,7 +78,8 @@ class Options:
     num_points: Annotated[int | None, number_flag(int, "by the ratio")] = None
     """Points in all, instead of a ratio."""
     budget: Annotated[str | None, budget_flag()] = None
-    """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph."""
+    """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph at
+    full size."""
     cover_cell: Annotated[int | None, cover_flag()] = None
     """Side in pixels of the parts of the photographs that get a seed if no point falls in."""
     verify: bool = False

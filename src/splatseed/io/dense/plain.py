@@ -35,9 +35,9 @@ def write_dense_maps(
 ) -> DenseReport:
     """Write a folder of depth maps of kind "z"; ``splatseed.io.find_depths`` reads them.
 
+    Args:
         scene: The scene of the maps.
         maps: The maps of some of its images, in any order and of any size; consumed one by one.
-        path: The folder to make.
         path: The folder to make.
         overwrite: Whether an earlier output of splatseed may be replaced.
         provenance: How the maps came about, for ``splatseed.json``.

@@ -7,7 +7,7 @@ that contribute to wrong pixels; the others are new, on wrong pixels whose depth
 ``placing``). Promise: the number of Gaussians never exceeds the budget; which ones grow depends
 only on the views and the seed. Growing by the error that a Gaussian contributes to follows S. Rota
 Bulo et al., "Revising Densification in Gaussian Splatting" (2024); what is removed, when, and the
-normalisation of the error were chosen on held-out training views: see benchmarks/README.md.
+normalisation of the error were chosen on held-out training views (benchmarks/training/README.md).
 """
 
 from __future__ import annotations

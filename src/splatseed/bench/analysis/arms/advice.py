@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
+from typing import NamedTuple
 
 from splatseed.bench.analysis.study import BASELINE, Study
 from splatseed.bench.analysis.tables import Table, number, words
@@ -86,7 +87,7 @@ def score_advice(study: Study, strategy: StrategyName) -> AdviceScore:
     for scene, scores in known.items():
         others = [each for each in known if each != scene]
         room = _fitted([(facts[each], known[each]) for each in others])
-        method = _followed(facts[scene], scores, room)
+        method = facts[scene].followed(scores, room)
         best = max(scores, key=lambda each: scores[each])
         advised.append(Advised(scene, method, best, scores))
     left = tuple(scene for scene in study.scenes if scene not in known)
@@ -103,27 +104,34 @@ def _by_method(study: Study, strategy: StrategyName, scene: str) -> dict[str, fl
     return scores
 
 
-def _facts(study: Study, strategy: StrategyName, scene: str) -> tuple[Measured, int]:
-    """A scene's measurements from the ledger, and the most seeds with which training may begin."""
+class _Facts(NamedTuple):
+    """A scene's measurements from the ledger, and its training."""
+
+    measured: Measured
+    most_seeds: int
+    strategy: StrategyName
+
+    def followed(self, scores: Mapping[str, float], room: float) -> str:
+        """The advised method, or the scene's points as they are if it was not run."""
+        said = advise(self.measured, self.most_seeds, strategy=self.strategy, room=room)
+        return said.method if said.method in scores else AS_IT_IS
+
+
+def _facts(study: Study, strategy: StrategyName, scene: str) -> _Facts:
     rows = [r for r in study.rows[scene] if r.spec.arm.strategy == strategy and r.result]
     base = next(r for r in rows if study.variant_of_key[r.spec.key] == BASELINE)
     assert base.result is not None  # noqa: S101  (checked by the caller)
     most = base.spec.most_seeds or base.result.num_gaussians
-    return Measured(base.result.num_seeds, 0, 0.0), most
+    return _Facts(Measured(base.result.num_seeds, 0, 0.0), most, strategy)
 
 
-def _followed(facts: tuple[Measured, int], scores: Mapping[str, float], room: float) -> str:
-    method = advise(*facts, room=room).method
-    return method if method in scores else AS_IT_IS
-
-
-def _fitted(others: Sequence[tuple[tuple[Measured, int], Mapping[str, float]]]) -> float:
+def _fitted(others: Sequence[tuple[_Facts, Mapping[str, float]]]) -> float:
     """The threshold that suits the other scenes best; among equals the one in use."""
     if not others:
         return ROOM
 
     def served(room: float) -> tuple[float, bool]:
-        gains = [scores[_followed(facts, scores, room)] for facts, scores in others]
+        gains = [scores[facts.followed(scores, room)] for facts, scores in others]
         return round(fmean(gains), 6), room == ROOM
 
     return max(ROOMS, key=served)

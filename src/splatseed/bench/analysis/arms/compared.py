@@ -102,8 +102,8 @@ def compared_arms(study: Study) -> tuple[Compared, ...]:
     if base is None:
         return ()
     arms = [Arm(s, v) for s in study.strategies for v in (BASELINE, *study.variants_of(s))]
-    found = [each for arm in arms if (each := _compared(study, base, arm)) is not None]
-    return tuple(sorted(_with_adjusted(found, base), key=lambda each: -each.gain.mean))
+    compared = [each for arm in arms if (each := _compared(study, base, arm)) is not None]
+    return tuple(sorted(_with_adjusted(compared, base), key=lambda each: -each.gain.mean))
 
 
 def _compared(study: Study, base: Arm, arm: Arm) -> Compared | None:
@@ -154,13 +154,13 @@ def _mean(scenes: Sequence[Sequence[RunResult]], measure: Measure) -> float | No
 
 def _difference(scenes: Sequence[Sequence[Pair]], measure: Measure) -> Difference | None:
     """Mean difference; its error over scenes, or over the repeats of one."""
-    found = []
+    differences = []
     for pairs in scenes:
         both = [(measure(base), measure(own)) for base, own in pairs]
         known = [own - base for base, own in both if base is not None and own is not None]
         if known:
-            found.append(known)
-    return _over(found) if len(found) == len(scenes) else None
+            differences.append(known)
+    return _over(differences) if len(differences) == len(scenes) else None
 
 
 def _over(scenes: Sequence[Sequence[float]]) -> Difference:
@@ -190,14 +190,14 @@ def psnr_at(result: RunResult, seconds: float) -> float | None:
 
 def _in_time(scenes: Sequence[Sequence[Pair]]) -> Difference | None:
     """The arm's lead when the baseline ends; None if an arm has no test by then."""
-    found = []
+    leads = []
     for pairs in scenes:
         at = [(base.psnr, psnr_at(own, base.seconds)) for base, own in pairs]
         known = [own - base for base, own in at if own is not None]
         if len(known) < len(at):
             return None
-        found.append(known)
-    return _over(found)
+        leads.append(known)
+    return _over(leads)
 
 
 def _times(scenes: Sequence[Sequence[Pair]]) -> list[list[tuple[float, float | None]]]:
@@ -224,13 +224,13 @@ def _sooner(scenes: Sequence[Sequence[tuple[float, float | None]]]) -> Differenc
     return _over(logs) if complete else None
 
 
-def _with_adjusted(found: Sequence[Compared], base: Arm) -> list[Compared]:
+def _with_adjusted(compared: Sequence[Compared], base: Arm) -> list[Compared]:
     """The differences with their p values adjusted over all arms except the baseline itself."""
-    others = [each for each in found if each.arm != base]
+    others = [each for each in compared if each.arm != base]
     kinds = ("gain", "covisible_gain", "ssim_gain", "lpips_gain", "gain_in_time", "sooner")
     columns = {kind: adjusted([getattr(each, kind) for each in others]) for kind in kinds}
     changed = []
     for i, each in enumerate(others):
         known: dict[str, Any] = {kind: column[i] for kind, column in columns.items()}
         changed.append(replace(each, **known))
-    return [*(each for each in found if each.arm == base), *changed]
+    return [*(each for each in compared if each.arm == base), *changed]

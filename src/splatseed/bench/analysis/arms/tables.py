@@ -27,11 +27,11 @@ SCORES_NOTE = (
     "making the seeds and of training."
 )
 SECONDS_NOTE = (
-    "Seconds count making the seeds and training. The gain at {base}'s seconds holds an arm's PSNR "
-    "when {base} ends beside {base}'s last; an arm that ended sooner has its last. The time to "
-    "{base}'s PSNR is when an arm first is as good as {base} in the end, as a share of the time "
-    "that {base} takes: 0.50 is in half of it; a geometric mean, given only where all runs get "
-    "there."
+    "Seconds count making the seeds and training. The gain at {base}'s seconds is an arm's PSNR "
+    "when {base} ends, less {base}'s final PSNR; an arm that ended sooner counts with its own "
+    "final PSNR. The time to {base}'s PSNR is when an arm first reaches {base}'s final PSNR, as a "
+    "share of the time that {base} takes: 0.50 is half of it; a geometric mean, given only where "
+    "all runs get there."
 )
 
 
@@ -41,15 +41,15 @@ def arm_table(study: Study) -> Table:
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
-    with_lpips = any(each.lpips is not None for each in found)
-    with_covisible = any(each.covisible_psnr is not None for each in found)
+    base, compared = baseline_of(study), compared_arms(study)
+    with_lpips = any(each.lpips is not None for each in compared)
+    with_covisible = any(each.covisible_psnr is not None for each in compared)
     scores = ["PSNR, dB", "gain, dB"]
     scores += ["co-visible, dB", "its gain, dB"] if with_covisible else []
     scores += ["SSIM", "its gain"]
     scores += ["LPIPS", "its gain"] if with_lpips else []
     rows = []
-    for each in found:
+    for each in compared:
         own = each.arm == base
         cells = [number(each.psnr), _gain(each.gain, own)]
         if with_covisible:
@@ -93,9 +93,9 @@ def scene_arm_table(study: Study) -> Table:
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
+    base, compared = baseline_of(study), compared_arms(study)
     rows = []
-    for each in found:
+    for each in compared:
         cells = []
         for scene in study.scenes:
             own = _runs(study, each.arm, scene)
@@ -132,7 +132,7 @@ def seconds_table(study: Study) -> Table:
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
+    base, compared = baseline_of(study), compared_arms(study)
     rows = [
         (
             words(each.arm.variant.label),
@@ -142,7 +142,7 @@ def seconds_table(study: Study) -> Table:
             words(f"{each.reached} of {each.runs}"),
             _share_of_time(each.sooner),
         )
-        for each in found
+        for each in compared
     ]
     name = base.label if base else "the baseline"
     header = ("seeds", "strategy", "seconds in all", f"gain at {name}'s seconds, dB",
@@ -164,8 +164,8 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
     Args:
         study: The study.
     """
-    base, found = baseline_of(study), compared_arms(study)
-    others = [each for each in found if each.arm != base]
+    base, compared = baseline_of(study), compared_arms(study)
+    others = [each for each in compared if each.arm != base]
     if base is None or not others:
         return ()
     best, scenes = others[0], len(others[0].scenes)
@@ -191,7 +191,7 @@ def _against(each: Compared, base: Arm) -> str:
     spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f})"
     doubt = {
         "within noise": ", which may be chance",
-        "unknown": ", of which one run says nothing sure",
+        "unknown": ", which a single run cannot confirm",
     }.get(gain.verdict, "")
     return f"{abs(gain.mean):.2f} dB{spread} {more} than {base.label}{doubt}"
 
@@ -209,9 +209,7 @@ def _in_time(best: Compared, base: Arm) -> tuple[str, ...]:
     if best.sooner is not None:
         share = math.exp(best.sooner.mean)
         sooner = f"{share:.0%} of the time" if share < 1 else f"{share:.2f} times as long"
-        told.append(f"To become as good as {base.label} is in the end it takes {sooner}.")
+        told.append(f"It takes {sooner} to reach {base.label}'s final PSNR.")
     elif best.reached < best.runs:
-        told.append(
-            f"{best.reached} of its {best.runs} runs become as good as {base.label} in the end."
-        )
+        told.append(f"{best.reached} of its {best.runs} runs reach {base.label}'s final PSNR.")
     return tuple(told)
