@@ -46,17 +46,28 @@ def test_a_kill_loses_one_step(name, number, sheet, tiles, monkeypatch):
     assert tiles.resumed
     per_tile = name in {"weigh", "place"}
     assert len(again) == (tiles.tiled.tiles - number if per_tile else 1)
+    xyz, _ = tiles(sheet, "linear", LINEAR, most=130)  # killed while the output was written
     expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
     np.testing.assert_array_equal(xyz, expected.xyz)
 
 
-def test_a_step_killed_while_it_writes_is_done_again(sheet, tiles):
-    tiles(sheet, "linear", LINEAR, most=130)
-    work = tiles.tiled.work
-    work.file("made/000000").rename(work.file("made/000000.partial"))
-    work.save("weighed/000000", {})
-    with pytest.raises(FileNotFoundError):  # it is: from what weighing left, which is not there
-        tiles(sheet, "linear", LINEAR, most=130)
+@pytest.mark.parametrize("step", ["tile_of_row", "tiles", "weighed/000001", "drawn", "made/000002"])
+def test_what_a_kill_leaves_half_written_is_written_again(step, sheet, tiles, monkeypatch):
+    complete = run.WorkFolder.complete
+
+    def killed(self, name):
+        if name == step:
+            raise KeyboardInterrupt
+        complete(self, name)
+
+    with monkeypatch.context() as context:
+        context.setattr(run.WorkFolder, "complete", killed)
+        with pytest.raises(KeyboardInterrupt):
+            tiles(sheet, "linear", LINEAR, most=130)
+    assert (tiles.path / f"{step}.partial").exists()
+    xyz, _ = tiles(sheet, "linear", LINEAR, most=130)
+    expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
+    np.testing.assert_array_equal(xyz, expected.xyz)
 
 
 def test_a_full_disk_leaves_what_is_done(sheet, tiles, monkeypatch):

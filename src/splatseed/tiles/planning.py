@@ -106,8 +106,10 @@ def plan_tiles(
 def _disk(method: object, count: int, num_new: int) -> int:
     """Bytes at most on disk at a time: rows, tiles, what the draw needs, new points, output."""
     neighbors = method.num_neighbors if isinstance(method, NearestMethod) else 0
-    passing = 27 + 23 + 4 + 4 + 8 + 4 * neighbors + 12 + 12 + 32
-    return count * passing + num_new * 15 + (count + num_new) * (27 + 43)
+    made = num_new * 15 + count * 12
+    at_work = count * (27 + 23 + 16 + 12 + 12 + 32 + 4 * neighbors) + made
+    in_the_end = count * (27 + 8) + made + (count + num_new) * (27 + 43)
+    return max(at_work, in_the_end)
 
 
 def check_disk(path: Path, needed: int | None, there: int = 0) -> None:

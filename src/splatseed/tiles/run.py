@@ -194,6 +194,8 @@ def _make(
         draw(work, num_new, seed, progress)
     left = [(path, method, tile) for tile in tiles if not work.has(made_name(tile))]
     tasks.run(place, left, "new points", progress)
+    for name in ("tiles", "weighed", "drawn", "tile_of_rank"):  # the output needs the space
+        work.discard(name)
 
 
 def weigh(path: str, method: NearestMethod, tile: int) -> None:
