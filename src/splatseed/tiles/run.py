@@ -22,6 +22,7 @@ from splatseed.tiles.box import box_points
 from splatseed.tiles.drawing import draw
 from splatseed.tiles.planning import TilePlan
 from splatseed.tiles.reading import Rows, read_rows
+from splatseed.tiles.repeats import find_repeats
 from splatseed.tiles.sources import Source
 from splatseed.tiles.splitting import split
 from splatseed.tiles.steps import made_name, place_tile, weigh_tile, weighed_name
@@ -103,6 +104,23 @@ class Tiled:
             seed = self.request.seed
             return box_points(self.work, self.num_new, seed, self.at_once, progress)
         return new_points(self.work, self.at_once, progress)
+
+    @property
+    def repeated(self) -> np.ndarray:
+        """Numbers of the new points that repeat a position, which scenes are written without."""
+        if not self.work.has("repeats"):
+            return np.empty(0, np.int64)
+        return self.work.load("repeats", "number")
+
+    def new_distinct(self, progress: Progress) -> Iterator[Piece]:
+        """The new points but for those."""
+        repeated, first = self.repeated, 0
+        for xyz, rgb in self.new(progress):
+            kept = np.ones(len(xyz), bool)
+            part = slice(*np.searchsorted(repeated, (first, first + len(xyz))))
+            kept[repeated[part] - first] = False
+            first += len(xyz)
+            yield xyz[kept], rgb[kept]
 
     def all(self, progress: Progress) -> Iterator[Piece]:
         """The originals, then the new points."""
@@ -194,6 +212,8 @@ def _make(
         draw(work, num_new, seed, progress)
     left = [(path, method, tile) for tile in tiles if not work.has(made_name(tile))]
     tasks.run(place, left, "new points", progress)
+    if not work.has("repeats"):
+        find_repeats(work, store, progress)
     for name in ("tiles", "weighed", "drawn", "tile_of_rank"):  # the output needs the space
         work.discard(name)
 

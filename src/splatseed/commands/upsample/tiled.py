@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -257,16 +258,21 @@ def _write(
 
     code, made = source_code(options.method), {"tiles": tiled.tiles, "origin": tiled.origin}
     about: dict[str, Any] = {**provenance, **made}
+    repeated = len(tiled.repeated)
+    num_new = tiled.num_new - repeated
     if isinstance(source, SceneSource):
         scene = source.scene
-        stream = PointStream(0, tiled.num_new, code, lambda: tiled.new(progress))
+        stream = PointStream(
+            0, num_new, code, lambda: tiled.new_distinct(progress), (), (0, repeated)
+        )
     else:
         assert isinstance(source, FileSource)  # noqa: S101  (the two there are)
         file = source.cloud.path
         scene, about = Scene(PointCloud.empty()), {**about, "source": str(file)}
         stream = PointStream(
-            tiled.num_original, tiled.num_new, code, lambda: tiled.all(progress),
-            (file,), (tiled.non_finite, tiled.repeats),
+            tiled.num_original, num_new, code,
+            lambda: chain(tiled.originals(progress), tiled.new_distinct(progress)),
+            (file,), (tiled.non_finite, tiled.repeats + repeated),
         )  # fmt: skip
     return write_scene(
         scene, options.output, format=options.format, overwrite=options.overwrite,
@@ -279,7 +285,8 @@ def _summarise(
 ) -> None:
     """Print the final table."""
     name = options.method
-    made = f"{tiled.num_original:,} original, {tiled.num_new:,} {name}"
+    new = report.num_points - tiled.num_original
+    made = f"{tiled.num_original:,} original, {new:,} {name}"
     rows = [
         ("points in", f"{tiled.num_original:,}"),
         ("points out", f"{report.num_points:,} ({made})"),
