@@ -221,7 +221,7 @@ def _gap(
 ) -> Float64[np.ndarray, " t"]:
     """The distance of each box from one; infinite for tiles without points."""
     away = np.maximum(np.maximum(low - box[1], box[0] - high), 0.0)
-    return np.nan_to_num(np.sqrt((away**2).sum(axis=1)), nan=np.inf)
+    return np.asarray(np.nan_to_num(np.sqrt((away**2).sum(axis=1)), nan=np.inf))
 
 
 def _others(

@@ -100,7 +100,7 @@ class PreparedCloud:
     rank: Int64[np.ndarray, " n"]
     trusted: Bool[np.ndarray, " n"]
     center: Float64[np.ndarray, " 3"]
-    tree: cKDTree | None
+    tree: cKDTree
     progress: Progress = silent
     halo: int = 0
 
