@@ -77,7 +77,7 @@ class TileStore:
     @cached_property
     def walls(self) -> Float64[np.ndarray, "t 2 3"]:
         """The boxes that space is divided into, some of them without end, [t, 2, 3]."""
-        return np.asarray(self.work.load("layout", "walls").astype(np.float64) - self.center
+        return np.asarray(self.work.load("layout", "walls").astype(np.float64) - self.center)
 
     @cached_property
     def extent(self) -> Float32[np.ndarray, "t 2 3"]:
@@ -87,7 +87,7 @@ class TileStore:
     @cached_property
     def bounds(self) -> Float64[np.ndarray, "t 2 3"]:
         """The same relative to the centroid."""
-        return np.asarray(self.extent.astype(np.float64) - self.center
+        return np.asarray(self.extent.astype(np.float64) - self.center)
 
     @cached_property
     def least(self) -> float:
