@@ -11,12 +11,18 @@ from hypothesis import given, settings, strategies as st
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.alignment import coarse
+from splatseed.seeding.alignment import align as align_module, coarse
 from splatseed.seeding.alignment.align import align
 from splatseed.seeding.alignment.coarse import spread_rotations
 from splatseed.similarity import Similarity
 
 MOVE = Similarity(0.37, spread_rotations(500)[321], np.array([5.6e5, 5.9e6, -80.0]))
+QUICK = (
+    (60, 150, 10, 0.25, 0.04, 0.04),
+    (6, 600, 15, 0.1, 0.02, 0.02),
+    (3, 1500, 40, 0.04, 0.005, 0.01),
+)
+"""Fewer tries than for real clouds, as tests must be quick."""
 
 
 def place(rng, num):
@@ -59,6 +65,7 @@ def made(tmp_path_factory):
     )
 
 
+@pytest.mark.slow
 def test_a_cloud_that_is_shifted_scaled_and_turned(made):
     found = align(made.scene, [made.folder / "moved.npz"])
     back = found.scene_from_cloud.points(MOVE.points(made.dense))
@@ -79,6 +86,7 @@ def test_a_cloud_that_is_shifted_scaled_and_turned(made):
 def few_starts(monkeypatch):
     """What is refused is refused after fewer tries as well."""
     monkeypatch.setattr(coarse, "ROTATIONS", 150)
+    monkeypatch.setattr(align_module, "ROUNDS", QUICK)
 
 
 def refused(made, xyz, match, rgb=None):

@@ -33,9 +33,9 @@ __all__ = ["Alignment", "align"]
 LEAST_MARKS = 200
 MOST_MARKS = 6000
 ROUNDS = (
-    (120, 200, 10, 0.25, 0.04, 0.04),
-    (12, 800, 12, 0.1, 0.02, 0.02),
-    (3, MOST_MARKS, 30, 0.04, 0.005, 0.01),
+    (150, 250, 10, 0.25, 0.04, 0.04),
+    (16, 1500, 15, 0.1, 0.02, 0.02),
+    (4, MOST_MARKS, 40, 0.04, 0.005, 0.01),
 )
 """Stages: alignments, marks, rounds of ICP, the first and the last reach, and within how much of
 the cloud marks count, in extents."""

@@ -30,7 +30,7 @@ ROTATIONS = 1200
 SCALES = (0.7, 0.84, 1.0, 1.19, 1.42)
 EVEN = 0.1
 """Side of the cells of which each counts once, however many marks it holds."""
-CELLS, HALF = 24, 2.7
+CELLS, HALF = 36, 2.7
 """Cells of the grid along each axis, and half its side."""
 FAR = 0.3
 INNER = 0.95

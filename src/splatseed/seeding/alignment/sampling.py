@@ -21,7 +21,7 @@ from splatseed.seeding.clouds.voxels import EvenVoxels
 
 __all__ = ["CloudSample", "normals_of", "sample_cloud"]
 
-SAMPLE = 1 << 17
+SAMPLE = 1 << 18
 CHUNK = 1 << 19
 NEIGHBORS = 12
 TEXT_ROW = 40
