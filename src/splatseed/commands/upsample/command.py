@@ -15,6 +15,14 @@ import tyro
 from splatseed.commands.info.advice import run_advice
 from splatseed.commands.options import parse_options
 from splatseed.commands.upsample.cloud import CLOUD, Bringing, bring_clouds, settle_cloud
+from splatseed.commands.upsample.flags import (
+    budget_flag,
+    cover_flag,
+    default_flag,
+    depth_folder_flag,
+    memory_flag,
+    number_flag,
+)
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
 from splatseed.commands.upsample.start import check_start, write_start
 from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
@@ -105,6 +113,16 @@ class Options:
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
     cloud_align: tyro.conf.Suppress[bool] = False
+    memory: Annotated[str | None, memory_flag()] = None
+    """Most memory. A cloud that takes more is worked on in tiles on disk, with the same result."""
+    jobs: Annotated[int | None, number_flag(int, "1; with Ray, as many as fit")] = None
+    """Tiles at a time, each in a process of its own."""
+    executor: Literal["local", "ray"] = "local"
+    """Who works on tiles: this machine, or a Ray cluster that shares its disk."""
+    address: Annotated[str | None, default_flag("a cluster on this machine")] = None
+    """The cluster's address, or auto on one of its nodes."""
+    tile_points: Annotated[int | None, number_flag(int, "by the memory")] = None
+    """Most points in a tile."""
     preview: bool = False
     """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's
     maps."""
@@ -119,6 +137,12 @@ class Options:
     """Copy the images instead of linking to them."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
+
+    @property
+    def tiling(self) -> Tiling:
+        """The options about memory and who works."""
+        memory = None if self.memory is None else bytes_of(self.memory)
+        return Tiling(memory, self.jobs, self.executor, self.address, self.tile_points)
 
     @property
     def bringing(self) -> Bringing:
