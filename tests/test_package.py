@@ -44,6 +44,7 @@ ORDER = (
     "depth",
     "stereo",
     "upsample",
+    "tiles",
     "seeding",
     "diagnostics",
     "preview",
@@ -335,7 +336,7 @@ def test_dependencies_are_those_that_are_imported():
         trains = trains or path.name == "torch_device.py"  # loads torch for those rooms
         allowed = base | more if trains else base
         allowed = base | names["depth"] if part == "monocular" else allowed
-        allowed = base | names["cluster"] if part == "bench" else allowed
+        allowed = base | names["cluster"] if path.name == "ray_tasks.py" else allowed
         if part in {"export", "view", "commands", "sfm"}:
             allowed = allowed | names["view"]
         if path.parent.name == "clouds":

@@ -12,7 +12,14 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress as Bar, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    Progress as Bar,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -123,11 +130,14 @@ class StageClock:
 
 
 @contextmanager
-def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
+def stage_display(
+    clock: StageClock | None = None, *, remaining: bool = False
+) -> Iterator[StageClock]:
     """Show progress bars on stderr while the block runs; print to stdout only outside the block.
 
     Args:
         clock: A clock that was shown before, to resume; a new one when left out.
+        remaining: Whether to show the time left too, for stages that take minutes.
     """
     clock = StageClock() if clock is None else clock
     if not ERR.is_terminal:
@@ -135,7 +145,9 @@ def stage_display(clock: StageClock | None = None) -> Iterator[StageClock]:
             yield clock
         clock.tell_compilation()
         return
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
+    left = (TextColumn("left", markup=False), TimeRemainingColumn()) if remaining else ()
+    named = TextColumn("{task.description}", markup=False)
+    columns = (named, BarColumn(), TimeElapsedColumn(), *left)
     with (
         Bar(*columns, console=ERR, transient=True) as bar,
         clock.shown_on(bar),

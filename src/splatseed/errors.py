@@ -10,12 +10,15 @@ Each says what was expected, what was found and how to mend it, in one line a us
     │   ├── ParameterError         an option or a method's parameter out of its range
     │   └── OutputError            the output cannot or must not be written
     ├── ReconstructionError        Structure-from-Motion ran and did not succeed
-    └── MissingDependencyError     an optional package is needed and absent
+    ├── MissingDependencyError     an optional package is needed and absent
+    └── TaskLostError              a task was lost with its process or node too often
 
 Anything else that escapes is a bug of ours.
 """
 
 from __future__ import annotations
+
+from functools import partial
 
 __all__ = [
     "InputError",
@@ -27,6 +30,7 @@ __all__ = [
     "SceneFormatError",
     "SceneNotFoundError",
     "SplatseedError",
+    "TaskLostError",
 ]
 
 
@@ -44,6 +48,10 @@ class SplatseedError(Exception):
         self.expected = expected
         self.found = found
         self.fix = fix
+
+    def __reduce__(self) -> tuple[partial[SplatseedError], tuple[str]]:
+        """How it is carried from one process to another."""
+        return partial(type(self), found=self.found, fix=self.fix), (self.expected,)
 
 
 class InputError(SplatseedError):
@@ -76,3 +84,7 @@ class ReconstructionError(SplatseedError):
 
 class MissingDependencyError(SplatseedError):
     """An optional package is needed and absent."""
+
+
+class TaskLostError(SplatseedError):
+    """A task was lost with its process or node too often."""

@@ -93,6 +93,11 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    @staticmethod
+    def empty() -> PointCloud:
+        """No points."""
+        return PointCloud(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))
+
     @property
     def attributes(self) -> dict[str, Float32[np.ndarray, "N ..."]]:
         """The ``ATTRIBUTES`` that the cloud has, by name."""
@@ -112,7 +117,8 @@ class PointCloud:
     @property
     def finite(self) -> Bool[np.ndarray, " N"]:
         """Which points have three finite coordinates, so that distances can be computed."""
-        return np.asarray((np.abs(self.xyz) < FARTHEST).all(axis=1))  # NaN compares false
+        x, y, z = (np.abs(self.xyz[:, axis]) < FARTHEST for axis in range(3))  # NaN compares false
+        return np.asarray(x & y & z)
 
     @property
     def distinct(self) -> Bool[np.ndarray, " N"]:

@@ -9,11 +9,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
 from typing import TypeAlias
 
-__all__ = ["Progress", "blocks", "in_threads", "silent"]
+__all__ = ["Progress", "blocks", "in_threads", "silent", "thread_limit"]
 
 Progress: TypeAlias = Callable[[str, float], None]
+
+thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)
+"""Most threads of ``in_threads``; as many as there are cores if None."""
 
 
 def silent(stage: str, fraction: float) -> None:
@@ -39,7 +43,7 @@ def in_threads(
     """
     progress(stage, 0.0)
     starts = range(0, total, size)
-    pool = ThreadPoolExecutor(os.cpu_count())
+    pool = ThreadPoolExecutor(thread_limit.get() or os.cpu_count())
     try:
         pieces = pool.map(lambda start: work(start, min(start + size, total)), starts)
         for done, _ in enumerate(pieces, start=1):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from splatseed import PointCloud, Scene, upsample
+from splatseed.progress import silent
 from splatseed.scene import Tracks
 from splatseed.upsample import configure
 from splatseed.upsample.neighbors import prepare
@@ -55,7 +56,7 @@ def test_no_tracks_no_verdict():
 @pytest.mark.parametrize(("profile", "weight"), [("default", 0.0), ("paper", 1.0)])
 def test_nothing_grows_from_a_mistrusted_point(profile, weight):
     cloud = prepare(MISTRUSTED.points, trusted_originals(MISTRUSTED))
-    _, weights = configure("linear", profile).neighborhoods(cloud, 1)
+    weights, _ = configure("linear", profile).weigh(cloud, cloud.neighbors(8), silent)
     assert weights[cloud.rank == 7] == weight
 
 

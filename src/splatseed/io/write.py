@@ -21,7 +21,9 @@ from splatseed.errors import OutputError, PointCloudError
 from splatseed.io.cloud import clean_scene
 from splatseed.io.output.image_folders import bring
 from splatseed.io.output.layouts import write_colmap, write_json, write_transforms
+from splatseed.io.output.point_stream import PointStream, append_points
 from splatseed.io.output.staging import MANIFEST, output_folder
+from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Scene
 
 __all__ = ["Layout", "WriteReport", "write_scene"]
@@ -66,6 +68,7 @@ def write_scene(
     overwrite: bool = False,
     copy_images: bool = False,
     provenance: Mapping[str, object] | None = None,
+    stream: PointStream | None = None,
 ) -> WriteReport:
     """Write a scene folder for training.
 
@@ -77,6 +80,7 @@ def write_scene(
         overwrite: Whether an earlier output of splatseed may be replaced.
         copy_images: Copy the image folders instead of linking them.
         provenance: How the points were made, for ``splatseed.json``.
+        stream: Points that follow those of the scene, more than memory holds.
 
     Returns:
         What was written.
@@ -88,7 +92,7 @@ def write_scene(
     """
     layout = _choose_layout(scene, format)
     clean = clean_scene(scene)  # a scene from load_scene is clean already
-    if not len(clean.points):
+    if not len(clean.points) and not (stream and len(stream)):
         raise PointCloudError(
             "at least one point with finite coordinates",
             found=f"{len(scene.points)} points, none of them finite",
@@ -96,17 +100,21 @@ def write_scene(
         )
     path = Path(path)
     kind = str((provenance or {}).get("command", _KIND))
-    with output_folder(path, kind=kind, overwrite=overwrite, protect=_inputs(scene)) as folder:
+    more = stream or PointStream(0, 0, ORIGINAL, lambda: iter(()))
+    inputs = (*_inputs(scene), *more.files)
+    with output_folder(path, kind=kind, overwrite=overwrite, protect=inputs) as folder:
         write_layout = write_colmap if layout == "colmap" else write_transforms
         notes, image_sources = write_layout(clean, folder)
+        if stream is not None:
+            append_points(folder, clean.points, stream)
         linked = bring(image_sources, folder, copy=copy_images)
         report = WriteReport(
             path=path,
             layout=layout,
-            num_points=len(clean.points),
-            num_original=clean.points.num_original,
-            dropped_nonfinite=clean.left_out.non_finite,
-            dropped_duplicates=clean.left_out.duplicates,
+            num_points=len(clean.points) + len(more),
+            num_original=clean.points.num_original + more.num_original,
+            dropped_nonfinite=clean.left_out.non_finite + more.left_out[0],
+            dropped_duplicates=clean.left_out.duplicates + more.left_out[1],
             files=_listing(folder, linked),
             notes=tuple(notes),
         )

@@ -12,9 +12,10 @@ from pathlib import Path
 
 from splatseed.errors import ParameterError
 
-__all__ = ["check_memory", "free_memory"]
+__all__ = ["bytes_of", "check_memory", "free_memory"]
 
 CGROUP = Path("/sys/fs/cgroup")
+SUFFIXES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
 def check_memory(count: int, bytes_each: int, what: str, *, found: str = "", fix: str) -> None:
@@ -39,6 +40,26 @@ def check_memory(count: int, bytes_each: int, what: str, *, found: str = "", fix
         found=found or f"{count:,}",
         fix=fix.replace("{most}", str(most)),
     )
+
+
+def bytes_of(text: str) -> int:
+    """An amount of memory such as 4G, 500M or a number of bytes.
+
+    Raises:
+        ParameterError: It is none.
+    """
+    plain = text.strip().upper().removesuffix("B").removesuffix("I")
+    number, suffix = (plain[:-1], plain[-1]) if plain[-1:] in SUFFIXES else (plain, "")
+    try:
+        amount = float(number)
+        known = 0 < amount < float("inf")
+    except ValueError:
+        known = False
+    if not known:
+        raise ParameterError(
+            "an amount of memory such as 4G or 500M", found=repr(text), fix="Give such an amount."
+        )
+    return int(amount * SUFFIXES[suffix])
 
 
 def free_memory() -> int | None:

@@ -35,7 +35,7 @@ def interpolate_colors(
 
 @kernel
 def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # type: ignore[no-untyped-def]  # Numba's types
-    for i in parallel_range(len(xyz)):
+    for i in parallel_range(len(count)):
         if count[i] > 0:
             around, color = _gather(xyz, rgb, i, idx[i])
             weight = np.empty(around.shape[1], np.float32)

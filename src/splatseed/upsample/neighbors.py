@@ -4,8 +4,10 @@ Notation: n distinct finite originals in *rows* (kd-tree leaf order: neighbourin
 neighbours in space, which keeps every later pass in cache); ``rank`` is a row's place among them
 in file order; k neighbours per row, nearest first, never the row itself; h = ``spacing`` = mean
 distance to the 6 nearest.
-Promise: random draws are assigned by rank, not by row, so that results do not depend on how the
-kd-tree happened to cut space.
+Promise: random draws are assigned by rank, not by row, and equally near neighbours are ordered by
+rank, so that results do not depend on how the kd-tree happened to cut space. A cloud that is one
+tile of a larger one has *halo* rows after its own: points of other tiles that are neighbours of its
+own, but no bases (``splatseed.tiles``).
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
+from splatseed.upsample.nearest_points import distances_of, nearest_others
 from splatseed.upsample.trust import trusted_originals
 
 __all__ = [
@@ -28,6 +31,9 @@ __all__ = [
     "Neighbors",
     "PreparedCloud",
     "draw_bases",
+    "draw_blocks",
+    "draw_in_block",
+    "least_distance",
     "prepare",
     "prepare_scene",
     "sound_bases",
@@ -37,6 +43,9 @@ SPACING_NEIGHBORS = 6
 OUTLIER_NEIGHBORS = 16
 OUTLIER_FACTOR = 3.0
 QUERY_BLOCK = 1 << 13
+DRAW_BLOCK = 1 << 20
+"""Ranks whose bases are drawn together: first how many each block of ranks makes, then which in it
+make them, so that clouds larger than memory are drawn a block at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +89,10 @@ class PreparedCloud:
         rank: Place of each row in file order, int64 [n].
         trusted: Rows that may serve as bases, bool [n].
         center: Centroid in the world, float64 [3].
-        tree: kd-tree over the positions in file order.
+        tree: kd-tree over the positions in file order; None in a tile of a larger cloud, whose
+            neighbours are found elsewhere.
         progress: Told how far the neighbour query is.
+        halo: Rows at the end that are neighbours only.
     """
 
     xyz: Float64[np.ndarray, "n 3"]
@@ -91,9 +102,15 @@ class PreparedCloud:
     center: Float64[np.ndarray, " 3"]
     tree: cKDTree
     progress: Progress = silent
+    halo: int = 0
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    @property
+    def num_own(self) -> int:
+        """Rows that may be bases."""
+        return len(self.xyz) - self.halo
 
     def neighbors(self, k: int) -> Neighbors:
         """The ``k`` nearest other rows of every row (all of them if there are fewer).
@@ -108,21 +125,26 @@ class PreparedCloud:
                 found=f"{len(self)}",
                 fix="Check that the scene holds the point cloud you meant.",
             )
-        idx = np.empty((len(self), k), np.int32)
-        distance = np.empty((len(self), k))
-        # Points that float64 cannot tell apart after centring must not end up at distance 0.
-        least = np.finfo(np.float64).eps * np.abs(self.xyz).max()
+        assert self.tree is not None  # noqa: S101  (a tile's neighbours are found elsewhere)
+        tree, idx = self.tree, np.empty((len(self), k), np.int32)
         row_of_rank = np.empty(len(self), np.int32)
         row_of_rank[self.rank] = np.arange(len(self), dtype=np.int32)
 
         def query(start: int, stop: int) -> None:
-            distances, ranks = self.tree.query(self.xyz[start:stop], k + 1)
-            # Column 0 is the row itself: rows are distinct, so nothing else is at distance 0.
-            idx[start:stop] = row_of_rank[ranks[:, 1:]]
-            np.maximum(distances[:, 1:], least, out=distance[start:stop])
+            _, ranks = nearest_others(tree, self.xyz[start:stop], self.rank[start:stop], k)
+            idx[start:stop] = row_of_rank[ranks]
 
         in_threads(query, len(self), QUERY_BLOCK, "neighbours", self.progress)
-        return Neighbors(idx, distance)
+        farthest = float(np.abs(self.xyz).max())
+        return Neighbors(idx, distances_of(self.xyz, idx, least_distance(farthest)))
+
+
+def least_distance(farthest: float) -> float:
+    """Least distance of two points of a cloud whose largest centred coordinate is ``farthest``.
+
+    Points that float64 cannot tell apart after centring must not end up at distance 0.
+    """
+    return float(np.finfo(np.float64).eps * farthest)
 
 
 def prepare(
@@ -200,19 +222,43 @@ def draw_bases(
     """
     by_rank = np.empty(len(cloud))
     by_rank[cloud.rank] = weight if weight.any() else 1.0
-    counts = rng.multinomial(num_new, by_rank / by_rank.sum())
+    sums = [by_rank[first : first + DRAW_BLOCK].sum() for first in range(0, len(cloud), DRAW_BLOCK)]
+    totals = draw_blocks(np.array(sums), num_new, rng)
+    counts = np.concatenate(
+        [
+            draw_in_block(by_rank[block * DRAW_BLOCK : (block + 1) * DRAW_BLOCK], total, rng)
+            for block, total in enumerate(totals)
+        ]
+    )
     starts = np.cumsum(counts) - counts
     return Bases(starts[cloud.rank], counts[cloud.rank].astype(np.int64), num_new)
 
 
+def draw_blocks(
+    sums: Float64[np.ndarray, " b"], num_new: int, rng: np.random.Generator
+) -> Int64[np.ndarray, " b"]:
+    """How many new points each block of ``DRAW_BLOCK`` ranks makes, from its sum of weights."""
+    return np.asarray(rng.multinomial(num_new, sums / sums.sum()))
+
+
+def draw_in_block(
+    weight: Float64[np.ndarray, " m"], total: int, rng: np.random.Generator
+) -> Int64[np.ndarray, " m"]:
+    """How many of a block's ``total`` new points each of its ranks makes; blocks come in order."""
+    if not weight.any():  # the only block without weight that is asked: total is 0
+        return np.zeros(len(weight), np.int64)
+    return np.asarray(rng.multinomial(total, weight / weight.sum()))
+
+
 def sound_bases(cloud: PreparedCloud, neighbors: Neighbors) -> Float64[np.ndarray, " n"]:
-    """Weight 1 for rows that may serve as bases and are not isolated, else 0, float64 [n].
+    """Weight 1 for own rows that may serve as bases and are not isolated, else 0, float64 [n].
 
     A row is isolated when its spacing is over 3 times the lower quartile of its neighbours'
     spacings: local, so that a sparse background is not taken for noise as a global filter would.
     """
-    lonely = _isolated(neighbors.idx[:, :OUTLIER_NEIGHBORS], neighbors.spacing)
-    return np.asarray(cloud.trusted & ~lonely, np.float64)
+    own = slice(cloud.num_own)
+    lonely = _isolated(neighbors.idx[own, :OUTLIER_NEIGHBORS], neighbors.spacing)
+    return np.asarray(cloud.trusted[own] & ~lonely, np.float64)
 
 
 def _isolated(

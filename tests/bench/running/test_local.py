@@ -18,9 +18,10 @@ import pytest
 from splatseed.bench.planning.records import Arm, RunResult, RunSpec
 from splatseed.bench.running import child
 from splatseed.bench.running.ledger import Ledger
-from splatseed.bench.running.local import LocalExecutor, slot_environment
+from splatseed.bench.running.local import LocalExecutor
 from splatseed.bench.running.watcher import Watcher
 from splatseed.errors import OutputError
+from splatseed.process.threads import slot_environment
 from splatseed.scores import EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 

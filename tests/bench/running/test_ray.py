@@ -20,13 +20,14 @@ from ray.cluster_utils import Cluster
 from splatseed.bench.planning.plan import plan_runs
 from splatseed.bench.planning.plan_file import plan_text
 from splatseed.bench.planning.scenes import survey
-from splatseed.bench.running import ray_cluster as module
 from splatseed.bench.running.child import Child, Killed
 from splatseed.bench.running.environment import package_version
 from splatseed.bench.running.kept import kept_folder
 from splatseed.bench.running.ledger import Ledger
-from splatseed.bench.running.ray_cluster import Share, run_on_node
+from splatseed.bench.running.ray_cluster import run_on_node
 from splatseed.errors import MissingDependencyError, ParameterError
+from splatseed.process import ray_tasks as module
+from splatseed.process.ray_tasks import Share
 
 COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()", "bench")
 STORE = 80 * 2**20  # bytes; the least that Ray takes

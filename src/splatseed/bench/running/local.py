@@ -7,7 +7,6 @@ once.
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Collection, Mapping, Sequence
@@ -22,15 +21,9 @@ from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.watcher import Watcher
 from splatseed.process.interruption import Interruption, interruption
 
-__all__ = ["LocalExecutor", "cores", "slot_environment"]
+__all__ = ["LocalExecutor"]
 
 POLL_SECONDS = 0.2
-THREAD_VARIABLES = (
-    "NUMBA_NUM_THREADS",
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-)
 
 
 class LocalExecutor(Executor):
@@ -138,24 +131,3 @@ class LocalExecutor(Executor):
             child = Child(spec, work, target, self._options, environment)
             self._children[spec.key] = child
         return child
-
-
-def cores() -> int:
-    """How many cores this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on Windows and macOS
-        return os.cpu_count() or 1
-
-
-def slot_environment(threads: int, gpu: str = "") -> dict[str, str]:
-    """The variables that tell a process its share of the machine.
-
-    Args:
-        threads: Its threads.
-        gpu: Its GPU, as ``CUDA_VISIBLE_DEVICES`` names it; empty to leave the choice to PyTorch.
-    """
-    environment = dict.fromkeys(THREAD_VARIABLES, str(threads))
-    # Idle threads of one pool would take the cores from the other: see splatseed.cli.
-    environment["OMP_WAIT_POLICY"] = os.environ.get("OMP_WAIT_POLICY", "passive")
-    return {**environment, "CUDA_VISIBLE_DEVICES": gpu} if gpu else environment

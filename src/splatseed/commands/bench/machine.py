@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, TypeAlias
 
 from splatseed.bench.running.job import JobOptions
 from splatseed.bench.running.ledger import Ledger
-from splatseed.bench.running.local import LocalExecutor, cores, slot_environment
+from splatseed.bench.running.local import LocalExecutor
 from splatseed.bench.running.watcher import Watcher
 from splatseed.commands.bench.options import Options
 from splatseed.process.memory import check_memory
+from splatseed.process.threads import cores, slot_environment
 from splatseed.requirements import require
 from splatseed.train.settings import BYTES_EACH, Backend
 
 if TYPE_CHECKING:
-    from splatseed.bench.running.ray_cluster import Cluster
+    from splatseed.process.ray_tasks import Cluster
 
 __all__ = ["Machine", "check_machine", "open_machine"]
 
@@ -69,7 +70,7 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
     """
     require("torch", "gsplat")
     if options.executor == "ray":
-        from splatseed.bench.running.ray_cluster import ray_cluster  # noqa: PLC0415  (an extra)
+        from splatseed.process.ray_tasks import ray_cluster  # noqa: PLC0415  (an extra)
 
         with ray_cluster(options.address) as cluster:
             yield _ray_machine(options, backend, cluster)

@@ -15,8 +15,17 @@ import tyro
 from splatseed.commands.info.advice import run_advice
 from splatseed.commands.options import parse_options
 from splatseed.commands.upsample.cloud import CLOUD, Bringing, bring_clouds, settle_cloud
+from splatseed.commands.upsample.flags import (
+    budget_flag,
+    cover_flag,
+    default_flag,
+    depth_folder_flag,
+    memory_flag,
+    number_flag,
+)
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
 from splatseed.commands.upsample.start import check_start, write_start
+from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
 from splatseed.console import (
     OUT,
     StageClock,
@@ -30,6 +39,7 @@ from splatseed.io import WriteReport, find_depths, load_scene, write_scene
 from splatseed.io.output.staging import check_output
 from splatseed.literal import visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.process.memory import bytes_of
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import photographed
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
@@ -52,44 +62,6 @@ __all__ = ["Options", "parse", "run"]
 HELP_ALL = "--help-all"
 
 
-def _number(kind: type, default: str) -> Any:
-    """How an optional number appears in the help: as a number, with its default in words."""
-    return tyro.conf.arg(
-        constructor=kind,
-        metavar=kind.__name__.upper(),
-        help_behavior_hint=f"(default: {default})",
-    )
-
-
-def _cover() -> Any:
-    """The flag --cover; its field has another name, since the method cover has that one."""
-    return tyro.conf.arg(
-        name="cover",
-        constructor=int,
-        metavar="INT",
-        help_behavior_hint="(default: none; auto and cover do so anyway)",
-    )
-
-
-def _budget() -> Any:
-    """How a budget appears in the help."""
-    return tyro.conf.arg(
-        constructor=str, metavar="N|Xrho", help_behavior_hint="(default: no limit)"
-    )
-
-
-def _default(stands_in: str) -> Any:
-    """How an optional choice appears in the help: with its default in words."""
-    return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
-
-
-def _depth_folder() -> Any:
-    """The flag --depth; its field has another name, since the method depth has that one."""
-    return tyro.conf.arg(
-        name="depth", constructor=Path, metavar="DIR", help_behavior_hint="(default: the scene's)"
-    )
-
-
 @dataclass(frozen=True)
 class Options:
     """Upsample the points of a scene, ready for any 3DGS trainer."""
@@ -101,14 +73,14 @@ class Options:
     method: str = DEFAULT_METHOD
     """The method that makes new points; the flags of each are below. auto uses the
     photographs."""
-    ratio: Annotated[float | None, _number(float, "4, unless --num-points is given")] = None
+    ratio: Annotated[float | None, number_flag(float, "4, unless --num-points is given")] = None
     """Points in all, as a multiple of the originals, for methods that interpolate."""
-    num_points: Annotated[int | None, _number(int, "by the ratio")] = None
+    num_points: Annotated[int | None, number_flag(int, "by the ratio")] = None
     """Points in all, instead of a ratio."""
-    budget: Annotated[str | None, _budget()] = None
+    budget: Annotated[str | None, budget_flag()] = None
     """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph at
     full size."""
-    cover_cell: Annotated[int | None, _cover()] = None
+    cover_cell: Annotated[int | None, cover_flag()] = None
     """Side in pixels of the parts of the photographs that get a seed if no point falls in."""
     verify: bool = False
     """Check interpolated points against the photographs: slide them onto surfaces, drop those that
@@ -117,11 +89,11 @@ class Options:
     """The same seed gives the same bytes."""
     profile: Profile = "default"
     """Defaults of the method flags below: improved ones, or those of the paper's text."""
-    depth_maps: Annotated[Path | None, _depth_folder()] = None
+    depth_maps: Annotated[Path | None, depth_folder_flag()] = None
     """For --method depth: a folder of depth maps, in any layout that docs/formats.md lists."""
-    depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
+    depth_kind: Annotated[DepthKind | None, default_flag("what the folder says, else z")] = None
     """What their values are: planar depth, distance along the ray, or inverse depth."""
-    depth_scale: Annotated[float | None, _number(float, "what the folder says")] = None
+    depth_scale: Annotated[float | None, number_flag(float, "what the folder says")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
     align: bool = True
     """With --cloud, --align finds the transform to the scene's own points; for --method depth,
@@ -141,6 +113,16 @@ class Options:
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
     cloud_align: tyro.conf.Suppress[bool] = False
+    memory: Annotated[str | None, memory_flag()] = None
+    """Most memory. A cloud that takes more is worked on in tiles on disk, with the same result."""
+    jobs: Annotated[int | None, number_flag(int, "1; with Ray, as many as fit")] = None
+    """Tiles at a time, each in a process of its own."""
+    executor: Literal["local", "ray"] = "local"
+    """Who works on tiles: this machine, or a Ray cluster that shares its disk."""
+    address: Annotated[str | None, default_flag("a cluster on this machine")] = None
+    """The cluster's address, or auto on one of its nodes."""
+    tile_points: Annotated[int | None, number_flag(int, "by the memory")] = None
+    """Most points in a tile."""
     preview: bool = False
     """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's
     maps."""
@@ -155,6 +137,12 @@ class Options:
     """Copy the images instead of linking to them."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
+
+    @property
+    def tiling(self) -> Tiling:
+        """The options about memory and who works."""
+        memory = None if self.memory is None else bytes_of(self.memory)
+        return Tiling(memory, self.jobs, self.executor, self.address, self.tile_points)
 
     @property
     def bringing(self) -> Bringing:
@@ -217,6 +205,10 @@ def run(arguments: list[str]) -> None:
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=inputs)
     if options.gaussians is not None:
         check_start(options.gaussians, options.output, overwrite=options.overwrite)
+    source = find_source(options, methods)
+    if source is not None:
+        run_tiled(options, methods, source, _provenance)
+        return
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)

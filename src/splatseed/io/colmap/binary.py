@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int64, UInt8
+from jaxtyping import Float32, Int64, UInt8
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
@@ -22,6 +22,7 @@ from splatseed.io.binary import ByteReader
 from splatseed.io.colmap.model import (
     EXPORT_AGAIN,
     NO_POINT,
+    UNKNOWN_ERROR,
     by_camera_id,
     check_names,
     check_unique,
@@ -35,9 +36,11 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
 __all__ = [
+    "point_rows",
     "read_cameras",
     "read_images",
     "read_points3d",
+    "set_point_count",
     "write_cameras",
     "write_images",
     "write_points3d",
@@ -262,6 +265,32 @@ def write_points3d(path: Path, points: PointCloud, tracks: Tracks | None) -> Non
                 stop = min(start + _POINTS_AT_ONCE, num_tracked)
                 file.write(_joined_records(heads[start:stop], tracks, start, stop).data)
         file.write(heads[num_tracked:].view(np.uint8).data)  # a record without a track is its head
+
+
+def set_point_count(path: Path, count: int) -> None:
+    """Change the number of points that a ``points3D.bin`` promises, before more are appended.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    with path.open("r+b") as file:
+        file.write(_COUNT.pack(count))
+
+
+def point_rows(
+    first_id: int, xyz: Float32[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"]
+) -> memoryview:
+    """Records of points without a track, as ``write_points3d`` writes them.
+
+    Args:
+        first_id: The id of the first; the others follow.
+        xyz: Positions.
+        rgb: Colours.
+    """
+    heads = np.zeros(len(xyz), _POINT)
+    heads["id"] = np.arange(first_id, first_id + len(xyz))
+    heads["xyz"], heads["rgb"], heads["error"] = xyz, rgb, UNKNOWN_ERROR
+    return heads.view(np.uint8).data
 
 
 def _point_heads(points: PointCloud, tracks: Tracks | None) -> np.ndarray:

@@ -20,7 +20,7 @@ from splatseed.io.output.staging import MANIFEST
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
 from splatseed.scene import Scene, Tracks
 
-__all__ = ["recall_seeds"]
+__all__ = ["number_of_originals", "recall_seeds"]
 
 
 def recall_seeds(scene: Scene) -> Scene:
@@ -44,6 +44,16 @@ def _by_manifest(scene: Scene) -> UInt8[np.ndarray, " N"]:
     source = np.full(total, GENERATED, np.uint8)
     source[: _num_original(root / MANIFEST, total)] = ORIGINAL
     return source
+
+
+def number_of_originals(root: Path, total: int) -> int:
+    """How many of the points of a file are originals, by the manifest beside it.
+
+    Args:
+        root: The file's folder.
+        total: Points of the file.
+    """
+    return _num_original(root / MANIFEST, total)
 
 
 def _added_note(points: PointCloud) -> str:

@@ -14,6 +14,7 @@ import io
 import tokenize
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,14 @@ from numpy.lib import format as npy_format
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
 
-__all__ = ["SEEDS", "KnownOfSeeds", "read_seeds", "write_seeds"]
+__all__ = [
+    "SEEDS",
+    "KnownOfSeeds",
+    "PositionDigest",
+    "read_seeds",
+    "write_origins",
+    "write_seeds",
+]
 
 SEEDS = "seeds.npz"
 
@@ -38,6 +46,8 @@ _STORED: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {
 }
 """Shape of one point's value, and type in the file."""
 _DIGEST_BYTES = 16
+_RUN = 1 << 20
+"""Bytes that are compressed at once."""
 _MOST_HEADER = 4096
 _FAILURES = (
     *(zipfile.BadZipFile, zlib.error, tokenize.TokenError, NotImplementedError),
@@ -77,6 +87,46 @@ def write_seeds(folder: Path, points: PointCloud) -> None:
     np.savez_compressed(folder / SEEDS, digest=digest, **arrays)  # type: ignore[arg-type]  # savez takes arrays by name
 
 
+class PositionDigest:
+    """The fingerprint of positions that come a piece at a time."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.blake2b(digest_size=_DIGEST_BYTES)
+
+    def add(self, xyz: Float32[np.ndarray, "n 3"]) -> None:
+        """Take the next positions."""
+        self._hash.update(_plain_rows(xyz))
+
+    def bytes(self) -> bytes:
+        """The fingerprint of all of them."""
+        return self._hash.digest()
+
+
+def write_origins(folder: Path, digest: bytes, runs: Sequence[tuple[int, int]]) -> None:
+    """Write the file for points of which only the origin is known, too many for memory.
+
+    Args:
+        folder: The output.
+        digest: The fingerprint of all positions.
+        runs: Codes and how many points in a row have each.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    total = sum(count for _, count in runs)
+    header = {"descr": "|u1", "fortran_order": False}
+    if all(code in {ORIGINAL, GENERATED} for code, count in runs if count):
+        return  # as in write_seeds: the other files say as much
+    with zipfile.ZipFile(folder / SEEDS, "w", zipfile.ZIP_DEFLATED) as archive:
+        with archive.open("digest.npy", "w", force_zip64=True) as member:
+            npy_format.write_array(member, np.frombuffer(digest, np.uint8))
+        with archive.open("source.npy", "w", force_zip64=True) as member:
+            npy_format.write_array_header_1_0(member, {**header, "shape": (total,)})
+            for code, count in runs:
+                for first in range(0, count, _RUN):
+                    member.write(bytes([code]) * min(_RUN, count - first))
+
+
 def read_seeds(folder: Path, points: PointCloud) -> KnownOfSeeds:
     """What the file in a folder says about the points read from there; unchanged without a file.
 
@@ -111,8 +161,12 @@ def _known(points: PointCloud) -> dict[str, np.ndarray]:
 
 def _digest(xyz: Float32[np.ndarray, "N 3"]) -> bytes:
     """A fingerprint of positions, equal for both zeros and for any byte order."""
+    return hashlib.blake2b(_plain_rows(xyz), digest_size=_DIGEST_BYTES).digest()
+
+
+def _plain_rows(xyz: Float32[np.ndarray, "N 3"]) -> bytes:
     rows = np.ascontiguousarray(xyz + np.float32(0.0), "<f4")  # adding turns -0.0 into 0.0
-    return hashlib.blake2b(rows.tobytes(), digest_size=_DIGEST_BYTES).digest()
+    return rows.tobytes()
 
 
 def _members(archive: zipfile.ZipFile, num_points: int) -> dict[str, np.ndarray]:

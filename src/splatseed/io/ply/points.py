@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Float32, Shaped, UInt8
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.binary import ByteReader
@@ -22,7 +22,7 @@ from splatseed.io.ply.foreign import refuse_packed
 from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.pointcloud import PointCloud
 
-__all__ = ["read_ply", "write_ply"]
+__all__ = ["ply_header", "ply_rows", "read_ply", "write_ply"]
 
 _XYZ = ("x", "y", "z")
 _RGB_NAMES = (
@@ -72,19 +72,29 @@ def write_ply(path: Path, points: PointCloud) -> None:
     Raises:
         OSError: The file cannot be written.
     """
-    rows = np.zeros(len(points), _DROP_IN)
-    for i, name in enumerate(_XYZ):
-        rows[name] = points.xyz[:, i]
-    for i, name in enumerate(("red", "green", "blue")):
-        rows[name] = points.rgb[:, i]
+    with path.open("wb") as file:
+        file.write(ply_header(len(points)))
+        file.write(ply_rows(points.xyz, points.rgb))
+
+
+def ply_header(count: int) -> bytes:
+    """The header of a PLY as ``write_ply`` writes it, of ``count`` points."""
     kinds = {"f": "float", "u": "uchar"}
     properties = "".join(
         f"property {kinds[_DROP_IN[name].kind]} {name}\n" for name in _DROP_IN.names or ()
     )
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}"
-    with path.open("wb") as file:
-        file.write(f"{header}end_header\n".encode("ascii"))
-        file.write(rows.view(np.uint8).data)
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
+    return f"{header}end_header\n".encode("ascii")
+
+
+def ply_rows(xyz: Float32[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"]) -> memoryview:
+    """The body of such a PLY: some of its points."""
+    rows = np.zeros(len(xyz), _DROP_IN)
+    for i, name in enumerate(_XYZ):
+        rows[name] = xyz[:, i]
+    for i, name in enumerate(("red", "green", "blue")):
+        rows[name] = rgb[:, i]
+    return rows.view(np.uint8).data
 
 
 def _vertex_element(path: Path, header: Header) -> Element:

@@ -8,13 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float32, Float64
 
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints
 from splatseed.upsample.neighbors import prepare_scene
 
-__all__ = ["BoundingBox"]
+__all__ = ["BoundingBox", "in_box"]
 
 BLOCK = 1 << 18
 
@@ -41,9 +42,19 @@ class BoundingBox:
         xyz = rng.random((num_new, 3), dtype=np.float32)
         for start in range(0, num_new, BLOCK):  # sums in float64 without a whole float64 cloud
             part = xyz[start : start + BLOCK]
-            part[...] = low + cloud.center + part * (high - low)
+            part[...] = in_box(part, low, high, cloud.center)
         by_rank = np.empty_like(cloud.rgb)
         by_rank[cloud.rank] = cloud.rgb
         rgb = by_rank[rng.integers(0, len(cloud), num_new, dtype=np.int32)]
         progress("random", 1.0)
         return NewPoints(xyz, rgb)
+
+
+def in_box(
+    draws: Float32[np.ndarray, "m 3"],
+    low: Float64[np.ndarray, " 3"],
+    high: Float64[np.ndarray, " 3"],
+    center: Float64[np.ndarray, " 3"],
+) -> Float64[np.ndarray, "m 3"]:
+    """Positions in the world, from numbers from 0 to 1 and a box relative to the centroid."""
+    return np.asarray(low + center + draws * (high - low))

@@ -7,15 +7,15 @@ likewise. Promise: every new point lies between two originals.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress
-from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints
-from splatseed.upsample.nearest import NearestMethod
-from splatseed.upsample.neighbors import draw_bases, prepare_scene
+from splatseed.upsample.nearest import Draws, Known, NearestMethod
+from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
 __all__ = ["Linear"]
 
@@ -33,13 +33,19 @@ class Linear(NearestMethod):
         ((8, 3), True)
     """
 
-    def __call__(
-        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
+    num_neighbors: ClassVar[int] = 1
+
+    def place(
+        self,
+        cloud: PreparedCloud,
+        neighbors: Neighbors,
+        known: Known,  # noqa: ARG002  (the base's)
+        bases: Bases,
+        rng: Draws,
+        progress: Progress,
     ) -> NewPoints:
-        """Make ``num_new`` points."""
-        cloud = prepare_scene(scene, progress)
-        neighbors, weight = self.neighborhoods(cloud, 1)
-        bases = draw_bases(cloud, num_new, rng, weight=weight)
+        """Make the points of all bases."""
+        num_new = bases.total
         alpha = rng.random(num_new, dtype=np.float32)
         progress("linear", 0.0)
         new = NewPoints(np.empty((num_new, 3), np.float32), np.empty((num_new, 3), np.uint8))
@@ -61,7 +67,7 @@ class Linear(NearestMethod):
 @kernel
 def _blend(xyz, rgb, center, idx, start, count, alpha, out_xyz, out_rgb):  # type: ignore[no-untyped-def]  # Numba's types
     """P = a P1 + (1 - a) P2 and the same for colours, for all new points of all rows."""
-    for i in parallel_range(len(xyz)):
+    for i in parallel_range(len(count)):
         j = idx[i, 0]
         for m in range(start[i], start[i] + count[i]):
             a = np.float64(alpha[m])

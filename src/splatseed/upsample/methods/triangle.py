@@ -14,10 +14,9 @@ import numpy as np
 
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress
-from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints
-from splatseed.upsample.nearest import NearestMethod
-from splatseed.upsample.neighbors import draw_bases, prepare_scene
+from splatseed.upsample.nearest import Draws, Known, NearestMethod
+from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
 __all__ = ["Triangle"]
 
@@ -37,13 +36,19 @@ class Triangle(NearestMethod):
 
     min_points: ClassVar[int] = 3
 
-    def __call__(
-        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
+    num_neighbors: ClassVar[int] = 2
+
+    def place(
+        self,
+        cloud: PreparedCloud,
+        neighbors: Neighbors,
+        known: Known,  # noqa: ARG002  (the base's)
+        bases: Bases,
+        rng: Draws,
+        progress: Progress,
     ) -> NewPoints:
-        """Make ``num_new`` points."""
-        cloud = prepare_scene(scene, progress)
-        neighbors, weight = self.neighborhoods(cloud, 2)
-        bases = draw_bases(cloud, num_new, rng, weight=weight)
+        """Make the points of all bases."""
+        num_new = bases.total
         draws = rng.random((num_new, 2), dtype=np.float32)
         progress("triangle", 0.0)
         new = NewPoints(np.empty((num_new, 3), np.float32), np.empty((num_new, 3), np.uint8))
@@ -65,7 +70,7 @@ class Triangle(NearestMethod):
 @kernel
 def _blend(xyz, rgb, center, idx, start, count, draws, out_xyz, out_rgb):  # type: ignore[no-untyped-def]  # Numba's types
     """P = b0 P1 + b1 P2 + b2 P3 and the same for colours, for all new points of all rows."""
-    for i in parallel_range(len(xyz)):
+    for i in parallel_range(len(count)):
         p, q = idx[i, 0], idx[i, 1]
         for m in range(start[i], start[i] + count[i]):
             root = np.sqrt(np.float64(draws[m, 0]))

@@ -21,12 +21,11 @@ from jaxtyping import Float64
 
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress, blocks
-from splatseed.scene import Scene
 from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
 from splatseed.upsample.colors import interpolate_colors
 from splatseed.upsample.method import NewPoints, require
-from splatseed.upsample.nearest import NearestMethod
-from splatseed.upsample.neighbors import Neighbors, PreparedCloud, draw_bases, prepare_scene
+from splatseed.upsample.nearest import Draws, Known, NearestMethod
+from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.surfaces.frames import local_frames
 
 __all__ = ["Voronoi"]
@@ -72,26 +71,46 @@ class Voronoi(NearestMethod):
         """Cells in the bounding box enlarged by 10%, drawn by volume alone."""
         return cls(cells="box", reject_isolated=False)
 
-    def __call__(
-        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
-    ) -> NewPoints:
-        """Build every cell, draw by volume, and put ``num_new`` points in the cells' balls."""
-        cloud = prepare_scene(scene, progress)
-        neighbors, weight = self.neighborhoods(cloud, self.k)
+    @property
+    def num_neighbors(self) -> int:
+        """Neighbours that shape a cell."""
+        return self.k
+
+    @property
+    def whole(self) -> str:
+        """Cells in the bounding box are those of one diagram of all points."""
+        return "the cells of Qhull's diagram in the bounding box" if self.cells == "box" else ""
+
+    def weigh(
+        self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
+    ) -> tuple[Float64[np.ndarray, " n"], Known]:
+        """Weights by volume, and the cells' centres [n, 3] and radii [n]."""
+        weight, _ = super().weigh(cloud, neighbors, progress)
         neighbors = neighbors.nearest(self.k)
-        frames, _ = local_frames(cloud.xyz, neighbors.idx)
         if self.cells == "box":
             from splatseed.upsample.cells.box import box_cells  # noqa: PLC0415  (SciPy's Qhull)
 
             center, radius, volume = box_cells(cloud, progress)
-            weight = weight * volume
-        else:
-            center, radius, volume, _ = _clamped_cells(cloud, neighbors, frames, progress)
-            weight = weight * _relative(volume, neighbors, self.max_weight)
-        bases = draw_bases(cloud, num_new, rng, weight=weight)
-        xyz = rng.random((num_new, 3), dtype=np.float32)
+            return weight * volume, {"center": center, "radius": radius}
+        center, radius, volume, _ = _clamped_cells(cloud, neighbors, progress)
+        weight = weight * _relative(volume, neighbors, self.max_weight, cloud.num_own)
+        own = slice(cloud.num_own)
+        return weight, {"center": center[own], "radius": radius[own]}
+
+    def place(
+        self,
+        cloud: PreparedCloud,
+        neighbors: Neighbors,
+        known: Known,
+        bases: Bases,
+        rng: Draws,
+        progress: Progress,  # noqa: ARG002  (the base's)
+    ) -> NewPoints:
+        """Put the points of all bases in the balls of their cells."""
+        frames, _ = local_frames(cloud.xyz, neighbors.idx)
+        xyz = rng.random((bases.total, 3), dtype=np.float32)
         _place(
-            cloud.xyz, cloud.center, center, self.ball * radius, frames,
+            cloud.xyz, cloud.center, known["center"], self.ball * known["radius"], frames,
             bases.start, bases.count, xyz,
         )  # fmt: skip
         return NewPoints(
@@ -99,14 +118,10 @@ class Voronoi(NearestMethod):
         )
 
 
-def _clamped_cells(
-    cloud: PreparedCloud,
-    neighbors: Neighbors,
-    frames: Float64[np.ndarray, "n 3 3"],
-    progress: Progress,
-) -> Cells:
-    """The cells of all rows, block by block."""
-    n = len(cloud)
+def _clamped_cells(cloud: PreparedCloud, neighbors: Neighbors, progress: Progress) -> Cells:
+    """The cells of all rows with neighbours, block by block."""
+    frames, _ = local_frames(cloud.xyz, neighbors.idx)
+    n = len(neighbors.idx)
     cells = Cells(np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n, bool))
     for first, last in blocks(n, BLOCK, "voronoi", progress):
         build_cells(cloud.xyz, neighbors.idx, neighbors.distance, frames, first, last, cells)
@@ -114,17 +129,17 @@ def _clamped_cells(
 
 
 def _relative(
-    volume: Float64[np.ndarray, " n"], neighbors: Neighbors, cap: float
-) -> Float64[np.ndarray, " n"]:
-    """Each volume relative to the median of its neighbours', at most ``cap``, [n]."""
-    relative = np.empty_like(volume)
+    volume: Float64[np.ndarray, " n"], neighbors: Neighbors, cap: float, num_own: int
+) -> Float64[np.ndarray, " own"]:
+    """Each own volume relative to the median of its neighbours', at most ``cap``, [num_own]."""
+    relative = np.empty(num_own)
     _relative_volume(volume, neighbors.idx, float(cap), relative)
     return relative
 
 
 @kernel
 def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def]  # Numba's types
-    for i in parallel_range(len(volume)):
+    for i in parallel_range(len(relative)):
         around = np.sort(volume[idx[i]])
         median = 0.5 * (around[(around.size - 1) // 2] + around[around.size // 2])
         relative[i] = min(volume[i] / median, cap) if median > 0.0 else 1.0
@@ -133,7 +148,7 @@ def _relative_volume(volume, idx, cap, relative):  # type: ignore[no-untyped-def
 @kernel
 def _place(xyz, site_center, center, radius, frames, start, count, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Uniform in each cell's ball, replacing the draws in ``out``; directions turn with frames."""
-    for i in parallel_range(len(xyz)):
+    for i in parallel_range(len(count)):
         for m in range(start[i], start[i] + count[i]):
             r = radius[i] * np.float64(out[m, 0]) ** (1.0 / 3.0)
             n = 2.0 * np.float64(out[m, 1]) - 1.0

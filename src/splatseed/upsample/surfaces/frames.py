@@ -28,25 +28,25 @@ def world_frames(
 
 
 def local_frames(
-    xyz: Float64[np.ndarray, "n 3"], idx: Int32[np.ndarray, "n k"]
-) -> tuple[Float64[np.ndarray, "n 3 3"], Bool[np.ndarray, " n"]]:
-    """Principal axes of every row and its k neighbours.
+    xyz: Float64[np.ndarray, "n 3"], idx: Int32[np.ndarray, "m k"]
+) -> tuple[Float64[np.ndarray, "m 3 3"], Bool[np.ndarray, " m"]]:
+    """Principal axes of the first m rows and their k neighbours.
 
     Args:
         xyz: Positions, float64 [n, 3].
-        idx: Neighbour rows, int32 [n, k].
+        idx: Neighbour rows, int32 [m, k].
 
     Returns:
-        Frames [n, 3, 3] with rows e_u, e_v, e_n, and which rows are collinear, bool [n].
+        Frames [m, 3, 3] with rows e_u, e_v, e_n, and which rows are collinear, bool [m].
     """
-    frames, collinear = np.empty((len(xyz), 3, 3)), np.empty(len(xyz), bool)
+    frames, collinear = np.empty((len(idx), 3, 3)), np.empty(len(idx), bool)
     _frames(xyz, idx, frames, collinear, COLLINEAR)
     return frames, collinear
 
 
 @kernel
 def _frames(xyz, idx, frames, collinear, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
-    for i in parallel_range(len(xyz)):
+    for i in parallel_range(len(idx)):
         covariance = _covariance(xyz, i, idx[i])
         collinear[i] = _principal_axes(covariance, frames[i]) < tolerance
         _fix_signs(xyz, i, idx[i], frames[i])

@@ -10,11 +10,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.progress import Progress, blocks
-from splatseed.scene import Scene
 from splatseed.upsample.colors import interpolate_colors
 from splatseed.upsample.method import NewPoints, require
-from splatseed.upsample.nearest import NearestMethod
-from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud, draw_bases, prepare_scene
+from splatseed.upsample.nearest import Draws, Known, NearestMethod
+from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.surfaces.frames import local_frames, world_frames
 from splatseed.upsample.surfaces.patches import Patches, lift
 from splatseed.upsample.surfaces.placement import place_in_box, place_in_triangle, place_on_disc
@@ -58,29 +57,36 @@ class PatchMethod(NearestMethod, ABC):
     ) -> None:
         """Fit rows ``first:last`` and write S(u, v) of all their new points into ``out`` [M]."""
 
-    def __call__(
-        self, scene: Scene, num_new: int, rng: np.random.Generator, progress: Progress
+    @property
+    def num_neighbors(self) -> int:
+        """Neighbours in a fit."""
+        return self.k
+
+    def place(
+        self,
+        cloud: PreparedCloud,
+        neighbors: Neighbors,
+        known: Known,  # noqa: ARG002  (the base's)
+        bases: Bases,
+        rng: Draws,
+        progress: Progress,
     ) -> NewPoints:
-        """Fit a patch to every base and put ``num_new`` points on them."""
-        cloud = prepare_scene(scene, progress)
-        neighbors, weight = self.neighborhoods(cloud, self.k)
-        neighbors = neighbors.nearest(self.k)
-        bases = draw_bases(cloud, num_new, rng, weight=weight)
-        patches = self._place(cloud, neighbors, bases, rng)
-        height = np.empty(num_new, np.float32)
-        for first, last in blocks(len(cloud), BLOCK, self.name, progress):
+        """Fit a patch to every base and put its points on it."""
+        patches = self._patches(cloud, neighbors, bases, rng)
+        height = np.empty(bases.total, np.float32)
+        for first, last in blocks(cloud.num_own, BLOCK, self.name, progress):
             self.heights(patches, first, last, height)
         xyz = lift(patches, height, self.clamp)
         return NewPoints(xyz, interpolate_colors(cloud, neighbors, bases, xyz))
 
-    def _place(
-        self, cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, rng: np.random.Generator
+    def _patches(
+        self, cloud: PreparedCloud, neighbors: Neighbors, bases: Bases, rng: Draws
     ) -> Patches:
         """Put a patch on every row and choose where its new points go."""
         if self.frame == "local":
             frames, collinear = local_frames(cloud.xyz, neighbors.idx)
         else:
-            frames, collinear = world_frames(len(cloud))
+            frames, collinear = world_frames(len(neighbors.idx))
         if self.placement == "disc":
             uv = place_on_disc(neighbors, bases, collinear, self.disc_radius, rng)
         elif self.placement == "triangle":

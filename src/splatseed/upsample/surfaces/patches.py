@@ -64,7 +64,7 @@ def lift(
 @kernel
 def _lift(xyz, center, idx, frames, start, count, uv, height, margin, out):  # type: ignore[no-untyped-def]  # Numba's types
     """Compute p + u e_u + v e_v + clamp(z) e_n for all new points of all rows."""
-    for i in parallel_range(len(xyz)):
+    for i in parallel_range(len(count)):
         if count[i] > 0:
             e_u, e_v, e_n = frames[i, 0], frames[i, 1], frames[i, 2]
             low, high = _height_range(xyz, i, idx[i], e_n)

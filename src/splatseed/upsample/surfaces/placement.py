@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from splatseed.kernels.jit import kernel, parallel_range
+from splatseed.upsample.nearest import Draws
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.surfaces.frames import coordinate
 
@@ -25,7 +26,7 @@ def place_on_disc(
     bases: Bases,
     collinear: Bool[np.ndarray, " n"],
     radius: float,
-    rng: np.random.Generator,
+    rng: Draws,
 ) -> Float32[np.ndarray, "M 2"]:
     """Uniform in the disc of ``radius`` times the base point's spacing."""
     uv = rng.random((bases.total, 2), dtype=np.float32)
@@ -38,7 +39,7 @@ def place_in_triangle(
     neighbors: Neighbors,
     bases: Bases,
     frames: Float64[np.ndarray, "n 3 3"],
-    rng: np.random.Generator,
+    rng: Draws,
 ) -> Float32[np.ndarray, "M 2"]:
     """Uniform in the triangle of the base and two of its 8 nearest, drawn at random."""
     draws = rng.random((bases.total, 3), dtype=np.float32)
@@ -53,7 +54,7 @@ def place_in_box(
     neighbors: Neighbors,
     bases: Bases,
     frames: Float64[np.ndarray, "n 3 3"],
-    rng: np.random.Generator,
+    rng: Draws,
 ) -> Float32[np.ndarray, "M 2"]:
     """Uniform in the bounding box of the neighbourhood along e_u and e_v (the paper's text)."""
     uv = rng.random((bases.total, 2), dtype=np.float32)
@@ -78,7 +79,7 @@ def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def] 
 def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-untyped-def]  # Numba's types
     """The square-root map on the triangle of the base and a random pair of its neighbours."""
     pairs = idx.shape[1] * (idx.shape[1] - 1) // 2
-    for i in parallel_range(len(xyz)):
+    for i in parallel_range(len(idx)):
         for m in range(start[i], start[i] + count[i]):
             pick = min(int(draws[m, 2] * pairs), pairs - 1)
             second = int((1.0 + math.sqrt(1.0 + 8.0 * pick)) / 2.0)
@@ -94,7 +95,7 @@ def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-unt
 @kernel
 def _box(xyz, idx, frames, start, count, uv):  # type: ignore[no-untyped-def]  # Numba's types
     """Stretch the draws in ``uv`` over the neighbourhood's bounding box."""
-    for i in parallel_range(len(xyz)):
+    for i in parallel_range(len(idx)):
         for axis in range(2):
             low = high = 0.0
             for j in idx[i]:

@@ -1,0 +1,62 @@
+"""How the options of ``splatseed upsample`` appear in its help."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+__all__ = [
+    "budget_flag",
+    "cover_flag",
+    "default_flag",
+    "depth_folder_flag",
+    "memory_flag",
+    "number_flag",
+]
+
+
+def number_flag(kind: type, default: str) -> Any:
+    """How an optional number appears in the help: as a number, with its default in words."""
+    return tyro.conf.arg(
+        constructor=kind,
+        metavar=kind.__name__.upper(),
+        help_behavior_hint=f"(default: {default})",
+    )
+
+
+def cover_flag() -> Any:
+    """The flag --cover; its field has another name, since the method cover has that one."""
+    return tyro.conf.arg(
+        name="cover",
+        constructor=int,
+        metavar="INT",
+        help_behavior_hint="(default: none; auto and cover do so anyway)",
+    )
+
+
+def budget_flag() -> Any:
+    """How a budget appears in the help."""
+    return tyro.conf.arg(
+        constructor=str, metavar="N|Xrho", help_behavior_hint="(default: no limit)"
+    )
+
+
+def memory_flag() -> Any:
+    """How an amount of memory appears in the help."""
+    return tyro.conf.arg(
+        constructor=str, metavar="BYTES|4G", help_behavior_hint="(default: what is free)"
+    )
+
+
+def default_flag(stands_in: str) -> Any:
+    """How an optional choice appears in the help: with its default in words."""
+    return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
+
+
+def depth_folder_flag() -> Any:
+    """The flag --depth; its field has another name, since the method depth has that one."""
+    return tyro.conf.arg(
+        name="depth", constructor=Path, metavar="DIR", help_behavior_hint="(default: the scene's)"
+    )

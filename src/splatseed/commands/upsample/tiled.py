@@ -1,0 +1,331 @@
+"""``splatseed upsample`` of clouds larger than memory: tile by tile, in processes, on a cluster."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from splatseed.console import (
+    ERR,
+    OUT,
+    StageClock,
+    print_commands,
+    print_note,
+    print_pairs,
+    stage_display,
+)
+from splatseed.errors import OutputError, ParameterError
+from splatseed.io import WriteReport, load_scene, write_scene
+from splatseed.io.clouds import open_cloud
+from splatseed.io.colmap.scene import find_model
+from splatseed.io.output.point_stream import PointStream
+from splatseed.literal import visible
+from splatseed.pointcloud import PointCloud
+from splatseed.process.memory import free_memory
+from splatseed.progress import Progress
+from splatseed.scene import Scene
+from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for
+from splatseed.upsample import BYTES_EACH, Upsampler, planned_size
+from splatseed.upsample.registry import source_code
+
+if TYPE_CHECKING:
+    from splatseed.commands.upsample.command import Options
+    from splatseed.process.tasks import Tasks
+    from splatseed.tiles import Source, Tiled, TilePlan
+
+__all__ = ["Tiling", "find_source", "run_tiled"]
+
+CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz", ".glb")
+"""Files of points that only ``open_cloud`` reads."""
+PROCESS, PER_POINT, PER_NEIGHBOR = 300 << 20, 120, 20
+"""Bytes that the process takes, a cloud in memory for each original, and for each neighbour."""
+WHOLE = ("budget", "cover_cell", "verify", "preview", "gaussians", "depth_maps", "cloud_files")
+"""Options that need all points in memory."""
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """The options about memory and who works.
+
+    Args:
+        memory: Most bytes of memory, if the user says so.
+        jobs: Tiles at a time; None for one, or on a cluster as many as fit.
+        executor: Who works on them.
+        address: The cluster's address.
+        tile_points: Most points in a tile, if the user says so.
+    """
+
+    memory: int | None
+    jobs: int | None
+    executor: Literal["local", "ray"]
+    address: str | None
+    tile_points: int | None
+
+    @property
+    def asked(self) -> bool:
+        """Whether the options ask for tiles, whatever the memory."""
+        return self.executor == "ray" or (self.jobs or 1) > 1 or self.tile_points is not None
+
+    @property
+    def bound(self) -> int | None:
+        """The memory that may be used; None if neither user nor system says."""
+        known = [each for each in (self.memory, free_memory()) if each is not None]
+        return min(known, default=None)
+
+
+def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | None:
+    """What to cut into tiles; None if all fits into memory.
+
+    Raises:
+        SceneNotFoundError: There is no scene.
+        SceneFormatError: It is not what its name says.
+        OutputError: It has attributes that tiles do not.
+    """
+    tiling, path = options.tiling, options.scene
+    if path.is_dir() and not tiling.asked and tiling.memory is None:
+        return None
+    from splatseed.tiles import FileSource, SceneSource  # noqa: PLC0415  (Numba)
+
+    if path.is_file() and path.suffix.lower() in CLOUDS and find_model(path.parent) is None:
+        return FileSource(open_cloud(path))
+    method = methods[options.method]
+    if path.is_file() and path.suffix.lower() == ".ply":
+        file = FileSource(open_cloud(path))
+        return file if tiling.asked or _is_large(options, method, file.count or 0) else None
+    if not tiling.asked and tiling.memory is None:  # a file that holds no cloud alone
+        return None
+    scene = load_scene(path)
+    scene = scene.replace(points=scene.points.originals)
+    large = tiling.asked or _is_large(options, method, len(scene.points))
+    return SceneSource(scene) if large else None
+
+
+def _is_large(options: Options, method: Upsampler, count: int) -> bool:
+    """Whether the whole cloud takes more memory than it may."""
+    from splatseed.upsample.nearest import NearestMethod  # noqa: PLC0415  (SciPy, Numba)
+
+    total = planned_size(count, options.ratio, options.num_points)
+    neighbors = method.num_queried if isinstance(method, NearestMethod) else 16
+    needed = PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
+    bound = options.tiling.bound
+    return bound is not None and needed > bound
+
+
+def run_tiled(
+    options: Options,
+    methods: Mapping[str, Upsampler],
+    source: Source,
+    provenance: Callable[[Options, Upsampler], dict[str, object]],
+) -> None:
+    """Upsample a cloud tile by tile, write it, and say so.
+
+    Args:
+        options: The command's options.
+        methods: All methods with their parameters.
+        source: The cloud.
+        provenance: What ``splatseed.json`` is to say, from the options and the method.
+
+    Raises:
+        ParameterError: An option or the method needs all points in memory, or the memory is not
+            enough for tiles.
+        OutputError: The disk is too small, or an earlier run's folder belongs to another command.
+    """
+    from splatseed.tiles import (  # noqa: PLC0415  (Numba)
+        Request,
+        SceneSource,
+        check_disk,
+        check_tileable,
+        open_work,
+        work_path,
+    )
+
+    if options.method == DEFAULT_METHOD:
+        scene = source.scene if isinstance(source, SceneSource) else PointCloud.empty()
+        options = replace(options, method=str(method_for(scene, note=print_note)))
+    method = methods[options.method]
+    _check_options(options, source)
+    check_tileable(options.method, method)
+    request = Request(options.method, method, options.ratio, options.num_points, options.seed)
+    path, clock = work_path(options.output), StageClock()
+    with _tasks(options.tiling) as tasks:
+        plan = _plan(options, method, source, tasks.processes)
+        check_disk(path, plan.disk, _size_of(path))
+        with _kept(path), open_work(path, request.job(source)) as (work, resumed):
+            _announce(options, source, plan, tasks, path if resumed else None)
+            with stage_display(clock, remaining=True):
+                from splatseed.tiles import make_tiled  # noqa: PLC0415  (Numba)
+
+                tiled = make_tiled(work, source, request, plan, tasks, clock)
+                report = _write(options, source, tiled, clock, provenance(options, method))
+    shutil.rmtree(path)
+    _summarise(options, tiled, report, clock.seconds())
+
+
+def _check_options(options: Options, source: Source) -> None:
+    from splatseed.tiles import SceneSource  # noqa: PLC0415  (Numba)
+
+    given = [name for name in WHOLE if getattr(options, name)]
+    if given:
+        flag = {"cover_cell": "cover", "depth_maps": "depth", "cloud_files": "cloud"}
+        names = ", ".join(f"--{flag.get(name, name)}" for name in given)
+        raise ParameterError(
+            "no option that needs all points in memory while a cloud is worked on in tiles",
+            found=names,
+            fix=f"Leave out {names}, or give it more memory.",
+        )
+    scene = source.scene if isinstance(source, SceneSource) else None
+    read = scene.source.format if scene is not None and scene.source is not None else "ply"
+    if options.format == "transforms" and read != "transforms":
+        raise ParameterError(
+            "--format colmap or auto for a cloud in tiles, whose points are not turned",
+            found="transforms",
+            fix="Leave --format out.",
+        )
+
+
+@contextmanager
+def _tasks(tiling: Tiling) -> Iterator[Tasks]:
+    """Who works on tiles, while the block runs."""
+    from splatseed.process import tasks  # noqa: PLC0415  (processes)
+    from splatseed.process.ray_tasks import ray_cluster  # noqa: PLC0415  (an extra)
+    from splatseed.process.threads import cores  # noqa: PLC0415
+
+    if tiling.executor == "ray":
+        with ray_cluster(tiling.address):
+            yield tasks.RayTasks(1, tiling.jobs)
+    elif (tiling.jobs or 1) > 1:
+        jobs = tiling.jobs or 1
+        yield tasks.ProcessTasks(jobs, max(1, cores() // jobs))
+    else:
+        yield tasks.HereTasks()
+
+
+def _plan(options: Options, method: Upsampler, source: Source, processes: int) -> TilePlan:
+    from splatseed.tiles import plan_tiles  # noqa: PLC0415  (Numba)
+
+    count = source.count
+    new = None
+    if count is not None:
+        new = planned_size(count, options.ratio, options.num_points) - count
+    tiling = options.tiling
+    memory = tiling.bound or 4 << 30
+    if tiling.executor == "ray" and tiling.memory is not None:
+        memory = tiling.memory  # of each task, wherever it runs
+    return plan_tiles(
+        method, count, new, memory, processes=processes, tile_points=tiling.tile_points
+    )
+
+
+def _announce(
+    options: Options,
+    source: Source,
+    plan: TilePlan,
+    tasks: Tasks,
+    resumed: Path | None,
+) -> None:
+    """Print what will be done, and what it takes."""
+    count = "unknown" if source.count is None else f"{source.count:,}"
+    OUT.print(
+        f"{visible(options.scene)} ({count} points)\n  -> {options.method}"
+        f" ({options.profile}), in {plan.words}\n  -> {visible(options.output)}"
+        f" (seed {options.seed}, {tasks.words})",
+        soft_wrap=True,
+    )
+    if resumed is not None:
+        done = {name: len(list((resumed / name).glob("*[0-9]"))) for name in ("weighed", "made")}
+        print_note(
+            f"Going on with the tiles in {visible(resumed)}:"
+            f" {sum(done.values()):,} of them were weighed, {done['made']:,} are done."
+        )
+
+
+def _write(
+    options: Options,
+    source: Source,
+    tiled: Tiled,
+    progress: Progress,
+    provenance: Mapping[str, object],
+) -> WriteReport:
+    """Write the scene, its points a piece at a time."""
+    from splatseed.tiles import FileSource, SceneSource  # noqa: PLC0415  (Numba)
+
+    code, made = source_code(options.method), {"tiles": tiled.tiles, "origin": tiled.origin}
+    about: dict[str, Any] = {**provenance, **made}
+    repeated = len(tiled.repeated)
+    num_new = tiled.num_new - repeated
+    if isinstance(source, SceneSource):
+        scene = source.scene
+        stream = PointStream(
+            0, num_new, code, lambda: tiled.new_distinct(progress), (), (0, repeated)
+        )
+    else:
+        assert isinstance(source, FileSource)  # noqa: S101  (the two there are)
+        file = source.cloud.path
+        scene, about = Scene(PointCloud.empty()), {**about, "source": str(file)}
+        stream = PointStream(
+            tiled.num_original, num_new, code,
+            lambda: chain(tiled.originals(progress), tiled.new_distinct(progress)),
+            (file,), (tiled.non_finite, tiled.repeats + repeated),
+        )  # fmt: skip
+    return write_scene(
+        scene, options.output, format=options.format, overwrite=options.overwrite,
+        copy_images=options.copy_images, provenance=about, stream=stream,
+    )  # fmt: skip
+
+
+def _summarise(
+    options: Options, tiled: Tiled, report: WriteReport, seconds: Mapping[str, float]
+) -> None:
+    """Print the final table."""
+    name = options.method
+    new = report.num_points - tiled.num_original
+    made = f"{tiled.num_original:,} original, {new:,} {name}"
+    rows = [
+        ("points in", f"{tiled.num_original:,}"),
+        ("points out", f"{report.num_points:,} ({made})"),
+        ("tiles", f"{tiled.tiles:,}"),
+        ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
+        ("output", str(options.output)),
+    ]
+    if report.dropped_nonfinite + report.dropped_duplicates:
+        left_out = f"{report.dropped_nonfinite:,} not finite"
+        rows.insert(2, ("left out", f"{left_out}, {report.dropped_duplicates:,} duplicate"))
+    print_pairs("splatseed upsample", rows)
+    if any(tiled.origin):
+        away = ", ".join(f"{each:,.0f}" for each in tiled.origin)
+        print_note(
+            f"The cloud lies far from zero, where float32 is coarse: ({away}) was subtracted from"
+            " all points. splatseed.json has it as origin."
+        )
+    for note in report.notes:
+        print_note(note)
+    if not np.any(tiled.origin) and options.scene.is_dir():
+        print_commands("train it with", [("", f"splatseed train {options.output} -o RUN")])
+
+
+@contextmanager
+def _kept(path: Path) -> Iterator[None]:
+    """Say that what is done is kept, if the block is interrupted or the disk is full."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        ERR.print(f"\nFinished tiles are kept in {path}; the same command goes on from there.")
+        raise
+    except OSError as error:
+        raise OutputError(
+            f"{path} to be written",
+            found=error.strerror or type(error).__name__,
+            fix="Free some space and run the same command: it goes on from the finished tiles.",
+        ) from error
+
+
+def _size_of(path: Path) -> int:
+    """Bytes of an earlier run's folder."""
+    return sum(each.stat().st_size for each in path.rglob("*") if each.is_file())

@@ -1,0 +1,110 @@
+"""``splatseed upsample`` in tiles: the files of the same command in memory, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from splatseed.io.ply.points import write_ply
+from splatseed.pointcloud import PointCloud
+from splatseed.process.memory import bytes_of
+
+
+def files(folder):
+    """All files but the manifest, which says how many tiles there were."""
+    return {
+        path.relative_to(folder): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != "splatseed.json"
+    }
+
+
+@pytest.fixture
+def cloud(tmp_path):
+    """A PLY of 300 points, one of them twice and one nowhere."""
+    rng = np.random.default_rng(0)
+    xyz = rng.random((302, 3)).astype(np.float32)
+    xyz[300], xyz[301] = xyz[7], np.nan
+    path = tmp_path / "cloud.ply"
+    write_ply(path, PointCloud(xyz, rng.integers(0, 256, (302, 3), np.uint8)))
+    return path
+
+
+def test_a_bare_cloud_in_tiles_gives_the_files_of_memory(cloud, tmp_path, splatseed):
+    words = ("upsample", cloud, "--method", "linear", "--ratio", 3)
+    assert splatseed(*words, "-o", tmp_path / "whole").code == 0
+    run = splatseed(*words, "-o", tmp_path / "out", "--tile-points", 120)
+    assert (run.code, run.err) == (0, "")
+    assert "in about 3 tiles of at most 120 points, at most " in run.out
+    assert "900 (300 original, 600 linear)" in run.out
+    assert "1 not finite, 1 duplicate" in run.out
+    assert files(tmp_path / "out") == files(tmp_path / "whole")
+    told = json.loads((tmp_path / "out" / "splatseed.json").read_text())
+    assert (told["num_points"], told["num_original"]) == (900, 300)
+    assert (told["tiles"], told["source"]) == (3, str(cloud))
+    assert not (tmp_path / "out.tiles").exists()
+
+
+def test_new_points_that_fall_together_are_left_out_as_in_memory(tmp_path, splatseed):
+    xyz = np.random.default_rng(0).random((300, 3)) * 1e-3 + 4096  # float32 has 3 values an axis
+    path = tmp_path / "coarse.ply"
+    write_ply(path, PointCloud(xyz, np.zeros((300, 3), np.uint8)))
+    words = ("upsample", path, "--method", "linear", "--ratio", 9)
+    whole = splatseed(*words, "-o", tmp_path / "whole")
+    run = splatseed(*words, "-o", tmp_path / "out", "--tile-points", 9)
+    assert (run.code, whole.code) == (0, 0)
+    assert files(tmp_path / "out") == files(tmp_path / "whole")
+
+
+def test_a_scene_in_tiles_gives_the_files_of_memory(room, tmp_path, splatseed):
+    words = ("upsample", room, "--method", "linear", "--ratio", 2, "--copy-images")
+    assert splatseed(*words, "-o", tmp_path / "whole").code == 0
+    run = splatseed(*words, "-o", tmp_path / "out", "--tile-points", 2000)
+    assert (run.code, run.err) == (0, "")
+    assert files(tmp_path / "out") == files(tmp_path / "whole")
+
+
+def test_points_from_an_output_are_not_taken_for_originals(cloud, tmp_path, splatseed):
+    words = ("--method", "linear", "--tile-points", 200)
+    first, again = tmp_path / "first", tmp_path / "again"
+    assert splatseed("upsample", cloud, "-o", first, "--ratio", 2, *words).code == 0
+    ply = first / "sparse/0/points3D.ply"
+    (first / "splatseed.json").rename(ply.with_name("splatseed.json"))
+    run = splatseed("upsample", ply, "-o", again, "--ratio", 3, *words)
+    assert "900 (300 original, 600 linear)" in run.out
+
+
+def test_a_survey_far_from_zero_is_moved_and_says_so(tmp_path, splatseed):
+    xyz = np.random.default_rng(0).random((200, 3)) * 20 + [564000.25, 5932000.5, 80]
+    np.savetxt(tmp_path / "survey.xyz", xyz, fmt="%.4f")
+    out = tmp_path / "out"
+    run = splatseed("upsample", tmp_path / "survey.xyz", "-o", out, "--method", "linear")
+    assert (run.code, run.err) == (0, "")
+    assert "(564,010, 5,932,010, 90) was subtracted" in run.out
+    assert json.loads((out / "splatseed.json").read_text())["origin"] == [564010, 5932010, 90]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--memory", "100M"), r"at least .* MB of memory for 1 process; found 100 MB"),
+        (("--memory", "much"), r"an amount of memory such as 4G or 500M; found 'much'"),
+        (("--tile-points", "99", "--budget", "50"), r"no option that needs all .* found --budget"),
+        (("--tile-points", "99", "--method", "stereo"), r"a method that works tile by tile"),
+    ],
+)
+def test_what_cannot_be_is_one_line(words, told, cloud, tmp_path, splatseed):
+    import re
+
+    method = () if "--method" in words else ("--method", "linear")
+    run = splatseed("upsample", cloud, "-o", tmp_path / "out", *method, *words)
+    assert run.code == 2
+    assert re.search(told, run.err.replace("\n", " "))
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_amounts_of_memory():
+    assert bytes_of("4G") == bytes_of("4GB") == bytes_of(" 4gib ") == 4 << 30
+    assert (bytes_of("500M"), bytes_of("123"), bytes_of("1.5K")) == (500 << 20, 123, 1536)

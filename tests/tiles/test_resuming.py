@@ -1,0 +1,174 @@
+"""Kills, full disks, damaged notes, changed inputs, too little memory."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from splatseed.errors import OutputError, ParameterError, PointCloudError
+from splatseed.pointcloud import PointCloud
+from splatseed.process.tasks import HereTasks
+from splatseed.tiles import check_disk, check_tileable, plan_tiles, run
+from splatseed.tiles.reading import origin_of
+from splatseed.upsample import configure, upsample
+
+LINEAR = configure("linear")
+
+
+def kill_after(monkeypatch, name, number):
+    """Let a step of ``run`` be done so often, and then be killed in its middle."""
+    done, step = [], getattr(run, name)
+
+    def killed(*arguments):
+        if len(done) == number:
+            raise KeyboardInterrupt
+        done.append(arguments)
+        return step(*arguments)
+
+    monkeypatch.setattr(run, name, killed)
+    return done
+
+
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [("read_rows", 0), ("split", 0), ("weigh", 2), ("draw", 0), ("place", 1), ("place", 3)],
+)
+def test_a_kill_loses_one_step(name, number, sheet, tiles, monkeypatch):
+    with monkeypatch.context() as context:
+        kill_after(context, name, number)
+        with pytest.raises(KeyboardInterrupt):
+            tiles(sheet, "linear", LINEAR, most=130)
+    again = kill_after(monkeypatch, name, 10**6)
+    xyz, _ = tiles(sheet, "linear", LINEAR, most=130)
+    assert tiles.resumed
+    per_tile = name in {"weigh", "place"}
+    assert len(again) == (tiles.tiled.tiles - number if per_tile else 1)
+    xyz, _ = tiles(sheet, "linear", LINEAR, most=130)  # killed while the output was written
+    expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
+    np.testing.assert_array_equal(xyz, expected.xyz)
+
+
+@pytest.mark.parametrize("step", ["tile_of_row", "tiles", "weighed/000001", "drawn", "made/000002"])
+def test_what_a_kill_leaves_half_written_is_written_again(step, sheet, tiles, monkeypatch):
+    complete = run.WorkFolder.complete
+
+    def killed(self, name):
+        if name == step:
+            raise KeyboardInterrupt
+        complete(self, name)
+
+    with monkeypatch.context() as context:
+        context.setattr(run.WorkFolder, "complete", killed)
+        with pytest.raises(KeyboardInterrupt):
+            tiles(sheet, "linear", LINEAR, most=130)
+    assert (tiles.path / f"{step}.partial").exists()
+    xyz, _ = tiles(sheet, "linear", LINEAR, most=130)
+    expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
+    np.testing.assert_array_equal(xyz, expected.xyz)
+
+
+def test_a_full_disk_leaves_what_is_done(sheet, tiles, monkeypatch):
+    save = run.WorkFolder.save
+    left = [2]
+
+    def full(self, name, arrays):
+        if name.startswith("weighed"):
+            if not left[0]:
+                raise OSError(28, "No space left on device")
+            left[0] -= 1
+        save(self, name, arrays)
+
+    with monkeypatch.context() as context:
+        context.setattr(run.WorkFolder, "save", full)
+        with pytest.raises(OSError, match="No space"):
+            tiles(sheet, "linear", LINEAR, most=130)
+    assert len(list((tiles.path / "weighed").iterdir())) == 2
+    tiles(sheet, "linear", LINEAR, most=130)
+    assert tiles.resumed
+
+
+def test_another_command_or_a_changed_input_is_refused(sheet, tiles):
+    tiles(sheet, "linear", LINEAR)
+    with pytest.raises(OutputError, match=r"the same seed .*\(0\); found 1\. Repeat the earlier"):
+        tiles(sheet, "linear", LINEAR, seed=1)
+    with pytest.raises(OutputError, match="the same parameters"):
+        tiles(sheet, "linear", dataclasses.replace(LINEAR, reject_isolated=False))
+    moved = PointCloud(sheet.xyz + 1, sheet.rgb)
+    with pytest.raises(OutputError, match=r"the same input .* Repeat the earlier command"):
+        tiles(moved, "linear", LINEAR)
+
+
+def test_less_memory_than_the_tiles_were_cut_for_is_refused(sheet, tiles):
+    tiles(sheet, "linear", LINEAR, most=130)
+    with pytest.raises(ParameterError, match=r"tiles of 130 points.*found enough for 60\. Pass"):
+        tiles(sheet, "linear", LINEAR, most=60)
+
+
+def test_a_damaged_note_is_one_line(sheet, tiles):
+    tiles(sheet, "linear", LINEAR)
+    note = tiles.path / "job.json"
+    note.write_text(note.read_text()[:40])
+    with pytest.raises(OutputError, match=r"found a damaged file\. Remove the folder .*OUT.tiles"):
+        tiles(sheet, "linear", LINEAR)
+
+
+def test_a_foreign_folder_is_left_alone(sheet, tiles):
+    tiles.path.mkdir()
+    (tiles.path / "holiday.jpg").touch()
+    with pytest.raises(OutputError, match=r"found a folder without job\.json"):
+        tiles(sheet, "linear", LINEAR)
+    assert [each.name for each in tiles.path.iterdir()] == ["holiday.jpg"]
+
+
+def test_nothing_finite_and_too_few_are_refused(tiles):
+    nothing = PointCloud(np.full((5, 3), np.nan), np.zeros((5, 3), np.uint8))
+    with pytest.raises(PointCloudError, match="none of them finite"):
+        tiles(nothing, "linear", LINEAR)
+    tiles.path = tiles.path.with_name("other")
+    with pytest.raises(PointCloudError, match="at least 3 distinct"):
+        tiles(PointCloud(np.eye(3)[:2], nothing.rgb[:2]), "triangle", configure("triangle"))
+
+
+def test_methods_of_the_whole_are_refused():
+    for name, method in (("auto", configure("auto")), ("voronoi", configure("voronoi", "paper"))):
+        with pytest.raises(ParameterError, match=r"tile by tile .* at once\. Choose one of these"):
+            check_tileable(name, method)
+    check_tileable("random", configure("random"))
+
+
+def test_too_little_memory_names_what_is_needed():
+    with pytest.raises(ParameterError, match=r"at least (.*) of memory .* --memory (.*)\.") as told:
+        plan_tiles(LINEAR, 10**8, 3 * 10**8, 100 << 20)
+    fix = told.value.fix.split("--memory ")[1].rstrip(".")
+    assert fix.endswith("M")
+    plan = plan_tiles(LINEAR, 10**8, 3 * 10**8, int(fix[:-1]) << 20)
+    assert plan.memory <= int(fix[:-1]) << 20
+    assert plan.tiles >= 10**8 / plan.tile_points
+
+
+def test_more_processes_share_the_memory():
+    one = plan_tiles(configure("mls"), 10**8, 10**8, 2 << 30)
+    three = plan_tiles(configure("mls"), 10**8, 10**8, 2 << 30, processes=3)
+    assert three.tile_points < one.tile_points
+    assert three.memory <= 2 << 30
+
+
+def test_a_small_disk_is_refused_beforehand(tmp_path):
+    with pytest.raises(OutputError, match=r"of free disk at .*; found .* Free some space"):
+        check_disk(tmp_path / "OUT.tiles", 1 << 60)
+    check_disk(tmp_path / "OUT.tiles", 1 << 60, there=1 << 60)
+
+
+def test_only_clouds_far_off_are_moved():
+    low, high = np.array([4e5, 5e6, 100.0]), np.array([4e5 + 50, 5e6 + 60, 130.0])
+    assert origin_of(low, high, exact=False).tolist() == [400025, 5000030, 115]
+    assert not origin_of(low, high, exact=True).any()  # float32 holds them as they are
+    assert not origin_of(low - low, high - low, exact=False).any()
+
+
+def test_notes_are_json(sheet, tiles):
+    tiles(sheet, "linear", LINEAR, tasks=HereTasks())
+    assert json.loads((tiles.path / "job.json").read_text())["method"] == "linear"

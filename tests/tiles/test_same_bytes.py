@@ -1,0 +1,159 @@
+"""Tiles give the bytes of the cloud in memory, wherever their borders fall."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra import numpy as arrays
+
+from splatseed.pointcloud import PointCloud
+from splatseed.process.tasks import ProcessTasks
+from splatseed.scene import Scene, Tracks
+from splatseed.tiles.cuts import cut_up
+from splatseed.tiles.stream import TileDraws, stream_state
+from splatseed.upsample import configure, neighbors, upsample
+from splatseed.upsample.trust import trusted_originals
+
+from .conftest import Tiles
+
+KINDS = [
+    *((name, "default") for name in ("linear", "triangle", "spline", "mls", "voronoi", "random")),
+    *((name, "paper") for name in ("linear", "spline", "mls")),
+]
+
+
+def assert_same(found, expected):
+    xyz, rgb = found
+    np.testing.assert_array_equal(xyz.view(np.uint32), expected.xyz.view(np.uint32))
+    np.testing.assert_array_equal(rgb, expected.rgb)
+
+
+def distinct(cloud):
+    return cloud.select(cloud.distinct)
+
+
+@pytest.mark.parametrize(("name", "profile"), KINDS)
+def test_every_method_gives_the_same_bytes(name, profile, sheet, tiles):
+    method = configure(name, profile)
+    found = tiles(sheet, name, method, most=130)
+    assert tiles.tiled.tiles >= 3
+    assert (tiles.tiled.non_finite, tiles.tiled.repeats) == (1, 30)
+    assert_same(found, upsample(distinct(sheet), method, ratio=3))
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    xyz=st.one_of(
+        arrays.arrays(np.float32, (60, 3), elements=st.integers(0, 4).map(np.float32)),  # ties
+        arrays.arrays(np.float32, (40, 3), elements=st.floats(-1, 1, width=32)),
+        arrays.arrays(np.float32, (50, 2), elements=st.floats(-1, 1, width=32)).map(
+            lambda flat: np.concatenate([flat, np.full((len(flat), 1), 7, np.float32)], axis=1)
+        ),
+    ),
+    most=st.integers(5, 45),
+    at_once=st.integers(7, 70),
+    seed=st.integers(0, 9),
+)
+def test_any_cloud_gives_the_same_bytes(xyz, most, at_once, seed):
+    cloud = PointCloud(xyz, np.arange(3 * len(xyz), dtype=np.uint8).reshape(-1, 3))
+    if cloud.distinct.sum() < 2:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        run = Tiles(Path(folder) / "W")
+        found = run(cloud, "linear", configure("linear"), most=most, at_once=at_once, seed=seed)
+    assert_same(found, upsample(distinct(cloud), "linear", ratio=3, seed=seed))
+
+
+def test_points_far_from_all_others_find_their_neighbors(tiles):
+    """Two clusters and a point alone, whose nearest lie beyond empty tiles and tiles' borders."""
+    rng = np.random.default_rng(1)
+    xyz = np.concatenate([rng.normal(0, 1, (60, 3)), rng.normal(100, 1, (60, 3)), [[40, 0, 9]]])
+    cloud = PointCloud(xyz.astype(np.float32), np.zeros((121, 3), np.uint8))
+    assert_same(tiles(cloud, "mls", configure("mls"), most=11), upsample(cloud, "mls", ratio=3))
+    assert tiles.tiled.tiles >= 11
+
+
+def test_draws_of_many_blocks_are_those_in_memory(sheet, tiles, monkeypatch):
+    monkeypatch.setattr(neighbors, "DRAW_BLOCK", 50)
+    assert_same(
+        tiles(sheet, "linear", configure("linear"), most=130),
+        upsample(distinct(sheet), "linear", ratio=3),
+    )
+
+
+def test_blocks_change_no_draw_of_a_cloud_within_one(sheet):
+    """What was drawn before there were blocks."""
+    cloud = neighbors.prepare(distinct(sheet))
+    weight = np.linspace(0, 1, len(cloud))
+    bases = neighbors.draw_bases(cloud, 999, np.random.default_rng(3), weight=weight[cloud.rank])
+    expected = np.random.default_rng(3).multinomial(999, weight / weight.sum())
+    np.testing.assert_array_equal(bases.count, expected[cloud.rank])
+
+
+def test_tracks_are_heeded(tiles):
+    rng = np.random.default_rng(2)
+    xyz = rng.random((200, 3)).astype(np.float32)
+    errors = np.where(np.arange(200) % 5 == 0, 9.0, 1.0)
+    ids = np.arange(200)
+    none = np.zeros(400, np.uint32)
+    tracks = Tracks(ids + 1, xyz.astype(np.float64), errors, np.arange(201) * 2, none, none)
+    scene = Scene(PointCloud(xyz, np.zeros((200, 3), np.uint8)), tracks=tracks)
+    assert not trusted_originals(scene).all()
+    assert_same(tiles(scene, "linear", configure("linear"), most=70),
+                upsample(scene, "linear", ratio=3))  # fmt: skip
+
+
+def dying(flag, function, *arguments):
+    """A task that ends its process the first time, as when memory is short."""
+    if not flag.exists():
+        flag.touch()
+        os._exit(9)
+    function(*arguments)
+
+
+class DyingTasks(ProcessTasks):
+    """Processes of which one is killed."""
+
+    def __init__(self, flag):
+        super().__init__(1, 1)
+        self.flag = flag
+
+    def run(self, function, calls, stage, progress):
+        super().run(dying, [(self.flag, function, *call) for call in calls], stage, progress)
+
+
+def test_processes_give_the_same_bytes_though_one_is_killed(sheet, tiles, tmp_path):
+    flag = tmp_path / "killed"
+    found = tiles(sheet, "linear", configure("linear"), most=250, tasks=DyingTasks(flag))
+    assert flag.exists()
+    assert_same(found, upsample(distinct(sheet), "linear", ratio=3))
+
+
+@pytest.mark.parametrize("columns", [None, 2, 3])
+def test_a_tile_draws_its_part_of_the_stream(columns):
+    rng = np.random.default_rng(5)
+    rng.multinomial(7, [0.5, 0.5])
+    state, shape = stream_state(rng), (301,) if columns is None else (301, columns)
+    first, second = (rng.random(shape, dtype=np.float32) for _ in range(2))
+    start, count = np.array([0, 4, 150, 299]), np.array([3, 1, 40, 2])
+    rows = np.concatenate([np.arange(s, s + c) for s, c in zip(start, count, strict=True)])
+    draws = TileDraws(state, 301, start, count)
+    for whole in (first, second):
+        np.testing.assert_array_equal(draws.random((46, *shape[1:]), np.float32), whole[rows])
+
+
+def test_every_point_is_in_one_tile_within_its_walls(rng):
+    xyz = rng.integers(0, 9, (3000, 3)).astype(np.float32)
+    cuts = cut_up(xyz, len(xyz), 40)
+    number = cuts.tiles_of(xyz)
+    low, high = np.stack(cuts.walls)[number].transpose(1, 0, 2)
+    assert ((low <= xyz) & (xyz < high)).all()
+    assert np.bincount(number, minlength=len(cuts)).max() <= 80
+    for each in range(len(cuts)):  # no point of another tile lies within the walls
+        inside = ((cuts.walls[each][0] <= xyz) & (xyz < cuts.walls[each][1])).all(axis=1)
+        np.testing.assert_array_equal(inside, number == each)
