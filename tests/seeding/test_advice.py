@@ -29,8 +29,8 @@ def test_room_is_filled_from_the_photographs():
     assert said.method == "auto"
     assert "3.5 times" in said.reasons[0]
     assert "40%" in said.reasons[1]
-    assert advise(FERN, most_seeds=7_000).method == AS_IT_IS
-    assert advise(FERN, most_seeds=7_000, room=1.1).method == "auto"
+    assert advise(FERN, most_seeds=6_500).method == AS_IT_IS
+    assert advise(FERN, most_seeds=6_500, room=1.0).method == "auto"
 
 
 def test_growth_needs_no_seeds_but_where_there_are_no_points():

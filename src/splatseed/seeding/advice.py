@@ -37,7 +37,7 @@ __all__ = [
 Layout: TypeAlias = Literal["facing one way", "around something", "through a place"]
 AS_IT_IS = "sfm"
 """The advice to leave the points as they are."""
-ROOM = 1.3
+ROOM = 1.1
 """Least room at which new points are worth making."""
 LOW_AGREEMENT = 0.15
 """Below this share of pixels with confirmed depth, stereo finds little."""
