@@ -1,8 +1,10 @@
 """All points in the order of the output: the originals in file order, then the new points.
 
 New points lie in the folders of their tiles, each tile's in order; a run of the output is put
-together from all tiles that have some of it. Promise: the order of the cloud in memory; at most
-``at_once`` points in memory.
+together from all tiles that have some of it. The method ``random`` has no tiles: in memory, the
+positions of all M new points are drawn first, three numbers each, then their colours; here one
+generator draws positions, and another, 3 M numbers ahead, colours. Promise: the order of the cloud
+in memory; at most ``at_once`` points in memory.
 """
 
 from __future__ import annotations
@@ -12,13 +14,14 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from splatseed.progress import Progress, blocks
+from splatseed.progress import Progress, blocks, silent
 from splatseed.tiles.reading import Rows
 from splatseed.tiles.steps import made_name
 from splatseed.tiles.store import TileStore
 from splatseed.tiles.work import WorkFolder
+from splatseed.upsample.methods.bounding_box import in_box
 
-__all__ = ["new_points", "originals"]
+__all__ = ["box_points", "new_points", "originals"]
 
 Piece = tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]
 
@@ -81,3 +84,37 @@ def _put(
     xyz[inside] = work.load(name, "xyz", mapped=True)[part]
     rgb[inside] = work.load(name, "rgb", mapped=True)[part]
     return done + len(inside)
+
+
+def box_points(
+    work: WorkFolder, num_new: int, seed: int, at_once: int, progress: Progress
+) -> Iterator[Piece]:
+    """New points in the bounding box, a piece at a time; all colours are held in memory.
+
+    Args:
+        work: The folder, in which the rows are split.
+        num_new: New points in all.
+        seed: The seed.
+        at_once: Points at a time.
+        progress: Told the stage.
+    """
+    store = TileStore(work)
+    colors = np.concatenate([rgb for _, rgb in originals(work, at_once, silent)])
+    low, high = np.nanmin(store.bounds[:, 0], axis=0), np.nanmax(store.bounds[:, 1], axis=0)
+    places, picks = np.random.default_rng(seed), _ahead(seed, 3 * num_new)
+    for first, last in blocks(num_new, at_once, "write", progress):
+        draws = places.random((last - first, 3), dtype=np.float32)
+        draws[...] = in_box(draws, low, high, store.center)
+        number = picks.integers(0, store.count, last - first, dtype=np.int32)
+        yield draws, colors[number]
+
+
+def _ahead(seed: int, floats: int) -> np.random.Generator:
+    """A generator after so many float32, of which every 64-bit number gives two."""
+    rng = np.random.default_rng(seed)
+    bits = rng.bit_generator
+    assert isinstance(bits, np.random.PCG64)  # noqa: S101  (NumPy's default)
+    bits.advance(floats // 2)
+    if floats % 2:
+        rng.random(dtype=np.float32)
+    return rng

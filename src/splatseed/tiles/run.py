@@ -17,8 +17,7 @@ import numpy as np
 from splatseed.errors import ParameterError
 from splatseed.process.tasks import Tasks
 from splatseed.progress import Progress
-from splatseed.tiles.assembly import Piece, new_points, originals
-from splatseed.tiles.box import box_points
+from splatseed.tiles.assembly import Piece, box_points, new_points, originals
 from splatseed.tiles.drawing import draw
 from splatseed.tiles.planning import TilePlan
 from splatseed.tiles.reading import Rows, read_rows
