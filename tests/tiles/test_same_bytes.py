@@ -127,7 +127,8 @@ class DyingTasks(ProcessTasks):
         super().run(dying, [(self.flag, function, *call) for call in calls], stage, progress)
 
 
-def test_processes_give_the_same_bytes_though_one_is_killed(sheet, tiles, tmp_path):
+def test_processes_give_the_same_bytes_though_one_is_killed(sheet, tiles, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2])  # where a new process finds ``dying``
     flag = tmp_path / "killed"
     found = tiles(sheet, "linear", configure("linear"), most=250, tasks=DyingTasks(flag))
     assert flag.exists()

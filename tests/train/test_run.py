@@ -240,7 +240,8 @@ def test_an_earlier_run_is_neither_replaced_nor_repeated_by_accident(begin, room
 
 def test_a_run_that_was_seeded_goes_on_with_the_same_seeds(begin):
     straight = begin("straight", seeding="auto", max_steps=20)
-    assert len(straight.state.params["means"]) > 300
+    plain = begin("plain", max_steps=20)
+    assert len(straight.state.params["means"]) > len(plain.state.params["means"])
     assert straight.train()
     assert not begin("stopped", seeding="auto", max_steps=20).train(_stop_after(5))
     resumed = begin("stopped", RESUME, max_steps=20)

@@ -8,16 +8,21 @@ several trees, gives the same neighbours.
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 from jaxtyping import Float64, Int32, Int64
 from scipy.spatial import cKDTree
-
-from splatseed.kernels.jit import kernel, parallel_range
 
 __all__ = ["distances_of", "nearest_others", "sort_rows"]
 
 AT_ONCE = 1 << 20
 """Neighbours fetched at once for points at whose k-th distance there are several."""
+FEW = 1 << 22
+"""Distances up to which NumPy is quick enough where Numba is not loaded, as in ``splatseed info``;
+the kernel gives the same bytes."""
+ROWS = 1 << 14
+"""Points at a time, so that what is computed on the way stays in the cache."""
 
 
 def nearest_others(
@@ -103,14 +108,15 @@ def distances_of(
     get the same distances again.
     """
     distance = np.empty(idx.shape)
-    _distances(xyz, idx, float(least), distance)
+    if idx.size > FEW or "numba" in sys.modules:
+        from splatseed.upsample.distances import fill_distances  # noqa: PLC0415  (loads Numba)
+
+        fill_distances(xyz, idx, float(least), distance)
+        return distance
+    for start in range(0, len(idx), ROWS):
+        part = slice(start, start + ROWS)
+        apart = xyz[idx[part]] - xyz[part][: len(idx[part]), None]
+        apart *= apart
+        squared = apart[..., 0] + apart[..., 1] + apart[..., 2]
+        distance[part] = np.maximum(np.sqrt(squared), least)
     return distance
-
-
-@kernel
-def _distances(xyz, idx, least, out):  # type: ignore[no-untyped-def]  # Numba's types
-    for i in parallel_range(len(idx)):
-        for j in range(idx.shape[1]):
-            row = idx[i, j]
-            x, y, z = xyz[row, 0] - xyz[i, 0], xyz[row, 1] - xyz[i, 1], xyz[row, 2] - xyz[i, 2]
-            out[i, j] = max(np.sqrt(x * x + y * y + z * z), least)

@@ -14,7 +14,7 @@ from hypothesis import given, settings, strategies as st
 from splatseed.bench.planning.estimate import Estimator
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene, plan_runs
 from splatseed.bench.planning.plan_file import KINDS, _kind_of, plan_text, read_plan
-from splatseed.bench.planning.presets import preset_plan
+from splatseed.bench.planning.presets import _laptop, preset_plan
 from splatseed.bench.planning.records import SFM, SHARED, Arm
 from splatseed.bench.planning.scenes import SceneFacts, survey
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
@@ -216,16 +216,14 @@ def test_what_would_fail_every_run_is_found_before(own_room):
         survey(own_room, "room")
 
 
-def test_the_plan_of_the_published_results_is_the_one_they_tell_of():
-    folder = Path(__file__).parents[3] / "docs" / "results"
-    plan = read_plan(folder / "plan.toml")
-    told = (folder / "README.md").read_text("utf-8")
-    assert [each.label for each in plan.scenes] == ["bonsai", "fox", "fern", "treehill", "demo"]
-    scenes, kinds, strategies = len(plan.scenes), len(plan.methods), len(plan.strategies)
-    runs = scenes * kinds * strategies * plan.repeats
-    assert f"{scenes} x {kinds} x {strategies} x {plan.repeats} = {runs} runs" in told
-    assert f"{plan.training.max_steps} steps" in told
-    assert f"{plan.training.cap_max:,} Gaussians" in told
+def test_the_published_results_tell_of_the_laptop_preset():
+    told = (Path(__file__).parents[3] / "docs" / "results" / "README.md").read_text("utf-8")
+    plan = _laptop(Path())
+    assert "--preset laptop --data DIR" in told
+    assert plan.repeats == 2
+    assert f"{plan.training.max_steps:,} steps, twice" in told
+    assert f"at most {plan.long_side} pixels a side" in told
+    assert f"at most {plan.budgets[0].removesuffix('rho')} per pixel" in told
 
 
 FERN = SceneFacts("fern", "ab12", "ab12", 6000, 20, 800 * 600, long_side=800)

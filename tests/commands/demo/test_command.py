@@ -23,7 +23,7 @@ def test_demo_leaves_a_scene_scores_and_pictures(tmp_path, splatseed):
         with PilImage.open(out / name) as picture:
             assert np.ptp(np.asarray(picture.convert("RGB")), axis=2).max() > 50
     scores = _scores(out / "geometry.csv")
-    assert set(scores) == {"originals", *METHODS}
+    assert set(scores) == {"originals", *METHODS} - {"cloud"}  # which needs a scan
     # What any upsampling is for, and what strewing points at random does not give.
     assert scores["mls"]["coverage_h"] < scores["originals"]["coverage_h"]
     assert scores["mls"]["error_h"] < scores["random"]["error_h"]

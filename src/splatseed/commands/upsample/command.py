@@ -83,8 +83,7 @@ class Options:
     cover_cell: Annotated[int | None, cover_flag()] = None
     """Side in pixels of the parts of the photographs that get a seed if no point falls in."""
     verify: bool = False
-    """Check interpolated points against the photographs: slide them onto surfaces, drop those that
-    fit none."""
+    """Slide interpolated points to where the photographs agree, and drop those that fit none."""
     seed: int = 0
     """The same seed gives the same bytes."""
     profile: Profile = "default"
@@ -102,8 +101,8 @@ class Options:
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),
     ] = ()
-    """Seeds from a scan or a dense cloud, in any format that docs/scans.md lists; alone, or beside
-    those of --method auto, stereo, cover or depth."""
+    """Seeds from a scan or a dense cloud (docs/scans.md); alone, or beside those of --method auto,
+    stereo, cover or depth."""
     cloud_transform: Annotated[
         Path | None,
         tyro.conf.arg(name="transform", constructor=Path, help_behavior_hint="(default: none)"),
