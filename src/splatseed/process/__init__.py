@@ -1,1 +1,1 @@
-"""This process and its children: memory, and the interpreter that children run in."""
+"""This process and its children: memory, tasks here or on a cluster, and children's interpreter."""

@@ -155,7 +155,7 @@ class Growing(Strategy):
         return needless
 
     def _split(self, params: Parameters, optimizers: Optimizers, wanted: int) -> None:
-        """Split where E / sqrt(c) is largest: E alone favours large ones, E / c chance."""
+        """Split where E / sqrt(c) is largest: E favours large ones, E / c those of few pixels."""
         sums = self._sums(params)
         scores = sums["errors"] / sums["pixels"].clamp_min(1e-6).sqrt()
         number = min(wanted, int((scores > 0).sum()))
