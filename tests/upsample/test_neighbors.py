@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from splatseed import PointCloud
+from splatseed.upsample.nearest_points import distances_of
 from splatseed.upsample.neighbors import draw_bases, prepare, sound_bases
 
 from . import references as slow
@@ -72,6 +75,15 @@ def test_neighbors_are_those_of_brute_force(wavy_exact, prepared, k):
         np.testing.assert_array_equal(prepared.rank[found.idx[row]], rows)
     first = found.nearest(4)
     np.testing.assert_array_equal(first.idx, found.idx[:, :4])
+
+
+def test_distances_are_the_same_bytes_without_numba(rng, monkeypatch):
+    xyz = rng.normal(size=(30_000, 3)) * 10.0 ** rng.integers(-6, 6, (30_000, 1))
+    idx = rng.integers(0, len(xyz), (20_000, 5)).astype(np.int32)
+    by_kernel = distances_of(xyz, idx, 1e-3)
+    monkeypatch.delitem(sys.modules, "numba")
+    np.testing.assert_array_equal(distances_of(xyz, idx, 1e-3), by_kernel)
+    assert by_kernel.min() == 1e-3
 
 
 def test_spacing_is_the_mean_of_six(wavy_exact, prepared):

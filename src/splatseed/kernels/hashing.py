@@ -1,4 +1,8 @@
-"""A hash of 64-bit words, for kernels: SplitMix64's finaliser."""
+"""Hashing for kernels: SplitMix64's finaliser, and tables of keys with open addressing.
+
+Notation: a table of keys has 2^n slots of uint64, of which a free one holds ``FREE``; a key is
+never ``FREE``. Promise: a table that is at most half full finds a key in a few steps.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,10 @@ import numpy as np
 
 from splatseed.kernels.jit import inline
 
-__all__ = ["scramble"]
+__all__ = ["FREE", "scramble", "slot_of"]
+
+FREE = np.uint64(0)
+"""A free slot of a table of keys."""
 
 
 @inline
@@ -16,3 +23,13 @@ def scramble(x):  # type: ignore[no-untyped-def]  # Numba infers uint64
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return x ^ (x >> np.uint64(31))
+
+
+@inline
+def slot_of(key, table):  # type: ignore[no-untyped-def]  # Numba's types
+    """The slot of a key, or the free one where it belongs: the first from key mod 2^n on."""
+    last = np.uint64(len(table) - 1)
+    slot = key & last
+    while table[slot] != FREE and table[slot] != key:
+        slot = (slot + np.uint64(1)) & last
+    return slot

@@ -38,7 +38,8 @@ Layout: TypeAlias = Literal["facing one way", "around something", "through a pla
 AS_IT_IS = "sfm"
 """The advice to leave the points as they are."""
 ROOM = 1.1
-"""Least room at which new points are worth making."""
+"""Least room at which new points are worth making. On validation views fox, with a room of 1.17,
+gained 0.41 dB (two seeds), and scenes with a room of 1.0 lost; nothing was measured between."""
 LOW_AGREEMENT = 0.15
 """Below this share of pixels with confirmed depth, stereo finds little."""
 FEW_EMPTY = 0.05

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.kernels.hashing import scramble
+from splatseed.kernels.hashing import FREE, scramble, slot_of
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.seeding.coverage import check_points, grid_from_world, project_block
 from splatseed.views.view import View
@@ -44,7 +44,6 @@ LEAST_POWER = 0.2
 """Least exponent e assumed in: number kept ~ (1 / spacing)^e; bounds a step. On surfaces e is 2."""
 ACROSS = 4096.0
 """Nominal width in pixels of a cloud without views."""
-FREE = np.uint64(0)
 
 
 def parse_budget(budget: str | float, pixels: float) -> int:
@@ -271,7 +270,7 @@ def _keep(order, group, place, spacing, limit, slots, kept):  # type: ignore[no-
             break
         if not kept[i] and group[i, 0] >= 0:
             key = _key(group[i, 0], place[i, 0], spacing)
-            if table[_slot(key, table)] == FREE:
+            if table[slot_of(key, table)] == FREE:
                 kept[i] = True
                 count += 1
                 _mark_cells(group[i], place[i], spacing, table)
@@ -283,7 +282,7 @@ def _mark_cells(group, place, spacing, table):  # type: ignore[no-untyped-def]  
     for k in range(len(group)):
         if group[k] >= 0:
             key = _key(group[k], place[k], spacing)
-            table[_slot(key, table)] = key
+            table[slot_of(key, table)] = key
 
 
 @inline
@@ -292,14 +291,4 @@ def _key(group, place, spacing):  # type: ignore[no-untyped-def]  # Numba's type
     key = scramble(np.uint64(group))
     for axis in range(3):
         key = scramble(key ^ np.uint64(np.int64(np.floor(place[axis] / spacing))))
-    return max(key, np.uint64(1))  # 0 is a free slot
-
-
-@inline
-def _slot(key, table):  # type: ignore[no-untyped-def]  # Numba's types
-    """The slot of a key in a hash table with open addressing, or the free slot where it belongs."""
-    last = np.uint64(len(table) - 1)
-    slot = key & last
-    while table[slot] != FREE and table[slot] != key:
-        slot = (slot + np.uint64(1)) & last
-    return slot
+    return max(key, FREE + np.uint64(1))

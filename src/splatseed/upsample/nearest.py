@@ -8,7 +8,7 @@ given only, so that they give the same for a cloud in tiles (``splatseed.tiles``
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, Self, TypeAlias
 
@@ -28,7 +28,7 @@ from splatseed.upsample.neighbors import (
     sound_bases,
 )
 
-__all__ = ["Draws", "Known", "NearestMethod"]
+__all__ = ["Draws", "Known", "NearestMethod", "blended"]
 
 OUTLIER_CHECK_NEIGHBORS = 8
 
@@ -140,3 +140,28 @@ class NearestMethod(ABC):
             rng: Where random numbers come from.
             progress: Told the stage.
         """
+
+
+def blended(
+    blend: Callable[..., None],
+    cloud: PreparedCloud,
+    neighbors: Neighbors,
+    bases: Bases,
+    draws: Float32[np.ndarray, "new ..."],
+) -> NewPoints:
+    """New points that a kernel blends from each base and its neighbours.
+
+    Args:
+        blend: A kernel of positions, colours, centre, neighbours, each row's first new point and
+            number of them, and draws; it fills positions and colours.
+        cloud: The prepared originals.
+        neighbors: Neighbours of own rows.
+        bases: How many points each own row makes.
+        draws: Uniform numbers, a row per new point.
+    """
+    new = NewPoints(np.empty((len(draws), 3), np.float32), np.empty((len(draws), 3), np.uint8))
+    blend(
+        cloud.xyz, cloud.rgb, cloud.center, neighbors.idx, bases.start, bases.count, draws,
+        new.xyz, new.rgb,
+    )  # fmt: skip
+    return new

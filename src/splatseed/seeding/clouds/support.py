@@ -9,12 +9,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from splatseed.kernels.hashing import scramble
+from splatseed.kernels.hashing import FREE, scramble, slot_of
 from splatseed.kernels.jit import inline, kernel, parallel_range
 
 __all__ = ["find_support"]
-
-FREE = np.uint64(0)
 
 
 def find_support(
@@ -39,7 +37,7 @@ def find_support(
 def _count(xyz, side, count, keys, sums):  # type: ignore[no-untyped-def]  # Numba's types
     for i in range(len(xyz)):
         key = _key(xyz[i], side[i], 0, 0, 0)
-        slot = _slot(key, keys)
+        slot = slot_of(key, keys)
         keys[slot] = key
         sums[slot] += count[i]
 
@@ -51,7 +49,7 @@ def _sum_up(xyz, side, keys, sums, support):  # type: ignore[no-untyped-def]  # 
         for a in range(-1, 2):
             for b in range(-1, 2):
                 for c in range(-1, 2):
-                    total += sums[_slot(_key(xyz[i], side[i], a, b, c), keys)]
+                    total += sums[slot_of(_key(xyz[i], side[i], a, b, c), keys)]
         support[i] = total
 
 
@@ -63,14 +61,4 @@ def _key(point, side, a, b, c):  # type: ignore[no-untyped-def]  # Numba's types
     key = scramble(key ^ np.uint64(np.int64(np.floor(point[0] * per_cell)) + a))
     key = scramble(key ^ np.uint64(np.int64(np.floor(point[1] * per_cell)) + b))
     key = scramble(key ^ np.uint64(np.int64(np.floor(point[2] * per_cell)) + c))
-    return max(key, np.uint64(1))  # 0 is a free slot
-
-
-@inline
-def _slot(key, keys):  # type: ignore[no-untyped-def]  # Numba's types
-    """The slot of a key, or the free one where it belongs."""
-    last = np.uint64(len(keys) - 1)
-    slot = key & last
-    while keys[slot] != FREE and keys[slot] != key:
-        slot = (slot + np.uint64(1)) & last
-    return slot
+    return max(key, FREE + np.uint64(1))

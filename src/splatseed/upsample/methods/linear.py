@@ -14,7 +14,7 @@ import numpy as np
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress
 from splatseed.upsample.method import NewPoints
-from splatseed.upsample.nearest import Draws, Known, NearestMethod
+from splatseed.upsample.nearest import Draws, Known, NearestMethod, blended
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
 __all__ = ["Linear"]
@@ -45,21 +45,9 @@ class Linear(NearestMethod):
         progress: Progress,
     ) -> NewPoints:
         """Make the points of all bases."""
-        num_new = bases.total
-        alpha = rng.random(num_new, dtype=np.float32)
+        alpha = rng.random(bases.total, dtype=np.float32)
         progress("linear", 0.0)
-        new = NewPoints(np.empty((num_new, 3), np.float32), np.empty((num_new, 3), np.uint8))
-        _blend(
-            cloud.xyz,
-            cloud.rgb,
-            cloud.center,
-            neighbors.idx,
-            bases.start,
-            bases.count,
-            alpha,
-            new.xyz,
-            new.rgb,
-        )
+        new = blended(_blend, cloud, neighbors, bases, alpha)
         progress("linear", 1.0)
         return new
 

@@ -15,7 +15,7 @@ import numpy as np
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress
 from splatseed.upsample.method import NewPoints
-from splatseed.upsample.nearest import Draws, Known, NearestMethod
+from splatseed.upsample.nearest import Draws, Known, NearestMethod, blended
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
 __all__ = ["Triangle"]
@@ -48,21 +48,9 @@ class Triangle(NearestMethod):
         progress: Progress,
     ) -> NewPoints:
         """Make the points of all bases."""
-        num_new = bases.total
-        draws = rng.random((num_new, 2), dtype=np.float32)
+        draws = rng.random((bases.total, 2), dtype=np.float32)
         progress("triangle", 0.0)
-        new = NewPoints(np.empty((num_new, 3), np.float32), np.empty((num_new, 3), np.uint8))
-        _blend(
-            cloud.xyz,
-            cloud.rgb,
-            cloud.center,
-            neighbors.idx,
-            bases.start,
-            bases.count,
-            draws,
-            new.xyz,
-            new.rgb,
-        )
+        new = blended(_blend, cloud, neighbors, bases, draws)
         progress("triangle", 1.0)
         return new
 
