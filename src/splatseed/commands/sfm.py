@@ -38,7 +38,10 @@ class Options:
     """A scene whose poses and intrinsics are kept, so that only points are triangulated."""
     matcher: Annotated[
         MatcherName | None,
-        tyro.conf.arg(help_behavior_hint="(default: exhaustive; sequential for a video)"),
+        tyro.conf.arg(
+            metavar="{exhaustive,sequential}",
+            help_behavior_hint="(default: exhaustive; sequential for a video)",
+        ),
     ] = None
     """Compare every pair of images, or (for a video) each with its successors."""
     frames: int = 150

@@ -17,7 +17,7 @@ import tyro
 
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
 from splatseed.bench.planning.plan_file import read_plan
-from splatseed.bench.planning.presets import PresetName, preset_plan
+from splatseed.bench.planning.presets import PRESETS, PresetName, preset_plan
 from splatseed.commands.options import parse_options
 from splatseed.errors import ParameterError
 from splatseed.train.settings import StrategyName, TrainSettings
@@ -102,7 +102,10 @@ class Options:
     depth: Annotated[tuple[Path, ...], _hint("the scene's")] = ()
     """For method depth: a folder of maps per scene, or one folder with a subfolder of each one's
     name."""
-    preset: Annotated[PresetName | None, _hint("none")] = None
+    preset: Annotated[
+        PresetName | None,
+        tyro.conf.arg(metavar="|".join(PRESETS), help_behavior_hint="(default: none)"),
+    ] = None
     """A ready-made plan: the paper's data sets, laptop (four real scenes within an hour on two
     cores), both with --data; or quick, on a synthetic room."""
     data: Annotated[Path | None, _one(Path, "none")] = None

@@ -25,7 +25,9 @@ def _number(default: str) -> Any:
     return tyro.conf.arg(constructor=int, metavar="INT", help_behavior_hint=f"(default: {default})")
 
 
-_BESIDE = tyro.conf.arg(help_behavior_hint="(default: as beside the file, else ImageNet's)")
+_BESIDE = tyro.conf.arg(
+    metavar="FLOAT FLOAT FLOAT", help_behavior_hint="(default: as beside the file, else ImageNet's)"
+)
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,9 @@ class Options:
     """A scene with photographs."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The folder of maps to write: one float32 .npy per image."""
-    model: Annotated[str | None, tyro.conf.arg(help_behavior_hint="(or --stereo)")] = None
+    model: Annotated[
+        str | None, tyro.conf.arg(metavar="NAME|PATH", help_behavior_hint="(or --stereo)")
+    ] = None
     """A folder in transformers' format, an id that Hugging Face's cache holds, or an .onnx file."""
     stereo: bool = False
     """Match the photographs with each other instead: no network, on the CPU; normals and confidence
@@ -60,7 +64,10 @@ class Options:
     max_size: Annotated[int | None, _number("1600; 800 with --stereo")] = None
     """Photographs with a longer side are reduced to this many pixels, and so are their maps."""
     depth_kind: Annotated[
-        DepthKind | None, tyro.conf.arg(help_behavior_hint="(default: what config.json says)")
+        DepthKind | None,
+        tyro.conf.arg(
+            metavar="{z,ray,inverse}", help_behavior_hint="(default: what config.json says)"
+        ),
     ] = None
     """What the network predicts: planar depth, distance along the ray, or inverse depth."""
     input_size: Annotated[int | None, _number("as beside the file, else 518")] = None

@@ -44,9 +44,9 @@ def _path(metavar: str) -> Any:
     return tyro.conf.arg(constructor=Path, metavar=metavar, help_behavior_hint="")
 
 
-def _default(stands_in: str) -> Any:
+def _default(stands_in: str, metavar: str) -> Any:
     """How an optional option appears in the help: with its default in words."""
-    return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {stands_in})")
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,11 @@ class Options:
     depth: Annotated[Path | None, _path("DIR")] = None
     """Also compare a folder of depth maps, in any layout of docs/formats.md, with the SfM
     points."""
-    depth_kind: Annotated[DepthKind | None, _default("what the folder says, else z")] = None
+    depth_kind: Annotated[
+        DepthKind | None, _default("what the folder says, else z", "{z,ray,inverse}")
+    ] = None
     """What their values are: planar depth, distance along the ray, or inverse depth."""
-    depth_scale: Annotated[float | None, _default("what the folder says")] = None
+    depth_scale: Annotated[float | None, _default("what the folder says", "FLOAT")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
     picture: Annotated[Path | None, _path("FILE")] = None
     """Write a PNG of depth beside photographs, and of where the two disagree."""

@@ -67,13 +67,16 @@ class Options:
     """The folder of the run."""
     training: Annotated[TrainSettings, tyro.conf.arg(name="")] = BEST_SETTINGS
     """The settings; its fields are options of their own."""
-    budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
-    """--cap-max as in upsample: a number, or Gaussians per pixel of a photograph at training size,
-    such as 0.25rho."""
+    budget: Annotated[
+        str | None, tyro.conf.arg(metavar="N|Xrho", help_behavior_hint="(default: --cap-max's)")
+    ] = None
+    """Most Gaussians: a number, or 0.25rho for a quarter of the pixels of a photograph at training
+    size."""
     seeds: Annotated[
         Seeding | None,
         tyro.conf.arg(
-            help_behavior_hint="(default: auto, for points that splatseed has not added to)"
+            metavar="{auto,scene}",
+            help_behavior_hint="(default: auto, for points that splatseed has not added to)",
         ),
     ] = None
     """Start from the points that method auto makes of the training photographs, or from the scene's
