@@ -64,7 +64,7 @@ ARMS: dict[str, tuple[str, str, dict[str, object]]] = {
     "depth, default": ("depth", "default", {}),
     "- least squares (eq. 7)": ("depth", "default", {"fit": "least-squares"}),
     "- all images": ("depth", "default", {"max_residual_ratio": None, "min_points": 1}),
-    "- not harmonized": ("depth", "default", {"harmonize": False}),
+    "- no synchronisation": ("depth", "default", {"synchronize_scales": False}),
     "- unit ray (eq. 9)": ("depth", "default", {"unit_ray": True}),
     "- the central half": ("depth", "default", {"region": 0.5}),
     "- uniform pixels": ("depth", "default", {"placement": "uniform"}),
@@ -75,10 +75,10 @@ ARMS: dict[str, tuple[str, str, dict[str, object]]] = {
     "- any colour": ("depth", "default", {"color_tolerance": None}),
     "- no other views": ("depth", "default", {"min_agreeing": 0, "see_through": True}),
     "- not spread": ("depth", "default", {"spread": False}),
-    "- no views, no harmony": (
+    "- no views, no synchronisation": (
         "depth",
         "default",
-        {"min_agreeing": 0, "see_through": True, "harmonize": False},
+        {"min_agreeing": 0, "see_through": True, "synchronize_scales": False},
     ),
 }
 """Method, profile, and what differs from it; a dash is the default with one choice undone."""

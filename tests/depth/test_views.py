@@ -11,7 +11,7 @@ from splatseed.depth.alignment import Alignment
 from splatseed.depth.consistency import find_support
 from splatseed.depth.neighbors import choose_neighbors
 from splatseed.depth.planar import PlanarDepth
-from splatseed.depth.scale_synchronisation import harmonize
+from splatseed.depth.scale_synchronisation import synchronize_scales
 from splatseed.depth.settings import Settings
 from splatseed.depth.views import Reduced, View
 from splatseed.depthmap import DepthMap
@@ -157,7 +157,7 @@ def test_maps_are_scaled_to_agree():
         view(camera, np.where(np.arange(WIDTH) < 20, 0.7, 1.0) * wall(camera), factor=factor)
         for camera, factor in zip(cameras, factors, strict=True)
     ]
-    corrections = harmonize(views, choose_neighbors(views, 6, silent), silent)
+    corrections = synchronize_scales(views, choose_neighbors(views, 6, silent), silent)
     left = np.log(corrections * factors)
     assert np.abs(left - left.mean()).max() < 0.01 < np.abs(np.log(factors)).max()
     assert abs(left.mean()) < 0.02
@@ -166,7 +166,7 @@ def test_maps_are_scaled_to_agree():
 def test_maps_without_overlap_are_left_alone():
     cameras = [camera_at(100.0 * i) for i in range(3)]
     views = [view(camera, wall(camera), factor=1.1) for camera in cameras]
-    factors = harmonize(views, choose_neighbors(views, 2, silent), silent)
+    factors = synchronize_scales(views, choose_neighbors(views, 2, silent), silent)
     np.testing.assert_allclose(factors, 1.0, rtol=1e-12)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from splatseed.depth.consistency import Support, find_support
 from splatseed.depth.neighbors import choose_neighbors
 from splatseed.depth.planar import lift_pixels
-from splatseed.depth.scale_synchronisation import harmonize
+from splatseed.depth.scale_synchronisation import synchronize_scales
 from splatseed.depth.settings import Settings
 from splatseed.depth.views import Reduced, View
 from splatseed.depth.voxel_thinning import thin_by_voxels
@@ -61,8 +61,8 @@ def gather(views: Sequence[View], settings: Settings, progress: Progress) -> Can
     counts = np.array([len(view) for view in views])
     neighbors = choose_neighbors(views, settings.num_neighbors, progress)
     factors = np.ones(len(views))
-    if settings.harmonizes:
-        factors = harmonize(views, neighbors, progress)
+    if settings.synchronizes:
+        factors = synchronize_scales(views, neighbors, progress)
     copies = _rescaled(views, factors)
     total, start_of = int(counts.sum()), np.cumsum(counts) - counts
     candidates = Candidates(

@@ -26,7 +26,7 @@ from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, in_threads
 from splatseed.views.projection import place
 
-__all__ = ["harmonize"]
+__all__ = ["synchronize_scales"]
 
 SAMPLES = 96
 """Candidates of a view that are compared with each neighbour."""
@@ -47,7 +47,7 @@ PIECE = 8
 """Views per task of a thread."""
 
 
-def harmonize(
+def synchronize_scales(
     views: Sequence[View], neighbors: Int64[np.ndarray, "V num"], progress: Progress
 ) -> Float64[np.ndarray, " V"]:
     """The factor by which to multiply the depth of each view, [V].
@@ -85,7 +85,7 @@ def _compare_all(
                     factor = other.factor * np.exp(g[j])
                     _compare_pair(samples, other.z, factor, other.grid_from_world, pairs[i, k, 2:])
 
-    in_threads(work, len(views), PIECE, "harmonize depth", progress)
+    in_threads(work, len(views), PIECE, "synchronize scales", progress)
     rows = pairs.reshape(-1, 4)
     return np.asarray(rows[np.isfinite(rows).all(axis=1)])
 

@@ -23,7 +23,7 @@ class Settings:
     """Fewest SfM points that an image must see, else it is left out (paper: 1)."""
     max_residual_ratio: float | None = 3.0
     """Leave out images that fit this many times worse than the median one (paper: none)."""
-    harmonize: bool = True
+    synchronize_scales: bool = True
     """Then scale the maps, each by one factor, to agree with each other (paper: no)."""
     unit_ray: bool = False
     """Take z for the distance along the ray, as equation 9 says; this bends walls (paper: yes)."""
@@ -52,9 +52,9 @@ class Settings:
     """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
 
     @property
-    def harmonizes(self) -> bool:
+    def synchronizes(self) -> bool:
         """Whether maps are scaled to agree with each other; maps in scene units are left alone."""
-        return self.align and self.harmonize
+        return self.align and self.synchronize_scales
 
     @property
     def compares_views(self) -> bool:

@@ -155,7 +155,7 @@ class Reader:
         )
         drawn = sample_pixels(planar.values, num, points.uv, self.settings, rng)
         seen = _Seen(alignment, camera, drawn, planar.at(drawn.pixel))
-        if not (self.settings.compares_views or self.settings.harmonizes):
+        if not (self.settings.compares_views or self.settings.synchronizes):
             return seen
         factor = -(-max(planar.values.shape) // GRID)
         return replace(seen, coarse=planar.every(factor // 2, factor), unit=planar.scale)

@@ -113,6 +113,7 @@ def test_paths_in_a_file_are_beside_it(tmp_path):
         ("[[scenes]]\npath = 'a/x'\n[[scenes]]\npath = 'b/x'", "x twice"),
         ("[parameters.mls]\nneighbours = 3", "neighbours"),
         ("[parameters.mls]\nk = -3", "mls.k"),
+        ("[parameters.depth]\nharmonize = true", "synchronize_scales"),  # its former name
         ("[parameters]\nmls = 3", "parameters.mls in .* to be a table"),
         ("[parameters.magic]\nk = 1", "magic"),
     ],

@@ -48,7 +48,7 @@ def test_the_maps_are_named_and_noted(room, tmp_path, splatseed):
     written = json.loads((tmp_path / "out/splatseed.json").read_text())
     assert written["depth"] == str((room / "depths").resolve())
     assert written["parameters"]["min_agreeing"] == 2
-    for stage in ("read images", "harmonize depth", "compare views", "choose points"):
+    for stage in ("read images", "synchronize scales", "compare views", "choose points"):
         assert stage in run.out
     surfaces = make_capture(0, num_views=12, width=120, height=90).surfaces
     seeds = load_scene(tmp_path / "out").points

@@ -64,7 +64,7 @@ class Depth(Settings):
             fit="least-squares",
             min_points=1,
             max_residual_ratio=None,
-            harmonize=False,
+            synchronize_scales=False,
             unit_ray=True,
             region=0.5,
             placement="uniform",
