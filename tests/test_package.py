@@ -56,7 +56,7 @@ ORDER = (
     "export",
     "evaluate",
     "train",
-    "view",
+    "viewer",
     "bench",
     "console",
     "commands",
@@ -332,12 +332,12 @@ def test_dependencies_are_those_that_are_imported():
         imported = {name.split(".")[0] for name in _imports(path)}
         needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
         part = path.relative_to(SOURCE).parts[0]
-        trains = part in {"render", "splat", "evaluate", "train", "view", "commands"}
+        trains = part in {"render", "splat", "evaluate", "train", "viewer", "commands"}
         trains = trains or path.name == "torch_device.py"  # loads torch for those rooms
         allowed = base | more if trains else base
         allowed = base | names["depth"] if part == "monocular" else allowed
         allowed = base | names["cluster"] if path.name == "ray_tasks.py" else allowed
-        if part in {"export", "view", "commands", "sfm"}:
+        if part in {"export", "viewer", "commands", "sfm"}:
             allowed = allowed | names["view"]
         if path.parent.name == "clouds":
             allowed = allowed | names["scan"]

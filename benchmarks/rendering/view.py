@@ -24,10 +24,10 @@ from benchmarks.rendering.splats import make_workload
 from PIL import Image
 
 from splatseed.splat.frame import training_frame
-from splatseed.view.live import FrameLoop
-from splatseed.view.paths import smooth_path
-from splatseed.view.pictures import Entry
-from splatseed.view.shown import Shown
+from splatseed.viewer.live import FrameLoop
+from splatseed.viewer.paths import smooth_path
+from splatseed.viewer.pictures import Entry
+from splatseed.viewer.shown import Shown
 from splatseed.views.view import View
 
 QUALITY = 70

@@ -37,9 +37,9 @@ class Arm:
 
 
 MEAN_OF_ALL = (
-    (COST, "least, second = splat(_WORST), splat(_WORST)", "least, second = splat(_NOTHING), splat(_NOTHING)"),  # noqa: E501  (the sources' own lines)
+    (COST, "least, second = broadcast(_WORST), broadcast(_WORST)", "least, second = broadcast(_NOTHING), broadcast(_NOTHING)"),  # noqa: E501  (the sources' own lines)
     (COST, "least, second = minimum(least, cost), minimum(second, worse)", "least = add(least, cost)"),  # noqa: E501  (the sources' own lines)
-    (COST, "multiply(add(least, second), splat(_HALF))", "divide(least, splat(np.float32(len(sizes))))"),  # noqa: E501  (the sources' own lines)
+    (COST, "multiply(add(least, second), broadcast(_HALF))", "divide(least, broadcast(np.float32(len(sizes))))"),  # noqa: E501  (the sources' own lines)
 )  # fmt: skip
 
 ARMS: dict[str, Arm] = {

@@ -67,7 +67,7 @@ def _fnma(a, b, c, out):
 @njit
 def _select(a, b, out):
     a, b = simd.load(a, 0), simd.load(b, 0)
-    yes, no = simd.splat(np.float32(1.0)), simd.splat(np.float32(2.0))
+    yes, no = simd.broadcast(np.float32(1.0)), simd.broadcast(np.float32(2.0))
     simd.store(out, 0, simd.select_greater(a, b, yes, no))
 
 
@@ -100,7 +100,7 @@ def _store_transposed(a, out, start):
 
 @njit
 def _broadcast(a, index, out):
-    simd.store(out, 0, simd.broadcast(a, index))
+    simd.store(out, 0, simd.broadcast_element(a, index))
 
 
 @njit
@@ -130,8 +130,8 @@ def _copy(a, start, out, to):
 
 
 @njit
-def _splat(x, out):
-    simd.store(out, 0, simd.splat(x))
+def _broadcast(x, out):
+    simd.store(out, 0, simd.broadcast(x))
 
 
 @pytest.mark.parametrize(
@@ -258,4 +258,4 @@ def test_load_and_store_at_any_offset(rng) -> None:
 
 
 def test_splat() -> None:
-    assert (applied(lambda x, out: _splat(x[0], out), SPECIAL[11:12]) == 7.5).all()
+    assert (applied(lambda x, out: _broadcast(x[0], out), SPECIAL[11:12]) == 7.5).all()

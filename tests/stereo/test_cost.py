@@ -16,7 +16,7 @@ IDENTITY = np.hstack([np.eye(3), np.zeros((3, 1))])
 
 
 def window(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Weights and likeness of windows, float32 [2, SAMPLES, 16]."""
+    """Weights and normalised samples of windows, float32 [2, SAMPLES, 16]."""
     out = np.zeros((2, SAMPLES * LANES), np.float32)
     height, width = image.shape
     prepare_window(make_quads(image).ravel(), width, height, places[0], places[1], out[0], out[1])
@@ -59,16 +59,16 @@ def make_warps(rng, num: int) -> list[np.ndarray]:
     return list(np.concatenate([turned, moved[:, :, None]], axis=2))
 
 
-def test_weights_and_likeness_are_those_of_the_formula(rough, places):
+def test_weights_and_normalised_samples_are_those_of_the_formula(rough, places):
     image = rough(*SIZE[::-1])
-    weights, likeness = window(image, places).reshape(2, SAMPLES, LANES)
+    weights, samples = window(image, places).reshape(2, SAMPLES, LANES)
     for lane, (u, v) in enumerate(places.T.astype(float)):
         c = window_weights(image, u, v)
         np.testing.assert_allclose(weights[:, lane], c, rtol=1e-3)
         r = np.array([bilinear(image, u + dx - 0.5, v + dy - 0.5) for dx, dy in OFFSETS])
         apart = r - c @ r
         expected = c * apart / np.sqrt(c @ apart**2 + NOISE)
-        np.testing.assert_allclose(likeness[:, lane], expected, atol=2e-4)
+        np.testing.assert_allclose(samples[:, lane], expected, atol=2e-4)
 
 
 @pytest.mark.parametrize("num", [1, 2, 5])

@@ -16,11 +16,11 @@ from splatseed.errors import OutputError, ParameterError
 from splatseed.export import keep_gaussians, parse_crop
 from splatseed.requirements import require
 from splatseed.train.settings import Backend
-from splatseed.view.video import check_video_name, even_size, write_video
+from splatseed.viewer.video import check_video_name, even_size, write_video
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.view.renderer import ModelRenderer
-    from splatseed.view.shown import Shown
+    from splatseed.viewer.renderer import ModelRenderer
+    from splatseed.viewer.shown import Shown
     from splatseed.views.view import View
 
 __all__ = ["run"]
@@ -92,7 +92,7 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "flight", arguments)
     _check(options)
     require("torch", "imageio_ffmpeg")
-    from splatseed.view.frames import flight_frames  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.viewer.frames import flight_frames  # noqa: PLC0415  (imports PyTorch)
 
     with stage_display() as clock:
         clock("read", 0.0)
@@ -132,7 +132,7 @@ def _check(options: Options) -> None:
 
 
 def _open(options: Options, path: Path) -> Shown:
-    from splatseed.view.shown import open_shown  # noqa: PLC0415  (loads with its use)
+    from splatseed.viewer.shown import open_shown  # noqa: PLC0415  (loads with its use)
 
     shown = open_shown(path, options.scene)
     if shown.gaussians is None:
@@ -165,7 +165,7 @@ def _size(options: Options, shown: Shown) -> tuple[int, int]:
 
 def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Sequence[View], float]:
     """The cameras, one per frame, and the frame rate."""
-    from splatseed.view.paths import orbit, smooth_path  # noqa: PLC0415  (loads with its use)
+    from splatseed.viewer.paths import orbit, smooth_path  # noqa: PLC0415  (loads with its use)
     from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     if options.path is not None:
@@ -186,7 +186,7 @@ def _views_of_file(
     from splatseed.evaluate.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
     from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415  (loads with its use)
     from splatseed.scene import Scene  # noqa: PLC0415  (loads with its use)
-    from splatseed.view.paths import check_path, path_of_file, views_from  # noqa: PLC0415  (loads with its use)
+    from splatseed.viewer.paths import check_path, path_of_file, views_from  # noqa: PLC0415  (loads with its use)
     from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     views, named = path_of_file(path, size)
@@ -203,7 +203,7 @@ def _views_of_file(
 def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> list[ModelRenderer]:
     """The renderers of the models, cropped and cleaned, all in the first one's frame."""
     from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.view.renderer import ModelRenderer, model_frame  # noqa: PLC0415  (loads with its use)
+    from splatseed.viewer.renderer import ModelRenderer, model_frame  # noqa: PLC0415  (loads with its use)
 
     clock("prepare", 0.0)
     crop = None if options.crop is None else parse_crop(options.crop)

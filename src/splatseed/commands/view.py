@@ -19,7 +19,7 @@ from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.view.shown import Shown
+    from splatseed.viewer.shown import Shown
 
 __all__ = ["run"]
 
@@ -59,7 +59,7 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "view", arguments)
     require("torch", "viser")
     from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.view.viewer import Viewer, free_port  # noqa: PLC0415  (likewise)
+    from splatseed.viewer.viewer import Viewer, free_port  # noqa: PLC0415  (likewise)
 
     if options.max_points < 1:
         raise ParameterError(
@@ -87,7 +87,7 @@ def _opened(options: Options) -> list[Shown]:
     """What to show, under names that tell them apart."""
     from dataclasses import replace  # noqa: PLC0415  (loads with its use)
 
-    from splatseed.view.shown import open_shown  # noqa: PLC0415  (loads with its use)
+    from splatseed.viewer.shown import open_shown  # noqa: PLC0415  (loads with its use)
 
     paths = _within(options.what)
     if options.compare is not None:

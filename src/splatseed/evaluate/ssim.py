@@ -30,12 +30,12 @@ from splatseed.kernels.jit import always_inline, inline, kernel, parallel_range
 from splatseed.kernels.simd import (
     LANES,
     add,
+    broadcast,
     divide,
     fma,
     load,
     multiply,
     select_greater,
-    splat,
     store,
     subtract,
 )
@@ -114,8 +114,8 @@ def _framed(height: int, width: int) -> Float32[np.ndarray, "3 H+10 W*3+30"]:
 def _splats(weights):
     """The outer six weights of the window, each in all lanes; the others mirror them."""
     return (
-        splat(weights[0]), splat(weights[1]), splat(weights[2]),
-        splat(weights[3]), splat(weights[4]), splat(weights[5]),
+        broadcast(weights[0]), broadcast(weights[1]), broadcast(weights[2]),
+        broadcast(weights[3]), broadcast(weights[4]), broadcast(weights[5]),
     )  # fmt: skip
 
 
@@ -159,7 +159,7 @@ def _similarity(means, at, columns, weights, partials, to, scores):
     w = _splats(weights)
     mean_x, mean_y, mean_xy, mean_2 = means[0], means[1], means[2], means[3]
     by_mean, by_xy, by_2 = partials[0], partials[1], partials[2]
-    two, c1, c2 = splat(np.float32(2.0)), splat(C1), splat(C2)
+    two, c1, c2 = broadcast(np.float32(2.0)), broadcast(C1), broadcast(C2)
     for i in range(0, columns, LANES):
         mx = _window_mean(mean_x, at + i, CHANNELS, w)
         my = _window_mean(mean_y, at + i, CHANNELS, w)
@@ -169,13 +169,17 @@ def _similarity(means, at, columns, weights, partials, to, scores):
         a1 = fma(two, product, c1)
         a2 = fma(two, subtract(exy, product), c2)
         b1, b2 = add(squares, c1), add(subtract(e2, squares), c2)
-        inverse = divide(splat(np.float32(1.0)), multiply(b1, b2))
+        inverse = divide(broadcast(np.float32(1.0)), multiply(b1, b2))
         twice = multiply(two, inverse)
         ssim = multiply(multiply(a1, a2), inverse)
         by_x = multiply(multiply(ssim, mx), subtract(b1, b2))
         store(by_mean, to + i, multiply(twice, fma(my, subtract(a2, a1), by_x)))
         store(by_xy, to + i, multiply(twice, a1))
-        store(by_2, to + i, subtract(splat(np.float32(0.0)), multiply(ssim, multiply(inverse, b1))))
+        store(
+            by_2,
+            to + i,
+            subtract(broadcast(np.float32(0.0)), multiply(ssim, multiply(inverse, b1))),
+        )
         store(scores, i, ssim)
 
 
@@ -231,8 +235,8 @@ def _combine(x, y, at, columns, means, row, weights, scales, gradient, differenc
     """The gradient along one row, and |x - y|, from the vertical means of the derivatives."""
     w = _splats(weights)
     of_mean, of_exy, of_e2 = means[0], means[1], means[2]
-    zero, two = splat(np.float32(0.0)), splat(np.float32(2.0))
-    by_ssim, by_l1 = splat(scales[0]), splat(scales[1])
+    zero, two = broadcast(np.float32(0.0)), broadcast(np.float32(2.0))
+    by_ssim, by_l1 = broadcast(scales[0]), broadcast(scales[1])
     for start in range(0, columns, LANES):
         i = min(start, columns - LANES)
         a, b = load(x, at + i), load(y, at + i)

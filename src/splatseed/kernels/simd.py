@@ -29,6 +29,7 @@ __all__ = [
     "aligned",
     "any_greater",
     "broadcast",
+    "broadcast_element",
     "divide",
     "element",
     "exp_of_eighth",
@@ -42,7 +43,6 @@ __all__ = [
     "negative_magnitude",
     "prefetch",
     "select_greater",
-    "splat",
     "store",
     "store_transposed",
     "subtract",
@@ -140,30 +140,30 @@ def select_greater(typing_context, a, b, yes, no):
 
 
 @intrinsic
-def splat(typing_context, x):
+def broadcast(typing_context, x):
     """The same float32 in every lane."""
 
     def generate(context, builder, signature, arguments):
-        return _splat(builder, arguments[0])
+        return _broadcast(builder, arguments[0])
 
     return f32x16(types.float32), generate
 
 
-def _splat(builder, x):
+def _broadcast(builder, x):
     undefined = ir.Constant(VECTOR, ir.Undefined)
     first = builder.insert_element(undefined, x, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INDEX, [0] * LANES))
 
 
 @intrinsic
-def broadcast(typing_context, array, index):
+def broadcast_element(typing_context, array, index):
     """Element ``index`` of a contiguous float32 array in every lane.
 
     Like ``element``'s, the index must not be negative.
     """
 
     def generate(context, builder, signature, arguments):
-        return _splat(builder, _element(context, builder, signature.args[0], *arguments))
+        return _broadcast(builder, _element(context, builder, signature.args[0], *arguments))
 
     return f32x16(array, types.intp), generate
 

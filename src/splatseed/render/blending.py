@@ -33,6 +33,7 @@ from splatseed.kernels.simd import (
     aligned,
     any_greater,
     broadcast,
+    broadcast_element,
     element,
     exp_of_eighth,
     fma,
@@ -43,7 +44,6 @@ from splatseed.kernels.simd import (
     negative_magnitude,
     prefetch,
     select_greater,
-    splat,
     store,
     subtract,
 )
@@ -99,8 +99,8 @@ def forward(
     for place in parallel_range(len(tile_start) - 1):
         row, column = row_order[place // columns], place % columns
         tile = row * columns + column
-        px = add(load(lane_x, 0), splat(np.float32(TILE * column + HALF)))
-        py = add(load(lane_y, 0), splat(np.float32(TILE * row + HALF)))
+        px = add(load(lane_x, 0), broadcast(np.float32(TILE * column + HALF)))
+        py = add(load(lane_y, 0), broadcast(np.float32(TILE * row + HALF)))
         _forward_tile(
             records, listed_rank, tile_start[tile], tile_start[tile + 1], tile, px, py,
             fourth, image, transmittance, hits,
@@ -111,8 +111,8 @@ def forward(
 def _forward_tile(
     records, listed_rank, first, last, tile, px, py, fourth, image, transmittance, hits
 ):  # fmt: skip
-    chunk, lowest = CHUNK, splat(LOWEST)
-    right, below = add(px, splat(FOUR)), add(py, splat(FOUR))
+    chunk, lowest = CHUNK, broadcast(LOWEST)
+    right, below = add(px, broadcast(FOUR)), add(py, broadcast(FOUR))
     h, state = aligned(BLOCKS * chunk * LANES), aligned(BLOCKS * STATE)
     hit = np.empty(BLOCKS * chunk, np.int64)
     open_blocks, start = np.int64(ALL), first
@@ -150,9 +150,9 @@ def _forward_tile(
 def _clear(state):
     """T = 1 and colour 0 at every pixel."""
     for q in range(BLOCKS):
-        store(state, STATE * q, splat(ONE))
+        store(state, STATE * q, broadcast(ONE))
         for channel in range(CHANNELS):
-            store(state, STATE * q + LANES * (1 + channel), splat(ZERO))
+            store(state, STATE * q + LANES * (1 + channel), broadcast(ZERO))
 
 
 @always_inline
@@ -160,7 +160,7 @@ def _write(state, tile, image, transmittance):
     for q in range(BLOCKS):
         block = BLOCKS * tile + q
         signed = negative_magnitude(load(state, STATE * q))  # -T, finished or not
-        store(transmittance, LANES * block, subtract(splat(ZERO), signed))
+        store(transmittance, LANES * block, subtract(broadcast(ZERO), signed))
         for channel in range(CHANNELS):
             color = load(state, STATE * q + LANES * (1 + channel))
             store(image, LANES * (CHANNELS * block + channel), color)
@@ -169,12 +169,16 @@ def _write(state, tile, image, transmittance):
 @always_inline
 def _exponents(records, r, left, right, above, below):
     """The h of a Gaussian at the pixels of a tile's four blocks."""
-    mean_x, mean_y = broadcast(records, r), broadcast(records, r + 1)
-    a, b, c = broadcast(records, r + 2), broadcast(records, r + 3), broadcast(records, r + 4)
+    mean_x, mean_y = broadcast_element(records, r), broadcast_element(records, r + 1)
+    a, b, c = (
+        broadcast_element(records, r + 2),
+        broadcast_element(records, r + 3),
+        broadcast_element(records, r + 4),
+    )
     # h = top - (a dx^2 + c dy^2) / 16 - b dx dy / 8; records hold -a/16, -b/8 and -c/16
     dx0, dx1 = subtract(mean_x, left), subtract(mean_x, right)
     dy0, dy1 = subtract(mean_y, above), subtract(mean_y, below)
-    top = broadcast(records, r + 5)
+    top = broadcast_element(records, r + 5)
     y0, y1 = fma(multiply(c, dy0), dy0, top), fma(multiply(c, dy1), dy1, top)
     x0, x1, cross0, cross1 = multiply(a, dx0), multiply(a, dx1), multiply(b, dy0), multiply(b, dy1)
     return (
@@ -188,7 +192,7 @@ def _exponents(records, r, left, right, above, below):
 @always_inline
 def _blend_block(records, hit, h, q, count, fourth, state):
     """Blend the hits of block q; returns 1 if some pixel is unfinished, else 0."""
-    zero, stop = splat(ZERO), splat(STOP)
+    zero, stop = broadcast(ZERO), broadcast(STOP)
     base, first = STATE * q, CHUNK * q
     transmittance = load(state, base)
     c0, c1 = load(state, base + LANES), load(state, base + 2 * LANES)
@@ -196,19 +200,19 @@ def _blend_block(records, hit, h, q, count, fourth, state):
     for entry in range(first, first + count):
         r, exponent = element(hit, entry), load(h, LANES * entry)
         # alpha = min(0.999, exp(8 h)), and 0 below 1/255
-        alpha = select_greater(exponent, splat(LOWEST), exp_of_eighth(exponent), zero)
-        alpha = minimum(alpha, splat(MAX_ALPHA))
+        alpha = select_greater(exponent, broadcast(LOWEST), exp_of_eighth(exponent), zero)
+        alpha = minimum(alpha, broadcast(MAX_ALPHA))
         # T' = T (1 - alpha); where T' <= 1e-4 the pixel is finished: weight 0, and T gets a minus
         # sign
         after = fnma(transmittance, alpha, transmittance)
         weight = select_greater(after, stop, multiply(transmittance, alpha), zero)
         transmittance = select_greater(after, stop, after, negative_magnitude(transmittance))
         # colour += alpha T c
-        c0 = fma(weight, broadcast(records, r + 7), c0)
-        c1 = fma(weight, broadcast(records, r + 8), c1)
-        c2 = fma(weight, broadcast(records, r + 9), c2)
+        c0 = fma(weight, broadcast_element(records, r + 7), c0)
+        c1 = fma(weight, broadcast_element(records, r + 8), c1)
+        c2 = fma(weight, broadcast_element(records, r + 9), c2)
         if fourth:
-            c3 = fma(weight, broadcast(records, r + 10), c3)
+            c3 = fma(weight, broadcast_element(records, r + 10), c3)
     store(state, base, transmittance)
     store(state, base + LANES, c0)
     store(state, base + 2 * LANES, c1)

@@ -27,6 +27,7 @@ from splatseed.kernels.simd import (
     add,
     aligned,
     broadcast,
+    broadcast_element,
     divide,
     element,
     exp_of_eighth,
@@ -40,7 +41,6 @@ from splatseed.kernels.simd import (
     negative_magnitude,
     prefetch,
     select_greater,
-    splat,
     store,
     store_transposed,
     subtract,
@@ -102,7 +102,7 @@ def backward(
         for column in range(columns):
             tile = row * columns + column
             for q in range(BLOCKS):
-                store(transmittance, LANES * q, splat(ONE))
+                store(transmittance, LANES * q, broadcast(ONE))
             for start in range(tile_start[tile], tile_start[tile + 1], CHUNK):
                 stop = min(start + CHUNK, tile_start[tile + 1])
                 counts = _queue_hits(
@@ -156,8 +156,8 @@ def _backward_block(
 
     ``gradient_at``, ``behind_at`` and ``at`` are the block's offsets in the preceding arrays.
     """
-    zero, stop = splat(ZERO), splat(STOP)
-    px, py = add(load(lane_x, 0), splat(x + HALF)), add(load(lane_y, 0), splat(y + HALF))
+    zero, stop = broadcast(ZERO), broadcast(STOP)
+    px, py = add(load(lane_x, 0), broadcast(x + HALF)), add(load(lane_y, 0), broadcast(y + HALF))
     t, far = load(transmittance, at), load(behind, behind_at)
     v0, v1 = load(gradient, gradient_at), load(gradient, gradient_at + LANES)
     v2, v3 = load(gradient, gradient_at + 2 * LANES), load(gradient, gradient_at + 3 * LANES)
@@ -176,17 +176,17 @@ def _backward_block(
             alpha = select_greater(after, stop, alpha, zero)
             weight = multiply(t, alpha)
             # shade = gradient . c, and far = gradient . (colour behind this Gaussian)
-            shade = multiply(v0, broadcast(records, r + 7))
-            shade = fma(v1, broadcast(records, r + 8), shade)
-            shade = fma(v2, broadcast(records, r + 9), shade)
+            shade = multiply(v0, broadcast_element(records, r + 7))
+            shade = fma(v1, broadcast_element(records, r + 8), shade)
+            shade = fma(v2, broadcast_element(records, r + 9), shade)
             if fourth:
-                shade = fma(v3, broadcast(records, r + 10), shade)
+                shade = fma(v3, broadcast_element(records, r + 10), shade)
             far = fnma(weight, shade, far)
             # d loss / d alpha = T shade - far / (1 - alpha); with d alpha / d sigma = -alpha,
             # p = d loss / d sigma = (far / (1 - alpha) - T shade) alpha
-            slope = fnma(t, shade, divide(far, subtract(splat(ONE), alpha)))
+            slope = fnma(t, shade, divide(far, subtract(broadcast(ONE), alpha)))
             # A clamped alpha is constant.
-            p = select_greater(splat(MAX_ALPHA), alpha, multiply(slope, alpha), zero)
+            p = select_greater(broadcast(MAX_ALPHA), alpha, multiply(slope, alpha), zero)
             t = select_greater(after, stop, after, zero)
             store(batch, LANES * k, p)
             store(batch, WEIGHTS + LANES * k, weight)
@@ -209,18 +209,25 @@ def _looked_up(array, queue, place):
 @always_inline
 def _alpha(records, r, px, py):
     """min(0.999, exp(8 h)) where that is at least 1/255, else 0."""
-    dx, dy = subtract(broadcast(records, r), px), subtract(broadcast(records, r + 1), py)
-    a, b, c = broadcast(records, r + 2), broadcast(records, r + 3), broadcast(records, r + 4)
-    h = fma(multiply(c, dy), dy, broadcast(records, r + 5))
+    dx, dy = (
+        subtract(broadcast_element(records, r), px),
+        subtract(broadcast_element(records, r + 1), py),
+    )
+    a, b, c = (
+        broadcast_element(records, r + 2),
+        broadcast_element(records, r + 3),
+        broadcast_element(records, r + 4),
+    )
+    h = fma(multiply(c, dy), dy, broadcast_element(records, r + 5))
     h = fma(add(multiply(a, dx), multiply(b, dy)), dx, h)
-    alpha = select_greater(h, splat(LOWEST), exp_of_eighth(h), splat(ZERO))
-    return minimum(alpha, splat(MAX_ALPHA))
+    alpha = select_greater(h, broadcast(LOWEST), exp_of_eighth(h), broadcast(ZERO))
+    return minimum(alpha, broadcast(MAX_ALPHA))
 
 
 @always_inline
 def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
     """From p, weights and means of sixteen hits to their sums over the block, one per row."""
-    zero = splat(ZERO)
+    zero = broadcast(ZERO)
     # Moments of p over x within each row of the block, then over y: s = sum p, x = sum p x, ...
     s0, x0, xx0 = _moments(load_columns(batch, 0))
     s1, x1, xx1 = _moments(load_columns(batch, 4))
@@ -230,7 +237,7 @@ def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
     x, xy, _ = _moments((x0, x1, x2, x3))
     xx = add(add(xx0, xx3), add(xx1, xx2))
     mx, my = load(batch, MEANS), load(batch, MEANS + LANES)
-    mx, my = subtract(mx, splat(center_x)), subtract(my, splat(center_y))
+    mx, my = subtract(mx, broadcast(center_x)), subtract(my, broadcast(center_y))
     # With dx = mx - x: sum p dx = mx s - x, sum p dx^2 = mx (sum p dx - x) + xx, and
     # sum p dx dy = mx sum p dy - my x + xy
     px, py = subtract(multiply(mx, s), x), subtract(multiply(my, s), y)
@@ -256,18 +263,18 @@ def _moments(values):
     """Sum, first and second moment of four values at -OUTER, -HALF, HALF and OUTER."""
     a, b, c, d = values
     outer, inner = add(a, d), add(b, c)
-    first = fma(subtract(d, a), splat(OUTER), multiply(subtract(c, b), splat(HALF)))
-    second = fma(outer, splat(OUTER * OUTER), multiply(inner, splat(HALF * HALF)))
+    first = fma(subtract(d, a), broadcast(OUTER), multiply(subtract(c, b), broadcast(HALF)))
+    second = fma(outer, broadcast(OUTER * OUTER), multiply(inner, broadcast(HALF * HALF)))
     return add(outer, inner), first, second
 
 
 @always_inline
 def _add_products(total, weights, values, first):
     """``total`` plus weights[i] values[first + i] for four weights."""
-    total = fma(weights[0], broadcast(values, first), total)
-    total = fma(weights[1], broadcast(values, first + 1), total)
-    total = fma(weights[2], broadcast(values, first + 2), total)
-    return fma(weights[3], broadcast(values, first + 3), total)
+    total = fma(weights[0], broadcast_element(values, first), total)
+    total = fma(weights[1], broadcast_element(values, first + 1), total)
+    total = fma(weights[2], broadcast_element(values, first + 2), total)
+    return fma(weights[3], broadcast_element(values, first + 3), total)
 
 
 @always_inline
@@ -277,11 +284,14 @@ def _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, 
         entry = queue[begin + k]
         r, s = RECORD * np.int64(listed_rank[entry]), SUMS * np.int64(listed_span[entry])
         p = load(batch, LANES * k)
-        along_x = multiply(p, subtract(broadcast(records, r), px))
-        along_y = multiply(p, subtract(broadcast(records, r + 1), py))
+        along_x = multiply(p, subtract(broadcast_element(records, r), px))
+        along_y = multiply(p, subtract(broadcast_element(records, r + 1), py))
         # records hold -a/16, -b/8, -c/16
-        a, b = splat(np.float32(-16.0) * records[r + 2]), splat(np.float32(-8.0) * records[r + 3])
-        c = splat(np.float32(-16.0) * records[r + 4])
+        a, b = (
+            broadcast(np.float32(-16.0) * records[r + 2]),
+            broadcast(np.float32(-8.0) * records[r + 3]),
+        )
+        c = broadcast(np.float32(-16.0) * records[r + 4])
         step_x = fma(a, along_x, multiply(b, along_y))
         step_y = fma(b, along_x, multiply(c, along_y))
         sums[s + ABSOLUTE] -= lane_sum(negative_magnitude(step_x))
@@ -292,7 +302,7 @@ def _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, 
 def sum_spans(span_start, sums, totals):
     """Add up each Gaussian's spans in order: [16 S] to [G, 16] by depth rank."""
     for g in parallel_range(len(totals)):
-        total = splat(ZERO)
+        total = broadcast(ZERO)
         for span in range(span_start[g], span_start[g + 1]):
             total = add(total, load(sums, SUMS * span))
         store(totals[g], 0, total)

@@ -26,12 +26,12 @@ from splatseed.kernels.shuffles import lane, permutation, three_sums, triple
 from splatseed.kernels.simd import (
     LANES,
     add,
+    broadcast,
     fma,
     load,
     multiply,
     prefetch,
     select_greater,
-    splat,
     store,
 )
 
@@ -196,7 +196,7 @@ def harmonics_vjp(
                 dx, dy = (dx - along * x) * inverse, (dy - along * y) * inverse
                 dz = (dz - along * z) * inverse
             else:
-                zero = splat(np.float32(0.0))
+                zero = broadcast(np.float32(0.0))
                 store(d_rest, row + FIRST[0], zero)
                 store(d_rest, row + FIRST[1], zero)
                 store(d_rest, row + FIRST[2], zero)
@@ -220,7 +220,7 @@ def _length(x, y, z):
 
 @always_inline
 def _vectors(x, y, z):
-    return splat(np.float32(x)), splat(np.float32(y)), splat(np.float32(z))
+    return broadcast(np.float32(x)), broadcast(np.float32(y)), broadcast(np.float32(z))
 
 
 @always_inline
@@ -259,7 +259,7 @@ def _row(rest, row, table):
 
 @always_inline
 def _live(v, marks):
-    zero = splat(np.float32(0.0))
+    zero = broadcast(np.float32(0.0))
     return select_greater(marks, zero, v, zero)
 
 

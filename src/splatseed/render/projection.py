@@ -36,8 +36,8 @@ BLOCK = 32
 """Gaussians per block."""
 X, Q, S, GIVEN = 0, 3, 7, 10
 """First rows of a block: the mean in the world, the quaternion, the scales, further inputs."""
-U, V, DEPTH, A, B, C, COMPENSATION, SIGMA_X, SIGMA_Y, OPACITY = range(10)
-"""Rows of a projected block; SIGMA are standard deviations."""
+U, V, DEPTH, A, B, C, COMPENSATION, SIGMA_X, SIGMA_Y, INVERSE_DET, OPACITY = range(11)
+"""Rows of a projected block: mean, conic, standard deviations in px, 1 / det of the covariance."""
 DU, DV, DDEPTH, DCOMPENSATION, DCONIC = range(GIVEN, GIVEN + 5)
 """Rows of the input gradients."""
 
@@ -71,7 +71,7 @@ def project(
     """
     for chunk in parallel_range(CHUNKS):
         # One allocation per chunk: one per Gaussian would take as long as all of the arithmetic.
-        block, projected = np.ones((GIVEN + 1, BLOCK), np.float32), np.empty((10, BLOCK))
+        block, projected = np.ones((GIVEN + 1, BLOCK), np.float32), np.empty((11, BLOCK))
         lanes = np.empty(BLOCK, np.intp)
         pose, lens = _pose(view), _lens(K, width, height)
         end = (chunk + 1) * len(means) // CHUNKS
@@ -177,7 +177,7 @@ def _project_block(block, pose, lens, eps2d, projected):
         # compensation = sqrt(det P P' / det(P P' + eps2d I))
         projected[COMPENSATION, lane] = math.sqrt(max(raw * over, 0.0))
         projected[SIGMA_X, lane], projected[SIGMA_Y, lane] = math.sqrt(xx), math.sqrt(yy)
-        projected[OPACITY, lane] = over
+        projected[INVERSE_DET, lane] = over
 
 
 @always_inline
@@ -223,10 +223,10 @@ def _rotation(quat):
 
 @always_inline
 def _cull(block, near, far, width, height, antialiased, projected):
-    """Overwrite 1 / determinant, in the row OPACITY, by the opacity, or 0 if culled."""
+    """Fill the row OPACITY: 0 where the Gaussian is culled."""
     for lane in range(BLOCK):
         u, v, z = projected[U, lane], projected[V, lane], projected[DEPTH, lane]
-        over = projected[OPACITY, lane]
+        over = projected[INVERSE_DET, lane]
         rx = MAX_SIGMAS * projected[SIGMA_X, lane] + 1.0
         ry = MAX_SIGMAS * projected[SIGMA_Y, lane] + 1.0
         opacity = np.float64(block[GIVEN, lane])

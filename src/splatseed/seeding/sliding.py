@@ -112,7 +112,7 @@ def _try(quad_images, places, window, own, tried, state):
 
 @always_inline
 def _variance(window, lane):
-    """Variance of a reference window, from its weights c and likeness a (``stereo.cost``)."""
+    """Variance of a reference window, from its weights c and samples a (``stereo.cost``)."""
     # sum a^2 / c = var / (var + NOISE)
     share = np.float32(0.0)
     for k in range(SAMPLES):

@@ -28,6 +28,7 @@ from splatseed.kernels.jit import always_inline, inline
 from splatseed.kernels.simd import (
     LANES,
     add,
+    broadcast,
     divide,
     exp_of_eighth,
     fma,
@@ -36,7 +37,6 @@ from splatseed.kernels.simd import (
     minimum,
     multiply,
     select_greater,
-    splat,
     store,
     subtract,
 )
@@ -60,15 +60,16 @@ BEST = 2
 LEAST = np.float32(-0.7)
 """End of ``exp_of_eighth``'s domain."""
 
+# Halved exponents, divided by 8 for ``exp_of_eighth``.
 _GREY = np.float32(-0.5 / SIGMA_GREY**2 / 8)
 _PLACE = np.float32(-0.5 / SIGMA_PLACE**2 / 8)
 _NOISE, _HALF, _ONE, _NOTHING = (np.float32(each) for each in (NOISE, 0.5, 1.0, 0.0))
-_UNSEEN, _WORST = np.float32(UNSEEN), np.float32(4.0)
+_UNSEEN, _WORST = np.float32(UNSEEN), np.float32(4.0)  # costs end at 2
 
 
 @inline
-def prepare_window(quads, width, height, u, v, weights, likeness):
-    """Weights c and likeness a of the windows around sixteen pixels.
+def prepare_window(quads, width, height, u, v, weights, reference):
+    """Weights c and normalised reference samples a of the windows around sixteen pixels.
 
     Args:
         quads: The reference view's quad image, flat.
@@ -77,39 +78,38 @@ def prepare_window(quads, width, height, u, v, weights, likeness):
         u: float32 [16], pixels.
         v: float32 [16].
         weights: Filled with c, float32 [SAMPLES * 16].
-        likeness: Filled with a, float32 [SAMPLES * 16]; holds r in between.
+        reference: Filled with a, float32 [SAMPLES * 16]; holds r in between.
     """
-    half = splat(_HALF)
+    half = broadcast(_HALF)
     column, row = subtract(load(u, 0), half), subtract(load(v, 0), half)
     center = sample(quads, width, height, column, row)
-    total, mean, square = splat(_NOTHING), splat(_NOTHING), splat(_NOTHING)
+    total, mean, square = broadcast(_NOTHING), broadcast(_NOTHING), broadcast(_NOTHING)
     for k in range(SAMPLES):
         x, y = STRIDE * (k % SIDE - RADIUS), STRIDE * (k // SIDE - RADIUS)
-        r = sample(
-            quads, width, height, add(column, splat(np.float32(x))), add(row, splat(np.float32(y)))
-        )
-        apart = subtract(r, center)
-        exponent = fma(
-            multiply(apart, apart), splat(_GREY), splat(np.float32(x * x + y * y) * _PLACE)
-        )
-        c = exp_of_eighth(select_greater(splat(LEAST), exponent, splat(LEAST), exponent))
+        right, down = broadcast(np.float32(x)), broadcast(np.float32(y))
+        r = sample(quads, width, height, add(column, right), add(row, down))
+        # c = exp(-(r - r_center)^2 / (2 SIGMA_GREY^2) - (x^2 + y^2) / (2 SIGMA_PLACE^2))
+        apart, place = subtract(r, center), broadcast(np.float32(x * x + y * y) * _PLACE)
+        exponent = fma(multiply(apart, apart), broadcast(_GREY), place)
+        c = exp_of_eighth(select_greater(broadcast(LEAST), exponent, broadcast(LEAST), exponent))
         total = add(total, c)
         mean = fma(c, r, mean)
         square = fma(multiply(c, r), r, square)
         store(weights, k * LANES, c)
-        store(likeness, k * LANES, r)
-    scale = divide(splat(_ONE), total)
+        store(reference, k * LANES, r)
+    scale = divide(broadcast(_ONE), total)  # the weights are to sum to 1
     mean, square = multiply(mean, scale), multiply(square, scale)
-    inverse = divide(splat(_ONE), square_root(_variance(square, mean)))
+    # a = c (r - mean_r) / sqrt(var_r + NOISE)
+    inverse = divide(broadcast(_ONE), square_root(_variance(square, mean)))
     for k in range(SAMPLES):
         c = multiply(load(weights, k * LANES), scale)
         store(weights, k * LANES, c)
-        r = load(likeness, k * LANES)
-        store(likeness, k * LANES, multiply(multiply(c, subtract(r, mean)), inverse))
+        r = load(reference, k * LANES)
+        store(reference, k * LANES, multiply(multiply(c, subtract(r, mean)), inverse))
 
 
 @inline
-def best_cost(sources, sizes, offsets, warps, u, v, planes, weights, likeness, out):
+def best_cost(sources, sizes, offsets, warps, u, v, planes, weights, reference, out):
     """The mean of the ``BEST`` lowest costs over the sources, for one plane per lane.
 
     Args:
@@ -121,72 +121,77 @@ def best_cost(sources, sizes, offsets, warps, u, v, planes, weights, likeness, o
         v: float32 [16].
         planes: w0, gx, gy, float32 [3 * 16].
         weights: float32 [SAMPLES * 16].
-        likeness: float32 [SAMPLES * 16].
+        reference: float32 [SAMPLES * 16].
         out: Filled with the costs, float32 [16].
     """
-    least, second = splat(_WORST), splat(_WORST)
+    least, second = broadcast(_WORST), broadcast(_WORST)
     for s in range(len(sizes)):
         quads = sources[offsets[s] : offsets[s + 1]]
-        cost = _cost(quads, sizes[s, 0], sizes[s, 1], warps[s], u, v, planes, weights, likeness)
+        cost = _cost(quads, sizes[s, 0], sizes[s, 1], warps[s], u, v, planes, weights, reference)
+        # The two lowest, without a branch: the loser of (cost, least) competes for second place.
         worse = select_greater(cost, least, cost, least)
         least, second = minimum(least, cost), minimum(second, worse)
     if len(sizes) == 1:
         store(out, 0, least)
     else:
-        store(out, 0, multiply(add(least, second), splat(_HALF)))
+        store(out, 0, multiply(add(least, second), broadcast(_HALF)))
 
 
 @always_inline
-def _cost(quads, width, height, warp, u, v, planes, weights, likeness):
+def _cost(quads, width, height, warp, u, v, planes, weights, reference):
     """The cost in one source: 1 - sum a_i s_i / sqrt(var_s + NOISE)."""
     u0, v0 = load(u, 0), load(v, 0)
     w, gx, gy = load(planes, 0), load(planes, LANES), load(planes, 2 * LANES)
     x0, ax, bx = _component(warp, 0, u0, v0, w, gx, gy)
     y0, ay, by = _component(warp, 1, u0, v0, w, gx, gy)
     z0, az, bz = _component(warp, 2, u0, v0, w, gx, gy)
-    half = splat(_HALF)
-    like, mean, square = splat(_NOTHING), splat(_NOTHING), splat(_NOTHING)
+    half = broadcast(_HALF)  # pixel centres lie at +0.5, samples at whole columns and rows
+    correlation, mean, square = broadcast(_NOTHING), broadcast(_NOTHING), broadcast(_NOTHING)
     for j in range(SIDE):
-        down = splat(np.float32(STRIDE * (j - RADIUS)))
+        # P is affine in the pixel: a row's start, then steps to the right, one division each.
+        down = broadcast(np.float32(STRIDE * (j - RADIUS)))
         rx, ry, rz = fma(down, bx, x0), fma(down, by, y0), fma(down, bz, z0)
         for i in range(SIDE):
-            right = splat(np.float32(STRIDE * (i - RADIUS)))
-            inverse = divide(splat(_ONE), fma(right, az, rz))
+            right = broadcast(np.float32(STRIDE * (i - RADIUS)))
+            inverse = divide(broadcast(_ONE), fma(right, az, rz))
             column = subtract(multiply(fma(right, ax, rx), inverse), half)
             row = subtract(multiply(fma(right, ay, ry), inverse), half)
             s = sample(quads, width, height, column, row)
             k = (j * SIDE + i) * LANES
             c = load(weights, k)
-            like = fma(load(likeness, k), s, like)
+            correlation = fma(load(reference, k), s, correlation)
             mean = fma(c, s, mean)
             square = fma(multiply(c, s), s, square)
-    cost = fnma(like, divide(splat(_ONE), square_root(_variance(square, mean))), splat(_ONE))
+    # sum a_i s_i needs no mean_s: the a_i sum to 0.
+    inverse = divide(broadcast(_ONE), square_root(_variance(square, mean)))
+    cost = fnma(correlation, inverse, broadcast(_ONE))
     return _where_seen(cost, x0, y0, z0, width, height)
 
 
 @always_inline
 def _component(warp, i, u, v, w, gx, gy):
     """Component i of P at the window's centre, and its change per pixel to the right and down."""
-    a, b = splat(warp[3 * i]), splat(warp[3 * i + 1])
-    c, d = splat(warp[3 * i + 2]), splat(warp[9 + i])
-    start = fma(a, u, fma(b, v, fma(d, w, c)))
+    a, b = broadcast(warp[3 * i]), broadcast(warp[3 * i + 1])
+    c, d = broadcast(warp[3 * i + 2]), broadcast(warp[9 + i])
+    start = fma(a, u, fma(b, v, fma(d, w, c)))  # P_i = a u + b v + c + d w
     return start, fma(d, gx, a), fma(d, gy, b)
 
 
 @always_inline
 def _variance(square, mean):
     """E[x^2] - E[x]^2 plus the noise; never 0."""
-    noise = splat(_NOISE)
-    variance = fnma(mean, mean, add(square, noise))
+    noise = broadcast(_NOISE)
+    variance = fnma(mean, mean, add(square, noise))  # rounding can take it below the noise
     return select_greater(variance, noise, variance, noise)
 
 
 @always_inline
 def _where_seen(cost, x, y, z, width, height):
     """The cost, or ``UNSEEN`` where P is behind the camera or outside the frame."""
-    nothing, unseen = splat(_NOTHING), splat(_UNSEEN)
+    nothing, unseen = broadcast(_NOTHING), broadcast(_UNSEEN)
+    # 0 < x / z < width, multiplied by z > 0; likewise y
     cost = select_greater(z, nothing, cost, unseen)
     cost = select_greater(x, nothing, cost, unseen)
     cost = select_greater(y, nothing, cost, unseen)
-    cost = select_greater(multiply(z, splat(np.float32(width))), x, cost, unseen)
-    return select_greater(multiply(z, splat(np.float32(height))), y, cost, unseen)
+    cost = select_greater(multiply(z, broadcast(np.float32(width))), x, cost, unseen)
+    return select_greater(multiply(z, broadcast(np.float32(height))), y, cost, unseen)

@@ -112,7 +112,7 @@ def sweep(quad_images, color, number, key, planes, costs):
 
 @inline
 def _buffers():
-    """Buffers: lanes' columns, pixels u and v, window weights and likeness, planes, costs."""
+    """Buffers: lanes' columns, pixels u and v, window weights c and samples a, planes, costs."""
     return (
         np.zeros(LANES, np.int64),
         np.zeros((2, LANES), np.float32),

@@ -60,9 +60,9 @@ class Stereo:
 
     def confidence(self, i: int) -> Float32[np.ndarray, "h w"]:
         """The correlation, with doubt halved by each view that agrees; 0 where not kept."""
-        likeness = np.clip(1.0 - self.costs[i], 0.0, 1.0)
+        correlation = np.clip(1.0 - self.costs[i], 0.0, 1.0)
         belief = 1.0 - 0.5 ** np.bitwise_count(self.agreeing[i])
-        return np.where(self.kept(i), likeness * belief, 0.0).astype(np.float32)
+        return np.where(self.kept(i), correlation * belief, 0.0).astype(np.float32)
 
     def normals(self, i: int) -> Float32[np.ndarray, "h w 3"]:
         """Unit normals towards the camera, in its axes.

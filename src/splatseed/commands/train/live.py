@@ -14,7 +14,7 @@ from splatseed.requirements import require
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
-    from splatseed.view.training import TrainingViewer
+    from splatseed.viewer.training import TrainingViewer
 
 __all__ = ["Watch", "view_port", "watched"]
 
@@ -53,7 +53,7 @@ def view_port(port: int) -> int:
         ParameterError: The port is taken.
     """
     require("viser")
-    from splatseed.view.viewer import free_port  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.viewer.viewer import free_port  # noqa: PLC0415  (imports PyTorch)
 
     return free_port(HOST, port)
 
@@ -64,7 +64,7 @@ def watched(training: TrainingRun, scene: Path, port: int | None) -> Iterator[Wa
     if port is None:
         yield Watch()
         return
-    from splatseed.view.training import TrainingViewer  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.viewer.training import TrainingViewer  # noqa: PLC0415  (imports PyTorch)
 
     loaded = load_scene(scene, require_points=False)
     viewer = TrainingViewer(training, loaded, scene.name or str(scene), HOST, port)

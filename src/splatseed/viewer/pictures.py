@@ -27,10 +27,10 @@ from splatseed.seeding.coverage import covered_cells
 from splatseed.splat.frame import TrainingFrame
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.pictures import error_map
-from splatseed.view.canvas import laid_onto
-from splatseed.view.frames import as_bytes, depth_colors
-from splatseed.view.renderer import ModelRenderer
-from splatseed.view.shown import Shown
+from splatseed.viewer.canvas import laid_onto
+from splatseed.viewer.frames import as_bytes, depth_colors
+from splatseed.viewer.renderer import ModelRenderer
+from splatseed.viewer.shown import Shown
 from splatseed.views.view import View, poses_of
 
 __all__ = ["NOTHING", "Drawn", "Entry"]

@@ -20,12 +20,12 @@ from splatseed.errors import ParameterError
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.splat.frame import TrainingFrame, training_frame
-from splatseed.view.canvas import fitted_fov, stage_pose
-from splatseed.view.paths import orbit
-from splatseed.view.pictures import Entry
-from splatseed.view.renderer import model_frame
-from splatseed.view.session import MOST_POINTS, Session
-from splatseed.view.shown import Shown
+from splatseed.viewer.canvas import fitted_fov, stage_pose
+from splatseed.viewer.paths import orbit
+from splatseed.viewer.pictures import Entry
+from splatseed.viewer.renderer import model_frame
+from splatseed.viewer.session import MOST_POINTS, Session
+from splatseed.viewer.shown import Shown
 from splatseed.views.view import poses_of
 from splatseed.views.viewpoint import choose_camera, choose_image
 

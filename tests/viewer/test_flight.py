@@ -13,7 +13,7 @@ ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpe
 from splatseed.io import load_scene
 from splatseed.similarity import Similarity
 from splatseed.splat.ply import read_gaussians
-from splatseed.view.renderer import ModelRenderer, model_frame
+from splatseed.viewer.renderer import ModelRenderer, model_frame
 from splatseed.views.view import poses_of
 
 

@@ -23,7 +23,7 @@ from splatseed.io.files import read_bytes
 from splatseed.similarity import Similarity
 from splatseed.splat.frame import stray_views
 from splatseed.splat.gaussians import Gaussians
-from splatseed.view.renderer import resized
+from splatseed.viewer.renderer import resized
 from splatseed.views.view import View
 from splatseed.views.viewpoint import look_at
 

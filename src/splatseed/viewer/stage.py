@@ -17,7 +17,7 @@ from splatseed.preview.origins import origin_colors
 from splatseed.scene import Image, Scene
 from splatseed.splat.frame import TrainingFrame
 from splatseed.upsample.registry import origin_name
-from splatseed.view.canvas import stage_pose
+from splatseed.viewer.canvas import stage_pose
 
 __all__ = ["Cloud", "add_cameras", "add_clouds", "clouds_of", "point_size"]
 

@@ -13,16 +13,17 @@ import pytest
 torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
+from splatseed.view import pictures, session as session_module
+
 from splatseed.cli import main
 from splatseed.errors import ParameterError
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.frame import TrainingFrame
-from splatseed.view import pictures, session as session_module
-from splatseed.view.canvas import canvas_view, fitted_fov, laid_onto, stage_pose
-from splatseed.view.pictures import Entry
-from splatseed.view.shown import open_shown
-from splatseed.view.stage import clouds_of
-from splatseed.view.viewer import Viewer, free_port, stage_frame
+from splatseed.viewer.canvas import canvas_view, fitted_fov, laid_onto, stage_pose
+from splatseed.viewer.pictures import Entry
+from splatseed.viewer.shown import open_shown
+from splatseed.viewer.stage import clouds_of
+from splatseed.viewer.viewer import Viewer, free_port, stage_frame
 
 from .page import (
     CHROMIUM,

@@ -16,9 +16,9 @@ from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene
 from splatseed.train.run import prepare_run
 from splatseed.train.settings import TrainSettings
-from splatseed.view.canvas import canvas_view, fitted_fov, stage_pose
-from splatseed.view.training import TrainingViewer
-from splatseed.view.viewer import free_port
+from splatseed.viewer.canvas import canvas_view, fitted_fov, stage_pose
+from splatseed.viewer.training import TrainingViewer
+from splatseed.viewer.viewer import free_port
 
 STEPS = 40
 

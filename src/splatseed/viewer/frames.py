@@ -9,7 +9,7 @@ from jaxtyping import Float32, UInt8
 
 from splatseed.preview.page import font
 from splatseed.progress import Progress, silent
-from splatseed.view.renderer import ModelRenderer
+from splatseed.viewer.renderer import ModelRenderer
 from splatseed.views.view import View
 
 __all__ = [

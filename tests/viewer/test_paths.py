@@ -13,11 +13,11 @@ from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io import load_scene
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.ply import read_gaussians
-from splatseed.view.frames import depth_colors, split_picture
-from splatseed.view.paths import focus_of, orbit, path_of_file, smooth_path
-from splatseed.view.renderer import ModelRenderer, model_frame
-from splatseed.view.shown import open_shown
-from splatseed.view.video import even_size
+from splatseed.viewer.frames import depth_colors, split_picture
+from splatseed.viewer.paths import focus_of, orbit, path_of_file, smooth_path
+from splatseed.viewer.renderer import ModelRenderer, model_frame
+from splatseed.viewer.shown import open_shown
+from splatseed.viewer.video import even_size
 from splatseed.views.view import View, poses_of
 from splatseed.views.viewpoint import look_at
 

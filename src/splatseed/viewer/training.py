@@ -19,10 +19,10 @@ from jaxtyping import Float32
 from splatseed.scene import Image, Scene
 from splatseed.splat.frame import training_frame
 from splatseed.train.run import TrainingRun
-from splatseed.view.pictures import Drawn, Entry
-from splatseed.view.session import Session
-from splatseed.view.shown import Shown
-from splatseed.view.viewer import Viewer
+from splatseed.viewer.pictures import Drawn, Entry
+from splatseed.viewer.session import Session
+from splatseed.viewer.shown import Shown
+from splatseed.viewer.viewer import Viewer
 from splatseed.views.view import View, poses_of
 
 __all__ = ["TrainingViewer"]

@@ -17,11 +17,11 @@ from splatseed.errors import SplatseedError
 from splatseed.literal import visible
 from splatseed.preview.photographs import photograph_at
 from splatseed.scene import Image, Scene
-from splatseed.view.canvas import canvas_view, fitted_fov, stage_pose
-from splatseed.view.frames import split_picture
-from splatseed.view.live import FrameLoop
-from splatseed.view.pictures import NOTHING, Drawn, Entry
-from splatseed.view.stage import add_cameras, add_clouds, clouds_of, point_size
+from splatseed.viewer.canvas import canvas_view, fitted_fov, stage_pose
+from splatseed.viewer.frames import split_picture
+from splatseed.viewer.live import FrameLoop
+from splatseed.viewer.pictures import NOTHING, Drawn, Entry
+from splatseed.viewer.stage import add_cameras, add_clouds, clouds_of, point_size
 from splatseed.views.view import View
 
 __all__ = ["MOST_POINTS", "Session"]
