@@ -17,7 +17,7 @@ from splatseed.scene import Scene, Tracks
 from splatseed.tiles.cuts import cut_up
 from splatseed.tiles.stream import TileDraws, stream_state
 from splatseed.upsample import configure, neighbors, upsample
-from splatseed.upsample.trust import trusted_originals
+from splatseed.upsample.neighbors import trusted_originals
 
 from .conftest import Tiles
 

@@ -9,8 +9,7 @@ from splatseed import PointCloud, Scene, upsample
 from splatseed.progress import silent
 from splatseed.scene import Tracks
 from splatseed.upsample import configure
-from splatseed.upsample.neighbors import prepare
-from splatseed.upsample.trust import trusted_originals
+from splatseed.upsample.neighbors import prepare, trusted_originals
 
 
 def scene_with(lengths, errors):

@@ -18,7 +18,7 @@ from splatseed.errors import OutputError
 from splatseed.io.clouds import CloudChunk, CloudFile
 from splatseed.io.output.earlier import number_of_originals
 from splatseed.scene import Scene
-from splatseed.upsample.trust import trusted_originals
+from splatseed.upsample.neighbors import trusted_originals
 
 __all__ = ["FileSource", "SceneSource", "Source"]
 

@@ -1,7 +1,8 @@
 """COLMAP models in binary form: ``cameras.bin``, ``images.bin``, ``points3D.bin``.
 
 Notation: ``_id`` comes from the file. Layouts as COLMAP's documentation of its output format gives
-them, little-endian. Promise: a file that was read is written back byte for byte; a malformed one
+them, little-endian. In ``points3D.bin``, N records hold T observations in all, and ``starts``
+[N + 1] are the records' byte offsets, ended by the end of the last. Promise: a file that was read is written back byte for byte; a malformed one
 raises a single error that names the file, the record and the byte; points are looped over in
 Python only to find where each record begins. Writers write straight to ``path`` and let ``OSError``
 pass: their caller stages the output.
@@ -31,7 +32,6 @@ from splatseed.io.colmap.model import (
     make_points,
     point_columns,
 )
-from splatseed.io.colmap.records import join_records, scan_records, split_records
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
@@ -54,6 +54,11 @@ _POINT = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
 )
 _OBSERVATION = np.dtype([("image_id", "<u4"), ("point2d_idx", "<u4")])
+# A record of points3D.bin is a head of 51 bytes, whose last field is the track's length L, then L
+# observations of 8 bytes; nothing is aligned.
+_HEAD_BYTES, _PAIR_BYTES = _POINT.itemsize, _OBSERVATION.itemsize
+_LENGTH_AT = 43  # of the track length within a head
+_LENGTH = struct.Struct("<Q")
 _POINTS_AT_ONCE = 1 << 18  # bounds the writer's memory to some tens of megabytes
 
 
@@ -156,7 +161,7 @@ def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
 
 def _scan_points(reader: ByteReader, count: int) -> Int64[np.ndarray, " N+1"]:
     """The byte offset of each point record, then the end of the last; consumes the file."""
-    starts = scan_records(reader.data, reader.offset, count)
+    starts = _scan_records(reader.data, reader.offset, count)
     complete = len(starts) - 1
     reader.offset = int(starts[complete])
     if complete < count:
@@ -170,7 +175,7 @@ def _split_points(
     reader: ByteReader, starts: Int64[np.ndarray, " N+1"]
 ) -> tuple[np.ndarray, np.ndarray]:
     """The heads [N] as ``_POINT`` and the track elements [T] as ``_OBSERVATION``."""
-    heads, pairs = split_records(np.frombuffer(reader.data, np.uint8), starts)
+    heads, pairs = _split_records(np.frombuffer(reader.data, np.uint8), starts)
     return heads.view(_POINT), pairs.view(_OBSERVATION)
 
 
@@ -312,8 +317,63 @@ def _joined_records(
     observations["point2d_idx"] = tracks.point2d_idx[first:last]
     record_offsets = (tracks.offsets[start : stop + 1] - first) * _OBSERVATION.itemsize
     record_offsets += np.arange(len(record_offsets)) * _POINT.itemsize
-    return join_records(heads.view(np.uint8), observations.view(np.uint8), record_offsets)
+    return _join_records(heads.view(np.uint8), observations.view(np.uint8), record_offsets)
 
 
 def _record(idx: int) -> str:
     return f"record {idx + 1}"
+
+
+def _scan_records(data: bytes, first: int, count: int) -> Int64[np.ndarray, " K+1"]:
+    """The offsets of ``count`` records that begin at ``first``, then the end of the last.
+
+    Returns:
+        Offsets of the K records that lie whole inside the data, and where the next one begins; K is
+        less than ``count`` if the data ends within that one.
+    """
+    at, last = first, len(data) - _HEAD_BYTES
+    starts = [at]
+    length_at = _LENGTH.unpack_from
+    for _ in range(count):  # a record's place is known only from the one before it
+        if at > last:
+            break
+        at += _HEAD_BYTES + _PAIR_BYTES * length_at(data, at + _LENGTH_AT)[0]
+        if at > len(data):
+            break
+        starts.append(at)
+    return np.array(starts, np.int64)
+
+
+def _split_records(
+    buffer: UInt8[np.ndarray, " B"], starts: Int64[np.ndarray, " N+1"]
+) -> tuple[UInt8[np.ndarray, " 51*N"], UInt8[np.ndarray, " 8*T"]]:
+    """The heads and the tracks of scanned records, apart; the inverse of ``_join_records``."""
+    heads = _anywhere(buffer, _HEAD_BYTES)[starts[:-1]]
+    pairs = _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)]
+    return heads.view(np.uint8), pairs.view(np.uint8)
+
+
+def _join_records(
+    heads: UInt8[np.ndarray, " 51*N"],
+    pairs: UInt8[np.ndarray, " 8*T"],
+    starts: Int64[np.ndarray, " N+1"],
+) -> UInt8[np.ndarray, " B"]:
+    """Heads and tracks interleaved, record i at ``starts[i]``."""
+    buffer = np.empty(starts[-1], np.uint8)
+    _anywhere(buffer, _HEAD_BYTES)[starts[:-1]] = heads.view(f"V{_HEAD_BYTES}")
+    _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)] = pairs.view(f"V{_PAIR_BYTES}")
+    return buffer
+
+
+def _anywhere(buffer: UInt8[np.ndarray, " B"], size: int) -> np.ndarray:
+    """The ``size`` bytes from each byte of a buffer on, as one element: a view."""
+    return np.ndarray(max(len(buffer) - size + 1, 0), f"V{size}", buffer, strides=(1,))
+
+
+def _pair_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " T"]:
+    """Where each observation stands."""
+    lengths = (np.diff(starts) - _HEAD_BYTES) // _PAIR_BYTES
+    before = np.cumsum(lengths) - lengths
+    offsets = np.repeat(starts[:-1] + _HEAD_BYTES - _PAIR_BYTES * before, lengths)
+    offsets += _PAIR_BYTES * np.arange(len(offsets))
+    return offsets

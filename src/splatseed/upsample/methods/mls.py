@@ -17,8 +17,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.kernels.jit import inline, kernel, parallel_range
-from splatseed.upsample.surfaces.patch_method import PatchMethod
-from splatseed.upsample.surfaces.patches import Patches
+from splatseed.upsample.surfaces.patches import Patches, PatchMethod
 
 __all__ = ["Mls"]
 

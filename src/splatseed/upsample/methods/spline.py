@@ -20,8 +20,7 @@ from jaxtyping import Float32, Float64
 
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.method import require
-from splatseed.upsample.surfaces.patch_method import PatchMethod
-from splatseed.upsample.surfaces.patches import Patches
+from splatseed.upsample.surfaces.patches import Patches, PatchMethod
 from splatseed.upsample.surfaces.spline_basis import (
     CONTROL,
     PatchBasis,
