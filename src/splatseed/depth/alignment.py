@@ -160,6 +160,7 @@ def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignmen
     plain = replace(plain, residual=_residual(depth.kind, value, z, 1.0, 0.0))
     with np.errstate(divide="ignore"):
         ratio = float(np.median((1.0 / value if depth.kind == "inverse" else value) / z))
+    # Depth in millimetres, or of another scene, is off by far more.
     if 1.0 / UNIT_SLACK < ratio < UNIT_SLACK:
         return plain
     return replace(plain, rejected=f"its depth is {ratio:.3g} times that of the SfM points")
@@ -220,6 +221,7 @@ def _residual(
     """
     aligned = scale * value + shift
     if kind == "inverse":
+        # Where 1 / z would not be positive there is no depth.
         aligned = 1.0 / np.where(aligned > 0, aligned, np.nan)
     error = np.abs(aligned / z - 1.0)
     return float(median(np.where(np.isfinite(error), error, np.inf)))

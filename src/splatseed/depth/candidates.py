@@ -28,6 +28,7 @@ from splatseed.progress import Progress, in_threads
 __all__ = ["DISTRUSTED", "NEAR_EDGE", "UNCONFIRMED", "Candidates", "choose", "gather"]
 
 SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
+"""Tiers, in the order in which they are used up; the last is never used."""
 PIECE = 4
 """Views per task of a thread."""
 
@@ -90,6 +91,7 @@ def gather(views: Sequence[View], settings: Settings, progress: Progress) -> Can
 def _fill(candidates: Candidates, mine: slice, view: View, factor: float) -> None:
     """Write a view's candidates into their slice."""
     lift_pixels(view.pixel, view.z, view.camera, candidates.xyz[mine], factor)
+    # A pixel at depth z is z / focal wide.
     np.multiply(view.z, factor / view.camera.K[0, 0], out=candidates.footprint[mine])
     candidates.tier[mine][view.edge] = NEAR_EDGE
 
@@ -104,6 +106,7 @@ def _rescaled(views: Sequence[View], factors: Float64[np.ndarray, " V"]) -> list
 
 def _tier(view: View, support: Support, settings: Settings) -> UInt8[np.ndarray, " C"]:
     tier = np.where(support.agreeing >= settings.min_agreeing, SOUND, UNCONFIRMED).astype(np.uint8)
+    # Later assignments override earlier ones: the worst tier counts.
     tier[view.edge] = NEAR_EDGE
     if not settings.see_through:
         tier[support.seen_through] = DISTRUSTED

@@ -22,11 +22,13 @@ __all__ = [
 ]
 
 PAIRS = 256
+"""Pairs of points whose lines are tried; nothing is random, as they follow the R2 sequence."""
 GOLDEN = np.array([0.7548776662466927, 0.5698402909980532])
 """Steps of the R2 sequence, which fills a square evenly (Roberts, 2018)."""
 TUKEY = 4.685
 """Tukey's biweight at 95% efficiency, in standard deviations."""
 STEPS = 20
+"""Most steps of reweighting."""
 SIGMA_OF_MEDIAN = 1.4826
 """Standard deviation of a normal variable over the median of its absolute value."""
 
@@ -66,6 +68,7 @@ def robust_line(value: Values, z: Values) -> tuple[float, float]:
     for _ in range(STEPS):
         r = z * (line[0] * value + line[1]) - 1.0
         sigma = max(SIGMA_OF_MEDIAN * float(np.median(np.abs(r))), floor)
+        # Tukey's biweight (1 - u^2)^2, 0 from 4.685 sigma on
         u = np.minimum(np.abs(r) / (TUKEY * sigma), 1.0)
         # The residual is relative, so a point's weight on 1 / z also has the factor z squared.
         line, before = _solve(value, 1.0 / z, (1.0 - u * u) ** 2 * z * z), line
@@ -84,6 +87,7 @@ def _best_of_pairs(value: Values, inverse: Values) -> tuple[float, float]:
     if not usable.any():
         return 0.0, float(np.median(inverse))
     first, second, run = first[usable], second[usable], run[usable]
+    # The line 1 / z = a value + b through both points.
     a = (inverse[first] - inverse[second]) / run
     b = inverse[first] - a * value[first]
     error = np.abs((a[:, None] * value + b[:, None]) / inverse - 1.0)
@@ -93,6 +97,7 @@ def _best_of_pairs(value: Values, inverse: Values) -> tuple[float, float]:
 
 def _solve(value: Values, target: Values, weight: Values) -> tuple[float, float]:
     """Weighted least squares of target = a value + b, about the weighted means for accuracy."""
+    # a = cov(value, target) / var(value), b = mean target - a mean value
     weight = weight / weight.sum()
     mean_value, mean_target = weight @ value, weight @ target
     spread = weight @ (value - mean_value) ** 2

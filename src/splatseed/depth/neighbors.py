@@ -21,7 +21,9 @@ from splatseed.views.projection import place
 __all__ = ["choose_neighbors"]
 
 SAMPLES = 40
+"""Candidates of a view by which its neighbours are judged."""
 MIN_SAMPLES = 4
+"""But never fewer, however many views there are."""
 WORK = 1 << 28
 """Limit on projections: the more views, the fewer samples of each."""
 SHORTLIST = 2
@@ -117,6 +119,7 @@ def _choose(covers, out):  # type: ignore[no-untyped-def]  # Numba's types
         out[k] = best
         free[best] = False
         covered += covers[best]
+        # A sample that one full neighbour covers is worth a quarter to the next.
         worth = 1.0 / (1.0 + covered) ** 2
 
 

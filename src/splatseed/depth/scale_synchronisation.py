@@ -33,6 +33,7 @@ SAMPLES = 96
 PAIRS = 6
 """Neighbours that each view is compared with: more do not change the result."""
 LEAST_SAMPLES = 12
+"""Fewer common samples say nothing about a pair."""
 OTHER_SURFACE = 0.25
 """Larger log ratios come from different surfaces."""
 LEAST_SIGMA, LEAST_RESIDUAL = 0.005, 0.0005
@@ -40,9 +41,13 @@ LEAST_SIGMA, LEAST_RESIDUAL = 0.005, 0.0005
 INDEPENDENT = 0.1
 """Fraction of the samples that counts as independent: neighbouring ones err alike."""
 HUBER = 1.345
+"""Residuals beyond this many sigmas count linearly: 95% efficiency for normal errors."""
 ROUNDS = 2
+"""Comparisons of all pairs: after the first, maps overlap better."""
 STEPS = 12
+"""Most reweightings of a solution."""
 CONVERGED = 1e-4
+"""Largest change of a log factor at which reweighting ends: 0.01% of depth."""
 PIECE = 8
 """Views per task of a thread."""
 
@@ -128,14 +133,17 @@ def _compare_pair(samples, z, factor, m, out):  # type: ignore[no-untyped-def]  
         across, down, depth = place(samples[k], m)
         if depth <= 0.0:
             continue
+        # The nearest grid point: those lie at whole numbers.
         column, row = int(np.floor(across + 0.5)), int(np.floor(down + 0.5))
         if not (0 <= column < z.shape[1] and 0 <= row < z.shape[0] and z[row, column] > 0):
             continue
+        # log d_j / z_ij
         log = np.log(factor * z[row, column] / depth)
         if abs(log) <= OTHER_SURFACE:
             logs[count] = log
             count += 1
     if count >= LEAST_SAMPLES:
         out[0] = np.median(logs[:count])
+        # Robust standard error of a median of INDEPENDENT count samples.
         spread = SIGMA_OF_MEDIAN * np.median(np.abs(logs[:count] - out[0]))
         out[1] = max(spread / np.sqrt(INDEPENDENT * count), LEAST_SIGMA)

@@ -25,14 +25,19 @@ BUCKETS = 32
 SAMPLED = 2
 """Parts used to find the side; all of them if there are few candidates."""
 FEW = 1 << 16
+"""Candidates below which all parts are counted."""
 STEPS = 24
+"""Most trials of a side."""
 LEAST_POWER = 0.2
 """Least exponent e assumed in: number of cubes ~ (1 / side)^e; bounds the length of a step."""
 SLACK = 0.02
+"""Surplus of cubes that is accepted: it is then dropped at random."""
 EMPTY, BLOCKED = -1, -2
 """Marks an empty slot."""
 BITS = 21
+"""Bits of a cube's position along one axis: three fit into 64."""
 OUTSIDE = 2.0**20 + 2
+"""Positions beyond every cube of a candidate, as no side is below ``FINEST``."""
 FINEST = 2.0**-20
 """The smallest side, as a fraction of the candidates' extent: positions fit into the bits."""
 
@@ -85,7 +90,9 @@ def _largest_side(cubes: _Cubes, num: int) -> float:
         if known is not None and count != known[1]:
             power = math.log(count / known[1]) / math.log(known[0] / side)
         known = side, count
+        # Secant step in log side: count ~ side^-power, aimed at the middle of the slack.
         guess = side * (count / (num * (1.0 + 0.5 * SLACK))) ** (1.0 / max(power, LEAST_POWER))
+        # A step out of the bracket is replaced by bisection, in log side.
         side = guess if least < guess < most else math.sqrt(least * most)
     return least
 

@@ -43,17 +43,23 @@ from splatseed.kernels.simd import (
 __all__ = ["WINDOW", "l1_and_ssim", "window_weights"]
 
 WINDOW = 11
+"""Side of the Gaussian window."""
 SIGMA = 1.5
+"""Its standard deviation, in pixels."""
 C1 = np.float32(0.01**2)
+"""(K1 L)^2 of the paper, with L = 1 the range of values."""
 C2 = np.float32(0.03**2)
+"""(K2 L)^2."""
 HALF = WINDOW // 2
 MARGIN = WINDOW - 1
+"""Rows and columns that a valid window loses."""
 CHANNELS = 3
 REACH = MARGIN * CHANNELS
 """Values from the first tap of a row to the last."""
 STRIP = 16
 """Rows per task; fixed, so that sums do not depend on the threads."""
 TALL = STRIP + MARGIN
+"""Rows that a strip reads."""
 BLOCK = 480
 """Values of a row that are processed at once, up to twice as many at its end: their working set
 stays in the nearer caches."""
@@ -111,7 +117,7 @@ def _framed(height: int, width: int) -> Float32[np.ndarray, "3 H+10 W*3+30"]:
 
 
 @always_inline
-def _splats(weights):
+def _all_lanes(weights):
     """The outer six weights of the window, each in all lanes; the others mirror them."""
     return (
         broadcast(weights[0]), broadcast(weights[1]), broadcast(weights[2]),
@@ -133,7 +139,7 @@ def _window_mean(source, i, step, w):
 @inline
 def _blur_columns(source, start, step, rows, columns, weights, out):
     """Vertical means of ``rows`` rows of a block: down each column of vectors, then the next."""
-    w = _splats(weights)
+    w = _all_lanes(weights)
     for i in range(0, columns, LANES):
         for row in range(rows):
             store(out, row * WIDE + i, _window_mean(source, start + row * step + i, step, w))
@@ -156,7 +162,7 @@ def _take_block(x, y, start, width, rows, columns, planes):
 @inline
 def _similarity(means, at, columns, weights, partials, to, scores):
     """Horizontal means of a row of vertical means, and from them SSIM and its three derivatives."""
-    w = _splats(weights)
+    w = _all_lanes(weights)
     mean_x, mean_y, mean_xy, mean_2 = means[0], means[1], means[2], means[3]
     by_mean, by_xy, by_2 = partials[0], partials[1], partials[2]
     two, c1, c2 = broadcast(np.float32(2.0)), broadcast(C1), broadcast(C2)
@@ -166,12 +172,15 @@ def _similarity(means, at, columns, weights, partials, to, scores):
         exy = _window_mean(mean_xy, at + i, CHANNELS, w)
         e2 = _window_mean(mean_2, at + i, CHANNELS, w)
         product, squares = multiply(mx, my), fma(mx, mx, multiply(my, my))
+        # A1 = 2 mu_x mu_y + C1, A2 = 2 (e_xy - mu_x mu_y) + C2
         a1 = fma(two, product, c1)
         a2 = fma(two, subtract(exy, product), c2)
+        # B1 = mu_x^2 + mu_y^2 + C1, B2 = e_2 - mu_x^2 - mu_y^2 + C2
         b1, b2 = add(squares, c1), add(subtract(e2, squares), c2)
         inverse = divide(broadcast(np.float32(1.0)), multiply(b1, b2))
         twice = multiply(two, inverse)
         ssim = multiply(multiply(a1, a2), inverse)
+        # dS/dmu_x, dS/de_xy and dS/de_2 as in the header
         by_x = multiply(multiply(ssim, mx), subtract(b1, b2))
         store(by_mean, to + i, multiply(twice, fma(my, subtract(a2, a1), by_x)))
         store(by_xy, to + i, multiply(twice, a1))
@@ -233,7 +242,7 @@ def _forward(x, y, width, weights, partials, ssim_sums):
 @inline
 def _combine(x, y, at, columns, means, row, weights, scales, gradient, differences):
     """The gradient along one row, and |x - y|, from the vertical means of the derivatives."""
-    w = _splats(weights)
+    w = _all_lanes(weights)
     of_mean, of_exy, of_e2 = means[0], means[1], means[2]
     zero, two = broadcast(np.float32(0.0)), broadcast(np.float32(2.0))
     by_ssim, by_l1 = broadcast(scales[0]), broadcast(scales[1])
@@ -243,8 +252,10 @@ def _combine(x, y, at, columns, means, row, weights, scales, gradient, differenc
         by_mean = _window_mean(of_mean, row + i, CHANNELS, w)
         by_exy = _window_mean(of_exy, row + i, CHANNELS, w)
         by_e2 = _window_mean(of_e2, row + i, CHANNELS, w)
+        # G'*dS/dmu_x + y G'*dS/de_xy + 2 x G'*dS/de_2
         ssim_part = fma(b, by_exy, fma(multiply(two, a), by_e2, by_mean))
         away, negative = subtract(a, b), subtract(b, a)
+        # d |x - y| / dx is the sign of x - y, and 0 where they are equal.
         slope = select_greater(away, zero, by_l1, zero)
         slope = select_greater(zero, away, subtract(zero, by_l1), slope)
         store(gradient, at + i, fma(by_ssim, ssim_part, slope))

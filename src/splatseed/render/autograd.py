@@ -25,6 +25,7 @@ __all__ = ["Blend", "Harmonics", "Lens", "Project", "is_seen"]
 GREATEST = np.float32(1e6)
 """Opacities above this are clamped: beyond 1 they only make a Gaussian wider."""
 ALIGNMENT = 64
+"""Bytes of a cache line and of an AVX-512 register."""
 
 
 class Lens(NamedTuple):
@@ -77,6 +78,7 @@ class Project(torch.autograd.Function):
         ctx.save_for_backward(means, quats, scales, viewmat)
         ctx.lens, ctx.radii, ctx.sparse = lens, radii, sparse
         results = [torch.from_numpy(each) for each in (radii, *out)]
+        # Radii are whole numbers.
         ctx.mark_non_differentiable(results[0])
         return tuple(results)
 
@@ -93,6 +95,7 @@ class Project(torch.autograd.Function):
             *(_array(g) for g in gradients[1:]), *results, by_view,
         )  # fmt: skip
         d_view = torch.zeros(4, 4)
+        # The last row of a pose is constant.
         d_view[:3] = torch.from_numpy(by_view.sum(axis=0))
         d_inputs = [torch.from_numpy(each) for each in results]
         if ctx.sparse:
@@ -159,6 +162,7 @@ class Harmonics(torch.autograd.Function):
             )
         d_origin = None
         if ctx.needs_input_grad[1]:
+            # Colours depend on mean - origin alone.
             d_origin = torch.from_numpy(-d_means.sum(axis=0, dtype=np.float64)).to(origin.dtype)
         return torch.from_numpy(d_means), d_origin, d_base, d_rest, None, None
 
@@ -235,6 +239,7 @@ class Blend(torch.autograd.Function):
         behind = np.zeros(channels, np.float32) if background is None else _array(background)
         image = np.empty((height, width, channels), np.float32)
         transmittance = np.empty((height, width), np.float32)
+        # Kept for backward, which then visits only blocks that forward blended.
         hits = np.empty(len(prepared.lists.listed_rank), np.uint8)
         for first in range(0, channels, blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
@@ -277,6 +282,7 @@ class Blend(torch.autograd.Function):
             ctx.on_absgrad(torch.from_numpy(results[4]))
         d_background = None
         if background is not None and ctx.needs_input_grad[4]:
+            # image = colour + T background
             d_background = torch.from_numpy((gradient * transmittance[:, :, None]).sum(axis=(0, 1)))
         d_means2d, d_conics, d_opacities, d_colors = map(torch.from_numpy, results[:4])
         return d_means2d, d_conics, d_colors, d_opacities, d_background, *(None,) * 5
@@ -297,6 +303,7 @@ def _prepare(
     seen = np.empty(len(alphas), np.bool_)
     layout.mark_visible(_array(radii), alphas, _array(colors), projection.MIN_ALPHA, seen)
     order = depth_order(_array(depths), seen)
+    # Blending wants exponents: alpha = exp(log opacity - sigma) takes one exp, not a product.
     log_opacities = np.log(np.minimum(alphas.take(order), GREATEST), dtype=np.float32)
     records = _gather(order, log_opacities, means2d, conics, colors, 0)
     lists = list_tiles(records, width, height)

@@ -30,6 +30,7 @@ from splatseed.kernels.jit import always_inline, inline, kernel, parallel_range
 __all__ = ["LOWEST", "RECORD", "TILE", "TileLists", "depth_order", "list_tiles", "row_order"]
 
 TILE = 8
+"""Pixels along a tile's side: four blocks of 4 x 4, one vector each, fit the registers."""
 RECORD = 16
 """Numbers in the record of a Gaussian, laid out in ``blending``."""
 LOWEST = np.float32(-np.log(255.0) / 8)
@@ -39,6 +40,7 @@ CHUNKS = 16
 STRIDE = 7
 """Pieces are taken in this stride: near Gaussians are large, and threads take consecutive turns."""
 GOLDEN = 0.6180339887498949
+"""Golden ratio's fraction: multiples of it, modulo 1, spread out evenly however many are taken."""
 BITS, PASSES = 8, 4
 """Radix sort of a depth's 32 bits: bits per pass, and passes, an even number."""
 SLACK = 0.01
@@ -70,6 +72,7 @@ def depth_order(depths: Float32[np.ndarray, " N"], visible: np.ndarray) -> UInt3
     """Indices of the visible Gaussians, nearest first, ties by index; no depth may be negative."""
     keys, spare = np.empty((2, len(depths)), np.uint64)
     total = _sort(depths.view(np.uint32), visible, keys, spare)
+    # keys = depth bits << 32 | index, so equal depths are ordered by index.
     # The lower halves are the indices.
     return keys[:total].astype(np.uint32)
 
@@ -87,12 +90,14 @@ def list_tiles(records: Float32[np.ndarray, " 16*G"], width: int, height: int) -
     touched = np.zeros((CHUNKS, rows + 1), np.int64)
     _find_rows(records, rows, row_range, touched)
     # ``spans`` is ordered by row, and within a row by chunk.
+    # ``touched`` holds +1 where a Gaussian's rows begin, -1 where they end: sums give counts.
     per_row = touched[:, :-1].cumsum(axis=1).T
     row_end = per_row.cumsum().reshape(rows, CHUNKS)
     row_spans = np.concatenate([[0], row_end[:, -1]])
     spans = np.empty((row_spans[-1], 4), np.uint32)
     span_start = np.zeros(num + 1, np.int64)
     np.cumsum(row_range[:, 1] - row_range[:, 0], out=span_start[1:])
+    # Every chunk has its own stretch of each row, so that chunks write without waiting.
     cursor = np.ascontiguousarray((row_end - per_row).T)
     pairs = np.zeros((CHUNKS, rows), np.int64)
     _find_columns(records, columns, row_range, span_start, cursor, spans, pairs)
@@ -127,12 +132,15 @@ def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]  # Numb
     for turn in range(PASSES):
         shift, cursor = np.uint64(32 + BITS * turn), np.zeros(1 << BITS, np.uint32)
         for i in range(total):
+            # Histogram of this digit, ...
             cursor[keys[i] >> shift & mask] += one
+        # ... its running sum, where each digit's keys begin, ...
         place = np.uint32(0)
         for digit in range(1 << BITS):
             place, cursor[digit] = place + cursor[digit], place
         for i in range(total):
             key = keys[i]
+            # ... and the keys in order of the digit; equal digits keep their order.
             digit = key >> shift & mask
             spare[cursor[digit]] = key
             cursor[digit] += one
@@ -144,6 +152,7 @@ def _sort(depths, visible, keys, spare):  # type: ignore[no-untyped-def]  # Numb
 def _ellipse(records, r):  # type: ignore[no-untyped-def]  # Numba's types
     """A, B, C and R of the ellipse A dx^2 + 2 B dx dy + C dy^2 <= R, d being pixel minus mean."""
     a, b, c = np.float64(records[r + 2]), np.float64(records[r + 3]), np.float64(records[r + 4])
+    # alpha = 1/255 where (log opacity - sigma) / 8 = LOWEST; records hold eighths and signs.
     reach = max(np.float64(records[r + 5]) - np.float64(LOWEST), 0.0)
     return -a, -0.5 * b, -c, reach
 
@@ -154,7 +163,9 @@ def _tiles(low, high, tiles):  # type: ignore[no-untyped-def]  # Numba's types
 
     Clipped before conversion to integers, which the pixels of a huge Gaussian would overflow.
     """
+    # Pixel centres of tile t: 8 t + 0.5 to 8 t + 7.5.
     last_pixel = TILE - 0.5
+    # The first tile whose last centre is not left of low; the last whose first is not right.
     first = min(max((low - (SLACK + last_pixel)) / TILE, 0.0), np.float64(tiles))
     last = min(max((high + (SLACK + last_pixel)) / TILE, 0.0), np.float64(tiles))
     return math.ceil(first), int(last)
@@ -178,6 +189,7 @@ def _find_rows(records, rows, row_range, touched):  # type: ignore[no-untyped-de
         for g in range(chunk * len(row_range) // CHUNKS, (chunk + 1) * len(row_range) // CHUNKS):
             a, b, c, reach = _ellipse(records, RECORD * g)
             det, mean = a * c - b * b, np.float64(records[RECORD * g + 1])
+            # The ellipse's half-height: max dy with A dx^2 + 2 B dx dy + C dy^2 = R
             extent = math.sqrt(reach * a / det) if det > 0.0 else np.inf
             first, last = _tiles(mean - extent, mean + extent, rows)
             row_range[g, 0], row_range[g, 1] = first, last
@@ -210,8 +222,10 @@ def _find_columns(  # type: ignore[no-untyped-def]  # Numba's types
             lean, extreme, width, falloff = _profile(*_ellipse(records, RECORD * g))
             span = span_start[g]
             for row in range(row_range[g, 0], row_range[g, 1]):
+                # The strip of the row's pixel centres, relative to the mean.
                 low = row * TILE + 0.5 - y
                 high = low + (TILE - 1)
+                # The dy in the strip at which each edge is farthest out.
                 right, left = min(max(extreme, low), high), min(max(-extreme, low), high)
                 x_right = x + lean * right + math.sqrt(max(width - falloff * right * right, 0.0))
                 x_left = x + lean * left - math.sqrt(max(width - falloff * left * left, 0.0))
@@ -235,7 +249,9 @@ def _profile(a, b, c, reach):  # type: ignore[no-untyped-def]  # Numba's types
     if not det > 0.0:
         return 0.0, 0.0, np.inf, 0.0
     inverse = 1.0 / a
+    # Where d/d dy of the right edge is 0.
     extreme = -b * math.sqrt(reach / (c * det))
+    # Solved for dx: -(b / a) dy +- sqrt(R / a - (det / a^2) dy^2).
     return -b * inverse, extreme, reach * inverse, det * inverse * inverse
 
 
@@ -260,10 +276,12 @@ def _fill(  # type: ignore[no-untyped-def]  # Numba's types
         row = row_order[turn]
         begin, end = np.uint64(row_spans[row]), np.uint64(row_spans[row + 1])
         cursor = np.zeros(columns + 1, np.uint64)
+        # Counts by column, as differences: a span adds 1 where it begins, -1 behind its end.
         for s in range(begin, end):
             cursor[spans[s, 1]] += one
             cursor[spans[s, 2]] -= one
         entries, place = np.uint64(0), np.uint64(row_start[row])
+        # Where each tile's entries begin; ``cursor`` changes from differences to places.
         for column in range(columns):
             entries += cursor[column]
             tile_start[row * columns + column] = cursor[column] = place

@@ -54,8 +54,11 @@ __all__ = ["BLOCKS", "CHANNELS", "MAX_ALPHA", "STOP", "forward"]
 CHANNELS = 4
 """Channels per pass; the fourth takes time only where it is used."""
 BLOCKS = 4
+"""Blocks of a tile."""
 STOP = np.float32(1e-4)
+"""Transmittance at which a pixel is finished, as in 3DGS."""
 MAX_ALPHA = np.float32(0.999)
+"""Largest alpha, as in gsplat: the gradient divides by 1 - alpha."""
 # A record, RECORD float32:
 #    0 1    2      3     4      5              6   7 .. 10        11 .. 15
 #    x y    -a/16  -b/8  -c/16  log(opacity)/8 0   the channels   0
@@ -71,6 +74,7 @@ ZERO, ONE, HALF, FOUR = np.float32(0.0), np.float32(1.0), np.float32(0.5), np.fl
 STATE = (1 + CHANNELS) * LANES
 """Transmittance and channels of a block."""
 CHUNK = 32
+"""List entries whose h are computed before any is blended: 8 KiB of h stay in the L1 cache."""
 AHEAD = 32
 """How many list entries ahead records are prefetched: a tile's lie all over memory."""
 ALL = 15
@@ -99,6 +103,7 @@ def forward(
     for place in parallel_range(len(tile_start) - 1):
         row, column = row_order[place // columns], place % columns
         tile = row * columns + column
+        # Pixel centres of the tile's upper left block; the others lie 4 to the right and below.
         px = add(load(lane_x, 0), broadcast(np.float32(TILE * column + HALF)))
         py = add(load(lane_y, 0), broadcast(np.float32(TILE * row + HALF)))
         _forward_tile(
@@ -115,6 +120,7 @@ def _forward_tile(
     right, below = add(px, broadcast(FOUR)), add(py, broadcast(FOUR))
     h, state = aligned(BLOCKS * chunk * LANES), aligned(BLOCKS * STATE)
     hit = np.empty(BLOCKS * chunk, np.int64)
+    # A block is open while one of its pixels is unfinished; a tile ends with its last one.
     open_blocks, start = np.int64(ALL), first
     _clear(state)
     while start < last and open_blocks:
@@ -142,6 +148,7 @@ def _forward_tile(
             | _blend_block(records, hit, h, 3, n3, fourth, state) << 3
         )
         start = stop
+    # Backward skips what lies behind the last chunk.
     hits[start:last] = 0
     _write(state, tile, image, transmittance)
 
@@ -151,6 +158,7 @@ def _clear(state):
     """T = 1 and colour 0 at every pixel."""
     for q in range(BLOCKS):
         store(state, STATE * q, broadcast(ONE))
+        # State of a block: 16 lanes of T, then 16 of each channel.
         for channel in range(CHANNELS):
             store(state, STATE * q + LANES * (1 + channel), broadcast(ZERO))
 
@@ -179,6 +187,7 @@ def _exponents(records, r, left, right, above, below):
     dx0, dx1 = subtract(mean_x, left), subtract(mean_x, right)
     dy0, dy1 = subtract(mean_y, above), subtract(mean_y, below)
     top = broadcast_element(records, r + 5)
+    # Two columns and two rows of blocks share dx and dy: 4 h for the price of about 2.
     y0, y1 = fma(multiply(c, dy0), dy0, top), fma(multiply(c, dy1), dy1, top)
     x0, x1, cross0, cross1 = multiply(a, dx0), multiply(a, dx1), multiply(b, dy0), multiply(b, dy1)
     return (
@@ -218,4 +227,5 @@ def _blend_block(records, hit, h, q, count, fourth, state):
     store(state, base + 2 * LANES, c1)
     store(state, base + 3 * LANES, c2)
     store(state, base + 4 * LANES, c3)
+    # Finished pixels are negative.
     return np.int64(any_greater(transmittance, zero))

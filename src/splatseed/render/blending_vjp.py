@@ -135,6 +135,7 @@ def _queue_hits(hits, start, stop, records, listed_rank, sums, listed_span, queu
     n0 = n1 = n2 = n3 = 0
     for entry in range(start, stop):
         bits = np.int64(hits[entry])
+        # Both are scattered over memory: asked for now, they are there when their turn comes.
         ahead = min(entry + AHEAD, len(hits) - 1)  # it may be the next tile's
         prefetch(records, RECORD * np.int64(listed_rank[ahead]))
         prefetch(sums, SUMS * np.int64(listed_span[ahead]))
@@ -158,6 +159,7 @@ def _backward_block(
     """
     zero, stop = broadcast(ZERO), broadcast(STOP)
     px, py = add(load(lane_x, 0), broadcast(x + HALF)), add(load(lane_y, 0), broadcast(y + HALF))
+    # Carried from chunk to chunk: T in front of the next Gaussian, and what lies behind it.
     t, far = load(transmittance, at), load(behind, behind_at)
     v0, v1 = load(gradient, gradient_at), load(gradient, gradient_at + LANES)
     v2, v3 = load(gradient, gradient_at + 2 * LANES), load(gradient, gradient_at + 3 * LANES)
@@ -173,6 +175,7 @@ def _backward_block(
             r = RECORD * _looked_up(listed_rank, queue, begin + k)
             alpha = load(batch, LANES * k)
             after = fnma(t, alpha, t)  # T' = T (1 - alpha)
+            # Where forward stopped, backward stops: alpha 0 gives p = 0 and weight 0.
             alpha = select_greater(after, stop, alpha, zero)
             weight = multiply(t, alpha)
             # shade = gradient . c, and far = gradient . (colour behind this Gaussian)
@@ -187,6 +190,7 @@ def _backward_block(
             slope = fnma(t, shade, divide(far, subtract(broadcast(ONE), alpha)))
             # A clamped alpha is constant.
             p = select_greater(broadcast(MAX_ALPHA), alpha, multiply(slope, alpha), zero)
+            # T = 0 keeps a finished pixel finished.
             t = select_greater(after, stop, after, zero)
             store(batch, LANES * k, p)
             store(batch, WEIGHTS + LANES * k, weight)
@@ -234,6 +238,7 @@ def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
     s2, x2, xx2 = _moments(load_columns(batch, 8))
     s3, x3, xx3 = _moments(load_columns(batch, 12))
     s, y, yy = _moments((s0, s1, s2, s3))
+    # The rows' sums give s, y, yy; their first moments give x and xy, as sums over y.
     x, xy, _ = _moments((x0, x1, x2, x3))
     xx = add(add(xx0, xx3), add(xx1, xx2))
     mx, my = load(batch, MEANS), load(batch, MEANS + LANES)
@@ -262,6 +267,7 @@ def _reduce(batch, center_x, center_y, gradient, gradient_at, fourth):
 def _moments(values):
     """Sum, first and second moment of four values at -OUTER, -HALF, HALF and OUTER."""
     a, b, c, d = values
+    # At +-3/2 and +-1/2: even moments need only the sums of the pairs, odd ones the differences.
     outer, inner = add(a, d), add(b, c)
     first = fma(subtract(d, a), broadcast(OUTER), multiply(subtract(c, b), broadcast(HALF)))
     second = fma(outer, broadcast(OUTER * OUTER), multiply(inner, broadcast(HALF * HALF)))
@@ -294,6 +300,7 @@ def _add_absolute(records, listed_rank, listed_span, queue, begin, end, px, py, 
         c = broadcast(np.float32(-16.0) * records[r + 4])
         step_x = fma(a, along_x, multiply(b, along_y))
         step_y = fma(b, along_x, multiply(c, along_y))
+        # d mean x = a p dx + b p dy; minus minus its magnitude, as only the sign bit need be set
         sums[s + ABSOLUTE] -= lane_sum(negative_magnitude(step_x))
         sums[s + ABSOLUTE + 1] -= lane_sum(negative_magnitude(step_y))
 

@@ -39,8 +39,10 @@ __all__ = ["MAX_DEGREE", "TABLES", "TERMS", "harmonics", "harmonics_vjp"]
 
 MAX_DEGREE = 3
 TERMS = 16
+"""Basis functions of degree 3: 1 + 3 + 5 + 7; also the lanes of a vector."""
 CHANNELS = 3
 ROW = 45
+"""Coefficients of a row: 15 functions beyond the first, 3 channels each."""
 CHUNKS = 64
 """Pieces of work for the threads."""
 AHEAD = 10
@@ -50,6 +52,8 @@ FIRST = (0, 15, 29)
 """Where in a row its three vectors of 16 begin; the last one ends with the row."""
 PART = 15
 """How many numbers each vector contributes; its overlap with another counts once."""
+# Y0 = sqrt(1 / (4 pi)), Y1 = sqrt(3 / (4 pi)), Y2A = sqrt(15 / (4 pi)), Y2B = 3 Y2D,
+# Y2D = sqrt(5 / (16 pi)), Y2C = Y2A / 2; degree 3 likewise.
 Y0 = np.float32(0.2820947917738781)
 Y1 = 0.48860251190292
 Y2A, Y2B, Y2C = 1.0925484305920792, 0.9461746957575601, 0.5462742152960396
@@ -145,8 +149,10 @@ def harmonics(means, origin, base, rest, skipped, radii, table, colors):
                 basis = multiply(factor, form)
                 _prefetch(rest, (i + AHEAD) * (skipped + ROW))
                 # sum_k y_k h_k over k >= 1, one channel in each of lanes 0 to 2
+                # A row runs r g b r g b ...: lane j of vector v is of channel (FIRST[v] + j) % 3.
                 a, b, c = _row(rest, i * (skipped + ROW) + skipped, table)
                 total = fma(spread_1(basis), b, multiply(spread_0(basis), a))
+                # The third vector begins at number 29, channel 2: one lane on, it is in phase.
                 total = _by_channel(add(total, later_1(multiply(spread_2(basis), c))))
                 colors[i, 0] = _shade(base[i, 0, 0], lane_0(total))
                 colors[i, 1] = _shade(base[i, 0, 1], lane_1(total))
@@ -197,6 +203,7 @@ def harmonics_vjp(
                 dz = (dz - along * z) * inverse
             else:
                 zero = broadcast(np.float32(0.0))
+                # Every row is written, as gradients of unseen Gaussians must be 0.
                 store(d_rest, row + FIRST[0], zero)
                 store(d_rest, row + FIRST[1], zero)
                 store(d_rest, row + FIRST[2], zero)
@@ -215,6 +222,7 @@ def _offset(means, origin, i):
 
 @always_inline
 def _length(x, y, z):
+    # A Gaussian in the camera's centre has no direction, and must not divide by 0.
     return max(math.sqrt(x * x + y * y + z * z), 1e-12)
 
 
@@ -266,6 +274,7 @@ def _live(v, marks):
 @always_inline
 def _by_channel(v):
     """Sums of lanes 0, 3, 6, 9, 12, of 1, 4, ... and of 2, 5, ... in lanes 0 to 2."""
+    # Lanes j, j + 3, j + 6, j + 9 by two additions, then j + 12; lane 15 is padding.
     pairs = add(v, later_6(v))
     return add(add(pairs, later_3(pairs)), later_12(v))
 
@@ -294,6 +303,7 @@ def _row_vjp(x, y, z, d_color, rest, row, table, d_rest):
     store(d_rest, row + FIRST[2], multiply(spread_2(basis), blue_first))
     a, b, c = _row(rest, row, table)
     a, b, c = multiply(a, red_first), multiply(b, red_first), multiply(c, blue_first)
+    # 2 x, 2 y and 2 z, the derivatives of the squares.
     xx, yy, zz = add(x, x), add(y, y), add(z, z)
     by_x = _derivative(xx, y, z, FORM + LANES, FORM + 4 * LANES, FORM + 6 * LANES, table)
     by_y = _derivative(yy, x, z, FORM + 2 * LANES, FORM + 4 * LANES, FORM + 5 * LANES, table)

@@ -85,6 +85,7 @@ def intersect(
     first, sizes = _boxes(means2d, radii, grid)
     counts = sizes.prod(dim=1)
     owner = torch.repeat_interleave(counts)
+    # Each pair's number within its Gaussian's box of tiles, row by row.
     place = torch.arange(len(owner)) - (counts.cumsum(0) - counts)[owner]
     columns = sizes[owner, 0]
     row = first[owner, 1] + place // columns
@@ -110,5 +111,6 @@ def _boxes(
 
 def _ids(cameras: Tensor, tiles: Tensor, depths: Tensor, grid: Grid) -> Int[Tensor, " I"]:
     bits = (grid.rows * grid.columns).bit_length()
+    # Bits of a positive float sort like the float; the mask undoes the sign's extension.
     depth = depths.detach().contiguous().view(torch.int32).long() & 0xFFFFFFFF
     return (cameras << (32 + bits)) | (tiles << 32) | depth

@@ -46,6 +46,7 @@ def mark_visible(radii, opacities, colors, least, visible):
         seen = (radii[i, 0] > 0) & (radii[i, 1] > 0) & (opacities[i] >= least)
         zero = np.float32(0.0)
         for channel in range(colors.shape[1]):
+            # 0 times NaN or infinity is NaN, which differs from 0.
             zero += np.float32(0.0) * colors[i, channel]
         visible[i] = seen & (zero == np.float32(0.0))
 
@@ -67,6 +68,7 @@ def gather(order, means2d, conics, log_opacities, colors, first, records):
     for g in parallel_range(len(order)):
         i, record = order[g], records[RECORD * g : RECORD * (g + 1)]
         record[0], record[1] = means2d[i, 0], means2d[i, 1]
+        # sigma = (a dx^2 + c dy^2) / 2 + b dx dy, and h = (log opacity - sigma) / 8
         record[2] = np.float32(-1 / 16) * conics[i, 0]
         record[3] = np.float32(-1 / 8) * _held(conics[i, 0], conics[i, 1], conics[i, 2])
         record[4] = np.float32(-1 / 16) * conics[i, 2]
@@ -83,6 +85,7 @@ def _held(a, b, c):
 
     Blending relies on sigma >= 0.
     """
+    # An ellipse has b^2 < a c.
     product = np.float64(a) * np.float64(c)
     if np.float64(b) * np.float64(b) <= product:
         return b
@@ -111,11 +114,14 @@ def scatter(
     for g in parallel_range(len(order)):
         i = order[g]
         a, b, c = conics[i, 0], conics[i, 1], conics[i, 2]
+        # d sigma / d mean = (a dx + b dy, b dx + c dy); the sums of p dx and p dy carry d loss.
         d_means2d[i, 0] += a * totals[g, 1] + b * totals[g, 2]
         d_means2d[i, 1] += b * totals[g, 1] + c * totals[g, 2]
+        # d sigma / d (a, b, c) = (dx^2 / 2, dx dy, dy^2 / 2)
         d_conics[i, 0] += np.float32(0.5) * totals[g, 3]
         d_conics[i, 1] += totals[g, 4]
         d_conics[i, 2] += np.float32(0.5) * totals[g, 5]
+        # alpha = opacity exp(-sigma): d / d opacity = -(d / d sigma) / opacity
         d_opacities[i] -= totals[g, 0] / opacities[i]
         if len(d_absolute):
             d_absolute[i, 0], d_absolute[i, 1] = totals[g, 10], totals[g, 11]
@@ -126,6 +132,7 @@ def scatter(
 @always_inline
 def _first_lane(x, y, columns):
     """The lane, over all tiles, of a pixel that is the first of its row in a block."""
+    # Layout [tile, block, lane]: see the table of lanes in ``blending``.
     tile, quarter = y // TILE * columns + x // TILE, y % TILE // 4 * 2 + x % TILE // 4
     return LANES * (BLOCKS * tile + quarter) + y % 4 * 4
 
@@ -215,6 +222,7 @@ def _to_lanes(d_pixels, pixels, d_alpha, T, first, count, depth, gradients, afte
     """Up to four neighbouring pixels of a row; zeros fill up the four and the channels."""
     wide = min(CHANNELS, depth - first)
     for k in range(count):
+        # alpha = 1 - T: it acts like one more channel, with a background of -1.
         total = -d_alpha[k] * T[k] if first == 0 else np.float32(0.0)
         for channel in range(wide):
             d_pixel = d_pixels[depth * k + first + channel]

@@ -82,10 +82,12 @@ def project(
                 block[GIVEN, i - first] = opacities[i]
             _project_block(block, pose, lens, eps2d, projected)
             _cull(block, near, far, width, height, antialiased, projected)
+            # Most Gaussians are culled: cleared in bulk, then written where seen.
             radii[first:last] = 0
             means2d[first:last], depths[first:last] = np.float32(0.0), np.float32(0.0)
             conics[first:last], compensations[first:last] = np.float32(0.0), np.float32(0.0)
             count = 0
+            # A culled lane is overwritten by the next one, so no branch can be mispredicted.
             for lane in range(last - first):  # branch-free compaction
                 lanes[count] = lane
                 count += projected[OPACITY, lane] > 0.0
@@ -166,6 +168,7 @@ def _project_block(block, pose, lens, eps2d, projected):
         # P = T R diag(s); covariance P P' + eps2d I, its inverse the conic (a, b, c)
         P0, P1 = _times(_of_rows(T0, R), s), _times(_of_rows(T1, R), s)
         xx, xy, yy = _dot(P0, P0), _dot(P0, P1), _dot(P1, P1)
+        # Its determinant before the blur, for the compensation below; then the blur.
         raw = xx * yy - xy * xy
         xx, yy = xx + eps2d, yy + eps2d
         over = 1.0 / (xx * yy - xy * xy)
@@ -198,6 +201,7 @@ def _jacobian(x, y, z, lens):
     """J00, J02, J11 and J12 of J = [fx/z, 0, -fx x/z^2; 0, fy/z, -fy y/z^2], clamped."""
     fx, fy, _, _, low_x, high_x, low_y, high_y = lens
     over = 1.0 / z
+    # Clamped: the linear approximation J breaks down far outside the image.
     x_z, y_z = min(max(x * over, low_x), high_x), min(max(y * over, low_y), high_y)
     return fx * over, -fx * over * x_z, fy * over, -fy * over * y_z
 
@@ -227,12 +231,14 @@ def _cull(block, near, far, width, height, antialiased, projected):
     for lane in range(BLOCK):
         u, v, z = projected[U, lane], projected[V, lane], projected[DEPTH, lane]
         over = projected[INVERSE_DET, lane]
+        # A box of 3.33 sigmas, and a pixel for the rounding up in _radii, which decides.
         rx = MAX_SIGMAS * projected[SIGMA_X, lane] + 1.0
         ry = MAX_SIGMAS * projected[SIGMA_Y, lane] + 1.0
         opacity = np.float64(block[GIVEN, lane])
         if antialiased:
             opacity *= projected[COMPENSATION, lane]
         seen = (near <= z) & (z <= far) & (opacity >= MIN_ALPHA) & (opacity < np.inf)
+        # A determinant that underflowed or is NaN leaves no ellipse; NaN fails every comparison.
         seen &= (over > 0.0) & (over < np.inf)
         seen &= (u + rx > 0) & (u - rx < width) & (v + ry > 0) & (v - ry < height)
         projected[OPACITY, lane] = opacity if seen else 0.0
@@ -247,6 +253,7 @@ def _radii(projected, lane, width, height, radius_clip):
     rx, ry = np.ceil(sigmas * projected[SIGMA_X, lane]), np.ceil(sigmas * projected[SIGMA_Y, lane])
     inside = u + rx > 0 and u - rx < width and v + ry > 0 and v - ry < height
     if inside and (rx > radius_clip or ry > radius_clip):
+        # int32 holds the radii.
         return min(rx, 1e9), min(ry, 1e9)
     return 0.0, 0.0
 
@@ -309,6 +316,7 @@ def project_vjp(
                         d_quats[each, k] = gradients[Q + k, lane]
                 count = 0
         for k in range(12):
+            # Lanes first, then (by the caller) chunks: a fixed order, so the bytes never vary.
             d_view[chunk, k // 4, k % 4] = sums[k // 4, k % 4].sum()
 
 
@@ -327,6 +335,7 @@ def _block_vjp(block, pose, lens, eps2d, gradients, sums):
         # dP = 2 dS P for the symmetric d covariance dS
         dP0, dP1 = _mix(2.0 * d_xx, P0, d_xy, P1), _mix(2.0 * d_yy, P1, d_xy, P0)
         for k in range(3):
+            # P = U diag(s), so ds_k = sum_rows dP_rk U_rk
             gradients[S + k, lane] = dP0[k] * U0[k] + dP1[k] * U1[k]
         # dU = dP diag(s), dR = T' dU, dT = dU R', dJ = dT W', dW = J' dT
         dU0, dU1 = _times(dP0, s), _times(dP1, s)
@@ -339,15 +348,19 @@ def _block_vjp(block, pose, lens, eps2d, gradients, sums):
         )
         for k in range(4):  # d (q / |q|): the component along q vanishes
             gradients[Q + k, lane] = (d_quat[k] - along * quat[k]) * over
+        # dT = dU R', row by row; dJ = dT W' for the four entries of J that are not 0
         dT0 = _dot(R[0], dU0), _dot(R[1], dU0), _dot(R[2], dU0)
         dT1 = _dot(R[0], dU1), _dot(R[1], dU1), _dot(R[2], dU1)
         dJ = _dot(dT0, pose[0]), _dot(dT0, pose[2]), _dot(dT1, pose[1]), _dot(dT1, pose[2])
         dt = _place_vjp(block, lane, x, y, z, lens, J, dJ)
+        # m_c = W m + t: d m = W' d m_c
         d_mean, mean = _of_rows(dt, pose), _column(block, X, lane)
+        # dW = J' dT + d m_c m': T = J W and m_c = W m + t both depend on W
         dW0, dW1 = _mix(J[0], dT0, dt[0], mean), _mix(J[2], dT1, dt[1], mean)
         dW2 = _mix(J[1], dT0, J[3], dT1)
         for k in range(3):
             gradients[X + k, lane] = d_mean[k]
+            # The pose's sums stay apart by lane, so that the loop over lanes vectorises.
             sums[0, k, lane] += dW0[k]
             sums[1, k, lane] += dW1[k]
             sums[2, k, lane] += dW2[k] + dt[2] * mean[k]
@@ -360,6 +373,7 @@ def _covariance_vjp(block, lane, P0, P1, eps2d):
     raw_xx, xy, raw_yy = _dot(P0, P0), _dot(P0, P1), _dot(P1, P1)
     xx, yy = raw_xx + eps2d, raw_yy + eps2d
     over = 1.0 / (xx * yy - xy * xy)
+    # The conic again, which is cheaper to recompute than to load.
     a, b, c = yy * over, -xy * over, xx * over
     da, db, dc = _column(block, DCONIC, lane)
     # d covariance = -X G X for the inverse X and the symmetric gradient G
@@ -382,6 +396,7 @@ def _rotation_vjp(quat, dR):
     """The gradient of the quaternion from d R, before its projection onto unit quaternions."""
     w, x, y, z = quat
     (d00, d01, d02), (d10, d11, d12), (d20, d21, d22) = dR
+    # R is quadratic in q: w meets the antisymmetric part of dR, and (x, y, z) meet both parts.
     skew_x, skew_y, skew_z = d21 - d12, d02 - d20, d10 - d01
     xy, xz, yz = d01 + d10, d02 + d20, d12 + d21
     return (
@@ -401,7 +416,9 @@ def _place_vjp(block, lane, x, y, z, lens, J, dJ):
     # J02 = -J00 x / z depends on x only where x / z is not clamped; J12 likewise.
     by_x = dJ[1] * J[0] * over if low_x <= x_z <= high_x else 0.0
     by_y = dJ[3] * J[2] * over if low_y <= y_z <= high_y else 0.0
+    # u = fx x / z + cx has the derivative fx / z = J00 by x; v likewise
     du, dv = block[DU, lane] * J[0], block[DV, lane] * J[2]
+    # All four entries of J are proportional to 1 / z (with x / z held): d J / dz = -J / z.
     by_depth = dJ[0] * J[0] + dJ[1] * J[1] + dJ[2] * J[2] + dJ[3] * J[3]
     dz = block[DDEPTH, lane] - (du * x_z + dv * y_z) - by_depth * over + by_x * x_z + by_y * y_z
     return du - by_x, dv - by_y, dz

@@ -155,6 +155,7 @@ def rasterization(
     info = make_info(views, packed, width, height, tile_size)
     images, alphas = _blend(views, shades, info, _background(backgrounds, render_mode), absgrad)
     if render_mode in {"ED", "RGB+ED"}:
+        # Accumulated depth is a sum of weights times z; divided by their sum it is the mean z.
         expected = images[..., -1:] / alphas.clamp(min=1e-10)
         images = torch.cat([images[..., :-1], expected], dim=-1)
     return images, alphas, info

@@ -15,7 +15,9 @@ from splatseed.render.projection import EDGE, MAX_SIGMAS, MIN_ALPHA
 __all__ = ["rasterize_reference"]
 
 MAX_ALPHA = 0.999
+"""Largest alpha: see ``blending``."""
 STOP = 1e-4
+"""Transmittance at which a pixel is finished."""
 
 
 def rasterize_reference(
@@ -56,6 +58,7 @@ def rasterize_reference(
     Returns:
         Image [H, W, D], alpha [H, W], and 2D means [N, 2].
     """
+    # m_c = W m + t
     points = means @ viewmat[:3, :3].T + viewmat[:3, 3]
     in_range = (points[:, 2] >= near_plane) & (points[:, 2] <= far_plane)
     # Culled Gaussians are moved far in front of the camera: their gradients must not be NaN.
@@ -63,9 +66,11 @@ def rasterize_reference(
     means2d = points[:, :2] / points[:, 2:] * _focal(K) + K[:2, 2]
     covariance, raw = _covariance2d(points, quats, scales, viewmat, K, width, height, eps2d)
     if antialiased:
+        # The blur widens a Gaussian; its opacity falls by the ratio of the areas.
         ratio = torch.linalg.det(raw) / torch.linalg.det(covariance)
         opacities = opacities * ratio.clamp(min=0.0).sqrt()
     seen = in_range & _touches_image(means2d, covariance, opacities, width, height)
+    # Front to back, the seen ones first.
     order = torch.argsort(torch.where(seen, points[:, 2], torch.inf), stable=True)[
         : int(seen.sum())
     ]
@@ -112,9 +117,11 @@ def _covariance2d(
     u = torch.maximum(torch.minimum(x / z, high[0] / focal[0]), low[0] / focal[0])
     v = torch.maximum(torch.minimum(y / z, high[1] / focal[1]), low[1] / focal[1])
     zero = torch.zeros_like(z)
+    # J of (fx x / z, fy y / z), with x / z and y / z clamped as u and v
     jacobian = torch.stack(
         [focal[0] / z, zero, -focal[0] * u / z, zero, focal[1] / z, -focal[1] * v / z], dim=-1
     ).reshape(-1, 2, 3)
+    # J W R S, whose product with its transpose is the covariance J W (R S S' R') W' J'
     half = jacobian @ viewmat[:3, :3] @ factor
     raw = half @ half.mT
     return raw + eps2d * torch.eye(2).to(raw), raw
@@ -124,6 +131,7 @@ def _touches_image(
     means2d: Tensor, covariance: Tensor, opacities: Tensor, width: int, height: int
 ) -> Tensor:
     """Whether the box where alpha reaches 1/255, at most 3.33 sigmas, is in the image."""
+    # opacity exp(-sigmas^2 / 2) = 1/255
     sigmas = (
         (2 * torch.log(opacities.clamp(min=MIN_ALPHA) / MIN_ALPHA)).sqrt().clamp(max=MAX_SIGMAS)
     )
@@ -144,10 +152,12 @@ def _blend(
     image = torch.zeros(height, width, colors.shape[1]).to(means2d)
     for mean, conic, opacity, color in zip(means2d, conics, opacities, colors, strict=True):
         d = mean - pixels
+        # sigma = d' conic d / 2; alpha = opacity exp(-sigma)
         sigma = 0.5 * (d[..., None, :] @ conic @ d[..., :, None])[..., 0, 0]
         alpha = (opacity * torch.exp(-sigma)).clamp(max=MAX_ALPHA)
         counts = going_on & (sigma >= 0) & (alpha >= MIN_ALPHA)
         after = torch.where(counts, transmittance * (1 - alpha), transmittance)
+        # The Gaussian that would bring T to the stop is not drawn itself.
         going_on = going_on & ~(counts & (after <= STOP))
         weight = torch.where(counts & going_on, alpha * transmittance, torch.zeros_like(alpha))
         image = image + weight[..., None] * color

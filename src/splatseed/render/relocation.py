@@ -46,13 +46,15 @@ def compute_relocation(
 
         return on_cuda(opacities, scales, ratios, binoms)  # type: ignore[no-any-return]  # gsplat is untyped
     largest = len(binoms)
-    shares = ratios.clamp(1, largest).view_as(opacities)
+    shares = ratios.clamp(1, largest).view_as(opacities)  # the table ends at M
     old = opacities.to(torch.float64)
+    # 1 - (1 - o)^(1/n), without losing the digits of a small o
     new = -torch.expm1(torch.log1p(-old) / shares)
     table = _coefficients(largest).to(old.device)
     total = torch.zeros_like(old)
     for k in reversed(range(largest)):  # Horner's rule
         total = (total + table[shares, k]) * new
+    # A Gaussian that stays alone keeps its size to the bit.
     factor = torch.where(shares == 1, 1.0, old / total)
     return new.to(opacities.dtype), scales * factor.to(scales.dtype).view(-1, 1)
 

@@ -104,6 +104,7 @@ def cover(
     cloud = _Growing(xyz)
     parts = []
     for v in rng.permutation(len(views)):
+        # Drawn for every view, empty cells or not: one view's gaps do not change the next's draw.
         asked = _draw_others(int(v), len(views), rng)
         depths = cell_depths(views[v], cloud.xyz, cell)
         empty = np.flatnonzero(np.isinf(depths))
@@ -121,6 +122,7 @@ def cover(
 def _draw_others(v: int, num: int, rng: np.random.Generator) -> Int64[np.ndarray, " K"]:
     """Some of the other views, drawn at random."""
     others = rng.choice(num - 1, min(WITNESSES, num - 1), replace=False)
+    # Numbers from v on move up by one: v itself is left out.
     return others + (others >= v)
 
 
@@ -203,6 +205,7 @@ def _make_seeds(
     _lift_all(world_from_grid(view, cell), shape[1], empty, depths, xyz)
     usable &= np.isfinite(xyz).all(axis=1)
     sides = depths * np.float32(_side_at_one(view, shape))
+    # reach is 1 beside a covered cell.
     confidence = np.maximum(np.float32(MOST_CONFIDENT) / reach, np.float32(LEAST_CONFIDENT))
     of = np.full(len(empty), idx, np.int32)
     return CoverSeeds(*(each[usable] for each in (xyz, rgb, of, sides, confidence)))
@@ -232,6 +235,7 @@ def _mean_colors(image, used, shape, empty, rgb, usable):  # type: ignore[no-unt
                         total[channel] += image[y, x, channel]
         usable[k] = count > 0 and 2 * count >= size
         for channel in range(3):
+            # The mean rounded to the nearest, in whole numbers.
             rgb[k, channel] = (2 * total[channel] + count) // (2 * max(count, 1))
 
 

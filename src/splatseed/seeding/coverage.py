@@ -181,6 +181,7 @@ def _sort_by_cell(cells, depths, num_cells):  # type: ignore[no-untyped-def]  # 
     for c in range(num_cells):
         starts[c + 1] += starts[c]
     by_cell = np.empty(starts[-1], np.float32)
+    # The next free place of each cell.
     free = starts[:-1].copy()
     for k in range(len(cells)):
         if cells[k] >= 0:
@@ -204,6 +205,7 @@ def _select(values, k):  # type: ignore[no-untyped-def]  # Numba's types
     """The k-th smallest, by Hoare's quickselect, which reorders the values."""
     low, high = 0, len(values) - 1
     while low < high:
+        # The middle one halves values that happen to be in order.
         pivot = values[(low + high) // 2]
         left, right = low, high
         while left <= right:
@@ -228,6 +230,7 @@ def _drop_hidden(depths, visible):  # type: ignore[no-untyped-def]  # Numba's ty
     rows, cols = depths.shape
     for i in range(rows):
         for j in range(cols):
+            # An empty cell is infinitely far and hides nothing; its own limit is infinite too.
             limit = depths[i, j] * np.float32(1.0 - NEARER)
             nearer = 0
             for a in range(max(i - 1, 0), min(i + 2, rows)):

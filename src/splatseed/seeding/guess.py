@@ -110,6 +110,7 @@ def _guess(depths, empty, back, matrices, shapes, starts, seen, guesses, reach):
             if nearest[s] < np.inf:
                 lift(back, i, j, depth_of[s], point)
                 against = _contradictions(point, matrices, shapes, starts, seen)
+                # 1 / ((1 + contradictions) distance^2)
                 weights[s] = 1.0 / ((1.0 + against) * nearest[s])
         guesses[k] = _weighted_median(depth_of, weights)
         reach[k] = np.sqrt(nearest.min())
@@ -147,10 +148,12 @@ def _look_around(depths, i, j, nearest, depth_of):  # type: ignore[no-untyped-de
     ring, seen = 1, False
     while ring <= last:
         for a in range(max(i - ring, 0), min(i + ring + 1, rows)):
+            # The first and last row of a ring are whole, of the others only both ends belong to it.
             step = 1 if abs(a - i) == ring else 2 * ring
             for b in range(j - ring, j + ring + 1, step):
                 if 0 <= b < cols and depths[a, b] < np.inf:
                     if not seen:
+                        # The first covered cell, r = ring away, bounds the search to 2 r + 1.
                         seen, last = True, min(last, 2 * ring + 1)
                     sector, square = _sector(a - i, b - j), (a - i) ** 2 + (b - j) ** 2
                     if square < nearest[sector]:

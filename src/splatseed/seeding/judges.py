@@ -79,6 +79,7 @@ def _choose(  # type: ignore[no-untyped-def]  # Numba's types
             if not _has_witnesses(xyz[i], sources[view], matrices, sizes):
                 continue
             value = focals[view] * _sight(xyz[i], normals[i], centers[view])
+            # Insertion into a sorted list of two.
             for k in range(JUDGES):
                 if value > worth[k]:
                     for after in range(JUDGES - 1, k, -1):

@@ -79,6 +79,7 @@ def _fill_lanes(first, uv, planes, reach, places, own, state):
 @inline
 def _search(quad_images, places, window, own, tried, state):
     """Try evenly spaced offsets, then ever closer ones around the best."""
+    # 13 offsets from -1.5 to 1.5 spacings, a quarter apart; then 1/8, 1/16, 1/32 and 1/64.
     step = np.float32(2.0 * REACH / (OFFSETS - 1))
     for k in range(OFFSETS):
         state[0, :] = step * np.float32(k - OFFSETS // 2)
@@ -105,6 +106,7 @@ def _try(quad_images, places, window, own, tried, state):
     )  # fmt: skip
     for lane in range(LANES):
         t, cost = state[0, lane], state[1, lane]
+        # (cost(t) + FLOOR) (1 + t^2): far moves must pay off.
         value = (cost + _FLOOR) * (_ONE + t * t)
         if value < state[2, lane]:
             state[2, lane], state[3, lane], state[4, lane] = value, t, cost
@@ -118,4 +120,5 @@ def _variance(window, lane):
     for k in range(SAMPLES):
         a = window[1, k * LANES + lane]
         share += a * a / window[0, k * LANES + lane]
+    # Solved for var; a share of 1 would be infinite variance.
     return _NOISE * share / max(_ONE - share, np.float32(1e-6))

@@ -21,6 +21,7 @@ from splatseed.upsample.surfaces.frames import local_frames
 __all__ = ["Surroundings", "survey"]
 
 NEIGHBORS = 16
+"""Neighbours that determine a normal, as for mls."""
 FLAT = 0.4
 """A neighbourhood counts as flat up to this ratio of thickness to width; noise alone has about
 0.7."""

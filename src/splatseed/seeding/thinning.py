@@ -76,6 +76,7 @@ def thin_to(
     if known.num_original >= num:
         return _keep(scene, known.originals, num)
     views = read_views(scene, photographed(scene, hold_out), MAX_SIZE, progress)
+    # Guesses get what the measured points leave, and a tenth at least.
     room = max(num - len(known), round(MOST_COVER * num))
     kept = _keep(scene, known, num - room)
     while cell <= MAX_SIZE:

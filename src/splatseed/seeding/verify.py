@@ -114,6 +114,7 @@ def _try_all(
     """Let every view judge its points."""
     greys = [grey_image(view.photograph) for view in views]
     trials = _no_trials(*judges.shape)
+    # The trials of each view side by side; -1, no judge, sorts before all.
     order = np.argsort(judges, axis=None, kind="stable")
     starts = np.searchsorted(judges.ravel()[order], np.arange(len(views) + 1))
 
@@ -156,6 +157,7 @@ def _judge(
     world = xyz[point].astype(np.float64)
     uv, planes, reach = _planes(view, world, around.normals[point], around.spacing[point])
     moves, costs, variances = (np.empty(len(mine), np.float32) for _ in range(3))
+    # No bounds on inverse depth: the slide itself is bounded.
     anything = np.array([0.0, np.inf], np.float32)
     quad_images = make_quad_images(
         view, greys[i], [views[j] for j in others], [greys[j] for j in others], 1, anything
@@ -187,6 +189,7 @@ def _planes(
     # n K^-1 (u, v, 1) w^-1 = n X, so w is linear in u and v with the slopes of n K^-1 / (n X)
     slopes = (n @ np.linalg.inv(view.K))[:, :2] / distance[:, None]
     planes = np.column_stack([1.0 / cam[:, 2], slopes])
+    # Negative, as n X is: t > 0 moves along the normal, towards the camera.
     reach = np.maximum(spacing / distance, -LARGEST_MOVE)
     return uv.astype(np.float32), planes.astype(np.float32), reach.astype(np.float32)
 
@@ -202,6 +205,7 @@ def _facing(
     n = np.where(np.isnan(normals), back, normals)
     cosine = np.einsum("ij,ij->i", n, back)[:, None]
     n, cosine = np.where(cosine < 0, -n, n), np.abs(cosine)
+    # Tilted just far enough: cos of the angle to the ray becomes STEEPEST.
     across = n - cosine * back
     length = np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
     leaning = STEEPEST * back + np.sqrt(1.0 - STEEPEST**2) * across / length
@@ -216,6 +220,7 @@ def _decide(
 ) -> NewPoints:
     """Keep, move and drop points by their judges' verdicts; ``centers`` are the judges' centres."""
     judged, textured = np.isfinite(trials.costs), trials.variances >= TEXTURE
+    # Where there is no texture a low cost is chance.
     costs = np.where(textured, trials.costs, np.inf)
     rows, best = np.arange(len(costs)), costs.argmin(axis=1)
     agrees = costs[rows, best] <= MAX_COST
@@ -224,6 +229,7 @@ def _decide(
     confidence = np.where(agrees, 1.0 - np.maximum(costs[rows, best], 0.0), np.nan)
     confidence[bare] = BARE_CONFIDENCE
     xyz = np.where(agrees[:, None], trials.xyz[rows, best], new.xyz)
+    # Principal axes have no sign: the normal is turned towards the judge.
     outward = np.einsum("ij,ij->i", around.normals, centers[rows, best] - new.xyz)
     normals = np.where((outward < 0)[:, None] & ~unknown[:, None], -1.0, 1.0) * around.normals
     changed = new._replace(

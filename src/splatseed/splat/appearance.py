@@ -63,6 +63,7 @@ def fit_harmonics(seeds: PointCloud, views: Sequence[View]) -> Float32[np.ndarra
         np.zeros((len(xyz), NUM_FITTED, 3)),
     )
     normal += np.diag([OWN * SH_C0**2, *[EVEN * SH_C1**2] * 3])
+    # Normal equations; OWN and EVEN make them regular even for a seed that no view sees.
     right[:, 0] += OWN * SH_C0 * own
     for view in _asked(views, len(xyz)):
         shown = _shown(xyz, view)
@@ -89,6 +90,7 @@ def _shown(xyz: Float32[np.ndarray, "N 3"], view: View) -> _Shown:
     column, row = column[index].astype(np.int64), row[index].astype(np.int64)
     (rows, cols), depths = grid_of(view, CELL), cell_depths(view, xyz, CELL)
     nearest = depths[row * rows // view.height, column * cols // view.width]
+    # A tenth behind the cell's depth still counts as its surface.
     seen = depth[index] <= nearest * (1 + NEARER)
     seen &= np.isfinite(nearest)
     return _Shown(index[seen], column[seen], row[seen])

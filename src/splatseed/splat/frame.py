@@ -67,6 +67,7 @@ class TrainingFrame:
         return dataclasses.replace(
             gaussians,
             means=self.points_to_world(gaussians.means).astype(np.float32),
+            # Scales are logarithms: division becomes subtraction.
             scales=gaussians.scales - np.float32(np.log(self.scale)),
         )
 
@@ -74,6 +75,7 @@ class TrainingFrame:
         """The same view, its camera posed in the training frame."""
         cam_from_train = view.cam_from_world.copy()
         rotation, translation = view.cam_from_world[:3, :3], view.cam_from_world[:3, 3]
+        # x_cam = R x + t = (R x_train + s (R o + t)) / s: the same image, depths times s.
         cam_from_train[:3, 3] = self.scale * (rotation @ self.origin + translation)
         return dataclasses.replace(view, cam_from_world=cam_from_train)
 
@@ -111,6 +113,7 @@ def _is_stray(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
         return np.zeros(len(centers), bool)
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     usual = max(1, len(centers) - max(1, round(STRAY_SHARE * len(centers))))
+    # The farthest of those that cannot be strays.
     reach = np.partition(distances, usual - 1)[usual - 1]
     rounding = 1e-9 * float(np.abs(np.median(centers, axis=0)).max())
     return np.asarray((distances > STRAY_DISTANCE * reach) & (reach > rounding))

@@ -21,6 +21,7 @@ __all__ = ["SH_C0", "Gaussians", "initial_gaussians", "neighbor_distances"]
 SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)); colour = 0.5 + SH_C0 * sh0."""
 NEIGHBORS = 3
+"""Neighbours whose mean square distance is a Gaussian's first size, as in 3DGS."""
 GAP = 10.0
 """Largest initial scale, relative to the median: beyond it a point is isolated."""
 COINCIDENT = 1e-2
@@ -86,8 +87,10 @@ def initial_gaussians(
     quats = np.tile(np.array([1.0, 0, 0, 0]), (count, 1))
     if seeds.normals is not None:
         known = ~np.isnan(seeds.normals[:, 0])
+        # The third axis is the normal's.
         scales[known, 2] += np.log(flatness)
         quats[known] = _quats_to(seeds.normals[known])
+    # colour = 1/2 + C0 sh0; no dependence on direction at first
     sh0, sh_rest = (seeds.rgb / 255.0 - 0.5) / SH_C0, np.zeros((count, rest, 3), np.float32)
     if harmonics is not None:
         sh0, first = harmonics[:, 0], harmonics[:, 1 : rest + 1]
@@ -96,6 +99,7 @@ def initial_gaussians(
         means=np.array(seeds.xyz, np.float32),
         scales=scales.astype(np.float32),
         quats=quats.astype(np.float32),
+        # logit, the inverse of the sigmoid
         opacities=np.full(count, np.log(opacity / (1 - opacity)), np.float32),
         sh0=sh0.astype(np.float32)[:, None],
         shN=sh_rest,

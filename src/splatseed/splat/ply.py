@@ -2,7 +2,6 @@
 
 Notation: one vertex per Gaussian, float32 x, y, z, nx, ny, nz (zero), f_dc_0..2, f_rest_* (all of
 red, then green, then blue), opacity (logit), scale_0..2 (logarithms), rot_0..3 (wxyz). Promise:
-red, then green, then blue), opacity (logit), scale_0..2 (logarithms), rot_0..3 (wxyz). Promise:
 what was written is read back bit for bit; properties are found by name, so order and additional
 ones do not matter; a file appears whole or not at all.
 """

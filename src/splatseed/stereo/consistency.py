@@ -41,6 +41,7 @@ def confirm(
         for column in range(width):
             if costs[row, column] > max_cost:
                 continue
+            # X at depth z on the pixel's ray, and its depth and pixel in the other view.
             z = 1.0 / planes[0, row, column]
             u, v = (column + 0.5) * grid * z, (row + 0.5) * grid * z
             depth = m[2, 0] * u + m[2, 1] * v + m[2, 2] * z + m[2, 3]
@@ -58,10 +59,12 @@ def _agrees(x, y, depth, grid, planes, costs, max_cost, tolerance):
     rows, columns = costs.shape
     if not (0.0 <= x < columns * grid and 0.0 <= y < rows * grid):
         return False
+    # The nearest grid point: (p, q) lies at pixel ((q + 0.5) g, (p + 0.5) g).
     q, p = int(x / grid), int(y / grid)
     if costs[p, q] > max_cost:
         return False
     # w(u, v) = w0 + gx (u - u0) + gy (v - v0)
     across, down = x - (q + 0.5) * grid, y - (p + 0.5) * grid
     w = planes[0, p, q] + planes[1, p, q] * across + planes[2, p, q] * down
+    # |z_ij w_j - 1|: a relative difference of depth, with one multiplication.
     return abs(depth * w - 1.0) <= tolerance

@@ -65,6 +65,7 @@ def fuse(stereo: Stereo, cell: float, progress: Progress = silent) -> StereoSeed
         [(int(view.height / cell) + 1, int(view.width / cell) + 1) for view in stereo.views]
     )
     offsets = np.cumsum([0, *shapes.prod(axis=1)])
+    # The depth of the seed in each cell of each view; 0 is free, as 0 / depth is far from 1.
     taken = np.zeros(offsets[-1], np.float32)
     parts = []
     for i in range(len(stereo.views)):
@@ -88,6 +89,7 @@ def _choose(
     Their cells are marked in all views that confirm them.
     """
     confidence = stereo.confidence(i).ravel()
+    # The most confident pixel takes its cell first; those at 0 are not kept at all.
     order = np.argsort(-confidence, kind="stable")[: np.count_nonzero(confidence)]
     others = stereo.sources[i]
     matrices: Float64[np.ndarray, "K 3 4"] = np.zeros((len(others), 3, 4))
@@ -115,6 +117,7 @@ def _take(order, planes, agreeing, own, others, matrices, grid, cell, taken, off
         places[0], depths[0] = offsets[own] + int(v / cell) * shapes[own, 1] + int(u / cell), w
         count = 1
         for k in range(num):
+            # Its cell in each view that confirms it: the same surface must not get two seeds.
             if agreeing[row, column] >> np.uint8(k) & 1:
                 m, j, z = matrices[k], others[k], 1.0 / w
                 depth = (m[2, 0] * u + m[2, 1] * v + m[2, 2]) * z + m[2, 3]
@@ -140,6 +143,7 @@ def _seeds(stereo: Stereo, i: int, chosen: Int64[np.ndarray, " M"], cell: float)
     z = 1.0 / stereo.planes[i][0][row, column].astype(np.float64)
     uv = (np.stack([column, row], axis=1) + 0.5) * grid
     camera = Camera(view.K, view.width, view.height, view.cam_from_world)
+    # n' R = (R' n)': from camera axes to the world's.
     normals = stereo.normals(i)[row, column] @ view.cam_from_world[:3, :3]
     return StereoSeeds(
         camera.unproject(uv, z).astype(np.float32),

@@ -110,6 +110,7 @@ def _match(
         for color in range(2):
             sweep(quad_images, color, number, rng.integers(1 << 63, dtype=np.uint64), planes, costs)
     if view.mask is not None:
+        # Undistortion leaves borders without pixels, whose planes mean nothing.
         costs[~_blocks_known(view.mask, grid)] = np.inf
     return planes, costs
 
@@ -154,6 +155,7 @@ def make_quad_images(
 
 def other_from_view(view: View, other: View) -> Float64[np.ndarray, "3 4"]:
     """Maps pixels (u, v, 1) of a view times depth, and 1, to another's: K_s [R K_r^-1, t]."""
+    # source from reference: x_s = R x_r + t with x_r = z K_r^-1 (u, v, 1)
     relative = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
     return np.asarray(
         other.K @ np.hstack([relative[:3, :3] @ np.linalg.inv(view.K), relative[:3, 3:]])
@@ -169,6 +171,7 @@ def _confirm_all(
     progress: Progress,
 ) -> list[UInt8[np.ndarray, "h w"]]:
     """Which witnesses of each view confirm each of its pixels."""
+    # Bit k: the k-th source confirms. Its own map was found without this view's.
     agreeing = [np.zeros(each.shape, np.uint8) for each in costs]
 
     def work(start: int, stop: int) -> None:

@@ -34,6 +34,7 @@ STEEPEST = 6.0
 DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5
 """Largest perturbations: a fraction of inverse depth, and of the tangent; halved each sweep."""
 
+# SplitMix64's constants; its increment is 2^64 over the golden ratio.
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 _MIX_A, _MIX_B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
@@ -98,9 +99,11 @@ def sweep(quad_images, color, number, key, planes, costs):
     height, width = costs.shape
     lanes, places, window, tried, trial_costs = _buffers()
     for row in range(height):
+        # Every second column of this row has the colour.
         for first in range((row + color) % 2, width, 2 * LANES):
             _fill_lanes(first, 2, width, lanes)
             _look(quad_images, row, lanes, places, window)
+            # First what neighbours know, then small changes of the best: 11 planes per visit.
             for way in range(8):
                 _propagate(quad_images.grid, way, row, lanes, planes, costs, tried)
                 _try(quad_images, row, lanes, places, window, tried, trial_costs, planes, costs)
@@ -161,6 +164,7 @@ def _allowed(quad_images, tried, lane):
     w, gx, gy = tried[lane], tried[LANES + lane], tried[2 * LANES + lane]
     if not quad_images.bounds[0] <= w <= quad_images.bounds[1]:
         return False
+    # A surface at angle a to the image plane has |(gx, gy)| = w tan(a) / focal.
     limit = STEEPEST * w / quad_images.focal
     return gx * gx + gy * gy <= limit * limit
 
@@ -175,11 +179,13 @@ def _propagate(grid, way, row, lanes, planes, costs, tried):
         best = 1 if way < 4 else 3
         if way >= 4:
             least = np.float32(np.inf)
+            # Odd distances: those points have the other colour, which no lane writes now.
             for far in range(3, ARM + 1, 2):
                 y, x = row + far * down, column + far * across
                 if 0 <= y < height and 0 <= x < width and costs[y, x] < least:
                     best, least = far, costs[y, x]
         y, x = row + best * down, column + best * across
+        # Beyond the border the point's own plane is tried again, which changes nothing.
         if not (0 <= y < height and 0 <= x < width):
             y, x = row, column
         gx, gy = planes[1, y, x], planes[2, y, x]
@@ -200,6 +206,7 @@ def _perturb(quad_images, row, lanes, share, key, planes, tried):
     width = planes.shape[2]
     for lane in range(LANES):
         column = lanes[lane]
+        # Four numbers are set aside per point, three are used: no two draws coincide.
         number = np.uint64(row * width + column) * np.uint64(4)
         w = planes[0, row, column] * (1.0 + DEPTH_CHANGE * share * _random(key, number))
         slope = SLOPE_CHANGE * share * w / quad_images.focal
@@ -217,4 +224,5 @@ def _random(key, number):
     z = (z ^ (z >> np.uint64(30))) * _MIX_A
     z = (z ^ (z >> np.uint64(27))) * _MIX_B
     z ^= z >> np.uint64(31)
+    # 53 random bits over 2^53, from [0, 1) to [-1, 1).
     return np.float64(z >> np.uint64(11)) * (2.0 / 9007199254740992.0) - 1.0

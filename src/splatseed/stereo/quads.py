@@ -54,6 +54,7 @@ def _grey(image, luma, out):
 def _pack(grey, out):
     height, width = grey.shape
     for y in range(height):
+        # The last row and column repeat themselves.
         below = min(y + 1, height - 1)
         for x in range(width):
             right = min(x + 1, width - 1)
@@ -75,7 +76,7 @@ def sample(typing_context, quads, width, height, column, row):
         data = context.make_array(signature.args[0])(context, builder, quads).data
         x, right = _split(builder, column, width)
         y, down = _split(builder, row, height)
-        stride = _splat_index(builder, builder.trunc(width, ir.IntType(32)))
+        stride = _broadcast_index(builder, builder.trunc(width, ir.IntType(32)))
         words = _gather(builder, data, builder.add(builder.mul(y, stride), x))
         a, b, c, d = (_byte(builder, words, i) for i in range(4))
         top, bottom = _lerp(builder, a, b, right), _lerp(builder, c, d, right)
@@ -100,8 +101,9 @@ def square_root(typing_context, v):
 def _split(builder, place, size):
     """Integer and fractional parts of coordinates, clamped to 0 and ``size - 1``."""
     last = builder.sitofp(builder.sub(size, ir.Constant(size.type, 1)), ir.FloatType())
+    # maxnum and minnum return the number where the other is NaN: NaN becomes 0.
     place = _limit(builder, place, "maxnum", ir.Constant(VECTOR, [0.0] * LANES))
-    place = _limit(builder, place, "minnum", _splat(builder, last, VECTOR))
+    place = _limit(builder, place, "minnum", _broadcast(builder, last, VECTOR))
     whole = builder.fptosi(place, INDEX)
     return whole, builder.fsub(place, builder.sitofp(whole, VECTOR))
 
@@ -112,14 +114,14 @@ def _limit(builder, vector, name, bound):
     return builder.call(function, [vector, bound])
 
 
-def _splat(builder, value, kind):
+def _broadcast(builder, value, kind):
     undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INDEX, [0] * LANES))
 
 
-def _splat_index(builder, value):
-    return _splat(builder, value, INDEX)
+def _broadcast_index(builder, value):
+    return _broadcast(builder, value, INDEX)
 
 
 def _gather(builder, data, index):
@@ -138,6 +140,7 @@ def _gather(builder, data, index):
 def _byte(builder, words, i):
     """Byte i of each word as a number."""
     shifted = builder.lshr(words, ir.Constant(INDEX, [i * BYTE] * LANES)) if i else words
+    # The topmost byte needs no mask: the shift has brought in zeros.
     low = builder.and_(shifted, ir.Constant(INDEX, [0xFF] * LANES)) if i < 3 else shifted
     return builder.sitofp(low, VECTOR)
 

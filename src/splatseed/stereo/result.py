@@ -43,6 +43,7 @@ class Stereo:
     def kept(self, i: int) -> np.ndarray:
         """Which pixels of view i have a depth that enough others confirm, bool [h, w]."""
         asked = int((self.sources[i] >= 0).sum())
+        # A view with a single source can be confirmed by no more than that one.
         needed = max(1, min(self.settings.min_agreeing, asked))
         return np.asarray(np.bitwise_count(self.agreeing[i]) >= needed)
 

@@ -24,6 +24,7 @@ RANDOM = 16
 MARGIN = 1.3
 """Bounds reach this many times beyond the nearest and the farthest point."""
 RIDGE = 1e-3
+"""Shrinks slopes, relative to the spread of the points: a few in a line do not determine them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +44,7 @@ class Hints:
 
 def hints_from(uv: Float64[np.ndarray, "M 2"], w: Float64[np.ndarray, " M"]) -> Hints:
     """Hints from at least one point: planes are searched a little beyond the points."""
+    # Percentiles, as a few of SfM's points float in front of the cameras.
     low, high = np.percentile(w, [0.5, 99.5])
     return Hints(uv, w, np.array([low / MARGIN, high * MARGIN], np.float32))
 
@@ -79,10 +81,12 @@ def _fit(
     design = np.concatenate([np.ones((*w.shape, 1)), apart], axis=2)
     normal = np.swapaxes(design, 1, 2) @ design
     spread = np.trace(normal[:, 1:, 1:], axis1=1, axis2=2)
+    # Normal equations of w0 + gx du + gy dv; only the slopes are shrunk.
     normal[:, [1, 2], [1, 2]] += RIDGE * (1.0 + spread)[:, None]
     right = np.swapaxes(design, 1, 2) @ w[..., None]
     fitted = np.linalg.solve(normal, right)[..., 0].T
     low, high = w.min(axis=1), w.max(axis=1)
+    # Extrapolated planes can leave the points' depths, or end behind the camera.
     outside = (fitted[0] < low / MARGIN) | (fitted[0] > high * MARGIN)
     fitted[:, outside] = [w[outside].mean(axis=1), np.zeros(outside.sum()), np.zeros(outside.sum())]
     return np.asarray(fitted)

@@ -42,6 +42,7 @@ LEAST_MOVE = 0.2
 AROUND = 3.0
 """The second search reaches this many times beyond the nearest and farthest tenth."""
 MOST_POINTS = 30_000
+"""Points kept: pairs of views need no more to be chosen."""
 SAMPLES = 18
 """Rows and columns at which a depth map is sampled."""
 
@@ -71,6 +72,7 @@ def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
     xyz, seen = _imagined_points(small, spread)
     centers = np.stack([_camera(view).center for view in small])
     sources = choose_sources(seen, xyz, centers, LOOK.num_witnesses)
+    # ``spread`` holds inverse depths, so low is far and high is near.
     hints = [_between(low / AROUND, high * AROUND) for low, _, high in spread]
     stereo = match_views(small, hints, sources, LOOK, seed, progress)
     return _unseen(fuse(stereo, CELL).xyz.astype(np.float64))
@@ -90,6 +92,7 @@ def _places(image: Image, depth: DepthMap) -> Float64[np.ndarray, "N 3"]:
     z = z[known]
     if depth.kind == "ray":
         rays = np.concatenate([uv, np.ones((len(uv), 1))], axis=1) @ np.linalg.inv(camera.K).T
+        # distance along the ray / |ray|, for rays of unit z, is planar depth
         z /= np.linalg.norm(rays, axis=1)
     return camera.unproject(uv, z)
 
@@ -143,6 +146,7 @@ def _any_depth(views: Sequence[View], i: int, sources: Int64[np.ndarray, " K"]) 
     """From the depth where the photograph hardly moves to where it moves by its width."""
     others = sources[sources >= 0]
     apart = [np.linalg.norm(_camera(views[j]).center - _camera(views[i]).center) for j in others]
+    # A sideways step b moves a point at inverse depth w by focal b w pixels.
     moves = views[i].K[0, 0] * float(np.median(apart)) if apart else 0.0
     return _between(LEAST_MOVE / moves, views[i].width / moves) if moves > 0 else None
 
@@ -153,6 +157,7 @@ def _imagined_points(
     """Positions that views may be seeing, and which of them fall into each view."""
     points = []
     for view, inverse in zip(views, spread, strict=True):
+        # 5 x 4 places of the image, each at the three depths.
         share = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
         uv = np.tile(share * [view.width, view.height], (3, 1))
         points.append(_camera(view).unproject(uv, np.repeat(1 / inverse, 20)))

@@ -35,6 +35,7 @@ def add_to_mean(mean: dict[str, Any], params: Parameters) -> None:
         if not value.requires_grad:
             continue
         if name in mean:
+            # m_n = m_(n-1) + (x - m_(n-1)) / n
             mean[name].lerp_(value, 1.0 / mean[COUNT])
         else:
             mean[name] = value.detach().clone()

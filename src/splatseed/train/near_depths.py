@@ -43,6 +43,7 @@ def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32
         depths, seen = _seen_depths(columns, views[i])
         np.minimum(nearest, np.where(seen, depths, np.inf), out=nearest)
     known = np.isfinite(nearest)
+    # A point that no view sees gets no gradient; any positive length will do.
     nearest[~known] = np.median(nearest[known]) if known.any() else 1.0
     return np.asarray(np.maximum(nearest, LEAST), np.float32)
 

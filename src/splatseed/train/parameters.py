@@ -37,7 +37,9 @@ Parameters = torch.nn.ParameterDict
 Optimizers = dict[str, torch.optim.Optimizer]
 
 ADAM_BETA1 = 0.9
+"""Decay of Adam's mean gradient, PyTorch's default."""
 ADAM_EPSILON = 1e-15
+"""3DGS's: far below any gradient, so that rarely seen Gaussians take full steps too."""
 NEAR_DEPTHS = "near_depths"
 
 

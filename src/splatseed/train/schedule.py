@@ -161,6 +161,7 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
     mcmc = densification == "mcmc"
     speedup = max(FULL_RUN / max_steps, 1.0)
     stop = _scaled(25_000 if mcmc else 15_000, max_steps)
+    # 3DGS densifies every 100 steps of 30,000.
     shrunk = 100 * max_steps / FULL_RUN
     every = max(1, round(shrunk), min(100, stop // LEAST_ROUNDS[densification]))
     start = _scaled(500, max_steps)
@@ -173,15 +174,18 @@ def _own(densification: Densification, max_steps: int) -> Schedule:
             n: rate * min(speedup, MOST_SPEEDUP[n]) for n, rate in LEARNING_RATES.items()
         },
         decays=DECAYS,
+        # 0.999 in a full run, 0.99 from a tenth of it down.
         beta2=1 - min(FORGETTING * speedup, MOST_FORGETTING),
         sh_every=_scaled(1000, max_steps),
         refine_start=start,
         refine_stop=stop,
         refine_every=every,
         reset_every=_scaled(3000, max_steps),
+        # Fewer rounds than 3DGS has grow by more each, so that the cap is reached as early.
         growth=GROWTH ** (every / shrunk),
         opacity=0.5 if mcmc else 0.1,
         largest=LARGEST,
+        # Only once the number of Gaussians no longer changes.
         mean_from=max(stop, round(MEAN_FROM * max_steps)),
     )
 

@@ -20,6 +20,7 @@ PER_RENDERED = 0.13
 """Most pixels compared per pixel rendered in training: stereo then takes about a quarter of
 training's seconds (on the CPU: fern, 0.045: 5 of 47 s; bonsai at 1,500 steps, 0.68: 83 of 64 s)."""
 LEAST_SIZE = 64
+"""Smallest size that is returned, in pixels."""
 
 
 def stereo_size(images: Sequence[Image], settings: TrainSettings) -> int:
@@ -40,5 +41,6 @@ def stereo_size(images: Sequence[Image], settings: TrainSettings) -> int:
     most = min(full, longest)
     compared = pixels * (most / longest) ** 2
     rendered = settings.max_steps * pixels / len(images) / settings.data_factor**2
+    # Pixels go with the square of the size.
     affordable = most * math.sqrt(PER_RENDERED * rendered / compared)
     return min(full, max(LEAST_SIZE, longest // settings.data_factor, int(affordable)))

@@ -105,10 +105,12 @@ class Trainer:
         view = self.train_views[self._view_index(step)]
         photograph = photograph_of(view, self.device)
         render, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
+        # gsplat's strategies ask PyTorch to retain the gradient of the 2D means here.
         strategy.before(params, optimizers, step, info)
         loss = photometric_loss(render, photograph)
         state.losses.append(loss.detach())
         penalty = strategy.regularization(params)
+        # The recorded loss is without the penalty, so that strategies can be compared.
         (loss if penalty is None else loss + penalty).backward()
         optimize(params, optimizers, schedule.rates(step))
         strategy.observe(params, view, render, photograph, step)
@@ -151,6 +153,7 @@ class Trainer:
     def _is_due(self, times: int) -> bool:
         """Whether something that happens ``times`` times in a run is due after this step."""
         step, last = self.state.step, self.settings.max_steps
+        # Evenly spread over the run, and always at its last step.
         return step * times // last > (step - 1) * times // last
 
     def _view_index(self, step: int) -> int:
@@ -174,4 +177,5 @@ def _epoch_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " V"]:
 
 
 def _step_seed(seed: int, step: int) -> int:
+    # 63 bits: PyTorch's seeds are signed.
     return int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0] >> 1)

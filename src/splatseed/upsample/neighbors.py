@@ -40,9 +40,13 @@ __all__ = [
 ]
 
 SPACING_NEIGHBORS = 6
+"""Nearest points over which the spacing h is averaged."""
 OUTLIER_NEIGHBORS = 16
+"""Neighbours that a point's spacing is compared with."""
 OUTLIER_FACTOR = 3.0
+"""Times their lower quartile, at which a point is isolated: catches 62% of planted outliers."""
 QUERY_BLOCK = 1 << 13
+"""Rows per task of a thread."""
 SHORT_TRACK = 3
 """Images, up to which a track counts as short."""
 BAD_ERROR = 2.0

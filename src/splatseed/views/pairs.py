@@ -64,6 +64,7 @@ def choose_by_pose(
     """
     centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
     gap = np.linalg.norm(centers[:, None] - centers, axis=2)
+    # The third row of a rotation is the camera's axis in the world.
     cosine = cam_from_world[:, 2, :3] @ cam_from_world[:, 2, :3].T
     chosen = np.full((len(centers), num), -1)
     for i in range(len(centers)):
@@ -72,6 +73,7 @@ def choose_by_pose(
         if len(alike) < num:
             alike = other[np.argsort(-cosine[i, other], kind="stable")[:num]]
         near = alike[np.argsort(gap[i, alike], kind="stable")]
+        # The nearest num / 2 are skipped, as far as the others suffice.
         near = near[min(num // 2, len(near) - min(num, len(near))) :][:num]
         chosen[i, : len(near)] = near
     return chosen

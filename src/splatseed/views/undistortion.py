@@ -43,6 +43,7 @@ def undistort(
         rays = _rays(K, column, np.arange(rows.start, rows.stop) + 0.5)
         with np.errstate(all="ignore"):  # beyond the fold nothing needs to be finite
             uv = distort(lens, rays) * K[[0, 1], [0, 1]] + K[:2, 2]
+        # Beyond the fold the lens maps two rays to one pixel.
         uv[np.linalg.norm(rays, axis=-1) > limit] = np.nan
         _resample(photograph, uv, out[rows], known[rows])
     return out, known

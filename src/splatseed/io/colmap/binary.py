@@ -2,10 +2,10 @@
 
 Notation: ``_id`` comes from the file. Layouts as COLMAP's documentation of its output format gives
 them, little-endian. In ``points3D.bin``, N records hold T observations in all, and ``starts``
-[N + 1] are the records' byte offsets, ended by the end of the last. Promise: a file that was read is written back byte for byte; a malformed one
-raises a single error that names the file, the record and the byte; points are looped over in
-Python only to find where each record begins. Writers write straight to ``path`` and let ``OSError``
-pass: their caller stages the output.
+[N + 1] are the records' byte offsets, ended by the end of the last. Promise: a file that was read
+is written back byte for byte; a malformed one raises a single error that names the file, the record
+and the byte; points are looped over in Python only to find where each record begins. Writers write
+straight to ``path`` and let ``OSError`` pass: their caller stages the output.
 """
 
 from __future__ import annotations

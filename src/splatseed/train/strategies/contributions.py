@@ -34,6 +34,7 @@ def contributions(
     """
     means = params["means"]
     with torch.enable_grad():
+        # Two channels of ones: their gradients are sum_p w_ip, plain or weighted by e_p.
         colors = means.new_ones((len(means), 2)).requires_grad_()
         frozen = {name: value.detach() for name, value in params.items()}
         plain, weighted = render_features(frozen, view, colors).unbind(-1)

@@ -74,6 +74,7 @@ class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
             return math.inf
         if room >= wanted:
             return self.grow_grad2d
+        # The (room + 1)-th largest: exactly ``room`` exceed it.
         return max(self.grow_grad2d, float(torch.topk(gradients, room + 1).values[-1]))
 
 
@@ -86,6 +87,7 @@ def _add_gradients(state: Any, info: Any) -> None:
     radii, half_cameras = info["radii"], info["n_cameras"] / 2.0
     seen = (radii[..., 0] > 0) & (radii[..., 1] > 0)
     x, y = info["means2d"].grad.unbind(-1)
+    # gsplat's units: gradients by normalised image coordinates, -1 to 1, whatever the size.
     lengths = torch.hypot(x * (info["width"] * half_cameras), y * (info["height"] * half_cameras))
     for camera in range(info["n_cameras"]):
         state["grad2d"] += lengths[camera]
@@ -99,10 +101,15 @@ class Default(Strategy):
         super().__init__(capacity)
         schedule = settings.schedule
         self.inner = Capped(
+            # Gradients mean little before the first Gaussians are in place: 500 of 30,000.
             refine_start_iter=schedule.refine_start,
+            # Half of a run is left to those that were added last (15,000 of 30,000).
             refine_stop_iter=schedule.refine_stop,
+            # Each round judges by the gradients since the last one.
             refine_every=schedule.refine_every,
+            # gsplat also begins to prune by size after this many steps.
             reset_every=schedule.reset_every,
+            # Larger Gaussians, in yardsticks, are removed: 0.1.
             prune_scale3d=schedule.prune_size,
         )
         self.inner.capacity = capacity
@@ -119,6 +126,7 @@ class Default(Strategy):
         self.state["scene_scale"] = yardsticks(params) if NEAR_DEPTHS in params else SCENE_SCALE
         self.inner.step_post_backward(params, optimizers, self.state, step, info)
         if self._resets_at(step):
+            # Twice the opacity at which Gaussians are pruned: those that matter recover, others go.
             reset_opa(params, optimizers, self.state, value=2 * self.inner.prune_opa)
 
     def _resets_at(self, step: int) -> bool:
@@ -162,7 +170,9 @@ class Mcmc(Strategy):
         self.schedule = schedule = settings.schedule
         self.inner = _Bounded(
             capacity=capacity,
+            # Gaussians grow by 5% a round, by more where rounds are fewer; up to the cap.
             growth=schedule.growth,
+            # 5e5 times the rate of positions: faint Gaussians wander, opaque ones stay.
             noise=schedule.noise,
             noise_lr=schedule.noise,
             refine_start_iter=schedule.refine_start,
@@ -176,6 +186,7 @@ class Mcmc(Strategy):
         opacities, sizes = torch.sigmoid(params["opacities"]), torch.exp(params["scales"])
         if NEAR_DEPTHS in params:
             sizes = sizes / yardsticks(params)[:, None]
+        # 0.01 (mean opacity + mean size): needless Gaussians fade, and are relocated.
         return self.schedule.penalty * (opacities.mean() + sizes.mean())
 
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:

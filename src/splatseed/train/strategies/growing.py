@@ -95,6 +95,7 @@ class Growing(Strategy):
         sums = self._sums(params)
         sums["errors"] += errors
         sums["pixels"] += pixels
+        # A look counts for the Gaussians that the view shows.
         sums["views"] += pixels > 0
         torch.maximum(sums["most_pixels"], pixels, out=sums["most_pixels"])
         if view.name in self.depths:
@@ -120,6 +121,7 @@ class Growing(Strategy):
         needless = self._needless(params)
         if bool(needless.all()):
             return  # the run is lost either way, and an empty scene cannot be rendered
+        # Candidates have no Gaussians yet: gsplat's operations must not see them in the state.
         candidates = self.state.pop("candidates", None)
         remove(params, optimizers, self.state, needless)
         count = len(params["means"])
@@ -143,10 +145,14 @@ class Growing(Strategy):
         sums, count = self._sums(params), len(params["means"])
         sizes = torch.exp(params["scales"].detach()).amax(dim=-1) / yardsticks(params)
         shown = sums["views"] >= LEAST_VIEWS
+        # Nearly transparent, ...
         needless = torch.sigmoid(params["opacities"].detach()) < FAINT
+        # ... or larger than 0.1 of its near depth, ...
         needless |= sizes > self.schedule.prune_size
+        # ... or worth less than half a pixel in every view that showed it.
         needless |= shown & (sums["most_pixels"] < _least(sums["most_pixels"][shown]))
         more = round(RECYCLED * count) - int(needless.sum())
+        # A full budget moves on only if the least useful tenth makes room.
         if more > 0 and self.capacity.cap and count >= FULL * self.capacity.cap:
             usable = shown & ~needless
             pixels = torch.where(usable, sums["most_pixels"], torch.inf)
@@ -157,6 +163,7 @@ class Growing(Strategy):
     def _split(self, params: Parameters, optimizers: Optimizers, wanted: int) -> None:
         """Split where E / sqrt(c) is largest: E favours large ones, E / c those of few pixels."""
         sums = self._sums(params)
+        # The geometric mean of E and E / c; a Gaussian without pixels scores 0.
         scores = sums["errors"] / sums["pixels"].clamp_min(1e-6).sqrt()
         number = min(wanted, int((scores > 0).sum()))
         if number > 0:
@@ -168,6 +175,7 @@ class Growing(Strategy):
     def _drawn_each(self, count: int, step: int) -> int:
         """Candidates to draw in a look: what the next round may ask for, shared by its looks."""
         every = self.schedule.refine_every
+        # The step at which this round ends.
         end = max(self.schedule.refine_start, math.ceil(step / every) * every)
         wanted = self._room(count, end) + round(RECYCLED * count)
         return math.ceil(PLACED * wanted / max(1, every // LOOK_EVERY))
@@ -182,6 +190,7 @@ class Growing(Strategy):
         )
         done = (step - schedule.refine_start) // schedule.refine_every + 1
         first = self.state["first"]
+        # Linear from the seeds to the budget.
         target = round(first + (budget - first) * min(1.0, done / rounds))
         return min(self.capacity.limit(count, target) - count, round(FASTEST * count))
 

@@ -48,11 +48,13 @@ def draw_candidates(
         count: The most candidates; a pixel drawn twice counts once.
     """
     height, width = error.shape
+    # The map is coarser: each pixel takes the depth of the map's pixel that covers it.
     rows = torch.arange(height, device=depth.device) * depth.shape[0] // height
     columns = torch.arange(width, device=depth.device) * depth.shape[1] // width
     d = depth[rows[:, None], columns].flatten()
     # In float64, so that the sum over a large photograph still grows with its last pixels.
     worth = torch.where(d > 0, error.flatten() ** 2, 0.0).double().cumsum(0)
+    # Inverse of the cumulative sum: pixel p is drawn with probability e_p^2 / sum e^2.
     drawn = torch.rand(count, dtype=torch.float64, device=worth.device) * worth[-1]
     pixels = torch.unique(torch.searchsorted(worth, drawn, right=True))
     pixels = pixels[(pixels < len(d)) & (worth[-1] > 0)]
@@ -109,6 +111,7 @@ def add_candidates(
         "scales": torch.log(chosen["sizes"])[:, None].expand(-1, 3),
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).expand(count, 4),
         "opacities": torch.logit(torch.full((count,), OPACITY, device=device)),
+        # colour = 1/2 + C0 sh0
         "sh0": ((chosen["colors"] - 0.5) / SH_C0)[:, None],
         "shN": torch.zeros_like(params["shN"][:count]),
         NEAR_DEPTHS: chosen["depths"],

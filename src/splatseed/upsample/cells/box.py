@@ -27,6 +27,7 @@ from splatseed.upsample.neighbors import PreparedCloud
 __all__ = ["box_cells"]
 
 ENLARGE = 0.1
+"""The paper's 10%."""
 FLAT = 1e-14
 """Tetrahedra flatter than this, relative to their edges, have no usable circumcentre."""
 SAME = 1e-9
@@ -143,6 +144,7 @@ def _circumcenter(sites, corners, out):  # type: ignore[no-untyped-def]  # Numba
     six_volumes = np.sum(a * bc)
     if six_volumes * six_volumes <= FLAT * FLAT * aa * bb * cc:
         return False
+    # The x with 2 x . a = |a|^2, 2 x . b = |b|^2, 2 x . c = |c|^2
     offset = (aa * bc + bb * _cross(c, a) + cc * _cross(a, b)) / (2.0 * six_volumes)
     out[:] = sites[corners[0]] + offset
     return True
@@ -167,8 +169,10 @@ def _add_volumes(sites, corners, vertex, volume):  # type: ignore[no-untyped-def
                     edge, other = sites[corners[j]] - origin, sites[corners[k]] - origin
                     last = sites[corners[6 - i - j - k]] - origin
                     face = _face_center(edge, other)
+                    # Six times the signed volume of (i, middle of ij, face's and own circumcentre).
                     signed = np.sum(0.5 * edge * _cross(face, vertex - origin))
                     inside = np.sum(edge * _cross(other, last))
+                    # The sign of (j, k, last) tells on which side of the face the tetrahedron lies.
                     share = np.sign(inside) * signed / 6.0
                     if np.isfinite(share):
                         volume[corners[i]] += share

@@ -24,6 +24,7 @@ from splatseed.kernels.jit import inline, kernel, parallel_range
 __all__ = ["Cells", "build_cells"]
 
 MAX_NEIGHBORS = 58
+"""So that planes, with the cube's 6, are 64."""
 MAX_PLANES = 6 + MAX_NEIGHBORS
 MAX_VERTICES = 2 * MAX_PLANES  # 2 F - 4 on a simple polytope of F faces
 COINCIDENT = 1e-12

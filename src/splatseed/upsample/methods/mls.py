@@ -22,7 +22,9 @@ from splatseed.upsample.surfaces.patches import Patches, PatchMethod
 __all__ = ["Mls"]
 
 TERMS = 6
+"""1, u, v, u^2, uv, v^2."""
 RIDGE = 1e-6
+"""Relative to the mean diagonal: far below what six or more points determine."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ def _heights(xyz, idx, distance, frames, start, count, uv, first, last, out):  #
             q = _fit(xyz, i, idx[i], distance[i], frames[i])
             for m in range(start[i], start[i] + count[i]):
                 u, v = uv[m, 0] / scale, uv[m, 1] / scale
+                # q(u, v), by Horner's rule
                 value = q[0] + u * (q[1] + u * q[3] + v * q[4]) + v * (q[2] + v * q[5])
                 out[m] = scale * value
 
@@ -82,6 +85,7 @@ def _fit(xyz, i, rows, distance, frame):  # type: ignore[no-untyped-def]  # Numb
     floor = 0.5 * distance[0]
     for j in range(-1, rows.size):  # -1 is the base itself, at the origin
         u = v = z = 0.0
+        # w = 1 / max(d, d_1 / 2), times d_k to be without a unit; the base has d = 0.
         weight = distance[-1] / floor
         if j >= 0:
             weight = distance[-1] / max(distance[j], floor)
@@ -116,8 +120,10 @@ def _solve(normal, rhs):  # type: ignore[no-untyped-def]  # Numba's types
         for c in range(a):
             normal[a, a] -= normal[a, c] * normal[a, c]
             rhs[a] -= normal[a, c] * rhs[c]
+        # L L' = normal; the forward substitution L y = rhs runs along.
         normal[a, a] = math.sqrt(normal[a, a])
         rhs[a] /= normal[a, a]
+    # L' x = y
     for a in range(TERMS - 1, -1, -1):
         for c in range(a + 1, TERMS):
             rhs[a] -= normal[c, a] * rhs[c]

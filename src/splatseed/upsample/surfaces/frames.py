@@ -72,6 +72,7 @@ def _covariance(xyz, i, rows):  # type: ignore[no-untyped-def]  # Numba's types
         mz += xyz[j, 2] - xyz[i, 2]
     count = rows.size + 1
     mx, my, mz = mx / count, my / count, mz / count
+    # The base itself lies at -mean from the mean.
     xx, xy, xz, yy, yz, zz = mx * mx, mx * my, mx * mz, my * my, my * mz, mz * mz
     for j in rows:
         x, y, z = xyz[j, 0] - xyz[i, 0] - mx, xyz[j, 1] - xyz[i, 1] - my, xyz[j, 2] - xyz[i, 2] - mz
@@ -94,6 +95,7 @@ def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]  # Numba
     (D. Eberly, A Robust Eigensolver for 3x3 Symmetric Matrices, Geometric Tools.)
     """
     xx, xy, xz, yy, yz, zz = covariance
+    # The trace is 1: without a third of it the eigenvalues sum to 0 and are 2 p cos(angle).
     a, b, c = xx - 1.0 / 3.0, yy - 1.0 / 3.0, zz - 1.0 / 3.0
     p = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
     if p < 1e-12:
@@ -112,6 +114,7 @@ def _principal_axes(covariance, frame):  # type: ignore[no-untyped-def]  # Numba
         _set_rows(frame, (wx, wy, wz), major, minor)
         return major_variance / (largest + 1.0 / 3.0)
     _set_rows(frame, major, minor, (wx, wy, wz))
+    # Middle variance = trace - largest - smallest, and the smallest is ``smallest`` + 1/3.
     return (2.0 / 3.0 - major_variance - smallest) / major_variance
 
 
@@ -147,6 +150,7 @@ def _null_vector(xx, xy, xz, yy, yz, zz):  # type: ignore[no-untyped-def]  # Num
 def _plane_axes(covariance, wx, wy, wz):  # type: ignore[no-untyped-def]  # Numba's types
     """Principal axes in the plane orthogonal to w: (major, minor, variance along major)."""
     xx, xy, xz, yy, yz, zz = covariance
+    # a and b are orthogonal to w; only the longer of two pairs of its components is divided by.
     if abs(wx) > abs(wy):
         s = 1.0 / math.sqrt(wx * wx + wz * wz)
         ax, ay, az = -wz * s, 0.0, wx * s
@@ -169,6 +173,7 @@ def _plane_axes(covariance, wx, wy, wz):  # type: ignore[no-untyped-def]  # Numb
         ax * cbx + ay * cby + az * cbz,
         bx * cbx + by * cby + bz * cbz,
     )
+    # The rotation that makes [[aa, ab], [ab, bb]] diagonal, larger variance first.
     theta = 0.5 * math.atan2(2.0 * ab, aa - bb)
     co, si = math.cos(theta), math.sin(theta)
     major = (co * ax + si * bx, co * ay + si * by, co * az + si * bz)

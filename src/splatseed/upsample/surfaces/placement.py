@@ -19,6 +19,7 @@ from splatseed.upsample.surfaces.frames import coordinate
 __all__ = ["place_in_box", "place_in_triangle", "place_on_disc"]
 
 TRIANGLE_NEIGHBORS = 8
+"""Neighbours from which the other two corners are drawn."""
 
 
 def place_on_disc(
@@ -70,6 +71,7 @@ def _disc(radius, collinear, start, count, uv):  # type: ignore[no-untyped-def] 
         reach_u = np.float32(radius[i])
         reach_v = np.float32(0.0) if collinear[i] else reach_u
         for m in range(start[i], start[i] + count[i]):
+            # The square root makes the area, not the radius, uniform.
             r, angle = np.sqrt(uv[m, 0]), turn * uv[m, 1]
             uv[m, 0] = reach_u * r * np.cos(angle)
             uv[m, 1] = reach_v * r * np.sin(angle)
@@ -82,8 +84,10 @@ def _triangle(xyz, idx, frames, start, count, draws, uv):  # type: ignore[no-unt
     for i in parallel_range(len(idx)):
         for m in range(start[i], start[i] + count[i]):
             pick = min(int(draws[m, 2] * pairs), pairs - 1)
+            # Pairs are counted (0,1), (0,2), (1,2), (0,3), ...: second (second - 1) / 2 precede.
             second = int((1.0 + math.sqrt(1.0 + 8.0 * pick)) / 2.0)
             first = pick - second * (second - 1) // 2
+            # Weights 1 - sqrt(r1) of the base, at 0, sqrt(r1) (1 - r2) and sqrt(r1) r2.
             root = math.sqrt(np.float64(draws[m, 0]))
             b2 = root * np.float64(draws[m, 1])
             for axis in range(2):

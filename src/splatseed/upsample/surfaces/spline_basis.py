@@ -22,7 +22,9 @@ from splatseed.upsample.surfaces.patches import Patches
 __all__ = ["CONTROL", "PatchBasis", "evaluate", "patch_basis", "penalty"]
 
 CONTROL = 6
+"""Control values a side: 3 uniform intervals and cubic degree."""
 HEIGHT_UNIT = 1.5
+"""Unit of heights, in distances of the k-th neighbour."""
 LINE = 1e-6
 """Least extent along v, as a fraction of the k-th distance: a collinear patch has none."""
 

@@ -81,6 +81,7 @@ def _planes(weight, cell):  # type: ignore[no-untyped-def]  # Numba's types
     for j in range(len(weight)):
         for axis in range(2):
             w = weight[j, axis]
+            # B-splines reproduce lines: sum_a B_a(u) a is linear in u.
             planes[j, 1 + axis] = cell[j, axis] - 1.5 + w[1] + 2.0 * w[2] + 3.0 * w[3]
     return planes
 
@@ -98,6 +99,7 @@ def _remove_planes(planes, gram, y):  # type: ignore[no-untyped-def]  # Numba's 
         alpha = -math.copysign(math.sqrt(squared), v[column])
         v[column] -= alpha
         squared += alpha * alpha - 2.0 * alpha * (v[column] + alpha)
+        # A column that is 0 already, as of a collinear patch, needs no reflection.
         if squared > 1e-24 * m:
             _reflect_rows(planes, v, column, squared)
             _reflect_rows(gram, v, column, squared)
@@ -191,6 +193,7 @@ def _score(diagonal, beside, y, smoothing):  # type: ignore[no-untyped-def]  # N
     for i in range(n):
         forward[i], carried[i] = diagonal[i] + smoothing, y[i]
         if i > 0:
+            # Elimination from the top, on matrix and right side alike.
             ratio = beside[i - 1] / forward[i - 1]
             forward[i] -= ratio * beside[i - 1]
             carried[i] -= ratio * carried[i - 1]
@@ -203,6 +206,7 @@ def _score(diagonal, beside, y, smoothing):  # type: ignore[no-untyped-def]  # N
             backward_here -= beside[i] * beside[i] / backward
             rest -= beside[i] * solution
         solution = rest / forward[i]
+        # The i-th diagonal entry of the inverse.
         trace += 1.0 / (forward[i] + backward_here - pivot)
         squared += solution * solution
         backward = backward_here
