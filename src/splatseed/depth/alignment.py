@@ -44,8 +44,7 @@ MAX_RESIDUAL = 0.25
 
 UNIT_POINTS = 20
 UNIT_SLACK = 1.25
-"""A map in scene units is refused if at least this many SfM points say that it is off by this
-factor."""
+"""A map in scene units is refused if at least this many SfM points show it off by this factor."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +52,7 @@ class Alignment:
     """How an image's depth map is taken to scene units.
 
     Args:
-        scale: Scene units per unit of the map; for inverse depth, its inverse units in inverse
-            units likewise.
+        scale: Scene units per unit of the map; for inverse depth, inverse scene units per unit.
         shift: Added after scaling; 0 except for inverse depth.
         num_points: SfM points that see depth.
         residual: Median of the points' |aligned depth / depth of the point - 1|; NaN without
@@ -86,7 +84,7 @@ def align(
         min_points: Images with fewer points that see depth are rejected.
         max_residual_ratio: Images whose residual exceeds this many times the median image's, and
             1%, are rejected; None keeps all.
-        progress: Told how many maps are read.
+        progress: Called with the stage and the fraction done.
 
     Returns:
         The alignments of all images that have a map, by name, in the order of ``scene.images``;

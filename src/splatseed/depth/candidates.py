@@ -1,4 +1,4 @@
-"""The candidates of all images in one list, how far each can be trusted, and the choice among them.
+"""The candidates of all images, how far each can be trusted, and the choice among them.
 
 Notation: C candidates; ``tier`` 0 is sound, then come ``UNCONFIRMED``, ``NEAR_EDGE`` and
 ``DISTRUSTED``.
@@ -129,7 +129,7 @@ def choose(
         num: How many.
         settings: Whether they are spread in space, or each image gives the same number.
         rng: Draws where nothing else distinguishes candidates.
-        progress: Told when it is done.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         PointCloudError: There are too few that may be used.

@@ -2,9 +2,9 @@
 
 Notation: every image gives *candidates*; a candidate is *sound* if enough views confirm it, none
 looks through it, and no depth discontinuity is near. Promise: exactly the number asked for, or one
-error that says how many are possible; sound candidates first, then those that too few views
-confirm, then those near discontinuities, and none that a view looks through (unless that is
-allowed). A note reports any use of the later ones.
+error that says how many are possible. Sound candidates come first, then those that too few views
+confirm, then those near discontinuities; none that a view looks through is used, unless that is
+allowed. A note says how many of the less certain ones were needed.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def lift(
         num: How many points.
         settings: The method's choices.
         rng: The source of all random numbers.
-        progress: Told how far reading, checking and choosing are.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         SceneNotFoundError: There are no maps or no photographs, or a file is gone.
@@ -221,7 +221,7 @@ def _originals(scene: Scene) -> Float32[np.ndarray, "N 3"]:
 
 
 def _relaxed_notes(tier: UInt8[np.ndarray, " M"], settings: Settings) -> tuple[str, ...]:
-    """One sentence on each requirement that was relaxed."""
+    """A sentence for each requirement that was relaxed."""
     unconfirmed, edge = (int(np.count_nonzero(tier == t)) for t in (UNCONFIRMED, NEAR_EDGE))
     notes = []
     if unconfirmed:

@@ -35,7 +35,7 @@ LEAST = 0.05
 SEEN = 0.25
 """A view sees a sample if its own depth there differs by less than this fraction."""
 MOST_COLUMNS = 1e6
-"""Larger than the number of columns of any grid."""
+"""More columns than any grid has."""
 PIECE = 8
 """Views per task of a thread."""
 
@@ -48,7 +48,7 @@ def choose_neighbors(
     Args:
         views: All views; those without a reduced copy neither ask nor answer.
         num: How many.
-        progress: Told how many have been chosen.
+        progress: Called with the stage and the fraction done.
     """
     chosen = np.full((len(views), num), -1)
     usable = np.array([i for i, v in enumerate(views) if v.reduced is not None and len(v)], int)

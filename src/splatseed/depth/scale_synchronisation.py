@@ -60,7 +60,7 @@ def synchronize_scales(
     Args:
         views: Views with reduced copies.
         neighbors: Which views to compare each with, -1 = none.
-        progress: Told how many are compared.
+        progress: Called with the stage and the fraction done.
     """
     residuals = np.array([view.alignment.residual for view in views])
     sigma = np.maximum(np.where(np.isfinite(residuals), residuals, OTHER_SURFACE), LEAST_RESIDUAL)

@@ -123,7 +123,7 @@ class Reader:
             SceneFormatError: A file is damaged, has the wrong aspect ratio, or the lens distorts.
         """
         check_lens(image, reason="along whose rays pixels are lifted")
-        seen = self._read_map(image, num, rng)  # the map is let go before the photograph is read
+        seen = self._read_map(image, num, rng)  # frees the map before reading the photograph
         if seen.alignment.rejected is not None:
             return _nothing(seen.alignment, seen.camera)
         photograph = decode_photograph(

@@ -1,4 +1,4 @@
-"""Thinning to a given number of points, as far apart as that number allows.
+"""Thinning to a given number of points, spread as evenly as possible.
 
 Notation: space is cut into cubes of one *side*; the key of a cube is its position, three numbers of
 21 bits, scrambled so that all its bits are as good as random. Promise: each cube gives at most one

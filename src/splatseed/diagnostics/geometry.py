@@ -1,4 +1,4 @@
-"""The accuracy of a cloud where the surfaces are known, and how far new points stray otherwise.
+"""The accuracy of a cloud: distances to known surfaces, or else from new points to originals.
 
 Notation: h is a cloud's spacing: the mean over its points of the mean distance to the 6 nearest
 others. All scores are in units of h of the *originals*, so that scenes of any size compare.

@@ -24,7 +24,9 @@ PERCENTILES = (5, 25, 50, 75, 95)
 EMPTY_CELLS = 32
 """Empty regions are counted on a grid with this many cells along an image's longer side."""
 MANY_ISOLATED = 0.02
+"""Share of isolated points that is worth a warning."""
 MANY_EMPTY = 0.5
+"""Share of the images' area without points that is worth a warning."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +174,7 @@ def _empty_share(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> float:
     cell = max(width, height) / EMPTY_CELLS
     columns, rows = max(math.ceil(width / cell), 1), max(math.ceil(height / cell), 1)
     pixel_from_world = camera.K @ camera.cam_from_world[:3]
-    # Ten times as fast as @, whose routines are made for matrices that are large both ways.
+    # Ten times as fast as @, whose routines suit matrices that are large in both dimensions.
     u, v, depth = np.einsum("ij,jn->in", pixel_from_world[:, :3], xyz) + pixel_from_world[:, 3:]
     # Before the division, which most points are spared; what is behind the camera fails it too.
     inside = (u >= 0) & (u < width * depth) & (v >= 0) & (v < height * depth)

@@ -1,12 +1,12 @@
 """Which pixels of the test views at least two training views see: where scores measure skill.
 
-What no training view shows can only be guessed, and what a single one shows has no depth: errors
-there are a matter of luck. Notation: frames are cut into the cells of ``seeding.coverage``; the
-geometry is the depth of each cell: from the scene's own depth map if there is one, else the lower
-quartile of its points' depths; an empty cell has the median of the nearest cells. A training view
-sees a point if it projects into the view and lies no more than ``NEARER`` behind the geometry
-there. Promise: the answer depends on the capture alone (cameras, points, depth maps), never on a
-render, so it is the same for everything that is scored on a scene.
+What no training view shows can only be guessed, and the depth of what a single one shows is
+unknown: errors there are a matter of luck. Notation: frames are cut into the cells of
+``seeding.coverage``; the geometry is the depth of each cell: from the scene's own depth map if
+there is one, else the lower quartile of its points' depths; an empty cell has the median of the
+nearest cells. A training view sees a point if it projects into the view and lies no more than
+``NEARER`` behind the geometry there. Promise: the answer depends on the capture alone (cameras,
+points, depth maps), never on a render, so it is the same for everything that is scored on a scene.
 """
 
 from __future__ import annotations
@@ -35,9 +35,11 @@ LEAST_VIEWS = 2
 CELLS = 100
 """Along the longer side: 8 pixels of 800. The SfM points of a capture fill most of such cells."""
 LEAST_CELL = 2.0
+"""Smallest side of a cell, in pixels."""
 MAX_SIZE = 800
+"""Longer side in pixels of the frames that are divided into cells."""
 NEAREST = 4
-"""Covered cells whose median inverse depth an empty cell gets."""
+"""Covered cells over which an empty cell takes the median of inverse depth."""
 STAGE = "find co-visible pixels"
 
 Grids = Mapping[str, Bool[np.ndarray, "rows cols"]]
@@ -51,7 +53,7 @@ def find_covisible(
     Args:
         scene: Provides cameras, original points and depth maps.
         test_every: Every ``test_every``-th image, sorted by name, is a test view.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
 
     Returns:
         Nothing if the scene has neither points nor depth maps.
@@ -156,7 +158,7 @@ def _filled(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "ro
 
 
 def _farthest(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
-    """The largest depth of each cell and its neighbours: at an edge both sides count as seen."""
+    """The largest depth of each cell and its neighbours: at an edge both surfaces count as seen."""
     from scipy.ndimage import maximum_filter  # noqa: PLC0415  (slow to import)
 
     return np.asarray(maximum_filter(depths, size=3, mode="nearest"))

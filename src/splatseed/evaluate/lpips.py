@@ -133,7 +133,7 @@ class Lpips:
         return total
 
     def _features(self, images: Float[Tensor, "2 3 H W"]) -> Iterator[Float[Tensor, "2 C h w"]]:
-        """What each stage makes of the images."""
+        """The features after each stage."""
         backbone = LPIPS_NETS[self.net]
         x = images
         for number, stage in enumerate(backbone.stages):
@@ -172,7 +172,7 @@ def load_lpips(net: LpipsNet = "vgg", weights: Path | None = None) -> Lpips:
 
 
 def _weights_path(backbone: Backbone, given: Path | None) -> Path:
-    """The file, which is there."""
+    """The file of weights, which exists."""
     folder = Path(torch.hub.get_dir()) / "checkpoints" if given is None else given
     path = folder if folder.is_file() else folder / backbone.file
     if not path.is_file():
@@ -186,7 +186,7 @@ def _weights_path(backbone: Backbone, given: Path | None) -> Path:
 
 
 def _read_state(path: Path) -> Mapping[str, Tensor]:
-    """A file of tensors by name; nothing else that it may hold is run."""
+    """The tensors in a file by name; no code in it is run."""
     try:
         with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
             state = torch.load(path, map_location="cpu", weights_only=True)

@@ -54,7 +54,7 @@ def evaluate_views(
         lpips_reason: Why it is left out, for the reader of the result.
         covisible: The pixels over which PSNR is also computed, for the views it contains; see
             ``evaluate.covisible``.
-        progress: Told how far scoring is.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         ParameterError: There are no views, or a render has another size or is not finite.

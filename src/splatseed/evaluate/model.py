@@ -88,7 +88,7 @@ def load_model(
             ``find_transform``. When left out, the model must be in the scene's own world.
         device: Where to render; the CPU when left out.
         cache_dir: Where smaller photographs are cached; nowhere when left out.
-        progress: Told how far reading is.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         SceneNotFoundError: The model, the scene or its images are missing.

@@ -38,12 +38,13 @@ __all__ = [
 GSPLAT, NO_TRANSFORM = "gsplat", "none"
 """Words that name a transform: that of gsplat's examples, and none, without any check."""
 APART = 8.0
-"""Beyond this distance it is another world."""
+"""Gaussians farther apart than this are in another world."""
 DOUBTFUL, CLOSER = 1.5, 3.0
-"""Beyond the first it is, if another world is closer by the second as a factor."""
+"""They are beyond the first, too, if another world is closer by the second as a factor."""
 SAMPLES = 3000
 """Number of points and Gaussians used to measure distances."""
 LEAST = 20
+"""Fewest points and Gaussians that can be compared."""
 VISIBLE = -2.2
 """Logit of the least opacity that counts, a tenth."""
 FILES = (NERFSTUDIO, "cameras.json")
@@ -177,7 +178,7 @@ def _of_gsplat(scene: Scene) -> Similarity:
     """How gsplat's examples (1.5, examples/datasets/normalize.py) normalise a COLMAP scene.
 
     Cameras are turned upright, moved and scaled; then points are rotated onto their principal axes,
-    and flipped if more of them are above than below.
+    and flipped if more of them lie above the mean than below.
     """
     xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
     if len(xyz) < 3 or not scene.images:
@@ -204,6 +205,7 @@ def _upright(world_from_cam: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray
     up /= np.linalg.norm(up)
     goal = np.array([0.0, -1.0, 0.0])
     cross = np.cross(up, goal)
+    # Rodrigues: the rotation that takes one unit vector to another
     skew = np.cross(np.eye(3), cross)
     if up @ goal > -1:
         rotation = np.eye(3) + skew + skew @ skew / (1 + up @ goal)
@@ -211,6 +213,7 @@ def _upright(world_from_cam: Float64[np.ndarray, "V 4 4"]) -> Float64[np.ndarray
         rotation = np.diag([-1.0, 1.0, 1.0])
     forward = world_from_cam[:, :3, 2] @ rotation.T
     centers = world_from_cam[:, :3, 3] @ rotation.T
+    # The point of each camera's axis that is nearest to the origin.
     nearest = centers - (forward * centers).sum(axis=1, keepdims=True) * forward
     shift = -np.median(nearest, axis=0)
     scale = 1.0 / np.median(np.linalg.norm(centers + shift, axis=1))

@@ -15,7 +15,9 @@ __all__ = ["codebook", "codes", "palette"]
 
 CODES = 256
 LLOYD_STEPS = 20
+"""Alternations of assigning values to codes and moving codes to the means."""
 POWER_STEPS = 3
+"""Steps of power iteration: a rough principal direction is enough to halve a group."""
 
 
 def codebook(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, " 256"]:
@@ -54,7 +56,7 @@ def palette(
     Args:
         vectors: Finite; N is at least 2^levels.
         levels: How often to halve.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
     """
     count = 2**levels
     size = -(-len(vectors) // count)

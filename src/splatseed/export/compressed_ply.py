@@ -28,6 +28,7 @@ from splatseed.splat.gaussians import SH_C0, Gaussians
 __all__ = ["decode", "encode"]
 
 CHUNK = 256
+"""Gaussians per chunk."""
 AXES = ("x", "y", "z")
 BOUNDS = tuple(
     f"{end}_{name}"
@@ -39,6 +40,7 @@ PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 MOST_LOG_SCALE = 20.0
 SH_RANGE = 8.0
 VECTOR_BITS = ((21, 11), (11, 10), (0, 11))
+"""Shift and number of bits of each part of a packed number; likewise the following."""
 THREE_BITS = ((20, 10), (10, 10), (0, 10))
 COLOR_BITS = ((24, 8), (16, 8), (8, 8))
 

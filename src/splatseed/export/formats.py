@@ -51,7 +51,7 @@ ELSEWHERE = {
     ".gltf": f"{CONVERTER} MODEL.ply OUT.glb makes a .glb from a .ply",
     ".usdz": "NVIDIA's converter (PyPI: usd-convert-gsplat) makes one from a .ply",
 }
-"""Formats that are not written here, and the tools that write them."""
+"""Formats that splatseed does not write, and the tools that do."""
 
 
 def format_of_name(path: Path) -> str:
@@ -82,7 +82,7 @@ def detect_format(path: Path, data: bytes) -> str:
         data: Its bytes.
 
     Raises:
-        SceneFormatError: The format is none that can be read.
+        SceneFormatError: The format cannot be read.
     """
     if data.startswith(b"ply") and data[3:4] in (b"\n", b"\r", b" ", b"\t"):
         return "compressed-ply" if b"packed_position" in data[:_HEADER] else "ply"

@@ -56,7 +56,7 @@ def write_model(path: Path, gaussians: Gaussians, progress: Progress = silent) -
     Args:
         path: The file.
         gaussians: At least one, with finite positions.
-        progress: Told how far slow formats are.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         ParameterError: The suffix belongs to no format written here.

@@ -22,6 +22,7 @@ __all__ = [
 SH_COUNTS = (0, 3, 8, 15)
 """Coefficients beyond the first, by the degree of the spherical harmonics."""
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""The components that remain, by the index of the largest."""
 _MORTON_BITS = 16
 
 
@@ -52,6 +53,7 @@ def from_smallest_three(
     rows = np.arange(len(three))
     quats = np.empty((len(three), 4), np.float32)
     quats[rows[:, None], _OTHERS[largest]] = three
+    # A unit quaternion: the fourth square is 1 minus the other three.
     quats[rows, largest] = np.sqrt(np.maximum(1 - (three**2).sum(axis=1), 0))
     return quats
 

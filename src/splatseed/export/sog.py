@@ -43,7 +43,9 @@ PER_ROW = 64
 MOST_LEVELS, LEAST_LEVELS = 16, 10
 """The palette grows with the number of Gaussians, from 2^10 to 2^16 entries at most."""
 MOST_BYTES = 2**31
+"""Larger parts of an archive are refused unread."""
 QUAT_MARK = 252
+"""Alpha of a rotation whose largest component is the first; SOG's marker."""
 FIX = "Copy the file again, or export it again."
 STAMP = (1980, 1, 1, 0, 0, 0)
 """The timestamp of each picture in the zip, fixed so that equal Gaussians give equal bytes."""

@@ -41,13 +41,16 @@ WRITTEN = 3
 """The version that is written: the latest that every reader accepts."""
 MOST_FRACTIONAL_BITS = 20
 MOST = 2**23 - 1
+"""Largest position in units of 2^-f: 24 bits with a sign."""
 NINE_BITS = 511
 COLOR = 0.15 * 255
+"""Bytes per unit of the first coefficient: the format's scale."""
 FIX = "Copy the file again, or export it again."
 AXES = np.array([1, -1, -1], np.float32)
 SH_AXES = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 """Signs of the spherical harmonics of degrees 1 to 3 when y and z are flipped."""
 XYZW = [1, 2, 3, 0]
+"""Order of the file's quaternion components in ours."""
 STEP = 4
 """Further coefficients are rounded to this many 128ths, so that gzip saves more. Niantic's writer
 takes 8 for the first degree and 16 for the others: files are a quarter smaller, but coefficients of

@@ -50,6 +50,7 @@ __all__ = [
 
 LANES = 16
 QUARTER = LANES // 4
+"""Lanes that are loaded at a time by ``load_columns``."""
 VECTOR = ir.VectorType(ir.FloatType(), LANES)
 PIECE = ir.VectorType(ir.FloatType(), QUARTER)
 INDEX = ir.VectorType(ir.IntType(32), LANES)
@@ -359,6 +360,7 @@ def exp_of_eighth(typing_context, x):
         for coefficient in reversed(_EXP[:-1]):
             constant = ir.Constant(VECTOR, [float(coefficient)] * LANES)
             value = _call(builder, "fma", [value, arguments[0], constant])
+        # (exp(x))^8 by squaring three times
         for _ in range(3):
             value = builder.fmul(value, value)
         return value

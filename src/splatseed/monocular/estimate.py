@@ -81,7 +81,7 @@ def estimate_depths(
             network sees it, and its map has that size.
         overwrite: Whether an earlier folder of maps may be replaced.
         provenance: How the maps were made, for ``splatseed.json``.
-        progress: Told how many photographs are done.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         ParameterError: A number is out of its range.

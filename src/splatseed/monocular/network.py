@@ -26,7 +26,7 @@ _METRIC = {
     "tipsv2_dpt": "TIPSv2",
     "zoedepth": "ZoeDepth",
 }
-"""Model types that only predict depth in metres, and their common names."""
+"""Model types that always predict metres, and their common names."""
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,9 @@ _TYPES: dict[str, np.dtype[Any]] = {
     "tensor(float16)": np.dtype(np.float16),
 }
 _OUTPUTS = ("predicted_depth", "depth")
+"""Names of the output that is taken if a network has several."""
 _ERRORS_ONLY = 3
+"""onnxruntime's level of logging."""
 
 
 @dataclass(frozen=True)

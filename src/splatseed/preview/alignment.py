@@ -1,4 +1,4 @@
-"""Where a cloud was laid in a scene: a photograph, the cloud from its camera, and the residuals."""
+"""The result of aligning a cloud: a photograph, the cloud from its camera, and the residuals."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def preview_alignment(
     share: Float64[np.ndarray, " M"],
     path: Path | str,
 ) -> Path:
-    """Write a page.
+    """Write a page of photograph, cloud and residuals, side by side.
 
     Args:
         scene: One of its cameras is chosen.
         cloud: A sample of the cloud in the scene's frame.
         rgb: Its colours; grey without.
-        marks: The scene's points that it was laid on.
+        marks: The scene's points that it was aligned with.
         share: For each, 0 on the cloud to 1 where it does not count.
         path: The PNG to write.
 

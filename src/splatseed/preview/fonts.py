@@ -40,7 +40,7 @@ def font_families() -> tuple[str, ...]:
 def plain(text: str) -> str:
     r"""A name as text for matplotlib: a dollar would begin a formula.
 
-    Characters that no font has become \u....
+    Characters that no font contains become \u....
 
     Example:
         >>> plain("a$b")
@@ -63,7 +63,7 @@ def _known_characters() -> frozenset[int]:
 
 
 def font_file(text: str) -> str | None:
-    """A font file that has all of a text's characters; None if no family has."""
+    """A font file with all of a text's characters; None if there is none."""
     from matplotlib.font_manager import FontProperties, findfont, get_font  # noqa: PLC0415  (loads with its use)
 
     for name in font_families():

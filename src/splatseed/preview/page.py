@@ -74,6 +74,7 @@ def _centered(
 
 
 LATIN = 0xFF
+"""The last character of Latin-1, which Pillow's own font has."""
 
 
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:

@@ -36,6 +36,6 @@ def photograph_at(
 def photograph_or_blank(
     scene: Scene, image: Image | None, size: tuple[int, int]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """The same, or plain light grey."""
+    """The photograph, or plain light grey if it cannot be read."""
     photograph = None if image is None else photograph_at(scene, image, size)
     return np.full((size[1], size[0], 3), BLANK, np.uint8) if photograph is None else photograph

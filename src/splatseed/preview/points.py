@@ -65,6 +65,7 @@ def render_points(
     large = np.array([width, height]) * SMOOTHING
     margin = 2 * size * SMOOTHING
     # NaN pixels of points behind the camera compare false.
+    # A disc just outside the picture still reaches in.
     drawn = ((uv > -margin) & (uv < large + margin)).all(axis=1)
     uv, depth, rgb = uv[drawn], depth[drawn], rgb[drawn]
     front = _front_points(uv, depth, _radii(depth, size * SMOOTHING), large)

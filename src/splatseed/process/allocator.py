@@ -2,8 +2,8 @@
 
 A step allocates some hundred MiB and frees them. glibc returns large blocks to the system at once,
 and every step then waits for the system to clear the pages again. Promise: results stay the same;
-other C libraries are left alone. While Gaussians are added, blocks of earlier sizes lie idle: a run
-that grew from 30,000 to 250,000 took 8 % more memory at its peak.
+other C libraries are left as they are. While Gaussians are added, blocks of earlier sizes lie idle:
+a run that grew from 30,000 to 250,000 took 8 % more memory at its peak.
 """
 
 from __future__ import annotations

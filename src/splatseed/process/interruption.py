@@ -44,7 +44,7 @@ def exit_code() -> int:
 
 @contextmanager
 def interruption() -> Iterator[Interruption]:
-    """Watch for signals in the main thread; other threads cannot, and are left alone."""
+    """Watch for signals in the main thread; in any other thread, do nothing."""
     flag = Interruption()
     if threading.current_thread() is not threading.main_thread():
         yield flag

@@ -82,10 +82,7 @@ def _of_machine() -> int | None:
 
 
 def _of_container() -> int | None:
-    """What a container's limit leaves.
-
-    Copies of files, which give way, are not counted as taken.
-    """
+    """What a container's limit leaves; cached files count as free, as the system drops them."""
     try:
         limit = (CGROUP / "memory.max").read_text("ascii").strip()
         used = int((CGROUP / "memory.current").read_text("ascii"))

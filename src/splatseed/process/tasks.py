@@ -1,8 +1,9 @@
-"""Tasks that need no answer, in this process, in several, or on a Ray cluster.
+"""Tasks without return values, in this process, in several, or on a Ray cluster.
 
-A task leaves its result on a disk that all see, and may run twice. Promise: tasks whose process or
-node is lost are started again, up to ``LOSSES`` times; the first error that a task raises ends all,
-and is raised here; an interrupt waits for tasks under way in processes of this machine.
+A task leaves its result on a disk that all processes see, and may run twice. Promise: tasks whose
+process or node is lost are started again, up to ``LOSSES`` times; the first error that a task
+raises ends all, and is raised here; an interrupt waits for tasks under way in processes of this
+machine.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Tasks(ABC):
             function: At the top of a module, so that other processes find it.
             calls: Its arguments, task by task.
             stage: What it does, for the progress.
-            progress: Told after each task.
+            progress: Called with the stage and the fraction done.
 
         Raises:
             TaskLostError: A task was lost with its process too often.

@@ -1,6 +1,6 @@
 """How many threads this process uses, where several processes share a machine.
 
-Promise: results do not depend on it.
+Promise: results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def slot_environment(threads: int, gpu: str = "") -> dict[str, str]:
 
     Args:
         threads: Its threads.
-        gpu: Its GPU, as ``CUDA_VISIBLE_DEVICES`` names it; empty to leave the choice to PyTorch.
+        gpu: Its GPU, as in ``CUDA_VISIBLE_DEVICES``; empty to leave the choice to PyTorch.
     """
     environment = dict.fromkeys(THREAD_VARIABLES, str(threads))
     # Idle threads of one pool would take the cores from the other: see splatseed.cli.

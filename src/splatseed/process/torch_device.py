@@ -1,7 +1,7 @@
 """The PyTorch device that a user's choice stands for.
 
-Promise: a requested GPU is used or an error, never silently replaced; PyTorch is imported only when
-a device is picked.
+Promise: a requested GPU is used, or there is an error: it is never silently replaced. PyTorch is
+imported only when a device is picked.
 """
 
 from __future__ import annotations

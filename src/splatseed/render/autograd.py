@@ -110,7 +110,7 @@ def is_seen(radii: Tensor) -> Tensor:
 
 
 def _sparse(dense: Tensor, rows: Tensor) -> Tensor:
-    """Some rows, in rising order, as a COO tensor; the others count as 0."""
+    """A COO tensor of the given rows, in ascending order; all others are 0."""
     return torch.sparse_coo_tensor(
         rows[None], dense[rows], dense.shape, is_coalesced=True, check_invariants=False
     )
@@ -183,7 +183,7 @@ def _resized(array: np.ndarray, count: int) -> np.ndarray:
 
 
 class _Prepared(NamedTuple):
-    """A view sorted and listed: what forward and backward share."""
+    """Gaussians sorted by depth and listed by tile, which forward and backward share."""
 
     order: np.ndarray
     log_opacities: np.ndarray

@@ -53,7 +53,7 @@ class Info(dict[str, Any]):
             self._make_lists()
         return super().__getitem__(name)
 
-    def __iter__(self) -> Iterator[str]:  # without it ``dict(info)`` would copy past ``[]``
+    def __iter__(self) -> Iterator[str]:  # else ``dict(info)`` would bypass ``[]``
         return super().__iter__()
 
     def __or__(self, other: Any) -> Any:

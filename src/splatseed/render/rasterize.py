@@ -92,7 +92,7 @@ def rasterization(
         unsupported: gsplat's further arguments; only their defaults are accepted.
 
     Returns:
-        Colours [C, H, W, D] (with depth as last channel where asked for), alphas [C, H, W, 1], and
+        Colours [C, H, W, D] (with depth as the last channel if requested), alphas [C, H, W, 1], and
         ``info``, gsplat's dictionary: means2d, radii, depths, conics, opacities ([C, N, ...], or
         for ``packed`` [G, ...] with batch_ids, camera_ids and gaussian_ids, otherwise None); width,
         height, tile_size, tile_width, tile_height (in tiles), n_batches, n_cameras; and, made when

@@ -77,7 +77,7 @@ class EvalResult:
 
     @property
     def covisible_psnr(self) -> float | None:
-        """Mean over the images that have such pixels; None where none has, or none is known."""
+        """Mean over the images with such pixels; None if there are none, or it was not measured."""
         return _mean_known(score.covisible_psnr for score in self.per_image)
 
     @property

@@ -88,9 +88,9 @@ def cover(
         xyz: The existing points, in the world; those that are not finite are in no cell.
         cell: Side of a cell in pixels of the views, at least 1.
         rng: Draws the order of the views.
-        masks: For each view which pixels count, or None for all. A cell gets no seed unless half of
-            its pixels count.
-        progress: Told how far it is.
+        masks: Which pixels of each view count; None for all. A cell gets a seed only if at least
+            half of its pixels count.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         ParameterError: There is no view, a view has no pixels, ``cell`` is below 1, or masks do not

@@ -7,8 +7,8 @@ are nearer by more than ``NEARER``: a surface hides what shows between its point
 *covered* if it holds a point and is not hidden.
 Promise: the bytes depend neither on the order of the points nor on the threads.
 
-The nearest depth, as in a z-buffer, will not do: of the points that their own tracks prove to be
-visible, a z-buffer that looks at neighbouring cells hides 7% (fox) to 97% (treehill), because
+The nearest depth, as in a z-buffer, does not work: a z-buffer that looks at neighbouring cells
+hides 7% (fox) to 97% (treehill) of the points that their own tracks prove to be visible, because
 Structure-from-Motion leaves a few points floating in front of the cameras. This rule hides 0.3% to
 16%.
 """
@@ -64,7 +64,7 @@ def covered_share(
         views: The views; only their cameras and sizes matter.
         xyz: The points, in the world.
         cell: Side of a cell in pixels, at least 1.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         ParameterError: There is no view, or ``cell`` is below 1.

@@ -31,7 +31,7 @@ SECTORS = 8
 
 @dataclass(frozen=True, eq=False)
 class Witnesses:
-    """What each of V views sees of the initial points.
+    """The depths at which each of V views sees the initial points.
 
     Args:
         grid_from_world: To columns and rows of cells, and depth, float64 [V, 3, 4].
@@ -49,7 +49,7 @@ class Witnesses:
 def call_witnesses(
     views: Sequence[View], xyz: Float32[np.ndarray, "N 3"], cell: float, progress: Progress
 ) -> Witnesses:
-    """What each view sees of the points, on cells of ``cell`` pixels."""
+    """The depths at which each view sees the points, on cells of ``cell`` pixels."""
     maps: list[Float32[np.ndarray, "rows cols"]] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the kernels release the GIL
         for depths in pool.map(lambda view: cell_depths(view, xyz, cell), views):

@@ -1,10 +1,10 @@
-"""Which views judge a new point: of the views that see its base, those that see it best.
+"""The views that judge a new point: those with the best sight of it.
 
 Notation: M new points, V views; the *base* of a point is the original it is nearest to. A view may
 judge a point if it sees its base, and the point lies well within its frame and within those of two
-of its sources (of its only one, if it has no more). It sees a point better, the closer and the more
-frontal it is. Promise: the judges of a point depend on that point, the poses and visibility, not on
-the other points or on threads.
+of its sources (of its only one, if it has no more). The closer and the more frontal a view, the
+better it sees the point. Promise: the judges of a point depend on that point, the poses and
+visibility, not on the other points or on threads.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class _Given(NamedTuple):
 
 @dataclass(frozen=True)
 class PhotographMethod:
-    """Shared by the three methods."""
+    """The base of the three methods."""
 
     max_size: int = MAX_SIZE
     """Photographs are downsampled by a whole factor to at most this many pixels a side."""
@@ -128,7 +128,7 @@ class Stereo(PhotographMethod):
             scene: The scene.
             only: Indices into ``photographed(scene, hold_out)``.
             seed: The same seed gives the same bytes.
-            progress: Told how far it is.
+            progress: Called with the stage and the fraction done.
         """
         given = self._read(scene, np.random.default_rng(seed), progress)
         stereo = self.find(given, only)
@@ -231,7 +231,7 @@ def cover_cloud(
         cloud: The points.
         cell: Side of a cell in pixels of the views.
         rng: Draws the order of the views.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
     """
     from splatseed.seeding.cover import cover  # noqa: PLC0415  (kernels load with use)
 
@@ -245,7 +245,7 @@ def cover_cloud(
 def with_cover(
     views: Sequence[View], points: PointCloud, cell: int, seed: int, progress: Progress
 ) -> PointCloud:
-    """The points, and a seed in each cell of the views that they leave empty."""
+    """The points, plus a seed in each cell of the views that they leave empty."""
     code = source_code("cover")
     new = cover_cloud(views, points, cell, np.random.default_rng([seed, code]), progress)
     source = np.full(len(new.xyz), code, np.uint8)

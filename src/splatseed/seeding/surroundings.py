@@ -55,7 +55,7 @@ def survey(
     Args:
         originals: Distinct finite positions, at least 2.
         xyz: The new points' positions.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
     """
     nothing = np.zeros((len(originals), 3), np.uint8)
     cloud = prepare(PointCloud(originals.astype(np.float32), nothing), progress=progress)

@@ -64,7 +64,7 @@ def thin_to(
         cell: Smallest side of cover's cells, in pixels.
         hold_out: Photographs that cover must not use, as in ``PhotographMethod``.
         seed: Determines the order of the views.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
     """
     if len(cloud) <= num:
         return cloud

@@ -1,4 +1,4 @@
-"""``upsample``: a scene's points and new ones: made, verified, completed and thinned.
+"""``upsample``: new points for a scene, made, verified, completed and thinned.
 
 Four steps, all but the first optional: a method makes points; ``verify`` checks interpolated ones
 against the photographs; ``cover`` gives a seed to the parts of photographs that no point falls in;
@@ -86,8 +86,8 @@ def upsample(
             of ``method``; ``auto`` and ``cover`` take them into account.
         seed: The same seed gives the same bytes, whatever the number of threads.
         profile: "default", or "paper" for the paper's text to the letter.
-        progress: Told each stage and the fraction done.
-        note: Told what was left out or replaced, one sentence each.
+        progress: Called with the stage and the fraction done.
+        note: Called with what was left out or replaced, one sentence each.
         parameters: Fields of the method, such as ``k=12``.
 
     Returns:
@@ -163,7 +163,7 @@ def add_cover(
         cloud: The points; the scene's own when left out.
         cell: Side of a part in pixels, at the size that methods use.
         seed: The same seed gives the same bytes.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         ParameterError: The side is below 1.
@@ -183,8 +183,8 @@ def add_verified(
     Args:
         scene: The scene with the photographs.
         cloud: The points; those of ``INTERPOLATING`` methods are checked, the others stay.
-        progress: Told how far it is.
-        note: Told how many met which fate, one sentence each.
+        progress: Called with the stage and the fraction done.
+        note: Called with how many met which fate, one sentence each.
 
     Raises:
         SceneNotFoundError: There are no photographs.

@@ -84,7 +84,7 @@ def verify(
         images: Their images, in the same order.
         visibility: The originals that the points were made from, and who sees them.
         new: The points, finite.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
 
     Returns:
         The points that stay, in order, with confidence and normals (towards the judge; NaN where

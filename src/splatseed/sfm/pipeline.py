@@ -62,7 +62,7 @@ def reconstruct(
         threads: Worker threads; -1 = all cores.
         overwrite: Replace ``output`` if it exists.
         verbose: Let pycolmap's log through to the terminal.
-        on_progress: Told the stage and its progress, 0 to 1.
+        on_progress: Called with the stage and the fraction done.
 
     Returns:
         What was found, and how long it took.
@@ -116,7 +116,7 @@ def triangulate(
         threads: As in ``reconstruct``.
         overwrite: Replace ``output`` if it exists.
         verbose: Let pycolmap's log through to the terminal.
-        on_progress: Told the stage and its progress, 0 to 1.
+        on_progress: Called with the stage and the fraction done.
 
     Returns:
         What was found, and how long it took.

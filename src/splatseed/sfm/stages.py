@@ -28,8 +28,8 @@ class Stages:
 
     Args:
         pycolmap: The pycolmap module.
-        seed: Given before each stage to pycolmap's generator, which is per thread.
-        on_progress: Told of each stage's progress, from the calling thread.
+        seed: Set in pycolmap's generator, which is per thread, before each stage.
+        on_progress: Called with the stage and the fraction done.
         seconds: Wall time of the stages so far.
     """
 

@@ -38,7 +38,7 @@ def undistort(
         threads: Worker threads; -1 = all cores.
         overwrite: Whether an earlier output of this function may be replaced.
         verbose: Let pycolmap's log through to the terminal.
-        on_progress: Told the stage and its progress, 0 to 1.
+        on_progress: Called with the stage and the fraction done.
 
     Returns:
         What the new scene holds.

@@ -1,7 +1,7 @@
 """Frames of a video to reconstruct from: sharp ones, spaced by how far the picture moves.
 
-Notation: the *way* of a frame is the distance that the picture has moved up to it, in widths: the
-sum over frames of the median shift of its blocks relative to the previous frame, by phase
+Notation: the *way* of a frame is how far the picture has moved by then, in picture widths: the sum,
+over the frames so far, of the median shift of blocks from one frame to the next, by phase
 correlation (Kuglin and Hines 1975). A frame's *sharpness* is the variance of its Laplacian.
 Promise: the sharpest frame of each stretch of the way is taken, so that a camera that stands still
 gives one frame, not hundreds; equal videos give equal frames.
@@ -32,7 +32,9 @@ BLOCK = 64
 LEAST_STEP = 0.02
 """Least distance, in widths, that the picture moves between chosen frames."""
 LEAST_FRAMES = 3
+"""Fewer photographs make no scene."""
 QUALITY = 95
+"""JPEG quality of the frames."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def pick_frames(
         video: The file.
         folder: An existing folder for the frames.
         most: The most frames to choose.
-        progress: Told how far reading is.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         MissingDependencyError: imageio-ffmpeg is absent.
@@ -122,9 +124,11 @@ def shift(before: Float32[np.ndarray, "H W"], now: Float32[np.ndarray, "H W"]) -
     blocks = _blocks(before), _blocks(now)
     window = np.hanning(BLOCK)[:, None] * np.hanning(BLOCK)
     spectra = [np.fft.rfft2((b - b.mean(axis=(1, 2), keepdims=True)) * window) for b in blocks]
+    # Phase correlation: the inverse transform of the normalised cross spectrum peaks at the shift.
     cross = spectra[0] * np.conj(spectra[1])
     peaks = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-6), s=(BLOCK, BLOCK))
     at = np.argmax(peaks.reshape(len(peaks), -1), axis=1)
+    # Shifts of more than half a block are negative ones.
     dy, dx = ((each + BLOCK // 2) % BLOCK - BLOCK // 2 for each in np.divmod(at, BLOCK))
     return float(np.median(np.hypot(dx, dy)))
 

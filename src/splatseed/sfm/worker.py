@@ -39,7 +39,7 @@ def run_job(job: Job, log: Path, *, verbose: bool, on_progress: Progress) -> Out
         job: What to do.
         log: Where pycolmap's log goes.
         verbose: Let the log through to the terminal instead.
-        on_progress: Told the stage and its progress, 0 to 1.
+        on_progress: Called with the stage and the fraction done.
 
     Raises:
         SplatseedError: The job failed; the class and the text are the child's.

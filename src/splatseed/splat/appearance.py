@@ -81,7 +81,7 @@ def _asked(views: Sequence[View], count: int) -> list[View]:
 
 
 def _shown(xyz: Float32[np.ndarray, "N 3"], view: View) -> _Shown:
-    """The seeds in the photograph that no other in their cell, or a cell beside it, occludes."""
+    """The seeds in the photograph that no seed in the same or a neighbouring cell occludes."""
     x, y, depth = _place(xyz, view)
     with np.errstate(divide="ignore", invalid="ignore"):
         column, row = x / depth, y / depth

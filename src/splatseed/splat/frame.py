@@ -108,7 +108,7 @@ def _centers(views: Sequence[View]) -> Float64[np.ndarray, "V 3"]:
 
 
 def _is_stray(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
-    """Which cameras are out of all proportion to the others: at most a tenth, or one."""
+    """Which cameras are far from all others: at most a tenth of them, or one."""
     if len(centers) < MIN_CAMERAS:
         return np.zeros(len(centers), bool)
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)

@@ -1,7 +1,7 @@
 """Renders of views beside the photograph, with an error map.
 
-Notation: the error of a pixel is the mean over the channels of |render -
-photograph|, 0 to 1. Promise: one colour scale for all pictures, so that they can be compared.
+Notation: the error of a pixel is the mean over the channels of |render - photograph|, 0 to 1.
+Promise: one colour scale for all pictures, so that they can be compared.
 """
 
 from __future__ import annotations

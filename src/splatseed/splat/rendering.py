@@ -76,7 +76,7 @@ def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
 def _harmonics(
     params: Mapping[str, Tensor] | torch.nn.ParameterDict, sh_degree: int
 ) -> Tensor | tuple[Tensor, Tensor]:
-    """The coefficients in use: idle ones would be copied and optimised all the same."""
+    """The coefficients in use; unused ones would cost copies and optimiser steps for nothing."""
     return params["sh0"] if sh_degree == 0 else (params["sh0"], params["shN"])
 
 

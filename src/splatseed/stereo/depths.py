@@ -1,4 +1,4 @@
-"""Depth maps from photographs alone: every view is compared with a few others, then the maps are.
+"""Depth maps from photographs alone: views are compared with each other, then their maps are.
 
 Notation: V views of a scene. Promise: the same scene, settings and seed give the same bytes,
 whatever the number of threads; a depth is kept only where other views' independently computed maps
@@ -45,7 +45,7 @@ def find_stereo(
             few, small copies of the photographs are compared first, to get some.
         settings: The choices of stereo.
         seed: The same seed gives the same bytes.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
         only: The views whose maps are wanted; the bytes are the same as if all were, and other
             views are computed only as far as they confirm these. All when left out.
     """

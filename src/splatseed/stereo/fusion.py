@@ -1,8 +1,8 @@
 """One seed for each piece of surface, from the depth maps of all views.
 
 Notation: every view's photograph is divided into cells of c x c pixels. A kept pixel of view i
-becomes a seed unless the cell it falls in, in i or in a view that confirms it, already has a seed
-at that depth. Promise: seeds come in the order of the views and, within one, of falling confidence,
+becomes a seed unless its cell in view i, or in a view that confirms it, already has a seed at that
+depth. Promise: seeds come in the order of the views and, within one, of falling confidence,
 whatever the number of threads; no two of them share a cell at one depth, in a view that confirms
 either.
 """
@@ -58,7 +58,7 @@ def fuse(stereo: Stereo, cell: float, progress: Progress = silent) -> StereoSeed
     Args:
         stereo: The result of stereo.
         cell: Side of a cell in pixels of the views; not below the grid of the maps.
-        progress: Told how many views are done.
+        progress: Called with the stage and the fraction done.
     """
     cell = max(float(cell), float(stereo.settings.grid))
     shapes = np.array(

@@ -1,4 +1,4 @@
-"""StereoMap: depth and normals at the pixels of one photograph, from comparing it with others.
+"""StereoMap: depth and normals at the pixels of one photograph.
 
 Notation: a map is H x W pixels; ``camera`` is the photograph's, scaled to the map's pixels, with
 the centre of the first at (0.5, 0.5). Promise: what other views do not confirm is NaN, and its

@@ -1,4 +1,4 @@
-"""Planes of every view by comparing it with others, and which of the others' planes agree.
+"""Planes for every view, by comparing it with others, and which views confirm them.
 
 Notation: as in ``result``. Promise: a view's planes depend only on the photographs, its hints and
 the seed: threads take whole views.
@@ -32,9 +32,9 @@ Grey = UInt8[np.ndarray, "H W"]
 
 
 def check_stereo_memory(views: Sequence[View], settings: StereoSettings) -> None:
-    """Refuse what does not fit into memory beside the photographs.
+    """Refuse photographs whose comparison does not fit into memory.
 
-    That is: all photographs in grey, the planes at each grid point, and for each thread the quads
+    It holds all photographs in grey, the planes at each grid point, and for each thread the quads
     (4 bytes per pixel) of its view and of the views that it is compared with.
 
     Raises:
@@ -65,11 +65,11 @@ def match_views(
 
     Args:
         views: The photographs.
-        hints: Prior depth of each photograph; None: it gets no map.
+        hints: What is known of each photograph's depth; one with None gets no map.
         sources: The views to compare each with, best first, int64 [V, K]; -1 = none.
         settings: The choices of stereo.
         seed: The same seed gives the same bytes.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
     """
     check_stereo_memory(views, settings)
     greys = [grey_image(view.photograph) for view in views]

@@ -28,7 +28,7 @@ def stereo_depths(
         scene: A scene with photographs.
         settings: The choices of stereo; the defaults when left out.
         seed: The same seed gives the same bytes.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
         choices: Fields of the settings, such as ``grid=2``.
 
     Raises:

@@ -23,11 +23,11 @@ class StereoSettings:
     sweeps: int = 4
     """PatchMatch iterations: each propagates and refines all planes."""
     num_sources: int = 5
-    """Views that a plane is compared in."""
+    """Views in which a plane is compared."""
     num_witnesses: int = 8
     """Views that may confirm a depth."""
     min_agreeing: int = 2
-    """How many of them must confirm it."""
+    """How many of these views must confirm it."""
     tolerance: float = 0.01
     """Relative difference at which two depths agree."""
     max_cost: float = 0.5

@@ -1,4 +1,4 @@
-"""Initial planes: through the points that Structure-from-Motion has near a pixel.
+"""Initial planes, through the Structure-from-Motion points near each pixel.
 
 Notation: a view sees M points at pixels uv [M, 2] with inverse depth w [M]; the grid has h x w
 points. Promise: K guesses per grid point, finite and positive; if a view sees too few points,
@@ -29,7 +29,7 @@ RIDGE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Hints:
-    """What is known about a view's depth before it is compared.
+    """What is known about the depth in a view before stereo.
 
     Args:
         uv: Pixels of points that it sees, float64 [M, 2].

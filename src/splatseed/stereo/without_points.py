@@ -1,8 +1,8 @@
 """Points for a scene that has none: from its depth maps, or from a glimpse at small photographs.
 
 Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, in two steps: a few views
-over every depth, then all views over the depths that those saw. Promise: as for all of stereo, one
-seed gives one result; points that no photographs confirm are not made up.
+over every depth, then all views over the depths seen by those few. Promise: as for all of stereo,
+the same seed gives the same result; no point is made that the photographs do not confirm.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ LOOK = StereoSettings(grid=2, sweeps=6, tolerance=0.03, max_cost=0.4)
 CELL = 4.0
 """Pixels of the small photographs between points."""
 LOOKED_AT = 24
-"""Number of views that are looked at first, for the depths of all."""
+"""Number of views compared first, to find the range of depths."""
 GOOD = 0.15
-"""Highest cost of a pixel that counts there."""
+"""Highest cost of a pixel that counts in that first comparison."""
 LEAST_MOVE = 0.2
 """Parallax in pixels at the farthest depth tried first."""
 AROUND = 3.0
@@ -63,10 +63,10 @@ def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
     Args:
         views: The photographs, two at least.
         seed: The same seed gives the same points.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
     """
     small = [_small(view) for view in views]
-    # A few views, compared with neighbours chosen by pose, show which depths there are.
+    # A few views, compared with neighbours chosen by pose, show which depths occur.
     spread = _spread_of_depth(small, seed, progress)
     # All views are compared with those that see such depths at a good angle.
     xyz, seen = _imagined_points(small, spread)

@@ -22,7 +22,9 @@ from splatseed.synthetic.surfaces import Surface
 __all__ = ["pixel_rays", "render_view", "render_views", "visible"]
 
 SUN = np.array([0.48, 0.30, 0.82]) / np.linalg.norm([0.48, 0.30, 0.82])
+"""Direction to the sun."""
 AMBIENT = 0.45
+"""Share of the light that comes from everywhere."""
 BACKGROUND = np.array([0.72, 0.78, 0.84])
 
 BUNDLE = 16_384

@@ -24,7 +24,9 @@ BARE = "bare wall"
 """Name of the surface without texture."""
 
 CORNER = -1.6
+"""x and y of the room's corner, metres."""
 REACH = 4.6
+"""Length of the walls."""
 WALL_HEIGHT = 2.4
 NUM_LEAVES = 300
 

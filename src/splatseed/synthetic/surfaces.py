@@ -356,6 +356,7 @@ def _roots(
     """
     discriminant = half_b * half_b - a * c
     real = discriminant >= 0
+    # One root is q / a; their product is c / a, so the other is c / q.
     q = -(half_b + np.copysign(np.sqrt(np.where(real, discriminant, 0.0)), half_b))
     with np.errstate(divide="ignore", invalid="ignore"):
         return q / a, c / q, real

@@ -33,7 +33,7 @@ FULL_STRENGTH = 2e-3
 """Corners at least this strong are always candidates, weaker ones in proportion to strength."""
 
 MIN_COSINE = 0.25
-"""Angle in degrees beyond which a surface is seen too obliquely to match."""
+"""Smallest cosine between ray and normal at which a surface can be matched: 75 degrees."""
 
 MISMATCH_NOISE = 2.5
 """Factor on the observation noise of mismatches."""
@@ -84,6 +84,7 @@ def corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H
     gx = ndimage.gaussian_filter(gray, 0.8, order=(0, 1))
     gy = ndimage.gaussian_filter(gray, 0.8, order=(1, 0))
     xx, yy, xy = (ndimage.gaussian_filter(g, 1.2) for g in (gx * gx, gy * gy, gx * gy))
+    # The smaller eigenvalue of [[xx, xy], [xy, yy]]
     return np.asarray((xx + yy) / 2 - np.hypot((xx - yy) / 2, xy), np.float32)
 
 
@@ -122,7 +123,7 @@ def track_points(
 
     outliers = rng.random(len(truth)) < noise.outlier_share
     truth, kept = _displace(cameras, truth, outliers, point_idx, view_idx, rng)
-    # A mismatch that no second camera could have seen is not a point at all.
+    # A mismatch that only one camera could have seen would never be triangulated.
     keep = np.bincount(point_idx[kept], minlength=len(truth)) >= 2
     truth, outliers = truth[keep], outliers[keep]
     point_idx, view_idx = _renumber(keep, point_idx[kept], view_idx[kept])
@@ -280,6 +281,7 @@ def _triangulate(
     for _ in range(num_steps):
         cam = np.einsum("tij,tj->ti", rotations, xyz[point_idx]) + shifts
         slope = cam[:, :2] / cam[:, 2:]
+        # d (x / z) / dX = (R_x - (x / z) R_z) / z; likewise y
         by_cam = rotations[:, :2] - slope[:, :, None] * rotations[:, 2:]
         jacobian = focal[:, :, None] * by_cam / cam[:, 2, None, None]  # [T, 2, 3]
         residual = uv - (focal * slope + center)

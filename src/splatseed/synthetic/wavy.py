@@ -21,8 +21,11 @@ _BISECTIONS = 36
 """Halvings of a bracket that starts as a small part of the sheet."""
 
 _STEPS_PER_WAVE = 48
+"""Steps of the march along a ray, per wavelength."""
 _GRID_PER_WAVE = 32
+"""Places along the profile from which the nearest point is bracketed."""
 _CHUNK = 20_000
+"""Points per pass, which bounds the memory of the grid of distances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +84,7 @@ class SineSheet:
         high = grid[np.minimum(best + 1, num - 1)]
         for _ in range(_BISECTIONS):
             foot = (low + high) / 2
+            # Half the derivative of the squared distance, by u.
             rising = (foot - u) + (self._height(foot) - w) * self._slope(foot) > 0
             low, high = np.where(rising, low, foot), np.where(rising, foot, high)
         return np.asarray(np.hypot(u - high, w - self._height(high)))

@@ -50,8 +50,8 @@ def known_depths(
         stereo: Maps that seeding has made already.
         kept: A file with the maps of the same photographs and seed, or a path at which to keep them
             for the next run.
-        note: Told the share of known depth.
-        progress: Told how much is done.
+        note: Called with the share of known depth.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         SceneFormatError: A photograph cannot be used.

@@ -38,7 +38,7 @@ def photometric_loss(
 
 
 class _CpuLoss(torch.autograd.Function):
-    """The loss together with its gradient: the loss is the end of the graph."""
+    """The loss, whose gradient is computed along with it, as it ends the graph."""
 
     @staticmethod
     def forward(ctx: Any, render: Tensor, photograph: Tensor) -> Tensor:

@@ -66,8 +66,7 @@ class RunOptions:
         depths: The file in which the depth that stereo finds, for growth, is kept for other runs
             on the same photographs with the same seed; nowhere when left out. Each run's time
             counts what finding it took.
-        seeding_knew: Whether making the seeds took that time already, so that it counts for
-            nothing.
+        seeding_knew: Whether that time is already counted as making the seeds.
     """
 
     resume: bool = False
@@ -94,8 +93,8 @@ def prepare_run(
         output: The folder of the run.
         settings: How to train.
         options: What else to do.
-        note: Told notes for the user, one sentence each.
-        progress: Told how far reading is.
+        note: Called with notes for the user, one sentence each.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         OutputError: ``output`` is taken, protected or cannot be written.
@@ -137,7 +136,7 @@ def prepare_run(
     strategy = make_strategy(settings, device, depths)
     state = _state(folder if begun else None, seeds, frame, near, settings, strategy, device)
     if not begun:
-        state.watch.seconds += seconds  # what growth needs to know is part of what it costs
+        state.watch.seconds += seconds  # the cost of growth includes finding depth
         folder.begin(config)
     if state.step:
         note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
@@ -211,7 +210,7 @@ class TrainingRun:
         """Train to the end, or until the user interrupts: then a checkpoint is saved.
 
         Args:
-            on_step: Told the number of steps done, after each.
+            on_step: Called with the number of steps done, after each.
 
         Returns:
             Whether the last step is done.
@@ -233,7 +232,7 @@ class TrainingRun:
 
         Args:
             score: Scores the test views.
-            progress: Told how far writing is.
+            progress: Called with the stage and the fraction done.
 
         Returns:
             What is written to metrics.json.
@@ -291,7 +290,7 @@ class TrainingRun:
 
     @contextmanager
     def _told_of_checkpoint(self) -> Iterator[None]:
-        """Add to a failure to write that not all is lost, and how to resume."""
+        """Say in an error on writing which step is saved, and how to resume."""
         try:
             yield
         except OutputError as error:

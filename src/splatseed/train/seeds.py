@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["SEEDS_SHARE", "seeded", "seeds_digest", "usable_seeds"]
 
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
-"""Most seeds as a fraction of the cap, for strategies that add Gaussians; for the others the whole
-cap."""
+"""Most seeds as a fraction of the cap, for strategies that add Gaussians; others may use it all."""
 
 
 def seeded(
@@ -42,8 +41,8 @@ def seeded(
     Args:
         scene: A scene without points added by splatseed.
         settings: Their cap limits the points, and they say which photographs are held out.
-        note: Told what was made, and how to do without.
-        progress: Told how far it is.
+        note: Called with what was made, and how to do without.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         SceneNotFoundError: Photographs are missing.
@@ -100,7 +99,7 @@ def usable_seeds(
     Args:
         points: The scene's points.
         settings: Provide the cap, and say whether sizes and normals are used.
-        note: Told what was left out, and what was requested but unknown.
+        note: Called with what was left out, and what was requested but unknown.
         views: The training views, for their cameras and sizes; when left out, crowding is measured
             in space.
     """

@@ -2,7 +2,7 @@
 
 Notation: seeds and views are in the training frame, but for ``gaussians_of_scene``, which is in the
 world's. Promise: NumPy alone, so that the same start can be written for other trainers without
-PyTorch; what a run begins with and what is written are one.
+PyTorch; a run begins with exactly what is written.
 """
 
 from __future__ import annotations

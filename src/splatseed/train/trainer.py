@@ -1,4 +1,4 @@
-"""The training loop: render a photograph's view, compare, optimise, densify.
+"""The training loop: render a view, compare it with its photograph, optimise, densify.
 
 Notation: a step shows one training view; all cameras are in the training frame. Promise: on the CPU
 equal settings and seeds give equal bytes, whatever the number of threads and however often the run
@@ -33,7 +33,7 @@ __all__ = ["Trainer"]
 RECORDS = 200
 """Number of records in the curve of a run."""
 TESTS = 20
-"""How often the test views are rendered during a run."""
+"""Number of times the test views are rendered during a run."""
 
 
 class Trainer:
@@ -44,7 +44,7 @@ class Trainer:
         settings: Its settings.
         train_views: The views to learn from, in the training frame.
         test_views: The views to evaluate on, likewise.
-        on_record: Told each record, and whether the test views were rendered for it.
+        on_record: Called with each record, and whether the test views were rendered for it.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Trainer:
         """Train to the last step, or until the user interrupts.
 
         Args:
-            on_step: Told the number of steps done, after each.
+            on_step: Called with the number of steps done, after each.
 
         Returns:
             Whether the last step is done.

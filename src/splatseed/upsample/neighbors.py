@@ -99,7 +99,7 @@ class PreparedCloud:
         center: Centroid in the world, float64 [3].
         tree: kd-tree over the positions in file order; None in a tile of a larger cloud, whose
             neighbours are found elsewhere.
-        progress: Told how far the neighbour query is.
+        progress: Called with the stage and the fraction done.
         halo: Rows at the end that are neighbours only.
     """
 

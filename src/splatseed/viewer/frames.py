@@ -41,7 +41,7 @@ def flight_frames(
         names: The models' names, shown when there are two.
         path: The cameras.
         depth: Show depth, not colour.
-        progress: Told how far it is.
+        progress: Called with the stage and the fraction done.
     """
     limits = depth_range(renderers[0], path) if depth else (0.0, 1.0)
     for i, view in enumerate(path):
@@ -72,7 +72,7 @@ def depth_range(renderer: ModelRenderer, path: Sequence[View]) -> tuple[float, f
 def depth_colors(
     depth: Float32[np.ndarray, "H W"], limits: tuple[float, float]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth as colours, spaced evenly in 1 / depth; near is bright, and nothing is black."""
+    """Depth as colours, spaced evenly in 1 / depth; near is bright, and black means no depth."""
     from matplotlib import colormaps  # noqa: PLC0415  (slow to import)
 
     near, far = (1 / max(limit, 1e-12) for limit in limits)

@@ -23,7 +23,7 @@ from splatseed.io.files import read_bytes
 from splatseed.similarity import Similarity
 from splatseed.splat.frame import stray_views
 from splatseed.splat.gaussians import Gaussians
-from splatseed.viewer.renderer import resized
+from splatseed.viewer.renderer import CORE, resized
 from splatseed.views.view import View
 from splatseed.views.viewpoint import look_at
 
@@ -40,7 +40,7 @@ MADE_UP_SIZE = (960, 720)
 LOOKS, LOOKED_AT = 60, 5000
 """Views and Gaussians sampled to decide whether a path misses the model."""
 LEAST_SEEN, HALF = 0.002, 0.5
-"""A view that sees a smaller share of the Gaussians misses them; most views must not."""
+"""A view that sees a smaller share of the Gaussians misses them; more than half must not."""
 FAR_AWAY = 10.0
 """A path is far away beyond this many times the cameras' extent."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -71,6 +71,7 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
     steps = np.linalg.norm(np.diff(poses * np.r_[np.ones(3) / reach, np.ones(6)], axis=0), axis=1)
     places = np.linspace(0, 1, FINE * frames + 1)
     fine = _interpolated(poses, steps, places)
+    # Then at even speed: by the distance covered, not by the stops passed.
     fine = gaussian_filter1d(fine, SMOOTHING * len(places), axis=0, mode="nearest")
     moved = np.linalg.norm(np.diff(fine[:, :3], axis=0), axis=1)
     even = _interpolated(fine, moved + 1e-9 * reach, np.linspace(0, 1, frames))
@@ -95,11 +96,12 @@ def orbit(
         focus, model = focus_of(views), _median_camera(views)
     else:
         focus = np.median(gaussians.means.astype(np.float64), axis=0)
-        reach = np.quantile(np.linalg.norm(gaussians.means - focus, axis=1), 0.6)
+        reach = np.quantile(np.linalg.norm(gaussians.means - focus, axis=1), CORE)
         up = np.array([0.0, -1.0, 0.0])  # as in the world of most captures
         centers, model = (focus + reach * np.array([2.0, -0.7, 0.0]))[None], _made_up()
     up = up / np.linalg.norm(up)
     offsets = centers - focus
+    # Distances from the focus along up, and around it.
     heights = offsets @ up
     radius = np.median(np.linalg.norm(offsets - heights[:, None] * up, axis=1))
     first = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
@@ -119,6 +121,7 @@ def focus_of(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
     """The point nearest to all cameras' axes; a point ahead of them if these are parallel."""
     centers = _centers(views)
     axes = np.array([view.cam_from_world[2, :3] for view in views])
+    # Distance of x to axis i: |A_i (x - c_i)| with A_i = I - a_i a_i'; sum A_i x = sum A_i c_i
     across = np.eye(3) - axes[:, :, None] * axes[:, None]
     middle, spread = centers.mean(axis=0), np.linalg.norm(centers - centers.mean(axis=0), axis=1)
     # A weak pull towards a point ahead decides where the axes do not.

@@ -169,7 +169,7 @@ class Session:
         threading.Thread(target=self._fill_in, daemon=True).start()
 
     def _send_points(self, scene: Scene, most: int) -> None:
-        """Have the browser draw so many of the points at most, in place of those it has."""
+        """Send the browser at most ``most`` points, in place of those it has."""
         clouds = clouds_of(scene.points, self._entry.frame, most)
         if clouds:
             self._clouds = {cloud.name: cloud for cloud in clouds}
@@ -177,7 +177,7 @@ class Session:
             self._nodes = add_clouds(self._client.scene, clouds, self._base_size)
 
     def _fill_in(self) -> None:
-        """What can wait: the photographs, and the points that the browser is quick enough for."""
+        """Send what can wait: photographs, and as many more points as the browser draws quickly."""
         self._add_thumbnails()
         scene, nodes = self._entry.shown.scene, self._nodes
         if scene is None or min(self._most_points, len(scene.points)) <= FIRST_POINTS:
@@ -203,7 +203,7 @@ class Session:
         for node in self._nodes.values():
             node.visible = points
         seconds = 0.0
-        for _ in range(2):  # the first may come before it has heard of the switch
+        for _ in range(2):  # the first may still show the points as they were
             start = time.perf_counter()
             self._client.get_render(48, 64, transport_format="jpeg", timeout=MOST_PATIENCE)
             seconds = time.perf_counter() - start
@@ -224,7 +224,7 @@ class Session:
         self._legend.content = self._legend_html() if self._nodes else ""
 
     def _show_cameras(self) -> None:
-        """All but the one that the browser's stands in: its photograph would hide what is seen."""
+        """Hide the camera at which the browser stands: its photograph would block the view."""
         on, at = self._cameras_on.value, self.at
         for image, handle in self._cameras:
             if handle.visible != (wanted := on and image is not at):

@@ -27,7 +27,7 @@ _HEADER = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Something to look at: a scene, a model, or a model with its scene.
+    """What a viewer shows: a scene, a model, or a model with its scene.
 
     Args:
         name: What to call it.
@@ -59,7 +59,8 @@ def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
 
     Args:
         path: A scene, a run folder, or a file of Gaussians or points.
-        scene_path: The scene a model belongs to; if left out, the one its run names, if it exists.
+        scene_path: The scene that a model belongs to; by default the one named by its run, if that
+            exists.
 
     Raises:
         SceneNotFoundError: ``path``, or the scene that the user names, does not exist.

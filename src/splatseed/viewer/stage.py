@@ -22,7 +22,7 @@ from splatseed.viewer.canvas import stage_pose
 __all__ = ["Cloud", "add_cameras", "add_clouds", "clouds_of", "point_size"]
 
 MOST_CAMERAS = 400
-"""Larger clouds are thinned evenly to this many points."""
+"""Most cameras that are drawn; of more, an even subset."""
 FRUSTUM, LEAST_FRUSTUM, MOST_FRUSTUM = 0.5, 0.008, 0.05
 """Size of a camera relative to the distance to the next one, and its bounds on the stage."""
 POINT_PIXELS = 1.4

@@ -54,7 +54,7 @@ class _LiveEntry(Entry):
         assert shown.scene is not None  # noqa: S101  (a run has a scene)
         train_images = shown.scene.split(shown.test_every)[0]
         super().__init__(shown, training_frame(poses_of(train_images)))
-        self.renderer = _LiveRenderer(run, self)  # type: ignore[assignment]  # it has what is used
+        self.renderer = _LiveRenderer(run, self)  # type: ignore[assignment]  # has what Entry calls
         self._asked: queue.SimpleQueue[tuple[Future[Drawn], Callable[[], Drawn]]] = (
             queue.SimpleQueue()
         )
@@ -142,7 +142,7 @@ class TrainingViewer(Viewer):
         self.kept = True
 
     def on_step(self, step: int) -> None:
-        """Between two steps: draw for the browsers, wait while paused, stop if asked to."""
+        """Between two steps, draw for the browsers, wait while paused, and stop on request."""
         del step
         if not self.sessions and not self.kept and not self._paused:
             return

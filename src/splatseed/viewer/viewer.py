@@ -1,7 +1,7 @@
 """The viewer's server: one page, any number of browsers.
 
-Promise: nothing but the host and port it listens on is used of the network; a port that is taken is
-an error, and no other port is tried.
+Promise: of the network, only the host and port to listen on are used; a taken port is an error, and
+no other port is tried.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from splatseed.splat.frame import TrainingFrame, training_frame
 from splatseed.viewer.canvas import fitted_fov, stage_pose
 from splatseed.viewer.paths import orbit
 from splatseed.viewer.pictures import Entry
-from splatseed.viewer.renderer import model_frame
+from splatseed.viewer.renderer import CORE, model_frame
 from splatseed.viewer.session import MOST_POINTS, Session
 from splatseed.viewer.shown import Shown
 from splatseed.views.view import poses_of
@@ -31,9 +31,8 @@ from splatseed.views.viewpoint import choose_camera, choose_image
 
 __all__ = ["Viewer", "free_port"]
 
-CORE = 0.6
 STEP_BACK = 0.6
-"""Length of the axes, as a fraction of the cameras' distance from their middle."""
+"""How far behind the first camera a browser begins, on the stage, so that it sees that camera."""
 
 
 def free_port(host: str, port: int) -> int:
@@ -119,7 +118,7 @@ class Viewer:
             return list(self._sessions.values())
 
     def greet(self, session: Session) -> None:
-        """A browser has connected: subclasses add controls here."""
+        """Called for each new browser; subclasses add controls here."""
 
     def _welcome(self, client: Any) -> None:
         session = Session(client, self.entries, self._most_points)

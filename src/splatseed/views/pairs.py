@@ -58,9 +58,9 @@ def choose_sources(
 def choose_by_pose(
     cam_from_world: Float64[np.ndarray, "V 4 4"], num: int
 ) -> Int64[np.ndarray, "V num"]:
-    """The same from poses alone: of the views that look the same way, the near ones.
+    """The same from poses alone: nearby views that look the same way.
 
-    But not the very nearest, if there are more: the parallax between close cameras is too small.
+    The very nearest are skipped if there are enough others: their parallax is too small.
     """
     centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
     gap = np.linalg.norm(centers[:, None] - centers, axis=2)

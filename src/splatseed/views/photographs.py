@@ -34,7 +34,7 @@ FILTER = "box-2"
 def load_photograph(
     path: Path, factor: int = 1, cache_dir: Path | None = None
 ) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]]:
-    """The pixels of an image file, smaller by ``factor``, and the file's own width and height.
+    """The pixels of an image file, downsampled by ``factor``, and the file's width and height.
 
     Transparent pixels are laid over black, which Gaussians are drawn on.
 

@@ -30,8 +30,8 @@ def undistort(
 
     Args:
         photograph: The photograph, of any size.
-        lens: Its camera, of which the distortion counts.
-        K: The matrix of the camera in pixels of ``photograph``; that of the result as well.
+        lens: Its camera, for the distortion.
+        K: The camera's matrix in pixels of ``photograph``, also valid for the result.
     """
     height, width = photograph.shape[:2]
     out, known = np.zeros_like(photograph), np.zeros((height, width), np.bool_)

@@ -102,7 +102,7 @@ def load_split(
         test_every: Every ``test_every``-th image, sorted by name, is a test view.
         min_side: The least number of pixels of a view's shorter side.
         cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
-        progress: Told how far reading is.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         SceneNotFoundError: Images are missing, or too few.
@@ -145,7 +145,7 @@ def load_views(
         min_side: The least number of pixels of a view's shorter side.
         undistort: Remove lens distortion from photographs that have some, instead of refusing them.
         cache_dir: Where smaller copies are kept for the next run; nowhere when left out.
-        progress: Told how far reading is.
+        progress: Called with the stage and the fraction done.
 
     Raises:
         ParameterError: They do not fit into memory all together.

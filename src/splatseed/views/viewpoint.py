@@ -70,8 +70,8 @@ def choose_image(scene: Scene) -> Image | None:
 
     An image's points are its features with a 3D point if the scene has features at all, else those
     of a sample that project into its frame. The mere number of points would favour close-ups of the
-    richest texture. Of a scene without points, such as an RGB-D capture, it is the image in the
-    middle. None for a scene without images.
+    richest texture. A scene without points, such as an RGB-D capture, gives the image in the middle
+    of its list; one without images gives None.
 
     Raises:
         PointCloudError: The scene has neither finite points nor images.

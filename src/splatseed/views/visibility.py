@@ -2,9 +2,9 @@
 
 Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the scene's
 world.
-Promise: only distinct finite originals take part. If Structure-from-Motion says which features a
-point has (its track), those count; without tracks, points are projected, and of those that fall
-close together in an image only the nearest are kept, as the others are probably hidden.
+Promise: only distinct finite originals take part. A point with a track is seen by the images of the
+track. Without tracks, points are projected; where several fall close together in an image, only the
+nearest are kept, as the others are probably hidden.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ def bring_photographs(
         scene: Of checked images.
         folder: The workspace.
         undistort: Removes lens distortion; None if there is none.
-        progress: Told how many are undistorted.
+        progress: Called with the stage and the fraction done.
         copy: Whether to copy rather than link.
     """
     bent = [image for image in scene.images if image.intrinsics.has_distortion]

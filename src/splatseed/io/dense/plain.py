@@ -41,7 +41,7 @@ def write_dense_maps(
         path: The folder to make.
         overwrite: Whether an earlier output of splatseed may be replaced.
         provenance: How the maps came about, for ``splatseed.json``.
-        progress: Told how many maps are written.
+        progress: Called with the stage and the fraction done.
 
     Returns:
         What was written.

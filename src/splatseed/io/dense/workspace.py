@@ -63,7 +63,7 @@ def write_dense_workspace(
             photographs and pinhole cameras of the same matrix, which the maps belong to. Without
             it, distorted cameras are refused.
         provenance: How the maps came about, for ``splatseed.json``.
-        progress: Told how many maps are written.
+        progress: Called with the stage and the fraction done.
 
     Returns:
         What was written.

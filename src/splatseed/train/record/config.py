@@ -52,7 +52,7 @@ def resumed_settings(begun: Mapping[str, Any] | None, asked: TrainSettings) -> T
 
     Args:
         begun: The run's config.
-        asked: The user's settings: one left at its default follows the run.
+        asked: The user's settings; those at their defaults take the run's values.
 
     Raises:
         ParameterError: A setting is neither the run's nor the default.

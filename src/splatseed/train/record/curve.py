@@ -25,7 +25,7 @@ class Record(NamedTuple):
     step: int
     """Steps done."""
     seconds: float
-    """Seconds of training, without reading, scoring and writing."""
+    """Seconds of training alone: not of reading, scoring or writing."""
     loss: float
     """Mean since the last record."""
     train_psnr: float
