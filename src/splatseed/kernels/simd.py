@@ -30,11 +30,13 @@ __all__ = [
     "any_greater",
     "broadcast",
     "broadcast_element",
+    "call_lanes",
     "divide",
     "element",
     "exp_of_eighth",
     "fma",
     "fnma",
+    "in_all_lanes",
     "lane_sum",
     "load",
     "load_columns",
@@ -91,8 +93,8 @@ add, subtract, multiply = _binary("fadd"), _binary("fsub"), _binary("fmul")
 divide = _binary("fdiv")
 
 
-def _call(builder, name, arguments):
-    """Call one of LLVM's own functions on vectors."""
+def call_lanes(builder, name, arguments):
+    """Call one of LLVM's own functions, such as ``sqrt``, on vectors of sixteen float32."""
     kind = ir.FunctionType(VECTOR, [VECTOR] * len(arguments))
     function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32")
     return builder.call(function, arguments)
@@ -103,7 +105,7 @@ def fma(typing_context, a, b, c):
     """The product a b plus c, rounded once."""
 
     def generate(context, builder, signature, arguments):
-        return _call(builder, "fma", arguments)
+        return call_lanes(builder, "fma", arguments)
 
     return f32x16(f32x16, f32x16, f32x16), generate
 
@@ -114,7 +116,7 @@ def fnma(typing_context, a, b, c):
 
     def generate(context, builder, signature, arguments):
         a, b, c = arguments
-        return _call(builder, "fma", [builder.fneg(a), b, c])
+        return call_lanes(builder, "fma", [builder.fneg(a), b, c])
 
     return f32x16(f32x16, f32x16, f32x16), generate
 
@@ -124,7 +126,7 @@ def minimum(typing_context, a, b):
     """The lesser in each lane; of a NaN and a number, the number."""
 
     def generate(context, builder, signature, arguments):
-        return _call(builder, "minnum", arguments)
+        return call_lanes(builder, "minnum", arguments)
 
     return f32x16(f32x16, f32x16), generate
 
@@ -145,13 +147,14 @@ def broadcast(typing_context, x):
     """The same float32 in every lane."""
 
     def generate(context, builder, signature, arguments):
-        return _broadcast(builder, arguments[0])
+        return in_all_lanes(builder, arguments[0])
 
     return f32x16(types.float32), generate
 
 
-def _broadcast(builder, x):
-    undefined = ir.Constant(VECTOR, ir.Undefined)
+def in_all_lanes(builder, x, kind=VECTOR):
+    """A vector type's value whose lanes all hold the scalar ``x``."""
+    undefined = ir.Constant(kind, ir.Undefined)
     first = builder.insert_element(undefined, x, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, undefined, ir.Constant(INDEX, [0] * LANES))
 
@@ -164,7 +167,7 @@ def broadcast_element(typing_context, array, index):
     """
 
     def generate(context, builder, signature, arguments):
-        return _broadcast(builder, _element(context, builder, signature.args[0], *arguments))
+        return in_all_lanes(builder, _element(context, builder, signature.args[0], *arguments))
 
     return f32x16(array, types.intp), generate
 
@@ -359,7 +362,7 @@ def exp_of_eighth(typing_context, x):
         value = ir.Constant(VECTOR, [float(_EXP[-1])] * LANES)
         for coefficient in reversed(_EXP[:-1]):
             constant = ir.Constant(VECTOR, [float(coefficient)] * LANES)
-            value = _call(builder, "fma", [value, arguments[0], constant])
+            value = call_lanes(builder, "fma", [value, arguments[0], constant])
         # (exp(x))^8 by squaring three times
         for _ in range(3):
             value = builder.fmul(value, value)

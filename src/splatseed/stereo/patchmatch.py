@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
+from splatseed.kernels.hashing import scramble
 from splatseed.kernels.jit import always_inline, inline
 from splatseed.kernels.simd import LANES
 from splatseed.stereo.cost import SAMPLES, best_cost, prepare_window
@@ -34,9 +35,8 @@ STEEPEST = 6.0
 DEPTH_CHANGE, SLOPE_CHANGE = 0.02, 0.5
 """Largest perturbations: a fraction of inverse depth, and of the tangent; halved each sweep."""
 
-# SplitMix64's constants; its increment is 2^64 over the golden ratio.
+# SplitMix64's increment: 2^64 over the golden ratio.
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-_MIX_A, _MIX_B = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 
 class QuadImages(NamedTuple):
@@ -219,10 +219,7 @@ def _perturb(quad_images, row, lanes, share, key, planes, tried):
 
 @always_inline
 def _random(key, number):
-    """Uniform in [-1, 1], hashed (SplitMix64)."""
-    z = key + (number + np.uint64(1)) * _GOLDEN
-    z = (z ^ (z >> np.uint64(30))) * _MIX_A
-    z = (z ^ (z >> np.uint64(27))) * _MIX_B
-    z ^= z >> np.uint64(31)
+    """Uniform in [-1, 1), hashed from a key and a number by SplitMix64."""
+    z = scramble(key + number * _GOLDEN)
     # 53 random bits over 2^53, from [0, 1) to [-1, 1).
     return np.float64(z >> np.uint64(11)) * (2.0 / 9007199254740992.0) - 1.0

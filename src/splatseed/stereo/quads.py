@@ -18,7 +18,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from splatseed.kernels.jit import inline
-from splatseed.kernels.simd import INDEX, LANES, VECTOR, f32x16
+from splatseed.kernels.simd import INDEX, LANES, VECTOR, call_lanes, f32x16, in_all_lanes
 
 __all__ = ["grey_image", "make_quads", "sample", "square_root"]
 
@@ -76,7 +76,7 @@ def sample(typing_context, quads, width, height, column, row):
         data = context.make_array(signature.args[0])(context, builder, quads).data
         x, right = _split(builder, column, width)
         y, down = _split(builder, row, height)
-        stride = _broadcast_index(builder, builder.trunc(width, ir.IntType(32)))
+        stride = in_all_lanes(builder, builder.trunc(width, ir.IntType(32)), INDEX)
         words = _gather(builder, data, builder.add(builder.mul(y, stride), x))
         a, b, c, d = (_byte(builder, words, i) for i in range(4))
         top, bottom = _lerp(builder, a, b, right), _lerp(builder, c, d, right)
@@ -91,9 +91,7 @@ def square_root(typing_context, v):
     """The square root in each lane."""
 
     def generate(context, builder, signature, arguments):
-        kind = ir.FunctionType(VECTOR, [VECTOR])
-        function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.sqrt.v{LANES}f32")
-        return builder.call(function, arguments)
+        return call_lanes(builder, "sqrt", arguments)
 
     return f32x16(f32x16), generate
 
@@ -102,26 +100,10 @@ def _split(builder, place, size):
     """Integer and fractional parts of coordinates, clamped to 0 and ``size - 1``."""
     last = builder.sitofp(builder.sub(size, ir.Constant(size.type, 1)), ir.FloatType())
     # maxnum and minnum return the number where the other is NaN: NaN becomes 0.
-    place = _limit(builder, place, "maxnum", ir.Constant(VECTOR, [0.0] * LANES))
-    place = _limit(builder, place, "minnum", _broadcast(builder, last, VECTOR))
+    place = call_lanes(builder, "maxnum", [place, ir.Constant(VECTOR, [0.0] * LANES)])
+    place = call_lanes(builder, "minnum", [place, in_all_lanes(builder, last)])
     whole = builder.fptosi(place, INDEX)
     return whole, builder.fsub(place, builder.sitofp(whole, VECTOR))
-
-
-def _limit(builder, vector, name, bound):
-    kind = ir.FunctionType(VECTOR, [VECTOR, VECTOR])
-    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{LANES}f32")
-    return builder.call(function, [vector, bound])
-
-
-def _broadcast(builder, value, kind):
-    undefined = ir.Constant(kind, ir.Undefined)
-    first = builder.insert_element(undefined, value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, undefined, ir.Constant(INDEX, [0] * LANES))
-
-
-def _broadcast_index(builder, value):
-    return _broadcast(builder, value, INDEX)
 
 
 def _gather(builder, data, index):
@@ -147,6 +129,4 @@ def _byte(builder, words, i):
 
 def _lerp(builder, a, b, t):
     """(1 - t) a + t b."""
-    kind = ir.FunctionType(VECTOR, [VECTOR] * 3)
-    fma = cgutils.get_or_insert_function(builder.module, kind, f"llvm.fma.v{LANES}f32")
-    return builder.call(fma, [t, builder.fsub(b, a), a])
+    return call_lanes(builder, "fma", [t, builder.fsub(b, a), a])

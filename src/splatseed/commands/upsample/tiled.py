@@ -195,7 +195,7 @@ def _tasks(tiling: Tiling) -> Iterator[Tasks]:
     """Who works on tiles, while the block runs."""
     from splatseed.process import tasks  # noqa: PLC0415  (processes)
     from splatseed.process.ray_tasks import ray_cluster  # noqa: PLC0415  (an extra)
-    from splatseed.process.threads import cores  # noqa: PLC0415
+    from splatseed.process.threads import cores  # noqa: PLC0415  (loads with its use)
 
     if tiling.executor == "ray":
         with ray_cluster(tiling.address):

@@ -82,9 +82,9 @@ class Cloud:
     def __call__(
         self,
         scene: Scene,  # noqa: ARG002  (a method's arguments)
-        num_new: int,  # noqa: ARG002
-        rng: np.random.Generator,  # noqa: ARG002
-        progress: Progress,  # noqa: ARG002
+        num_new: int,  # noqa: ARG002  (likewise)
+        rng: np.random.Generator,  # noqa: ARG002  (likewise)
+        progress: Progress,  # noqa: ARG002  (likewise)
     ) -> NewPoints:
         """Ask for a cloud: ``of`` names it.
 
