@@ -99,7 +99,7 @@ def _store_transposed(a, out, start):
 
 
 @njit
-def _broadcast(a, index, out):
+def _broadcast_element(a, index, out):
     simd.store(out, 0, simd.broadcast_element(a, index))
 
 
@@ -213,7 +213,7 @@ def test_transposition(rng) -> None:
 def test_single_elements() -> None:
     numbers = np.arange(40, dtype=np.float32)
     out = np.empty(LANES, np.float32)
-    _broadcast(numbers, 33, out)
+    _broadcast_element(numbers, 33, out)
     np.testing.assert_array_equal(out, np.full(LANES, 33.0, np.float32))
     assert _element(numbers, 39) == 39.0
     assert _element(numbers.astype(np.int32), 1) == 1

@@ -188,6 +188,7 @@ def reject_outliers(
     if max_ratio is None or not residuals:
         return alignments
     typical = float(np.median(residuals))
+    # The median image is not an outlier; 1% is good whatever the others do.
     limit = max(max_ratio * typical, GOOD_RESIDUAL)
     return {
         name: replace(a, rejected=f"depth is off by {a.residual:.1%}, typically {typical:.1%}")

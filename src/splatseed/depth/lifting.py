@@ -83,6 +83,7 @@ def lift(
     images, views, more = _leave_out(images, views, settings.max_residual_ratio)
     candidates = gather(views, settings, progress)
     while candidates.num_sound < num and factor < MAX_OVERSAMPLING and not _exhausted(views):
+        # In proportion to what was sound, so that one more round mostly suffices.
         growth = SURPLUS * num / max(candidates.num_sound, 1)
         factor = min(factor * min(growth, MAX_GROWTH), MAX_OVERSAMPLING)
         views = _read_all(reader, images, factor * num, rng, progress)
@@ -153,6 +154,7 @@ def _read_all(
 ) -> list[View]:
     """The views of all images, which share the number of candidates equally."""
     per_image = math.ceil(num / len(images))
+    # One seed per image, drawn in order, so that threads do not matter.
     seeds = rng.integers(0, 1 << 63, len(images))
     views: list[View | None] = [None] * len(images)
 

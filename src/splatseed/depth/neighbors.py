@@ -54,6 +54,7 @@ def choose_neighbors(
     usable = np.array([i for i, v in enumerate(views) if v.reduced is not None and len(v)], int)
     if len(usable) < 2:
         return chosen
+    # V^2 S projections for the shortlist.
     per_view = int(np.clip(WORK // len(usable) ** 2, MIN_SAMPLES, SAMPLES))
     samples = np.full((len(usable), per_view, 3), np.inf, np.float32)  # seen by nobody
     for i, k in enumerate(usable.tolist()):

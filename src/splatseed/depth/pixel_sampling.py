@@ -22,7 +22,9 @@ CELLS = 64
 """Most cells along the longer side of a map."""
 
 ROUNDS = 4
+"""Most rounds of drawing, each for what the last has left missing."""
 DIAGONAL = 2.0**0.5
+"""Length of a diagonal step, in cells."""
 LEAST_DISTANCE = 0.5
 """Distance, in cells, given to a cell that has points itself: it stays open to new ones."""
 
@@ -71,8 +73,10 @@ def sample_pixels(
         missing = num - len(pixel)
         if missing <= 0:
             break
+        # The share of usable pixels so far tells how many to try.
         will_do = max(len(pixel) / tried, LEAST_SHARE) if tried else 1.0
         picks = _picks(int(SURPLUS * missing / will_do) + 1, settings.placement, rng)
+        # Inverse of the cumulative weight: a cell is drawn in proportion to its weight.
         picks *= cumulative[-1]
         jitter = rng.random((len(picks), 2), dtype=np.float32)
         part = np.empty(len(picks), np.int64)
@@ -148,6 +152,7 @@ def _with_rest(
 def _spread_distance(distance):  # type: ignore[no-untyped-def]  # Numba's types
     """Chamfer distances from a grid's zeros, in place, at most 8% too long (Borgefors, 1986)."""
     rows, columns = distance.shape
+    # Forward from the upper left, then backward from the lower right.
     for sweep in range(2):
         for a in range(rows):
             row = a if sweep == 0 else rows - 1 - a
@@ -214,6 +219,7 @@ def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyp
     All distances are tested along the row, where memory is near, and only the largest one
     elsewhere: there, a discontinuity that is crossed twice can be missed.
     """
+    # w(-k) + w(+k) - 2 w(0), relative to w(0): 0 on any plane
     here = 2.0 / values[row, column]
     known, pairs = 0, 0
     for k in range(1, radius + 4):
@@ -229,4 +235,5 @@ def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyp
             known += 1
             if abs(1.0 / before + 1.0 / after - here) > 0.5 * tolerance * here:
                 return True
+    # Beside unknown depth there may be an edge, too.
     return 2 * known < pairs

@@ -94,6 +94,7 @@ class View:
             factor: Multiplies depth.
         """
         num = min(num, len(self))
+        # Pixels come roughly row by row, so even numbers are spread over the image.
         which = ((np.arange(num) + 0.5) * (len(self) / num)).astype(np.int64)
         out = np.empty((num, 3), np.float32)
         return lift_pixels(self.pixel[which], self.z[which], self.camera, out, factor)
@@ -157,6 +158,7 @@ class Reader:
         seen = _Seen(alignment, camera, drawn, planar.at(drawn.pixel))
         if not (self.settings.compares_views or self.settings.synchronizes):
             return seen
+        # The whole step at which the longer side keeps at most GRID pixels.
         factor = -(-max(planar.values.shape) // GRID)
         return replace(seen, coarse=planar.every(factor // 2, factor), unit=planar.scale)
 

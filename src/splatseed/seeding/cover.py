@@ -180,6 +180,7 @@ class _Growing:
     def add(self, more: Float32[np.ndarray, "M 3"]) -> None:
         num = self._num + len(more)
         if num > len(self._room):
+            # Doubled, so that all copies together are linear in the number of points.
             room = np.empty((2 * num, 3), np.float32)
             room[: self._num] = self.xyz
             self._room = room

@@ -121,6 +121,7 @@ def grid_from_world(view: View, cell: float) -> Float64[np.ndarray, "3 4"]:
     Cell (i, j) spans rows i to i + 1 and columns j to j + 1.
     """
     rows, cols = grid_of(view, cell)
+    # Cells are a little smaller than c pixels where c does not divide the size.
     grid_from_pixels = np.diag([cols / view.width, rows / view.height, 1.0])
     return np.asarray(grid_from_pixels @ view.K @ view.cam_from_world[:3])
 
@@ -197,6 +198,7 @@ def _lower_quartiles(starts, by_cell, quartiles):  # type: ignore[no-untyped-def
     for i in range(rows):
         for j in range(cols):
             values = by_cell[starts[i * cols + j] : starts[i * cols + j + 1]]
+            # Of one point its own depth, of four the second nearest.
             quartiles[i, j] = _select(values, len(values) // 4) if len(values) else NONE
 
 

@@ -136,6 +136,7 @@ def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-u
             rows, cols = shapes[v]
             if 0.0 <= column < cols and 0.0 <= row < rows:
                 there = seen[starts[v] + int(row) * cols + int(column)]
+                # In front of a covered cell by more than NEARER: that view sees past it.
                 count += there < np.inf and depth < there * (1.0 - NEARER)
     return count
 

@@ -78,6 +78,7 @@ def _choose(  # type: ignore[no-untyped-def]  # Numba's types
                 continue
             if not _has_witnesses(xyz[i], sources[view], matrices, sizes):
                 continue
+            # Pixels per unit of length at the point, weighted by the angle.
             value = focals[view] * _sight(xyz[i], normals[i], centers[view])
             # Insertion into a sorted list of two.
             for k in range(JUDGES):

@@ -63,6 +63,7 @@ def survey(
     frames, collinear = local_frames(cloud.xyz, neighbors.idx)
     flat = _thickness(cloud, neighbors, frames, progress) <= FLAT
     rank = _nearest(cloud, xyz, progress)
+    # The tree numbers points in file order, neighbours are stored by row.
     row_of_rank = np.argsort(cloud.rank)
     row = row_of_rank[rank]
     normals = np.where(collinear[row, None], np.nan, frames[row, 2])
@@ -80,6 +81,7 @@ def _thickness(
 
     def work(start: int, stop: int) -> None:
         near = cloud.xyz[neighbors.idx[start:stop]] - cloud.xyz[start:stop, None]
+        # The base itself, at the origin.
         near = np.concatenate([near, np.zeros((stop - start, 1, 3))], axis=1)
         spread = (near @ frames[start:stop, 1:].swapaxes(1, 2)).std(axis=1)
         thickness[start:stop] = spread[:, 1] / np.maximum(spread[:, 0], np.finfo(float).tiny)

@@ -122,6 +122,7 @@ def upsample(
             )
             return thin_to(whole, originals, most, CELL, 0, seed, progress)
     options: dict[str, Any] = {"seed": seed, "progress": progress, "note": note}
+    # Measured points come first, so that the method fills what they leave.
     first = None if beside is None else add_points(whole, beside, **options)
     cloud = add_points(
         scene if first is None else _with(whole, first, method), method, ratio=ratio,

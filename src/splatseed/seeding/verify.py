@@ -225,7 +225,9 @@ def _decide(
     rows, best = np.arange(len(costs)), costs.argmin(axis=1)
     agrees = costs[rows, best] <= MAX_COST
     unknown = ~judged.any(axis=1)
+    # Interpolation is safe where nothing can be compared but the originals are coplanar.
     bare = ~unknown & ~(judged & textured).any(axis=1) & around.flat
+    # 1 - cost is the correlation.
     confidence = np.where(agrees, 1.0 - np.maximum(costs[rows, best], 0.0), np.nan)
     confidence[bare] = BARE_CONFIDENCE
     xyz = np.where(agrees[:, None], trials.xyz[rows, best], new.xyz)

@@ -112,6 +112,7 @@ def _is_stray(centers: Float64[np.ndarray, "V 3"]) -> Bool[np.ndarray, " V"]:
     if len(centers) < MIN_CAMERAS:
         return np.zeros(len(centers), bool)
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
+    # The nearest nine tenths of the cameras can be no strays.
     usual = max(1, len(centers) - max(1, round(STRAY_SHARE * len(centers))))
     # The farthest of those that cannot be strays.
     reach = np.partition(distances, usual - 1)[usual - 1]

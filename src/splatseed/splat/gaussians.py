@@ -140,6 +140,7 @@ def neighbor_distances(xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N
             found=f"{len(xyz)} points in one place",
             fix="Check that the scene was read correctly (splatseed info SCENE).",
         )
+    # Root mean square of the distances, as in 3DGS.
     return np.asarray(np.clip(np.sqrt(squares), COINCIDENT * median, GAP * median))
 
 

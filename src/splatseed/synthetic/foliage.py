@@ -96,6 +96,7 @@ def _nearest_disc(
             z = xyz[i, 2] - centers[j, 2]
             off = x * axes[j, 0] + y * axes[j, 1] + z * axes[j, 2]
             x, y, z = x - off * axes[j, 0], y - off * axes[j, 1], z - off * axes[j, 2]
+            # Within the disc's plane: how far beyond its rim.
             beyond = max(np.sqrt(x * x + y * y + z * z) - radii[j], 0.0)
             squared = off * off + beyond * beyond
             if squared < best:
@@ -122,6 +123,7 @@ def _first_disc(
         limit = radii[j] * radii[j]
         for i in range(len(directions)):
             dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+            # Where the ray meets the disc's plane; infinite if parallel, and then no hit.
             t = -height / (dx * nx + dy * ny + dz * nz)
             x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
             if t > 0.0 and t < nearest[i] and x * x + y * y + z * z <= limit:

@@ -83,6 +83,7 @@ class Capacity:
 def free_bytes(device: torch.device) -> int | None:
     """Free memory of the device in bytes; None where the system does not tell."""
     if device.type == "cuda":
+        # PyTorch keeps freed blocks, which are free to us.
         kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + kept
     return free_memory()

@@ -78,6 +78,7 @@ def known_depths(
         "what it adds there. --placing none only splits."
     )
     return {
+        # Stereo's depths are in world units; unknown ones, NaN, become 0.
         name: torch.as_tensor(np.nan_to_num(depth * frame.scale)).to(device)
         for name, depth in known.items()
         if np.isfinite(depth).any()

@@ -38,6 +38,7 @@ def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32
     """
     nearest = np.full(len(xyz), np.inf)
     columns = np.ascontiguousarray(xyz.T, np.float64)
+    # Evenly spaced views, the first and the last among them.
     asked = max(LEAST_VIEWS, MOST_PROJECTIONS // max(1, len(xyz)))
     for i in np.unique(np.linspace(0, len(views) - 1, min(asked, len(views))).round().astype(int)):
         depths, seen = _seen_depths(columns, views[i])

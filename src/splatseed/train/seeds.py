@@ -120,6 +120,7 @@ def _within_cap(
         return points
     from splatseed.seeding.budget import thin  # noqa: PLC0415  (kernels load with use)
 
+    # Thinning takes the earlier of equals: originals first.
     points = points.select(np.argsort(points.source != ORIGINAL, kind="stable"))
     first = points.num_original
     seeds = points.select(thin(points.xyz, views, cap, first=first, priority=points.confidence))

@@ -27,6 +27,7 @@ from splatseed.train.strategies import Strategy
 __all__ = ["Stopwatch", "TrainState", "load_checkpoint", "save_checkpoint"]
 
 FORMAT = 3
+"""Version of the checkpoint's content."""
 
 
 class Stopwatch:

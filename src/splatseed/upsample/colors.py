@@ -39,6 +39,7 @@ def _interpolate(xyz, rgb, center, idx, floor, start, count, new_xyz, out):  # t
         if count[i] > 0:
             around, color = _gather(xyz, rgb, i, idx[i])
             weight = np.empty(around.shape[1], np.float32)
+            # Squared, like the distances it bounds.
             nearest = np.float32(floor[i] * floor[i])
             for m in range(start[i], start[i] + count[i]):
                 x = np.float32(new_xyz[m, 0] - center[0] - xyz[i, 0])
@@ -78,6 +79,7 @@ def _mix(weight, color, out):  # type: ignore[no-untyped-def]  # Numba's types
         red += weight[j] * color[j, 0]
         green += weight[j] * color[j, 1]
         blue += weight[j] * color[j, 2]
+    # Rounded to the nearest, as uint8 cuts off.
     half = np.float32(0.5)
     out[0] = np.uint8(red / total + half)
     out[1] = np.uint8(green / total + half)

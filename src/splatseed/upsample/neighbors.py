@@ -178,6 +178,7 @@ def prepare(
             found=f"{len(points)} points, none of them finite and original",
             fix="Check that the scene holds the point cloud you meant.",
         )
+    # In float64 about the centroid: UTM coordinates lose nothing.
     center = points.xyz[keep_idx].sum(axis=0, dtype=np.float64) / len(keep_idx)
     xyz = points.xyz[keep_idx].astype(np.float64) - center
     tree = cKDTree(xyz, balanced_tree=False)
@@ -278,6 +279,7 @@ def draw_in_block(
     """How many of a block's ``total`` new points each of its ranks makes; blocks come in order."""
     if not weight.any():  # the only block without weight that is asked: total is 0
         return np.zeros(len(weight), np.int64)
+    # Counts per base, drawn by rank: rows depend on how the kd-tree cut space.
     return np.asarray(rng.multinomial(total, weight / weight.sum()))
 
 
@@ -297,6 +299,7 @@ def _isolated(
 ) -> Bool[np.ndarray, " n"]:
     """Rows whose spacing exceeds 3 times the lower quartile of their neighbours'."""
     isolated = np.empty(len(idx), bool)
+    # The lower quartile, which a few outliers among the neighbours do not move.
     nth = idx.shape[1] // 4
 
     def judge(start: int, stop: int) -> None:

@@ -36,6 +36,7 @@ def canvas_view(
         frame: From the scene's world to the stage.
     """
     width, height = size
+    # fov is vertical: tan(fov / 2) = (height / 2) / focal
     focal = height / 2 / np.tan(fov / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     cam_from_world = np.eye(4)

@@ -20,6 +20,7 @@ MOVING_SECONDS = 0.12
 STILL_AFTER = 0.2
 """Seconds without movement after which the full picture is drawn."""
 LEAST_SCALE, FIRST_SCALE = 0.12, 0.3
+"""Coarsest scale of a frame, and the scale before any frame has been timed."""
 CLOSE_SECONDS = 2.0
 """Seconds to wait for the frame being drawn."""
 MEMORY = 0.5
@@ -69,6 +70,7 @@ class FrameLoop:
         if self._pixel_seconds is None:
             return FIRST_SCALE
         affordable = MOVING_SECONDS / self._pixel_seconds / self._full_pixels
+        # Pixels go with the square of the scale.
         return float(np.clip(np.sqrt(affordable), LEAST_SCALE, 1.0))
 
     def _frame(self, scale: float, *, learn: bool = True) -> None:

@@ -264,11 +264,13 @@ class Session:
         camera = self._client.camera
         wxyz, position = stage_pose(image.camera, self._entry.frame)
         start, origin = np.array(camera.wxyz), np.array(camera.position)
+        # q and -q are one rotation: the nearer one gives the shorter turn.
         wxyz = wxyz * (1 if wxyz @ start >= 0 else -1)
         fov, first = fitted_fov(image.camera, camera.aspect), camera.fov
         self._goal = image
         for step in range(1, FLIGHT_STEPS + 1):
             part = step / FLIGHT_STEPS
+            # Smoothstep: starts and ends gently.
             ease = part * part * (3 - 2 * part)
             turn = (1 - ease) * start + ease * wxyz
             with self._client.atomic():

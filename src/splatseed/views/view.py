@@ -29,6 +29,7 @@ __all__ = ["View", "check_lens", "data_factor", "load_split", "load_views", "pos
 ASPECT_SLACK = 0.02
 """By how much a file's aspect ratio may differ from its camera's: the rounding of a copy."""
 READERS = 4
+"""Threads that decode photographs."""
 BYTES_A_PIXEL = 3
 """Bytes per pixel of a photograph in memory: three colours."""
 

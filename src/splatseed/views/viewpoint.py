@@ -26,8 +26,11 @@ CORE_SHARE = 0.6
 """Share of the points, those nearest to the median, that a made-up camera frames."""
 
 ELEVATION = 28.0
+"""Degrees by which a made-up camera looks down."""
 MADE_UP_SIZE = (800, 600)
+"""Its width and height in pixels."""
 MADE_UP_FOCAL = 900.0
+"""Its focal length in pixels."""
 
 
 def look_at(

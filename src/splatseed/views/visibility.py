@@ -106,4 +106,5 @@ def _in_front(xyz: Float64[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarr
     cell = row * CELLS + column
     nearest = np.full(CELLS * CELLS, np.inf)
     np.minimum.at(nearest, cell, z[inside])
+    # A tenth beyond the nearest point of the cell may still be its surface.
     return np.asarray(inside[z[inside] <= HIDDEN * nearest[cell]])

@@ -150,6 +150,7 @@ class _Bounded(MCMCStrategy):
     def set_noise(self, params: Parameters) -> None:
         """Called before each step, and whenever the number of Gaussians changes."""
         if NEAR_DEPTHS in params:
+            # gsplat: noise = covariance x normal x lr x noise_lr
             self.noise_lr = self.noise / yardsticks(params)[:, None]
 
     def _add_new_gs(self, params: Parameters, optimizers: Any, binoms: Any) -> int:

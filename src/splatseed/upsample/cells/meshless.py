@@ -117,6 +117,7 @@ def _cut_all(xyz, i, rows, distance, normal, offset, triple, vertex, twin, count
     fresh, place = np.empty((MAX_VERTICES, 2), np.int16), np.empty((MAX_VERTICES, 3))
     farthest = _farthest_squared(vertex, count)
     for j in range(rows.size):
+        # The bisector lies at half the distance: beyond the farthest vertex it cuts nothing.
         if 0.25 * distance[j] * distance[j] > farthest:
             return count, True
         plane = 6 + j
@@ -166,6 +167,7 @@ def _cut(plane, triple, vertex, twin, count, signed, fresh, place):  # type: ign
                 a, b = triple[v, side], triple[v, (side + 1) % 3]
                 w = twin[b, a]
                 if signed[w] <= 0.0:
+                    # Where the edge from a removed vertex to a kept one meets the plane.
                     t = signed[v] / (signed[v] - signed[w])
                     fresh[made, 0], fresh[made, 1] = a, b
                     for axis in range(3):

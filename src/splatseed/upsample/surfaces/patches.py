@@ -153,11 +153,13 @@ def _lift(xyz, center, idx, frames, start, count, uv, height, margin, out):  # t
         if count[i] > 0:
             e_u, e_v, e_n = frames[i, 0], frames[i, 1], frames[i, 2]
             low, high = _height_range(xyz, i, idx[i], e_n)
+            # No fit is trusted far beyond the heights it was made from.
             slack = margin * (high - low) if margin < np.inf else np.inf
             for m in range(start[i], start[i] + count[i]):
                 u, v = np.float64(uv[m, 0]), np.float64(uv[m, 1])
                 z = min(max(np.float64(height[m]), low - slack), high + slack)
                 for axis in range(3):
+                    # p + u e_u + v e_v + z e_n, relative to the centroid until the last sum
                     local = u * e_u[axis] + v * e_v[axis] + z * e_n[axis]
                     out[m, axis] = center[axis] + (xyz[i, axis] + local)
 
