@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatseed.errors import OutputError, ParameterError
+from splatseed.process.memory import option_of, words_of
 from splatseed.tiles.work import free_space
 from splatseed.upsample.nearest import NearestMethod
 
-__all__ = ["TilePlan", "check_disk", "plan_tiles", "words_of"]
+__all__ = ["TilePlan", "check_disk", "plan_tiles"]
 
 PROCESS = 300 << 20
 """Memory of a process before it holds any points: libraries, compiled kernels, and their slack."""
@@ -90,8 +91,7 @@ def plan_tiles(
             f"at least {words_of(needed, up=True)} of memory for {processes} "
             f"process{'' if processes == 1 else 'es'}",
             found=words_of(memory),
-            fix=f"Pass --memory {words_of(needed, up=True).replace(' GB', 'G').replace(' MB', 'M')}"
-            + (", or fewer --jobs." if processes > 2 else "."),
+            fix=f"Pass {option_of(needed)}" + (", or fewer --jobs." if processes > 2 else "."),
         )
     room = (memory - fixed) // processes - PROCESS
     most = min(tile_points or MOST, room // each)
@@ -130,16 +130,3 @@ def check_disk(path: Path, needed: int | None, there: int = 0) -> None:
             found=words_of(free),
             fix="Free some space, choose an output on a larger disk, or ask for fewer points.",
         )
-
-
-def words_of(amount: int, *, up: bool = False) -> str:
-    """Bytes in words: tenths of GB, or whole MB.
-
-    Args:
-        amount: The bytes.
-        up: Whether to round up.
-    """
-    unit, name, digits = (1 << 30, "GB", 1) if amount >= 1 << 30 else (1 << 20, "MB", 0)
-    scaled = amount / unit * 10**digits
-    rounded = (-int(-scaled // 1) if up else round(scaled)) / 10**digits
-    return f"{rounded:,.{digits}f} {name}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -50,6 +51,7 @@ def test_a_scan_in_the_scenes_frame(splatseed, room, scan, tmp_path):
     assert CLOUD in seeds.source
     assert "cloud)" in run.out
     assert "120,000 points were read" in run.err + run.out
+    assert re.search(r"voxels, 4\.\d GB of memory", run.out)
     told = json.loads((out / "splatseed.json").read_text())
     assert told["method"] == "cloud"
     assert len(told["cloud"]["files"]) == 2
@@ -112,6 +114,9 @@ def test_a_cloud_beside_cover(splatseed, room, scan, tmp_path):
     [
         (("--method", "cloud"), "--cloud FILE"),
         (("--transform", "x.txt"), "--cloud FILE"),
+        (("--align",), "--cloud FILE"),
+        (("--cloud", "SCAN", "--memory", "500M"), "found 500 MB. Pass --memory 6"),
+        (("--cloud", "SCAN", "--memory", "a lot"), "such as 4G or 500M; found 'a lot'"),
         (("--cloud", "none.laz"), "no such file"),
         (("--cloud", "SCAN", "--method", "mls"), "with --cloud; found mls"),
         (("--cloud", "SCAN", "--align", "--transform", "t.txt"), "found both"),

@@ -89,7 +89,7 @@ def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | 
         OutputError: It has attributes that tiles do not.
     """
     tiling, path = options.tiling, options.scene
-    if path.is_dir() and not tiling.asked and tiling.memory is None:
+    if not tiling.asked and (options.cloud_files or (path.is_dir() and tiling.memory is None)):
         return None
     from splatseed.tiles import FileSource, SceneSource  # noqa: PLC0415  (Numba)
 

@@ -107,8 +107,8 @@ def _choose_cell(views: Sequence[View], xyz: Float32[np.ndarray, "N 3"]) -> int:
     some = views[:: -(-len(views) // 8)]
     for cell in CELLS[:-1]:
         counts = [count[count > 0] for view in some if len(count := cell_counts(view, xyz, cell))]
-        found = np.concatenate(counts)
-        if len(found) and np.median(found) >= FILLED:
+        filled = np.concatenate(counts)
+        if len(filled) and np.median(filled) >= FILLED:
             return cell
     return CELLS[-1]
 
@@ -132,7 +132,7 @@ def find_evidence(
         progress: Told how far it is.
     """
     num = len(xyz)
-    found = Evidence(
+    evidence = Evidence(
         np.zeros(num, np.uint16),
         np.full((num, 3), 128, np.uint8),
         np.full(num, np.nan, np.float32),
@@ -151,11 +151,11 @@ def find_evidence(
             _observe(
                 block, grid_from_world(view, 1), np.sqrt(abs(view.K[0, 0] * view.K[1, 1])),
                 view.width, view.height, surfaces[v], behind, free, view.photograph, _mask(view),
-                closeness, samples, found.seen[part], found.through[part], found.confirmed[part],
+                closeness, samples, evidence.seen[part], evidence.through[part], evidence.confirmed[part],
             )  # fmt: skip
             progress("look at photographs", (b * len(views) + v + 1) / steps)
-        _summarise(closeness, samples, found.rgb[part], found.agreement[part])
-    return found
+        _summarise(closeness, samples, evidence.rgb[part], evidence.agreement[part])
+    return evidence
 
 
 def surface_agreement(

@@ -29,12 +29,11 @@ from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.judging import Judged
-    from splatseed.seeding.clouds.streaming import Streamed
+    from splatseed.seeding.clouds.streaming import MemoryPlan, Streamed
     from splatseed.views.view import View
 
 __all__ = ["Cloud", "GivenClouds"]
 
-GIGABYTE = 1e9
 FITS = 0.2
 """Below this share of the scene's own points at the cloud's depth it is another's: a cloud of
 another place has 0 to 0.1, one in the right place 0.36 (red kitchen, noisy) to 0.92 (room0)."""
@@ -58,8 +57,6 @@ class Cloud:
     """Take colours from the photographs even if the cloud has some."""
     clean: bool = True
     """Leave out points that the photographs contradict, and points that float alone."""
-    memory: float = 4.0
-    """Most memory, in gigabytes; voxels grow where they do not fit."""
 
     name: ClassVar[str] = "cloud"
     traits: ClassVar[Traits] = Traits(frozenset({"cloud"}), chooses_number=True)
@@ -67,17 +64,20 @@ class Cloud:
     def __post_init__(self) -> None:
         check_fields(self)
         require(0.25 <= self.pixels <= 64, "cloud.pixels from 0.25 to 64", self.pixels)
-        require(self.memory >= 1, "cloud.memory of at least 1 gigabyte", self.memory)
 
-    def of(self, *files: Path | str, transform: Similarity | None = None) -> GivenClouds:
+    def of(
+        self, *files: Path | str, transform: Similarity | None = None, memory: int | None = None
+    ) -> GivenClouds:
         """The method for some files.
 
         Args:
             files: The clouds, in one frame.
             transform: From their frame to the scene's; the same frame when None.
+            memory: Most bytes of memory; voxels grow where they do not fit. 4 GB when None.
         """
         known = {field.name: getattr(self, field.name) for field in fields(Cloud)}
-        return GivenClouds(**known, files=tuple(map(str, files)), transform=transform)
+        paths = tuple(map(str, files))
+        return GivenClouds(**known, files=paths, transform=transform, memory=memory)
 
     def __call__(
         self,
@@ -104,6 +104,18 @@ class GivenClouds(Cloud):
     """The clouds."""
     transform: Similarity | None = None
     """From their frame to the scene's; the same frame when None."""
+    memory: int | None = None
+    """Most bytes of memory; 4 GB when None, and never more than is free."""
+
+    def plan(self, scene: Scene) -> MemoryPlan:
+        """What it will take for a scene.
+
+        Raises:
+            ParameterError: The scene has no cameras, or the memory is not enough.
+        """
+        from splatseed.seeding.clouds.streaming import plan_memory  # noqa: PLC0415  (loads Numba)
+
+        return plan_memory(self.memory, _frames(scene))
 
     def __call__(
         self,
@@ -118,11 +130,11 @@ class GivenClouds(Cloud):
             SceneNotFoundError: A file is missing.
             SceneFormatError: One is damaged.
             PointCloudError: No point is in view, or the cloud does not fit the scene.
+            ParameterError: The scene has no cameras, or the memory is not enough.
         """
-        from splatseed.seeding.clouds.streaming import capacity_of, stream  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.clouds.streaming import stream  # noqa: PLC0415  (loads Numba)
 
-        frames = _frames(scene)
-        capacity = capacity_of(self.memory * GIGABYTE)
+        frames, capacity = _frames(scene), self.plan(scene).capacity
         paths = [Path(each) for each in self.files]
         streamed = stream(paths, self.transform, frames, self.pixels, capacity, progress)
         _check_in_view(streamed, scene)
@@ -238,7 +250,7 @@ def _read_notes(streamed: Streamed) -> tuple[str, ...]:
     if voxels.coarser:
         told.append(
             f"The cloud was merged at {2**voxels.coarser} times the spacing asked for, to stay "
-            "within the memory: --cloud.memory raises it."
+            "within the memory: pass more --memory."
         )
     return tuple(told)
 
