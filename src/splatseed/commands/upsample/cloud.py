@@ -141,7 +141,9 @@ class Brought(NamedTuple):
             _write_json(folder / ALIGNMENT, alignment.report)
             off = alignment.residuals / (2 * CLOSE * alignment.extent)
             picture = folder / "preview_alignment.png"
-            preview_alignment(self.scene, alignment.sample, alignment.rgb, alignment.marks, off, picture)
+            preview_alignment(
+                self.scene, alignment.sample, alignment.rgb, alignment.marks, off, picture
+            )
 
 
 def _write_json(path: Path, content: Mapping[str, object]) -> None:

@@ -4,9 +4,9 @@ Notation: a view's *surface* is the depth of its cells (``coverage.cell_depths``
 which a typical cell holds ``FILLED`` points, so that walls have no holes. A view *sees* points in
 front of its surface, and up to ``BEHIND`` of the depth behind it. The *samples* of a point are its
 pixels in the ``CLOSEST`` views that see it; their *agreement* is the share within ``ALIKE`` grey
-levels of their median, channel by channel. A tracked point of Structure-from-Motion proves that the
-ray to it is free: a cloud point in the same cell of the same view, clearly nearer, is *seen
-through*, and *confirmed* if it is about as far.
+levels of their median, channel by channel. A tracked point of Structure-from-Motion, or a depth that
+stereo confirms, proves that the ray to it is free: a cloud point in the same cell of the same view,
+clearly nearer, is *seen through*, and *confirmed* if it is about as far.
 Promise: depends neither on the order of the points nor on the threads.
 """
 
@@ -50,20 +50,33 @@ Surface = Float32[np.ndarray, "rows cols"]
 
 @dataclass(frozen=True, eq=False)
 class FreeRays:
-    """Where tracked points prove that rays are free, in each view.
+    """How far rays are known to be free, in each view.
 
     Args:
-        depths: For each view, the least depth of its tracked points per cell of ``RAY_CELL``
-            pixels, float32; infinite where there is none.
+        depths: For each view, the least depth per cell of about ``RAY_CELL`` pixels, float32;
+            infinite where none is known.
     """
 
     depths: tuple[Surface, ...]
 
     @classmethod
-    def of(cls, views: Sequence[View], seen: Sequence[Float64[np.ndarray, "M 3"]]) -> FreeRays:
-        """The free rays of views that each see some points for certain."""
-        depths = (_nearest(view, xyz) for view, xyz in zip(views, seen, strict=True))
-        return cls(tuple(depths))
+    def of(
+        cls,
+        views: Sequence[View],
+        seen: Sequence[Float64[np.ndarray, "M 3"]],
+        depths: Sequence[Surface] | None = None,
+    ) -> FreeRays:
+        """The free rays of some views.
+
+        Args:
+            views: The views.
+            seen: The points that each sees for certain, world.
+            depths: What stereo knows of each, infinite where it knows nothing.
+        """
+        if depths is None:
+            depths = [_nothing(view) for view in views]
+        known = zip(views, seen, depths, strict=True)
+        return cls(tuple(_nearest(view, xyz, depth) for view, xyz, depth in known))
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,11 +199,16 @@ def _mask(view: View) -> Bool[np.ndarray, "H W"]:
     return np.ones((1, 1), np.bool_) if view.mask is None else view.mask
 
 
-def _nearest(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Surface:
-    """The least depth of points per cell of ``RAY_CELL`` pixels."""
+def _nothing(view: View) -> Surface:
+    """No depth in any cell of ``RAY_CELL`` pixels."""
     shape = -(-view.height // RAY_CELL), -(-view.width // RAY_CELL)
-    nearest = np.full(shape, np.inf, np.float32)
-    rows, cols, depth = _cells(view, xyz, shape)
+    return np.full(shape, np.inf, np.float32)
+
+
+def _nearest(view: View, xyz: Float64[np.ndarray, "M 3"], known: Surface) -> Surface:
+    """The least depth per cell, of points and of what is known."""
+    nearest = np.array(known, np.float32)
+    rows, cols, depth = _cells(view, xyz, nearest.shape)
     np.minimum.at(nearest, (rows, cols), depth.astype(np.float32))
     return nearest
 

@@ -1,9 +1,9 @@
 """The method ``cloud``: seeds from scans and dense clouds, as many as the photographs resolve.
 
 Points stream into voxels (``voxels``); of these, those stay that a photograph sees and nothing
-speaks against (``evidence``): no ray of Structure-from-Motion passes through them, the photographs
-that see them agree on a colour, and they do not float alone. A budget thins them afterwards, as
-those of every method.
+speaks against (``evidence``): no ray of Structure-from-Motion or stereo passes through them, the
+photographs that see them agree on a colour, and they do not float alone. A budget thins them
+afterwards, as those of every method.
 Promise: memory does not grow with the clouds; a cloud that is nowhere near the cameras, or does not
 fit the scene's own points, is refused with the reason.
 """
@@ -28,6 +28,7 @@ from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
+    from splatseed.seeding.clouds.evidence import FreeRays
     from splatseed.seeding.clouds.judging import Judged
     from splatseed.seeding.clouds.streaming import MemoryPlan, Streamed
     from splatseed.views.view import View
@@ -45,6 +46,8 @@ UNKNOWN = 0.5
 CORNER = 0.5
 """Below this share of the photographs' cells, a note says how little the cloud covers."""
 CELL = 8
+TWO = 2
+"""Photographs that stereo compares at least."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,8 @@ class Cloud:
     """Take colours from the photographs even if the cloud has some."""
     clean: bool = True
     """Leave out points that the photographs contradict, and points that float alone."""
+    hold_out: int = 0
+    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
 
     name: ClassVar[str] = "cloud"
     traits: ClassVar[Traits] = Traits(frozenset({"cloud"}), chooses_number=True)
@@ -64,6 +69,8 @@ class Cloud:
     def __post_init__(self) -> None:
         check_fields(self)
         require(0.25 <= self.pixels <= 64, "cloud.pixels from 0.25 to 64", self.pixels)
+        held = self.hold_out
+        require(held != 1 and held >= 0, "cloud.hold_out of 0 or 2 and more", held)
 
     def of(
         self, *files: Path | str, transform: Similarity | None = None, memory: int | None = None
@@ -121,7 +128,7 @@ class GivenClouds(Cloud):
         self,
         scene: Scene,
         num_new: int,  # noqa: ARG002  (the photographs determine the number)
-        rng: np.random.Generator,  # noqa: ARG002  (nothing is random)
+        rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
         """Seeds from the clouds.
@@ -138,24 +145,26 @@ class GivenClouds(Cloud):
         paths = [Path(each) for each in self.files]
         streamed = stream(paths, self.transform, frames, self.pixels, capacity, progress)
         _check_in_view(streamed, scene)
-        return self._choose(scene, streamed, progress)
+        return self._choose(scene, streamed, rng, progress)
 
-    def _choose(self, scene: Scene, streamed: Streamed, progress: Progress) -> NewPoints:
+    def _choose(
+        self, scene: Scene, streamed: Streamed, rng: np.random.Generator, progress: Progress
+    ) -> NewPoints:
         """The points that stay, their colours, and notes."""
         from splatseed.seeding.clouds.judging import judge  # noqa: PLC0415  (loads Numba)
         from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
-        voxels, images = streamed.voxels, _images(scene)
+        voxels, images = streamed.voxels, _images(scene, self.hold_out)
         views = _views(scene, images, progress)
         visibility = find_visibility(scene)
         nothing = np.empty((0, 3))
         seen = [visibility.of(image) if len(visibility.xyz) else nothing for image in images]
         colored = all(file.has_color for file in streamed.files)
         own = voxels.rgb if any(file.colors != "none" for file in streamed.files) else None
+        rays = _free_rays(scene, images, views, seen, rng, progress) if self.clean else None
         judged = judge(
-            views, seen, voxels, own if colored else None, progress,
-            clean=self.clean, tracked=scene.tracks is not None,
-        )  # fmt: skip
+            views, seen, voxels, own if colored else None, progress, clean=self.clean, rays=rays
+        )
         xyz, evidence = voxels.xyz[judged.kept], judged.evidence
         rgb = evidence.rgb if own is None else own[judged.kept]
         if scene.has_photographs and (self.recolor or not colored):
@@ -178,8 +187,8 @@ def _frames(scene: Scene) -> tuple[View, ...]:
     return frames_of(scene)
 
 
-def _images(scene: Scene) -> tuple[Image, ...]:
-    return photographed(scene) if scene.has_photographs else scene.images
+def _images(scene: Scene, hold_out: int) -> tuple[Image, ...]:
+    return photographed(scene, hold_out) if scene.has_photographs else scene.images
 
 
 def _views(scene: Scene, images: Sequence[Image], progress: Progress) -> tuple[View, ...]:
@@ -187,6 +196,30 @@ def _views(scene: Scene, images: Sequence[Image], progress: Progress) -> tuple[V
     if scene.has_photographs:
         return read_views(scene, images, MAX_SIZE, progress)
     return frames_of(scene)
+
+
+def _free_rays(
+    scene: Scene,
+    images: Sequence[Image],
+    views: Sequence[View],
+    seen: Sequence[Float64[np.ndarray, "M 3"]],
+    rng: np.random.Generator,
+    progress: Progress,
+) -> FreeRays | None:
+    """Where rays are known to be free: up to tracked points, and up to what stereo confirms."""
+    from splatseed.seeding.clouds.evidence import FreeRays  # noqa: PLC0415  (loads Numba)
+
+    certain = seen if scene.tracks is not None else [np.empty((0, 3))] * len(views)
+    if not scene.has_photographs or len(views) < TWO:
+        return FreeRays.of(views, certain) if scene.tracks is not None else None
+    from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
+    from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
+    from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415  (loads with its use)
+
+    seed, visibility = int(rng.integers(1 << 32)), known_visibility(scene)
+    stereo = find_stereo(views, images, visibility, StereoSettings(), seed, progress)
+    maps = [stereo.map(i).depth for i in range(len(views))]
+    return FreeRays.of(views, certain, [np.nan_to_num(depth, nan=np.inf) for depth in maps])
 
 
 def _check_in_view(streamed: Streamed, scene: Scene) -> None:

@@ -31,8 +31,8 @@ DEFAULT = 4 << 30
 """Most bytes of memory, unless the user says so."""
 RESERVED = 700_000_000
 """Bytes for the program, its libraries and a chunk."""
-PER_PIXEL = 4
-"""Bytes for each pixel of the photographs: the pixel, and depths in cells."""
+PER_PIXEL = 8
+"""Bytes for each pixel of the photographs: the pixel, grey as well, and what stereo knows of it."""
 TEXT_ROW = 40
 """Bytes of a line of text, to tell how far reading is where the number of lines is not known."""
 
