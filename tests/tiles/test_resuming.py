@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.process.tasks import HereTasks
 from splatseed.tiles import check_disk, check_tileable, plan_tiles, run
 from splatseed.tiles.reading import origin_of
+from splatseed.tiles.repeats import find_repeats
 from splatseed.upsample import configure, upsample
 
 LINEAR = configure("linear")
@@ -134,8 +136,10 @@ def test_nothing_finite_and_too_few_are_refused(tiles):
 
 def test_methods_of_the_whole_are_refused():
     for name, method in (("auto", configure("auto")), ("voronoi", configure("voronoi", "paper"))):
-        with pytest.raises(ParameterError, match=r"tile by tile .* at once\. Choose one of these"):
+        with pytest.raises(ParameterError, match=r"tile by tile .* at once\. Choose one of these.* or work in"):
             check_tileable(name, method)
+    with pytest.raises(ParameterError, match="or voronoi with --profile default"):
+        check_tileable("voronoi", configure("voronoi", "paper"))
     check_tileable("random", configure("random"))
 
 
@@ -147,6 +151,36 @@ def test_too_little_memory_names_what_is_needed():
     plan = plan_tiles(LINEAR, 10**8, 3 * 10**8, int(fix[:-1]) << 20)
     assert plan.memory <= int(fix[:-1]) << 20
     assert plan.tiles >= 10**8 / plan.tile_points
+
+
+def test_what_the_source_keeps_counts():
+    bound = 1 << 30
+    plain = plan_tiles(LINEAR, 10**7, 10**7, bound)
+    kept = plan_tiles(LINEAR, 10**7, 10**7, bound, held=bound // 2)
+    assert kept.tile_points < plain.tile_points
+    assert kept.memory <= bound
+    with pytest.raises(ParameterError, match=r"at least 1\.\d GB of memory"):
+        plan_tiles(LINEAR, 10**7, 10**7, bound, held=bound)
+
+
+def test_the_memory_for_repeats_is_that_of_a_tile(tiles, tmp_path, monkeypatch):
+    """However many there are: here nearly all new points fall together."""
+    peaks = []
+
+    def watched(*arguments):
+        tracemalloc.start()
+        find_repeats(*arguments)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+
+    monkeypatch.setattr(run, "find_repeats", watched)
+    for side in (8, 24):
+        grid = np.stack(np.meshgrid(*[np.arange(side)] * 2, [0]), axis=-1).reshape(-1, 3)
+        cloud = PointCloud((grid + 2**24).astype(np.float32), np.zeros(grid.shape, np.uint8))
+        tiles.path = tmp_path / f"{side}.tiles"
+        tiles(cloud, "linear", LINEAR, most=40, ratio=40)
+        assert tiles.tiled.num_repeated > 0.9 * tiles.tiled.num_new
+    assert peaks[1] < 1.5 * peaks[0]
 
 
 def test_more_processes_share_the_memory():

@@ -91,7 +91,7 @@ def test_a_survey_far_from_zero_is_moved_and_says_so(tmp_path, splatseed):
     [
         (("--memory", "100M"), r"at least .* MB of memory for 1 process; found 100 MB"),
         (("--memory", "much"), r"an amount of memory such as 4G or 500M; found 'much'"),
-        (("--tile-points", "99", "--budget", "50"), r"no option that needs all .* found --budget"),
+        (("--tile-points", "99", "--budget", "50"), r"looks at all .* found --budget\. Leave it .*--num-points"),
         (("--tile-points", "99", "--method", "stereo"), r"a method that works tile by tile"),
     ],
 )
@@ -102,6 +102,18 @@ def test_what_cannot_be_is_one_line(words, told, cloud, tmp_path, splatseed):
     run = splatseed("upsample", cloud, "-o", tmp_path / "out", *method, *words)
     assert run.code == 2
     assert re.search(told, run.err.replace("\n", " "))
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_a_model_larger_than_the_memory_is_refused_before_it_is_read(
+    room, tmp_path, splatseed, monkeypatch
+):
+    monkeypatch.setattr("splatseed.commands.upsample.tiled.load_scene", None)  # must not be called
+    run = splatseed("upsample", room, "-o", tmp_path / "out", "--method", "mls", "--memory", "200M")
+    assert run.code == 2
+    told = " ".join(run.err.split())
+    assert "MB of memory for the points and tracks of" in told
+    assert "found 200 MB. Pass --memory 30" in told
     assert not list(tmp_path.glob("out*"))
 
 

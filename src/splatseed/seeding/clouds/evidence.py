@@ -4,9 +4,9 @@ Notation: a view's *surface* is the depth of its cells (``coverage.cell_depths``
 which a typical cell holds ``FILLED`` points, so that walls have no holes. A view *sees* points in
 front of its surface, and up to ``BEHIND`` of the depth behind it. The *samples* of a point are its
 pixels in the ``CLOSEST`` views that see it; their *agreement* is the share within ``ALIKE`` grey
-levels of their median, channel by channel. A tracked point of Structure-from-Motion, or a depth that
-stereo confirms, proves that the ray to it is free: a cloud point in the same cell of the same view,
-clearly nearer, is *seen through*, and *confirmed* if it is about as far.
+levels of their median, channel by channel. A tracked point of Structure-from-Motion, or a depth of stereo,
+proves that the ray to it is free: a cloud point in the same cell of the same view, clearly nearer,
+is *seen through*, and *confirmed* if it is about as far.
 Promise: depends neither on the order of the points nor on the threads.
 """
 
@@ -164,7 +164,8 @@ def find_evidence(
             _observe(
                 block, grid_from_world(view, 1), np.sqrt(abs(view.K[0, 0] * view.K[1, 1])),
                 view.width, view.height, surfaces[v], behind, free, view.photograph, _mask(view),
-                closeness, samples, evidence.seen[part], evidence.through[part], evidence.confirmed[part],
+                closeness, samples, evidence.seen[part], evidence.through[part],
+                evidence.confirmed[part],
             )  # fmt: skip
             progress("look at photographs", (b * len(views) + v + 1) / steps)
         _summarise(closeness, samples, evidence.rgb[part], evidence.agreement[part])
