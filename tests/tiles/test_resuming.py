@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import signal
+import subprocess
+import sys
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -49,6 +54,38 @@ def test_a_kill_loses_one_step(name, number, sheet, tiles, monkeypatch):
     per_tile = name in {"weigh", "place"}
     assert len(again) == (tiles.tiled.tiles - number if per_tile else 1)
     xyz, _ = tiles(sheet, "linear", LINEAR, most=130)  # killed while the output was written
+    expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
+    np.testing.assert_array_equal(xyz, expected.xyz)
+
+
+@pytest.mark.slow
+def test_sigkill_in_the_middle_of_a_tile_loses_that_tile(sheet, tiles):
+    """A process of its own, as nothing can catch the signal."""
+    code = (
+        "import os, signal; from pathlib import Path; import numpy as np\n"
+        "from splatseed.tiles import run; from tests.tiles.conftest import Tiles\n"
+        "from splatseed.pointcloud import PointCloud; from splatseed.upsample import configure\n"
+        "complete = run.WorkFolder.complete\n"
+        "def killed(self, name):\n"
+        "    if name == 'made/000002': os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    complete(self, name)\n"
+        "run.WorkFolder.complete = killed\n"
+        f"kept = np.load({str(tiles.path.with_name('sheet.npz'))!r})\n"
+        "cloud = PointCloud(kept['xyz'], kept['rgb'])\n"
+        f"Tiles(Path({str(tiles.path)!r}))(cloud, 'linear', configure('linear'), most=130)\n"
+    )
+    np.savez(tiles.path.with_name("sheet.npz"), xyz=sheet.xyz, rgb=sheet.rgb)
+    root = Path(__file__).parents[2]
+    paths = os.pathsep.join([str(root), str(root / "src")])
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths}, check=False
+    )
+    assert done.returncode == -signal.SIGKILL
+    assert sorted(each.name for each in (tiles.path / "made").iterdir()) == [
+        "000000", "000001", "000002.partial",
+    ]  # fmt: skip
+    xyz, _ = tiles(sheet, "linear", LINEAR, most=130)
+    assert tiles.resumed
     expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
     np.testing.assert_array_equal(xyz, expected.xyz)
 
@@ -136,7 +173,9 @@ def test_nothing_finite_and_too_few_are_refused(tiles):
 
 def test_methods_of_the_whole_are_refused():
     for name, method in (("auto", configure("auto")), ("voronoi", configure("voronoi", "paper"))):
-        with pytest.raises(ParameterError, match=r"tile by tile .* at once\. Choose one of these.* or work in"):
+        with pytest.raises(
+            ParameterError, match=r"tile by tile .* at once\. Choose one of these.* or work in"
+        ):
             check_tileable(name, method)
     with pytest.raises(ParameterError, match="or voronoi with --profile default"):
         check_tileable("voronoi", configure("voronoi", "paper"))

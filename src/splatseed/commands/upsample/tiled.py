@@ -21,7 +21,7 @@ from splatseed.console import (
     print_pairs,
     stage_display,
 )
-from splatseed.errors import OutputError, ParameterError
+from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
 from splatseed.io import WriteReport, load_scene, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap.scene import find_model
@@ -339,9 +339,15 @@ def _summarise(
 
 @contextmanager
 def _kept(path: Path) -> Iterator[None]:
-    """Say that what is done is kept, if the block is interrupted or the disk is full."""
+    """Say that what is done is kept, if the block is interrupted or the disk is full.
+
+    Of an input that is damaged or empty nothing is kept: mended, it is another.
+    """
     try:
         yield
+    except (PointCloudError, SceneFormatError):
+        shutil.rmtree(path, ignore_errors=True)
+        raise
     except KeyboardInterrupt:
         ERR.print(f"\nFinished tiles are kept in {path}; the same command goes on from there.")
         raise

@@ -46,6 +46,8 @@ UNKNOWN = 0.5
 CORNER = 0.5
 """Below this share of the photographs' cells, a note says how little the cloud covers."""
 CELL = 8
+DEGREES = 0.01
+"""Extent to the sides over height, below which coordinates may be degrees: a degree is 100 km."""
 TWO = 2
 """Photographs that stereo compares at least."""
 
@@ -170,6 +172,9 @@ class GivenClouds(Cloud):
         if scene.has_photographs and (self.recolor or not colored):
             rgb = evidence.rgb
         notes = (*_read_notes(streamed), *_check_fit(judged), *_fates(judged, len(voxels)))
+        if scene.has_photographs and not colored:
+            lacks = "no colours" if own is None else "intensity only"
+            notes = (*notes, f"The cloud has {lacks}: colours are those of the photographs.")
         return NewPoints(
             xyz, rgb, (*notes, *_note_on_cover(scene, xyz)),
             confidence=np.nan_to_num(evidence.agreement, nan=UNKNOWN),
@@ -231,18 +236,33 @@ def _check_in_view(streamed: Streamed, scene: Scene) -> None:
     if len(streamed.voxels):
         return
     centers = np.array([image.camera.center for image in scene.images])
+    fix = "They are in different frames: find the transform with --align, or give it with "
+    fix += "--transform FILE."
+    if _like_degrees(streamed.low, streamed.high):
+        fix = "They look like longitude and latitude: export the cloud in metres, then --align it."
     raise PointCloudError(
         "points of the cloud in view of the scene's cameras, which stand "
         f"{_span(centers.min(axis=0), centers.max(axis=0))}",
         found=f"none of {streamed.voxels.total:,}, which lie {_span(streamed.low, streamed.high)}",
-        fix="They are in different frames: find the transform with --align, or give it with "
-        "--transform FILE.",
+        fix=fix,
     )
 
 
+def _like_degrees(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> bool:
+    """Whether a cloud is flat as a sheet on edge, as metres above degrees are."""
+    across, up = (high - low)[:2].max(), (high - low)[2]
+    within = max(abs(low[0]), abs(high[0])) <= 180 and max(abs(low[1]), abs(high[1])) <= 90
+    return bool(within and across < DEGREES * up)
+
+
 def _span(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> str:
-    first, last = (", ".join(f"{value:.6g}" for value in each) for each in (low, high))
+    first, last = (", ".join(_plain(value) for value in each) for each in (low, high))
     return f"from ({first}) to ({last})"
+
+
+def _plain(value: float) -> str:
+    """A coordinate without an exponent where its digits matter."""
+    return f"{value:.0f}" if 1e5 <= abs(value) < 1e12 else f"{value:.6g}"
 
 
 def _check_fit(judged: Judged) -> tuple[str, ...]:
@@ -261,7 +281,7 @@ def _check_fit(judged: Judged) -> tuple[str, ...]:
             fix="It is in another frame (try --align, or give --transform FILE), or of another "
             "place.",
         )
-    doubt = ": check its frame" if judged.fit < DOUBTFUL else ""
+    doubt = ": check its frame and its unit" if judged.fit < DOUBTFUL else ""
     return (f"The cloud fits: {found}, within 3%{doubt}.",)
 
 
