@@ -67,7 +67,8 @@ def repeated(work: WorkFolder, first: int, last: int) -> Bool[np.ndarray, " n"]:
     """Which of a run of new points repeat a position."""
     if repeats_known(work) is None:
         return np.zeros(last - first, bool)
-    return np.fromfile(work.file(FLAGS), np.uint8, last - first, offset=first) != 0
+    flags = np.fromfile(work.file(FLAGS), np.uint8, last - first, offset=first)
+    return np.asarray(flags != 0)
 
 
 def _repeats_in(

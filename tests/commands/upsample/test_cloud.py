@@ -102,12 +102,13 @@ def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, tmp_path):
     )
 
 
+FAR = np.array([564_000, 5_932_000, 87])
 SPOILT = {
     "cut short": lambda xyz: xyz,
     "empty": lambda xyz: xyz[:0],
-    "not a number": lambda xyz: np.full((9, 3), np.nan),
+    "not a number": lambda xyz: np.full_like(xyz[:9], np.nan),
     "degrees": lambda xyz: np.column_stack([xyz[:, :2] / 1e5 + (11.5, 48.1), xyz[:, 2] + 500]),
-    "a national grid": lambda xyz: xyz + (564_000, 5_932_000, 87),
+    "a national grid": lambda xyz: xyz + FAR,
     "another place": lambda xyz: np.column_stack([3 * xyz[:, :2], 0.5 * np.sin(xyz[:, 0])]),
     "once, a million times": lambda xyz: np.repeat(xyz[:1] + 9, 1_000_000, axis=0),
 }

@@ -1,7 +1,8 @@
 """Scenes of a benchmark: opening one, and checking it before it is run.
 
 Promise: a benchmark always opens a scene in the same way; whatever would make every run on a scene
-fail (no photographs, lenses with distortion, unreadable depth or scan) is detected here, before any run.
+fail (no photographs, lenses with distortion, unreadable depth or scan) is detected here, before any
+run.
 """
 
 from __future__ import annotations

@@ -124,8 +124,8 @@ def _check_model(path: Path, bound: int | None) -> None:
     if model is None or bound is None or needed <= bound:
         return
     raise ParameterError(
-        f"at least {words_of(needed, up=True)} of memory for the points and tracks of {path}, which "
-        "are read whole",
+        f"at least {words_of(needed, up=True)} of memory for the points and tracks of {path}, which"
+        " are read whole",
         found=words_of(bound),
         fix=f"Pass {option_of(needed)}; or name a file of its points alone, such as points3D.ply.",
     )

@@ -4,9 +4,9 @@ Notation: a view's *surface* is the depth of its cells (``coverage.cell_depths``
 which a typical cell holds ``FILLED`` points, so that walls have no holes. A view *sees* points in
 front of its surface, and up to ``BEHIND`` of the depth behind it. The *samples* of a point are its
 pixels in the ``CLOSEST`` views that see it; their *agreement* is the share within ``ALIKE`` grey
-levels of their median, channel by channel. A tracked point of Structure-from-Motion, or a depth of stereo,
-proves that the ray to it is free: a cloud point in the same cell of the same view, clearly nearer,
-is *seen through*, and *confirmed* if it is about as far.
+levels of their median, channel by channel. A tracked point of Structure-from-Motion, or a depth of
+stereo, proves that the ray to it is free: a cloud point in the same cell of the same view, clearly
+nearer, is *seen through*, and *confirmed* if it is about as far.
 Promise: depends neither on the order of the points nor on the threads.
 """
 
@@ -81,7 +81,7 @@ class FreeRays:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What N points have speaking for and against them.
+    """The evidence for and against N points.
 
     Args:
         seen: In how many views each is visible, uint16 [N].

@@ -1,10 +1,9 @@
-"""Which voxels of a cloud stay: those that a photograph sees and nothing speaks against.
+"""Which voxels of a cloud stay: those that a photograph sees and nothing contradicts.
 
-Notation: against a voxel speaks that views *see past* it (``evidence``), that the photographs that
-see it do not *agree* on its colour although no ray ends there, that they show *another colour* than
-the cloud, or that it lies *alone*: its support (``support``) is below ``ALONE`` of the median.
-Ghosts also hide what is behind them, so where many voxels go, the others are judged once more
-without them.
+Notation: four things contradict a voxel. Views *see past* it (``evidence``); the photographs that
+see it do not *agree* on its colour, although no ray ends there; they show *another colour* than the
+cloud; or it lies *alone*: its support (``support``) is below ``ALONE`` of the median. Ghosts also
+hide what is behind them, so where many voxels go, the others are judged once more without them.
 Promise: depends neither on the order of the points nor on the threads.
 """
 
@@ -87,7 +86,7 @@ def judge(
         voxels: The cloud.
         colors: Its own colours, where it has some.
         progress: Told how far it is.
-        clean: Whether voxels go that something speaks against, or only those that are hidden.
+        clean: Whether contradicted voxels go, or only hidden ones.
         rays: Where rays are known to be free.
 
     Raises:
@@ -130,7 +129,7 @@ def _alone(voxels: Voxels) -> Bool[np.ndarray, " N"]:
 def _against(
     evidence: Evidence, colors: UInt8[np.ndarray, "N 3"] | None
 ) -> tuple[Bool[np.ndarray, " N"], dict[str, int]]:
-    """Which voxels something speaks against, and how many by reason; the first counts."""
+    """Which voxels are contradicted, and how many by reason; the first counts."""
     past = (evidence.through >= THROUGH) & (evidence.through > evidence.confirmed)
     torn = (evidence.seen >= ASKED) & (evidence.agreement < AGREES)  # NaN compares false
     torn &= evidence.confirmed < CONFIRMED  # what shines looks different from all sides

@@ -1,9 +1,9 @@
 """The method ``cloud``: seeds from scans and dense clouds, as many as the photographs resolve.
 
 Points stream into voxels (``voxels``); of these, those stay that a photograph sees and nothing
-speaks against (``evidence``): no ray of Structure-from-Motion or stereo passes through them, the
-photographs that see them agree on a colour, and they do not float alone. A budget thins them
-afterwards, as those of every method.
+contradicts (``evidence``, ``judging``): no ray of Structure-from-Motion or stereo passes through
+them, the photographs that see them agree on a colour, and they do not float alone. A budget thins
+them afterwards, as those of every method.
 Promise: memory does not grow with the clouds; a cloud that is nowhere near the cameras, or does not
 fit the scene's own points, is refused with the reason.
 """
