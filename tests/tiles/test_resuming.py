@@ -4,6 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import signal
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +19,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.process.tasks import HereTasks
 from splatseed.tiles import check_disk, check_tileable, plan_tiles, run
 from splatseed.tiles.reading import origin_of
+from splatseed.tiles.repeats import find_repeats
 from splatseed.upsample import configure, upsample
 
 LINEAR = configure("linear")
@@ -47,6 +54,38 @@ def test_a_kill_loses_one_step(name, number, sheet, tiles, monkeypatch):
     per_tile = name in {"weigh", "place"}
     assert len(again) == (tiles.tiled.tiles - number if per_tile else 1)
     xyz, _ = tiles(sheet, "linear", LINEAR, most=130)  # killed while the output was written
+    expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
+    np.testing.assert_array_equal(xyz, expected.xyz)
+
+
+@pytest.mark.slow
+def test_sigkill_in_the_middle_of_a_tile_loses_that_tile(sheet, tiles):
+    """A process of its own, as nothing can catch the signal."""
+    code = (
+        "import os, signal; from pathlib import Path; import numpy as np\n"
+        "from splatseed.tiles import run; from tests.tiles.conftest import Tiles\n"
+        "from splatseed.pointcloud import PointCloud; from splatseed.upsample import configure\n"
+        "complete = run.WorkFolder.complete\n"
+        "def killed(self, name):\n"
+        "    if name == 'made/000002': os.kill(os.getpid(), signal.SIGKILL)\n"
+        "    complete(self, name)\n"
+        "run.WorkFolder.complete = killed\n"
+        f"kept = np.load({str(tiles.path.with_name('sheet.npz'))!r})\n"
+        "cloud = PointCloud(kept['xyz'], kept['rgb'])\n"
+        f"Tiles(Path({str(tiles.path)!r}))(cloud, 'linear', configure('linear'), most=130)\n"
+    )
+    np.savez(tiles.path.with_name("sheet.npz"), xyz=sheet.xyz, rgb=sheet.rgb)
+    root = Path(__file__).parents[2]
+    paths = os.pathsep.join([str(root), str(root / "src")])
+    done = subprocess.run(
+        [sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths}, check=False
+    )
+    assert done.returncode == -signal.SIGKILL
+    assert sorted(each.name for each in (tiles.path / "made").iterdir()) == [
+        "000000", "000001", "000002.partial",
+    ]  # fmt: skip
+    xyz, _ = tiles(sheet, "linear", LINEAR, most=130)
+    assert tiles.resumed
     expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
     np.testing.assert_array_equal(xyz, expected.xyz)
 
@@ -134,8 +173,12 @@ def test_nothing_finite_and_too_few_are_refused(tiles):
 
 def test_methods_of_the_whole_are_refused():
     for name, method in (("auto", configure("auto")), ("voronoi", configure("voronoi", "paper"))):
-        with pytest.raises(ParameterError, match=r"tile by tile .* at once\. Choose one of these"):
+        with pytest.raises(
+            ParameterError, match=r"tile by tile .* at once\. Choose one of these.* or work in"
+        ):
             check_tileable(name, method)
+    with pytest.raises(ParameterError, match="or voronoi with --profile default"):
+        check_tileable("voronoi", configure("voronoi", "paper"))
     check_tileable("random", configure("random"))
 
 
@@ -147,6 +190,36 @@ def test_too_little_memory_names_what_is_needed():
     plan = plan_tiles(LINEAR, 10**8, 3 * 10**8, int(fix[:-1]) << 20)
     assert plan.memory <= int(fix[:-1]) << 20
     assert plan.tiles >= 10**8 / plan.tile_points
+
+
+def test_what_the_source_keeps_counts():
+    bound = 1 << 30
+    plain = plan_tiles(LINEAR, 10**7, 10**7, bound)
+    kept = plan_tiles(LINEAR, 10**7, 10**7, bound, held=bound // 2)
+    assert kept.tile_points < plain.tile_points
+    assert kept.memory <= bound
+    with pytest.raises(ParameterError, match=r"at least 1\.\d GB of memory"):
+        plan_tiles(LINEAR, 10**7, 10**7, bound, held=bound)
+
+
+def test_the_memory_for_repeats_is_that_of_a_tile(tiles, tmp_path, monkeypatch):
+    """However many there are: here nearly all new points fall together."""
+    peaks = []
+
+    def watched(*arguments):
+        tracemalloc.start()
+        find_repeats(*arguments)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+
+    monkeypatch.setattr(run, "find_repeats", watched)
+    for side in (8, 24):
+        grid = np.stack(np.meshgrid(*[np.arange(side)] * 2, [0]), axis=-1).reshape(-1, 3)
+        cloud = PointCloud((grid + 2**24).astype(np.float32), np.zeros(grid.shape, np.uint8))
+        tiles.path = tmp_path / f"{side}.tiles"
+        tiles(cloud, "linear", LINEAR, most=40, ratio=40)
+        assert tiles.tiled.num_repeated > 0.9 * tiles.tiled.num_new
+    assert peaks[1] < 1.5 * peaks[0]
 
 
 def test_more_processes_share_the_memory():

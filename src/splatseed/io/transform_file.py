@@ -69,8 +69,8 @@ def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarit
         world = None
     if world is None:
         raise SceneFormatError(
-            f"{path} to hold a similarity: a matrix of 3 or 4 rows of 4, by itself or as "
-            "transform, with a scale beside it",
+            f"{path} to hold a similarity (rotation, shift and one scale; no shear, no mirror): 3 "
+            "or 4 rows of 4 numbers, by themselves or as transform, with a scale beside them",
             found=repr(rows)[:80],
             fix=fix,
         )

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from splatseed.errors import ParameterError
 
-__all__ = ["bytes_of", "check_memory", "free_memory"]
+__all__ = ["bytes_of", "check_memory", "free_memory", "option_of", "words_of"]
 
 CGROUP = Path("/sys/fs/cgroup")
 SUFFIXES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
@@ -60,6 +60,24 @@ def bytes_of(text: str) -> int:
             "an amount of memory such as 4G or 500M", found=repr(text), fix="Give such an amount."
         )
     return int(amount * SUFFIXES[suffix])
+
+
+def words_of(amount: int, *, up: bool = False) -> str:
+    """Bytes in words: tenths of GB, or whole MB.
+
+    Args:
+        amount: The bytes.
+        up: Whether to round up.
+    """
+    unit, name, digits = (1 << 30, "GB", 1) if amount >= 1 << 30 else (1 << 20, "MB", 0)
+    scaled = amount / unit * 10**digits
+    rounded = (-int(-scaled // 1) if up else round(scaled)) / 10**digits
+    return f"{rounded:,.{digits}f} {name}"
+
+
+def option_of(amount: int) -> str:
+    """The option that allows at least so many bytes, such as ``--memory 4.1G``."""
+    return f"--memory {words_of(amount, up=True).replace(',', '')[:-1].replace(' ', '')}"
 
 
 def free_memory() -> int | None:

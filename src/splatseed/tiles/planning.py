@@ -10,14 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatseed.errors import OutputError, ParameterError
+from splatseed.process.memory import option_of, words_of
 from splatseed.tiles.work import free_space
 from splatseed.upsample.nearest import NearestMethod
 
-__all__ = ["TilePlan", "check_disk", "plan_tiles", "words_of"]
+__all__ = ["TilePlan", "check_disk", "plan_tiles"]
 
 PROCESS = 300 << 20
 """Memory of a process before it holds any points: libraries, compiled kernels, and their slack."""
-PER_POINT, PER_NEIGHBOR, PER_NEW = 200, 20, 50
+PER_POINT, PER_NEIGHBOR, PER_NEW = 200, 20, 100
 """Bytes that a tile takes for each point, for each neighbour of each, and for each new point."""
 MOST, LEAST = 1 << 20, 1 << 13
 """Larger tiles are no faster; smaller ones spend their time on their borders."""
@@ -66,6 +67,7 @@ def plan_tiles(
     *,
     processes: int = 1,
     tile_points: int | None = None,
+    held: int = 0,
 ) -> TilePlan:
     """Choose the size of tiles.
 
@@ -76,6 +78,7 @@ def plan_tiles(
         memory: Bytes that all processes may take together.
         processes: How many there are.
         tile_points: Most points in a tile, if the user says so.
+        held: Bytes that the source keeps in memory all the while.
 
     Raises:
         ParameterError: The memory is not enough.
@@ -83,15 +86,14 @@ def plan_tiles(
     neighbors = method.num_queried if isinstance(method, NearestMethod) else 0
     ratio = 4.0 if count is None or num_new is None else num_new / max(count, 1)
     each = int(PER_POINT + PER_NEIGHBOR * neighbors + PER_NEW * ratio)
-    fixed = 0 if isinstance(method, NearestMethod) else 3 * (count or 0)  # the colours it draws
+    fixed = held + (0 if isinstance(method, NearestMethod) else 3 * (count or 0))  # its colours
     needed = processes * (PROCESS + LEAST * each) + fixed
     if memory < needed:
         raise ParameterError(
             f"at least {words_of(needed, up=True)} of memory for {processes} "
             f"process{'' if processes == 1 else 'es'}",
             found=words_of(memory),
-            fix=f"Pass --memory {words_of(needed, up=True).replace(' GB', 'G').replace(' MB', 'M')}"
-            + (", or fewer --jobs." if processes > 2 else "."),
+            fix=f"Pass {option_of(needed)}" + (", or fewer --jobs." if processes > 2 else "."),
         )
     room = (memory - fixed) // processes - PROCESS
     most = min(tile_points or MOST, room // each)
@@ -106,7 +108,7 @@ def plan_tiles(
 def _disk(method: object, count: int, num_new: int) -> int:
     """Bytes at most on disk at a time: rows, tiles, what the draw needs, new points, output."""
     neighbors = method.num_neighbors if isinstance(method, NearestMethod) else 0
-    made = num_new * 15 + count * 12
+    made = num_new * 16 + count * 12
     at_work = count * (27 + 23 + 16 + 12 + 12 + 32 + 4 * neighbors) + made
     in_the_end = count * (27 + 8) + made + (count + num_new) * (27 + 43)
     return max(at_work, in_the_end)
@@ -130,16 +132,3 @@ def check_disk(path: Path, needed: int | None, there: int = 0) -> None:
             found=words_of(free),
             fix="Free some space, choose an output on a larger disk, or ask for fewer points.",
         )
-
-
-def words_of(amount: int, *, up: bool = False) -> str:
-    """Bytes in words: tenths of GB, or whole MB.
-
-    Args:
-        amount: The bytes.
-        up: Whether to round up.
-    """
-    unit, name, digits = (1 << 30, "GB", 1) if amount >= 1 << 30 else (1 << 20, "MB", 0)
-    scaled = amount / unit * 10**digits
-    rounded = (-int(-scaled // 1) if up else round(scaled)) / 10**digits
-    return f"{rounded:,.{digits}f} {name}"

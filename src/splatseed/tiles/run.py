@@ -21,7 +21,7 @@ from splatseed.tiles.assembly import Piece, box_points, new_points, originals
 from splatseed.tiles.drawing import draw
 from splatseed.tiles.planning import TilePlan
 from splatseed.tiles.reading import Rows, read_rows
-from splatseed.tiles.repeats import find_repeats
+from splatseed.tiles.repeats import find_repeats, repeated, repeats_known
 from splatseed.tiles.sources import Source
 from splatseed.tiles.splitting import split
 from splatseed.tiles.steps import made_name, place_tile, weigh_tile, weighed_name
@@ -32,6 +32,9 @@ from splatseed.upsample.methods.bounding_box import BoundingBox
 from splatseed.upsample.nearest import NearestMethod
 
 __all__ = ["Request", "Tiled", "check_tileable", "make_tiled"]
+
+LAYOUT = 2
+"""Changes with the files of the work folder, so that another version's are not gone on with."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class Request:
             "ratio": self.ratio,
             "num_points": self.num_points,
             "seed": self.seed,
+            "layout": LAYOUT,
         }
 
 
@@ -105,19 +109,15 @@ class Tiled:
         return new_points(self.work, self.at_once, progress)
 
     @property
-    def repeated(self) -> np.ndarray:
-        """Numbers of the new points that repeat a position, which scenes are written without."""
-        if not self.work.has("repeats"):
-            return np.empty(0, np.int64)
-        return self.work.load("repeats", "number")
+    def num_repeated(self) -> int:
+        """New points that repeat a position, which scenes are written without."""
+        return repeats_known(self.work) or 0
 
     def new_distinct(self, progress: Progress) -> Iterator[Piece]:
         """The new points but for those."""
-        repeated, first = self.repeated, 0
+        first = 0
         for xyz, rgb in self.new(progress):
-            kept = np.ones(len(xyz), bool)
-            part = slice(*np.searchsorted(repeated, (first, first + len(xyz))))
-            kept[repeated[part] - first] = False
+            kept = ~repeated(self.work, first, first + len(xyz))
             first += len(xyz)
             yield xyz[kept], rgb[kept]
 
@@ -134,16 +134,19 @@ def check_tileable(name: str, method: object) -> None:
     """
     if isinstance(method, BoundingBox):
         return
+    way_out = ""
     if not isinstance(method, NearestMethod):
         reason = f"{name}, which needs the whole scene at once"
     elif method.whole:
         reason = f"{name} with {method.whole}, which needs all points at once"
+        way_out = f", or {name} with --profile default"
     else:
         return
     raise ParameterError(
         "a method that works tile by tile (linear, triangle, spline, mls, voronoi, random)",
         found=reason,
-        fix="Choose one of these, or work in memory: without --memory, --jobs and --executor.",
+        fix=f"Choose one of these{way_out}, or work in memory: without --memory, --jobs, --executor"
+        " and --tile-points.",
     )
 
 
@@ -211,8 +214,8 @@ def _make(
         draw(work, num_new, seed, progress)
     left = [(path, method, tile) for tile in tiles if not work.has(made_name(tile))]
     tasks.run(place, left, "new points", progress)
-    if not work.has("repeats"):
-        find_repeats(work, store, progress)
+    if repeats_known(work) is None:
+        find_repeats(work, store, num_new, progress)
     for name in ("tiles", "weighed", "drawn", "tile_of_rank"):  # the output needs the space
         work.discard(name)
 

@@ -29,9 +29,11 @@ class Source(ABC):
     Attributes:
         count: How many there are; None if only reading tells.
         trusted: Which of them may be bases; None if all may.
+        held: Bytes that it keeps in memory.
     """
 
     count: int | None
+    held: int = 0
     trusted: Bool[np.ndarray, " n"] | None = None
 
     @abstractmethod
@@ -94,6 +96,7 @@ class SceneSource(Source):
             )
         self.count = len(self.points)
         self.trusted = trusted_originals(self.scene)
+        self.held = _bytes_of(self.scene)
 
     def chunks(self, size: int) -> Iterator[CloudChunk]:
         """See ``Source``."""
@@ -108,3 +111,10 @@ class SceneSource(Source):
         for array in (self.points.xyz, self.points.rgb, trusted):
             digest.update(np.ascontiguousarray(array).data)
         return {"points": len(self.points), "digest": digest.hexdigest()}
+
+
+def _bytes_of(scene: Scene) -> int:
+    """Bytes of a scene's arrays."""
+    parts = [scene.points, scene.tracks, *(image.observations for image in scene.images)]
+    arrays = (value for part in parts if part is not None for value in vars(part).values())
+    return sum(value.nbytes for value in arrays if isinstance(value, np.ndarray))

@@ -50,19 +50,19 @@ def weigh_tile(work: WorkFolder, method: NearestMethod, tile: int) -> None:
     """
     store = TileStore(work)
     k = min(method.num_queried, store.count - 1)
-    found = find_neighborhood(store, tile, k)
-    cloud = prepared(store, found.points, found.num_own)
-    neighbors = neighbors_of(store, found.points, found.idx)
+    around = find_neighborhood(store, tile, k)
+    cloud = prepared(store, around.points, around.num_own)
+    neighbors = neighbors_of(store, around.points, around.idx)
     weight, known = method.weigh(cloud, neighbors, silent)
-    by_position = np.empty(found.num_own)
-    by_position[found.order] = weight
-    idx, last = found.idx[: found.num_own, : method.num_neighbors], len(found.idx)
-    ring = found.points.select(np.arange(found.num_own, last))
+    by_position = np.empty(around.num_own)
+    by_position[around.order] = weight
+    idx, last = around.idx[: around.num_own, : method.num_neighbors], len(around.idx)
+    ring = around.points.select(np.arange(around.num_own, last))
     work.save(
         weighed_name(tile),
         {
             "weight": by_position,
-            "order": found.order,
+            "order": around.order,
             "idx": idx,
             **{f"ring_{name}": getattr(ring, name) for name in ("xyz", "rgb", "rank", "trusted")},
             **{f"{KNOWN}{name}": values for name, values in known.items()},

@@ -37,7 +37,7 @@ def _some(strategy):
 
 PLANS = st.builds(
     Plan,
-    methods=_some(st.sampled_from(["sfm", "linear", "mls", "depth"])),
+    methods=_some(st.sampled_from(["sfm", "linear", "mls", "depth", "cloud+auto"])),
     ratios=_some(RATIOS),
     strategies=_some(st.sampled_from(get_args(StrategyName))),
     profiles=_some(st.sampled_from(["default", "paper"])),
@@ -56,6 +56,7 @@ PLANS = st.builds(
             name=TEXTS,
             images=st.just("") | TEXTS,
             depth=st.just("") | TEXTS.map(lambda text: f"/{text}"),
+            cloud=st.just("") | TEXTS.map(lambda text: f"/{text}"),
         ),
         max_size=3,
         unique_by=lambda scene: scene.name,
@@ -72,6 +73,7 @@ def test_a_plan_survives_its_file(tmp_path_factory, plan):
     for a, b in zip(again.scenes, plan.scenes, strict=True):
         assert (a.name, a.images, bool(a.depth)) == (b.name, b.images, bool(b.depth))
         assert (Path(a.path), Path(a.depth)) == (Path(b.path), Path(b.depth))
+        assert (bool(a.cloud), Path(a.cloud)) == (bool(b.cloud), Path(b.cloud))
 
 
 def test_a_file_has_a_key_for_each_field():
@@ -162,6 +164,35 @@ def test_depth_needs_maps_and_never_sees_the_test_photographs(small_plan, room_p
     assert depth.depth_digest == facts.depth_digest
     with pytest.raises(SceneNotFoundError, match="folder of depth maps"):
         survey(room_path, "room", depth=tmp_path / "none", with_depth=True)
+
+
+def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp_path):
+    methods = ("sfm", "cloud", "cloud+cover")
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("1 2 3\n" * 9)
+    plan = dataclasses.replace(small_plan, methods=methods, repeats=1)
+    plain = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
+    assert [run.arm.method for run in plain] == [SFM]
+    facts = survey(room_path, "room", cloud=scan)
+    sfm, *others = runs = plan_runs(plan, [facts], "cpu", "1")
+    assert [run.arm.label for run in runs] == list(methods)
+    assert sfm.key == plain[0].key
+    assert {run.cloud_path for run in others} == {str(scan)}
+    every = plan.training.test_every
+    assert [run.parameters for run in others] == [
+        {"hold_out": every}, {"hold_out": every, "cloud.hold_out": every},
+    ]  # fmt: skip
+    scan.write_text("1 2 4\n" * 9)
+    changed = plan_runs(plan, [survey(room_path, "room", cloud=scan)], "cpu", "1")
+    assert [run.key == old.key for run, old in zip(changed, runs, strict=True)] == [
+        True,
+        False,
+        False,
+    ]
+    assert Estimator([facts], []).seconds(others[0]) > 0
+    (tmp_path / "scan.laz").write_bytes(b"no scan")
+    with pytest.raises(SceneFormatError, match=r"scan\.laz"):
+        survey(room_path, "room", cloud=tmp_path / "scan.laz")
 
 
 def test_a_stray_camera_is_named_before_anything_is_run(room_path, tmp_path):

@@ -49,7 +49,9 @@ def test_results_of_the_old_layout_are_read():
 
 
 def test_where_a_scene_lies_is_no_part_of_the_key():
-    there = dataclasses.replace(SPEC, scene_path="/a", depth_path="/b", images="images_4")
+    there = dataclasses.replace(
+        SPEC, scene_path="/a", depth_path="/b", images="images_4", cloud_path="/c"
+    )
     assert there.key == SPEC.key
 
 
@@ -60,7 +62,7 @@ def test_a_whole_ratio_may_be_written_either_way():
 @pytest.mark.parametrize(
     "change",
     [{"scene": "x"}, {"scene_digest": "x"}, {"repeat": 1}, {"version": "2"},
-     {"parameters": {"k": 13}}, {"depth_digest": "x"},
+     {"parameters": {"k": 13}}, {"depth_digest": "x"}, {"cloud_digest": "x"},
      {"arm": Arm("mls", "default", 4, "none")}, {"arm": Arm("mls", "paper", 8, "none")},
      {"arm": Arm("mls", "default", 8, "mcmc")}, {"arm": Arm("linear", "default", 8, "none")}],
 )  # fmt: skip
@@ -82,7 +84,14 @@ def test_so_is_every_setting_of_training(change):
 def test_an_older_ledger_keeps_its_keys():
     """Its runs have fewer settings, and must not be run again for that."""
     old = json.loads(SPEC.to_json())
-    for later in ("placing", "seed_sizes", "seed_normals", "seed_colors"):
+    for later in (
+        "placing",
+        "seed_sizes",
+        "seed_normals",
+        "seed_colors",
+        "cloud_digest",
+        "cloud_path",
+    ):
         del old[later]
     assert RunSpec.from_json(json.dumps(old)) == SPEC
     where = {"scene_path", "depth_path", "images"}

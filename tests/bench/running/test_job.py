@@ -23,6 +23,7 @@ from splatseed.bench.running.seeds import make_seeds, scene_of
 from splatseed.cli import main
 from splatseed.io import load_scene, write_scene
 from splatseed.process.peak import peak_bytes
+from splatseed.synthetic import make_capture
 from splatseed.train.seeds import seeds_digest
 
 
@@ -134,6 +135,27 @@ def test_seeds_are_those_that_the_command_writes(specs, own_room, tmp_path, meth
     assert seeds_digest(seeds) == seeds_digest(written)
     assert len(seeds) == int(ratio) * (len(xyz) - 2)
     assert (seconds == 0.0) == (method == "sfm")
+
+
+@pytest.mark.parametrize("method", ["cloud", "cloud+cover"])
+def test_seeds_from_a_scan_are_those_that_the_command_writes(
+    small_plan, room_path, tmp_path, method
+):
+    scan, out = tmp_path / "scan.npz", tmp_path / "out"
+    surfaces = make_capture(0, 3, 32, 32).surfaces
+    np.savez(scan, xyz=surfaces.sample(20_000, np.random.default_rng(2)))
+    plan = dataclasses.replace(small_plan, methods=(method,), repeats=1)
+    (spec,) = plan_runs(plan, [survey(room_path, "room", cloud=scan)], "cpu", "1")
+    first, seconds = make_seeds(scene_of(spec), spec, bench=tmp_path)
+    again, known = make_seeds(scene_of(spec), spec, bench=tmp_path)
+    assert seeds_digest(first) == seeds_digest(again)
+    assert min(seconds, known) > 0
+    words = ["--method", method.removeprefix("cloud+"), "--cloud.hold-out", "4"]
+    words += ["--cover.hold-out", "4"] * (method != "cloud")
+    main(["upsample", str(room_path), "--cloud", str(scan), "-o", str(out), *words])
+    written = load_scene(out).points
+    np.testing.assert_array_equal(first.xyz, written.xyz)
+    np.testing.assert_array_equal(first.rgb, written.rgb)
 
 
 def test_an_interrupted_run_goes_on_to_the_same_result(specs, do, tmp_path):

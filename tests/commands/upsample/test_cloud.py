@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -50,6 +51,7 @@ def test_a_scan_in_the_scenes_frame(splatseed, room, scan, tmp_path):
     assert CLOUD in seeds.source
     assert "cloud)" in run.out
     assert "120,000 points were read" in run.err + run.out
+    assert re.search(r"voxels, 4\.\d GB of memory", run.out)
     told = json.loads((out / "splatseed.json").read_text())
     assert told["method"] == "cloud"
     assert len(told["cloud"]["files"]) == 2
@@ -100,6 +102,54 @@ def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, tmp_path):
     )
 
 
+FAR = np.array([564_000, 5_932_000, 87])
+SPOILT = {
+    "cut short": lambda xyz: xyz,
+    "empty": lambda xyz: xyz[:0],
+    "not a number": lambda xyz: np.full_like(xyz[:9], np.nan),
+    "degrees": lambda xyz: np.column_stack([xyz[:, :2] / 1e5 + (11.5, 48.1), xyz[:, 2] + 500]),
+    "a national grid": lambda xyz: xyz + FAR,
+    "another place": lambda xyz: np.column_stack([3 * xyz[:, :2], 0.5 * np.sin(xyz[:, 0])]),
+    "once, a million times": lambda xyz: np.repeat(xyz[:1] + 9, 1_000_000, axis=0),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("cut short", r"scan\.npz to be an archive of NumPy arrays"),
+        ("empty", "points with finite coordinates in .*found none"),
+        ("not a number", "found 9 that are not finite"),
+        ("degrees", "longitude and latitude: export the cloud in metres"),
+        ("a national grid", r"found none of 60,000, which lie from \(56\d{4}, 59\d{5}, .*--align"),
+        ("another place", "lie at its depth. It is in another frame .* or of another place"),
+        ("once, a million times", "found none of 1,000,000"),
+    ],
+)
+def test_what_is_wrong_with_a_scan_is_one_line(splatseed, room, xyz, tmp_path, kind, says):
+    path = tmp_path / "scan.npz"
+    np.savez(path, xyz=SPOILT[kind](xyz))
+    if kind == "cut short":
+        path.write_bytes(path.read_bytes()[:-20_000])
+    run = splatseed("upsample", room, "--cloud", path, "-o", tmp_path / "out")
+    assert run.code == 2
+    assert re.search(says, run.err.replace("\n", " "))
+    assert len([line for line in run.err.splitlines() if line.startswith("error")]) == 1
+    assert not list(tmp_path.glob("out*"))
+
+
+def test_duplicates_by_the_million_change_nothing(splatseed, room, xyz, tmp_path):
+    count = {}
+    for name, repeats in (("once", 0), ("often", 1_000_000)):
+        path = tmp_path / f"{name}.npz"
+        np.savez(path, xyz=np.concatenate([xyz, np.repeat(xyz[:1], repeats, axis=0)]))
+        run = splatseed("upsample", room, "--cloud", path, "-o", tmp_path / name)
+        assert run.code == 0
+        assert "no colours: colours are those of the photographs" in run.err + run.out
+        count[name] = len(load_scene(tmp_path / name).points)
+    assert abs(count["often"] - count["once"]) <= 2
+
+
 def test_a_cloud_beside_cover(splatseed, room, scan, tmp_path):
     words = ("--cloud", scan, "--method", "cover", "-o", tmp_path / "out", "--preview")
     run = splatseed("upsample", room, *words)
@@ -112,6 +162,9 @@ def test_a_cloud_beside_cover(splatseed, room, scan, tmp_path):
     [
         (("--method", "cloud"), "--cloud FILE"),
         (("--transform", "x.txt"), "--cloud FILE"),
+        (("--align",), "--cloud FILE"),
+        (("--cloud", "SCAN", "--memory", "500M"), "found 500 MB. Pass --memory 6"),
+        (("--cloud", "SCAN", "--memory", "a lot"), "such as 4G or 500M; found 'a lot'"),
         (("--cloud", "none.laz"), "no such file"),
         (("--cloud", "SCAN", "--method", "mls"), "with --cloud; found mls"),
         (("--cloud", "SCAN", "--align", "--transform", "t.txt"), "found both"),

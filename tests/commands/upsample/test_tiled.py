@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -91,17 +92,39 @@ def test_a_survey_far_from_zero_is_moved_and_says_so(tmp_path, splatseed):
     [
         (("--memory", "100M"), r"at least .* MB of memory for 1 process; found 100 MB"),
         (("--memory", "much"), r"an amount of memory such as 4G or 500M; found 'much'"),
-        (("--tile-points", "99", "--budget", "50"), r"no option that needs all .* found --budget"),
+        (
+            ("--tile-points", "99", "--budget", "50"),
+            r"looks at all .* found --budget\. Leave it .*--num-points",
+        ),
         (("--tile-points", "99", "--method", "stereo"), r"a method that works tile by tile"),
     ],
 )
 def test_what_cannot_be_is_one_line(words, told, cloud, tmp_path, splatseed):
-    import re
-
     method = () if "--method" in words else ("--method", "linear")
     run = splatseed("upsample", cloud, "-o", tmp_path / "out", *method, *words)
     assert run.code == 2
     assert re.search(told, run.err.replace("\n", " "))
+    assert not list(tmp_path.glob("out*"))
+
+
+@pytest.mark.parametrize("content", ["nan nan nan\n" * 9, "1 2 3\n" * 99 + "1 2\n"])
+def test_of_a_damaged_cloud_nothing_is_kept(content, tmp_path, splatseed):
+    (tmp_path / "a.xyz").write_text(content)
+    run = splatseed("upsample", tmp_path / "a.xyz", "-o", tmp_path / "out", "--method", "linear")
+    assert run.code == 2
+    assert re.search("row 100 of|none of them finite", run.err.replace("\n", " "))
+    assert [each.name for each in tmp_path.iterdir()] == ["a.xyz"]
+
+
+def test_a_model_larger_than_the_memory_is_refused_before_it_is_read(
+    room, tmp_path, splatseed, monkeypatch
+):
+    monkeypatch.setattr("splatseed.commands.upsample.tiled.load_scene", None)  # must not be called
+    run = splatseed("upsample", room, "-o", tmp_path / "out", "--method", "mls", "--memory", "200M")
+    assert run.code == 2
+    told = " ".join(run.err.split())
+    assert "MB of memory for the points and tracks of" in told
+    assert "found 200 MB. Pass --memory 30" in told
     assert not list(tmp_path.glob("out*"))
 
 

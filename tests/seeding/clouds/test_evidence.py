@@ -62,6 +62,22 @@ def test_colours_are_robust_means_and_agreement_their_share(wall):
     np.testing.assert_allclose(found.agreement[four], 0.75)
 
 
+def test_rays_are_free_up_to_what_stereo_knows(wall):
+    ghost = np.array([[0.02, 0.02, 2.0]], np.float32)
+    surfaces, cell = find_surfaces(VIEWS, wall, silent)
+    known = np.full((H // 4, W // 4), 4.0, np.float32)
+    nothing, nobody = np.full_like(known, np.inf), [np.empty((0, 3))] * 4
+    rays = FreeRays.of(VIEWS, nobody, [known, known, nothing, nothing])
+    xyz = np.concatenate([wall, ghost])
+    evidence = find_evidence(VIEWS, xyz, surfaces, cell, rays, silent)
+    assert evidence.through[-1] == 2
+    assert evidence.through[:-1].max() == 0
+    assert evidence.confirmed[-1] == 0
+    assert evidence.confirmed[:-1].max() == 2
+    nearer = FreeRays.of(VIEWS, [ghost.astype(float), *nobody[1:]], [known] * 4)
+    assert nearer.depths[0].min() == 2.0
+
+
 def test_rays_to_tracked_points_are_free(wall):
     ghost = np.array([[0.02, 0.02, 2.0]], np.float32)
     xyz = np.concatenate([wall, ghost])

@@ -66,6 +66,18 @@ def test_ghosts_go_and_what_they_hid_stays(scan, seeds):
     assert any("have another colour" in note and "lie alone" in note for note in seeds[1])
 
 
+def test_ghosts_without_colours_are_told_by_what_lies_behind(room, room_capture, scan, tmp_path):
+    np.savez(tmp_path / "bare.npz", xyz=scan[0])
+    kept = {}
+    for clean in (True, False):
+        cloud = ss.upsample(room, Cloud(clean=clean).of(tmp_path / "bare.npz"))
+        new = cloud.xyz[cloud.source == CLOUD].astype(float)
+        ghosts = np.abs(room_capture.surfaces.distance(new)) > 0.05
+        kept[clean] = np.count_nonzero(ghosts), np.count_nonzero(~ghosts)
+    assert kept[True][0] < 0.1 * kept[False][0]
+    assert kept[True][1] > 0.97 * kept[False][1]
+
+
 def test_a_grid_far_away_and_another_scale_lose_nothing(room, scan, seeds, tmp_path):
     moved = written(tmp_path, (MOVE.points(scan[0]), scan[1]))
     again = ss.upsample(room, Cloud().of(moved, transform=MOVE.inverse))

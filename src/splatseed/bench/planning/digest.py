@@ -1,8 +1,8 @@
-"""Fingerprints of what runs depend on: a scene's content, its photographs, its depth maps.
+"""Fingerprints of what runs depend on: a scene's content, photographs, depth maps and scan.
 
 Promise: a fingerprint depends on content alone, not on where files are, when they were written, or
-the order in which a system lists them; photographs count byte for byte, depth maps as they are
-read.
+the order in which a system lists them; photographs and scans count byte for byte, depth maps as
+they are read.
 """
 
 from __future__ import annotations
@@ -17,16 +17,19 @@ from typing import TypeVar
 import numpy as np
 
 from splatseed.depthmap import DepthMaps
+from splatseed.io.files import open_file
 from splatseed.io.photograph import photograph_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 
-__all__ = ["depth_digest", "scene_digest"]
+__all__ = ["cloud_digest", "depth_digest", "scene_digest"]
 
 Item = TypeVar("Item")
 
 SIZE = 16
 """Bytes of a fingerprint."""
+PIECE = 1 << 22
+"""Bytes of a scan that are read at a time."""
 
 
 def scene_digest(scene: Scene, folder: Path, progress: Progress = silent) -> str:
@@ -82,6 +85,26 @@ def depth_digest(maps: DepthMaps, progress: Progress = silent) -> str:
     digest = hashlib.blake2b(digest_size=SIZE)
     for each in _in_threads(of_map, sorted(maps), "fingerprint depth", progress):
         digest.update(each)
+    return digest.hexdigest()
+
+
+def cloud_digest(path: Path, progress: Progress = silent) -> str:
+    """Fingerprint of a scan's file, byte for byte: 32 hexadecimal digits.
+
+    Args:
+        path: The file.
+        progress: Told how far reading is.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+    """
+    digest, done = hashlib.blake2b(digest_size=SIZE), 0
+    with open_file(path) as file:
+        size = max(os.fstat(file.fileno()).st_size, 1)
+        while piece := file.read(PIECE):
+            digest.update(piece)
+            done += len(piece)
+            progress("fingerprint the scan", done / size)
     return digest.hexdigest()
 
 

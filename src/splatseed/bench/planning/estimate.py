@@ -20,7 +20,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from splatseed.bench.planning.records import SFM, RunResult, RunRow, RunSpec
+from splatseed.bench.planning.records import CLOUD, SFM, RunResult, RunRow, RunSpec, plain
 from splatseed.bench.planning.scenes import SceneFacts
 from splatseed.train.schedule import Densification
 from splatseed.train.settings import TrainSettings
@@ -237,7 +237,7 @@ class Estimator:
     def _compares(self, spec: RunSpec) -> bool:
         """Whether training looks for depth in the photographs, which seeding has not paid for."""
         looks = spec.settings.densification == "grow" and spec.settings.placing == "stereo"
-        return looks and not self.is_twin(spec) and spec.arm.method != AUTO
+        return looks and not self.is_twin(spec) and plain(spec.arm.method) != AUTO
 
     def _modelled_around(self, spec: RunSpec, result: RunResult | None = None) -> float:
         last = self._counts(spec)[1] if result is None else result.num_gaussians
@@ -245,7 +245,7 @@ class Estimator:
         return self._speed(spec).around + TESTS * tests * RENDER_SHARE * self._step(spec, last)
 
     def _modelled_seeding(self, spec: RunSpec) -> float:
-        scene, method = self._scenes[spec.scene_digest], spec.arm.method
+        scene, method = self._scenes[spec.scene_digest], plain(spec.arm.method)
         points = scene.num_points
         if method == SFM:
             return SECONDS_A_POINT * points if spec.most_seeds is not None else 0.0
@@ -253,7 +253,7 @@ class Estimator:
             return SECONDS_A_POINT * (points + self._made(spec))
         if self.is_twin(spec) and method == AUTO:  # it looks at no photograph then
             return SECONDS_A_POINT * points
-        return self._comparing(spec) * (COVERING if method == COVER else 1.0)
+        return self._comparing(spec) * (COVERING if method in {COVER, CLOUD} else 1.0)
 
     def _comparing(self, spec: RunSpec) -> float:
         """Seconds of comparing a scene's photographs with each other."""
@@ -310,7 +310,8 @@ def _densification(spec: RunSpec) -> Densification:
 
 def _makes(spec: RunSpec) -> bool:
     """Whether a run's method looks at photographs, so that what it makes is kept for others."""
-    return spec.arm.method in METHODS and chooses_number(spec.arm.method)
+    method = plain(spec.arm.method)
+    return method in METHODS and chooses_number(method)
 
 
 def _shares(spec: RunSpec) -> bool:

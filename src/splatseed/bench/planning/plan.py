@@ -14,7 +14,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, get_args
 
-from splatseed.bench.planning.records import ANY_RATIO, SFM, Arm, RunSpec
+from splatseed.bench.planning.records import (
+    ANY_RATIO,
+    CLOUD,
+    SFM,
+    WITH_CLOUD,
+    Arm,
+    RunSpec,
+    needs_cloud,
+    plain,
+)
 from splatseed.bench.planning.scenes import SceneFacts
 from splatseed.errors import ParameterError
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
@@ -39,12 +48,14 @@ class PlannedScene:
         name: Its name in tables; the folder's name when left empty.
         images: The folder of photographs within it, such as ``images_4``; detected when left empty.
         depth: The folder of its depth maps; looked for in the scene when left out.
+        cloud: The file of its scan, in the scene's frame.
     """
 
     path: str
     name: str = ""
     images: str = ""
     depth: str = ""
+    cloud: str = ""
 
     @property
     def is_demo(self) -> bool:
@@ -68,7 +79,8 @@ class Plan:
     scenes: tuple[PlannedScene, ...] = ()
     """The scenes."""
     methods: tuple[str, ...] = (SFM, "linear", "mls")
-    """How new points are made; ``sfm`` for none, with which all others are compared."""
+    """How new points are made; ``sfm`` for none, with which all others are compared; ``cloud+auto``
+    for those of a scan and, where it has none, of ``auto``."""
     ratios: tuple[float, ...] = (8.0,)
     """Points in all, per original; empty if budgets determine the number."""
     budgets: tuple[str, ...] = ()
@@ -95,7 +107,7 @@ class Plan:
     def __post_init__(self) -> None:
         object.__setattr__(self, "ratios", tuple(float(ratio) for ratio in self.ratios))
         object.__setattr__(self, "budgets", tuple(map(_budget, self.budgets)))
-        _check_choices("methods", self.methods, (SFM, *METHODS))
+        _check_choices("methods", self.methods, (SFM, *METHODS, *WITH_CLOUD))
         _check_choices("strategies", self.strategies, get_args(StrategyName))
         _check_choices("profiles", self.profiles, get_args(Profile))
         if self.ratios or not self.budgets:
@@ -126,9 +138,9 @@ class Plan:
 
     def parameters_of(self, method: str) -> Mapping[str, Any]:
         """Differences from the profile; no method sees the held-out test photographs."""
-        looks = hasattr(METHODS[method], "hold_out")
+        looks = hasattr(METHODS[plain(method)], "hold_out")
         held = {"hold_out": self.training.test_every} if looks else {}
-        return MappingProxyType({**held, **self.parameters.get(method, {})})
+        return MappingProxyType({**held, **self.parameters.get(plain(method), {})})
 
     def arms(self, strategy: StrategyName) -> tuple[Arm, ...]:
         """The arms of one strategy: for each budget, the original cloud first.
@@ -150,13 +162,13 @@ class Plan:
         return tuple(arms)
 
     def _ratios_of(self, method: str) -> tuple[float, ...]:
-        return (ANY_RATIO,) if chooses_number(method) or not self.ratios else self.ratios
+        return (ANY_RATIO,) if chooses_number(plain(method)) or not self.ratios else self.ratios
 
     def _profiles_of(self, method: str) -> list[Profile]:
         seen: list[Upsampler] = []
         chosen = []
         for profile in self.profiles:
-            configured = configure(method, profile, **self.parameters_of(method))
+            configured = configure(plain(method), profile, **self.parameters_of(method))
             if configured not in seen:
                 seen.append(configured)
                 chosen.append(profile)
@@ -168,7 +180,8 @@ def plan_runs(
 ) -> list[RunSpec]:
     """The runs of a plan, in the order in which they should be run.
 
-    Arms of the method depth are left out for scenes without depth maps.
+    Arms of the method depth are left out for scenes without depth maps, and those that need a scan
+    for scenes without one.
 
     Args:
         plan: The plan.
@@ -182,9 +195,11 @@ def plan_runs(
             scene_digest=scene.digest,
             arm=arm,
             repeat=repeat,
-            parameters={} if arm.method == SFM else dict(plan.parameters_of(arm.method)),
+            parameters=_parameters(plan, arm.method),
             depth_digest=scene.depth_digest if arm.method == DEPTH else "",
             depth_path=scene.depth_path if arm.method == DEPTH else "",
+            cloud_digest=scene.cloud_digest if needs_cloud(arm.method) else "",
+            cloud_path=scene.cloud_path if needs_cloud(arm.method) else "",
             scene_path=scene.path,
             images=scene.images,
             training=_training(plan, scene, arm, backend),
@@ -193,6 +208,16 @@ def plan_runs(
         for repeat in range(plan.repeats)
         for scene, arm in _scene_arms(plan, scenes)
     ]
+
+
+def _parameters(plan: Plan, method: str) -> dict[str, Any]:
+    """A method's parameters; those of the scan beside it begin with ``cloud.``."""
+    if method == SFM:
+        return {}
+    own = dict(plan.parameters_of(method))
+    if method not in WITH_CLOUD:
+        return own
+    return own | {f"{CLOUD}.{name}": value for name, value in plan.parameters_of(CLOUD).items()}
 
 
 def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> TrainSettings:
@@ -240,7 +265,8 @@ def _scene_arms(plan: Plan, scenes: Sequence[SceneFacts]) -> list[tuple[SceneFac
         for scene in scenes
         for strategy in plan.strategies
         for arm in plan.arms(strategy)
-        if arm.method != DEPTH or scene.depth_digest
+        if (arm.method != DEPTH or scene.depth_digest)
+        and (not needs_cloud(arm.method) or scene.cloud_digest)
     ]
     if plan.budgets:  # runs that come to the same seeds as sfm's take over their training
         pairs.sort(key=lambda pair: pair[1].method != SFM)
@@ -271,7 +297,7 @@ def _check_distinct(name: str, given: Sequence[object]) -> None:
 def _check_text(scene: PlannedScene) -> None:
     """A plan is a text file, which cannot hold file names that are not text."""
     try:
-        f"{scene.path}{scene.name}{scene.images}{scene.depth}".encode()
+        f"{scene.path}{scene.name}{scene.images}{scene.depth}{scene.cloud}".encode()
     except UnicodeEncodeError:
         raise ParameterError(
             "scenes whose paths are valid text", found=ascii(scene.path), fix="Rename the folder."

@@ -22,6 +22,8 @@ __all__ = ["plan_text", "read_plan"]
 
 SCENES = "scenes"
 PARAMETERS = "parameters"
+FILES = ("path", "depth", "cloud")
+"""Keys of a scene that are paths, relative to the plan's file."""
 SCENE_KEYS = tuple(each.name for each in dataclasses.fields(PlannedScene))
 
 
@@ -165,7 +167,7 @@ def _scene(path: Path, content: Mapping[str, Any]) -> PlannedScene:
         )
     beside = {
         key: str(path.parent / content[key])
-        for key in ("path", "depth")
+        for key in FILES
         if content.get(key) and content[key] != DEMO
     }
     return PlannedScene(**{**content, **beside})
@@ -173,7 +175,7 @@ def _scene(path: Path, content: Mapping[str, Any]) -> PlannedScene:
 
 def _scene_lines(scene: PlannedScene) -> list[str]:
     values = dataclasses.asdict(scene)
-    for key in ("path", "depth"):
+    for key in FILES:
         if values[key] and values[key] != DEMO:
             values[key] = str(Path(values[key]).absolute())
     return [f"{key} = {_value(value)}" for key, value in values.items() if value]

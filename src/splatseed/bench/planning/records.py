@@ -22,11 +22,14 @@ __all__ = [
     "ANY_RATIO",
     "SFM",
     "SHARED",
+    "WITH_CLOUD",
     "Arm",
     "RunResult",
     "RunRow",
     "RunSpec",
     "RunStatus",
+    "needs_cloud",
+    "plain",
 ]
 
 SFM = "sfm"
@@ -34,6 +37,12 @@ SFM = "sfm"
 
 ANY_RATIO = 0.0
 """The ratio of methods that choose their number of seeds, and of all if a budget determines it."""
+
+CLOUD = "cloud"
+"""The method whose seeds are those of a scene's scan."""
+
+WITH_CLOUD = ("cloud+auto", "cloud+stereo", "cloud+cover")
+"""A scan's seeds, and those that another method puts where it has none."""
 
 RunStatus = Literal["pending", "running", "done", "failed"]
 
@@ -48,8 +57,18 @@ EARLY = {
 }  # fmt: skip
 """Settings that every key includes, default or not: older ledgers' keys have only these."""
 
-WHERE = {"scene_path", "depth_path", "images"}
+WHERE = {"scene_path", "depth_path", "cloud_path", "images"}
 """Fields of a specification that say where things are, not what they are."""
+
+
+def plain(method: str) -> str:
+    """The method, without the scan that its seeds come beside."""
+    return method.removeprefix(f"{CLOUD}+")
+
+
+def needs_cloud(method: str) -> bool:
+    """Whether a method needs the scene's scan."""
+    return method == CLOUD or method in WITH_CLOUD
 
 
 @dataclass(frozen=True)
@@ -57,7 +76,7 @@ class Arm:
     """How a scene is seeded and trained.
 
     Args:
-        method: ``SFM``, or a key of ``splatseed.METHODS``.
+        method: ``SFM``, a key of ``splatseed.METHODS``, or one of ``WITH_CLOUD``.
         profile: "default" or "paper".
         ratio: Points in all, per original; ``ANY_RATIO`` if photographs or the budget decide.
         strategy: The densification strategy.
@@ -99,6 +118,8 @@ class RunSpec:
         version: The package's version.
         scene_path: Where the scene lies; not part of the key.
         depth_path: Where its depth maps lie, if any; not part of the key.
+        cloud_digest: Fingerprint of the scan's file, for methods that need it; empty without.
+        cloud_path: Where the scan lies, if any; not part of the key.
         images: The folder of photographs within the scene's, such as ``images_4``; empty for the
             one that is found. Not part of the key either: the fingerprint is of its files.
     """
@@ -114,6 +135,8 @@ class RunSpec:
     scene_path: str = ""
     depth_path: str = ""
     images: str = ""
+    cloud_digest: str = ""
+    cloud_path: str = ""
 
     @property
     def key(self) -> str:
@@ -121,6 +144,8 @@ class RunSpec:
         told = {k: v for k, v in self._flat().items() if k not in WHERE and self._is_told(k, v)}
         if not self.arm.budget:  # later than the ledgers of runs without
             del told["arm"]["budget"]
+        if not self.cloud_digest:
+            del told["cloud_digest"]
         text = json.dumps(told, sort_keys=True, separators=(",", ":"))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 

@@ -1,7 +1,8 @@
 """Scenes of a benchmark: opening one, and checking it before it is run.
 
 Promise: a benchmark always opens a scene in the same way; whatever would make every run on a scene
-fail (no photographs, lenses with distortion, unreadable depth) is detected here, before any run.
+fail (no photographs, lenses with distortion, unreadable depth or scan) is detected here, before any
+run.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatseed.bench.planning.digest import depth_digest, scene_digest
+from splatseed.bench.planning.digest import cloud_digest, depth_digest, scene_digest
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths, load_scene
+from splatseed.io.clouds import open_cloud
 from splatseed.io.depth_search import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
 from splatseed.progress import Progress, silent
@@ -39,6 +41,8 @@ class SceneFacts:
         depth_digest: Their fingerprint; empty without.
         warnings: What is odd about it, one sentence each.
         long_side: Pixels of its longer side.
+        cloud_path: The file of its scan, absolute; empty without.
+        cloud_digest: Its fingerprint; empty without.
     """
 
     name: str
@@ -52,6 +56,8 @@ class SceneFacts:
     depth_digest: str = ""
     warnings: tuple[str, ...] = ()
     long_side: int = 0
+    cloud_path: str = ""
+    cloud_digest: str = ""
 
 
 def open_scene(path: Path, *, images: str = "", depth: Path | None = None) -> Scene:
@@ -80,6 +86,7 @@ def survey(
     images: str = "",
     depth: Path | None = None,
     with_depth: bool = False,
+    cloud: Path | None = None,
     progress: Progress = silent,
 ) -> SceneFacts:
     """Check a scene and all files that a run on it reads.
@@ -90,6 +97,7 @@ def survey(
         images: The folder of photographs within it; the one that is found when left out.
         depth: The folder of its depth maps; if left out, they are looked for in the scene's.
         with_depth: Whether depth maps are needed at all.
+        cloud: The file of its scan, if needed.
         progress: Told how far reading is.
 
     Raises:
@@ -119,7 +127,15 @@ def survey(
             *map(stray_note, stray_views(poses_of(scene.images))),
         ),
         long_side=max(size),
+        cloud_path="" if cloud is None else str(cloud.resolve()),
+        cloud_digest="" if cloud is None else _cloud_digest(cloud, progress),
     )
+
+
+def _cloud_digest(path: Path, progress: Progress) -> str:
+    """The fingerprint of a scan whose header makes sense."""
+    open_cloud(path)
+    return cloud_digest(path, progress)
 
 
 def _with_images(scene: Scene, name: str) -> Scene:

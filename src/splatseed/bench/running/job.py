@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from splatseed.bench.planning.digest import depth_digest, scene_digest
-from splatseed.bench.planning.records import RunResult, RunSpec
+from splatseed.bench.planning.digest import cloud_digest, depth_digest, scene_digest
+from splatseed.bench.planning.records import RunResult, RunSpec, plain
 from splatseed.bench.planning.scenes import open_scene
 from splatseed.bench.running.kept import (
     ERROR,
@@ -154,10 +154,12 @@ def _check_unchanged(scene: Scene, spec: RunSpec) -> None:
     same = folder is not None and scene_digest(scene, folder) == spec.scene_digest
     if same and spec.depth_digest and scene.depths is not None:
         same = depth_digest(scene.depths) == spec.depth_digest
+    if same and spec.cloud_digest:
+        same = cloud_digest(Path(spec.cloud_path)) == spec.cloud_digest
     if not same:
         raise SceneFormatError(
             f"the files of {spec.scene_path} as they were when the benchmark was planned",
-            found="other points, cameras, photographs or depth maps",
+            found="other points, cameras, photographs, depth maps or scan",
             fix="Start the benchmark again: it plans anew.",
         )
 
@@ -177,7 +179,7 @@ def _prepare(
     ways: dict[str, Any] = {
         "cache_dir": user_cache_dir(),
         "depths": bench / DEPTHS / f"{spec.scene_digest}_{every}_{size}_{spec.repeat}.npz",
-        "seeding_knew": spec.arm.method == DEFAULT_METHOD and not is_full(scene, spec),
+        "seeding_knew": plain(spec.arm.method) == DEFAULT_METHOD and not is_full(scene, spec),
     }
     try:
         resume = RunOptions(resume=True, **ways)

@@ -32,7 +32,8 @@ def made_file(bench: Path, spec: RunSpec) -> Path:
     """
     arm = spec.arm
     told = [spec.scene_digest, spec.depth_digest, arm.method, arm.profile, arm.ratio, spec.repeat,
-            dict(spec.parameters), spec.version]  # fmt: skip
+            dict(spec.parameters), spec.version,
+            *([spec.cloud_digest] if spec.cloud_digest else [])]  # fmt: skip
     text = json.dumps(told, sort_keys=True)
     return bench / SEEDS / f"{hashlib.blake2b(text.encode(), digest_size=16).hexdigest()}.npz"
 

@@ -15,13 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from splatseed.bench.planning.records import SFM, RunSpec
+from splatseed.bench.planning.records import CLOUD, SFM, WITH_CLOUD, RunSpec, plain
 from splatseed.bench.planning.scenes import open_scene
 from splatseed.bench.running.made import made_file, read_made, write_made
 from splatseed.kernels.compilation import watched
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
+from splatseed.seeding.clouds.method import Cloud
 from splatseed.seeding.thinning import thin_to
 from splatseed.seeding.upsampling import CELL, DEFAULT_METHOD, upsample
 from splatseed.upsample import Upsampler, chooses_number, configure
@@ -61,9 +62,9 @@ def make_seeds(
     if spec.arm.method == SFM and spec.most_seeds is None:
         return scene.points, 0.0
     method, numbers = _asked(scene, spec)
-    looks = spec.arm.method != SFM and chooses_number(spec.arm.method)
+    looks = spec.arm.method != SFM and chooses_number(plain(spec.arm.method))
     if bench is not None and looks and not is_full(scene, spec):
-        return _thinned(scene, method, spec, bench, progress)
+        return _thinned(scene, method, numbers, spec, bench, progress)
     with _compilation() as compiling:
         start = time.perf_counter()
         seeds = upsample(
@@ -80,7 +81,12 @@ def is_full(scene: Scene, spec: RunSpec) -> bool:
 
 
 def _thinned(
-    scene: Scene, method: Upsampler, spec: RunSpec, bench: Path, progress: Progress
+    scene: Scene,
+    method: Upsampler,
+    given: dict[str, Any],
+    spec: RunSpec,
+    bench: Path,
+    progress: Progress,
 ) -> tuple[PointCloud, float]:
     """The points that a method makes, new or stored, within the budget."""
     kept = made_file(bench, spec)
@@ -88,7 +94,7 @@ def _thinned(
     with _compilation() as compiling:
         start = time.perf_counter()
         if made is None:
-            cloud = upsample(scene, method, seed=spec.repeat, progress=progress)
+            cloud = upsample(scene, method, **given, seed=spec.repeat, progress=progress)
             made = cloud, max(time.perf_counter() - start - sum(compiling), 0.0)
             write_made(kept, *made)
         start, before = time.perf_counter(), sum(compiling)
@@ -105,13 +111,21 @@ def _num_original(scene: Scene) -> int:
 
 
 def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
-    """The method of a run, and how many points it should make.
+    """The method of a run, and how many points it should make or what it comes beside.
 
     Under a budget, a method without a ratio fills the room that the originals leave.
     """
     arm, most = spec.arm, spec.most_seeds
     if arm.method == SFM:
         return configure(PLAIN), {"ratio": 1.0}
+    if arm.method == CLOUD:
+        return Cloud(**spec.parameters).of(spec.cloud_path), {}
+    if arm.method in WITH_CLOUD:
+        begin = f"{CLOUD}."
+        own = {name: v for name, v in spec.parameters.items() if not name.startswith(begin)}
+        cloud = {n.removeprefix(begin): v for n, v in spec.parameters.items() if n not in own}
+        beside = Cloud(**cloud).of(spec.cloud_path)
+        return configure(plain(arm.method), arm.profile, **own), {"beside": beside}
     method = configure(arm.method, arm.profile, **spec.parameters)
     if chooses_number(arm.method):
         return method, {}

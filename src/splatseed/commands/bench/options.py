@@ -102,6 +102,8 @@ class Options:
     depth: Annotated[tuple[Path, ...], _hint("the scene's")] = ()
     """For method depth: a folder of maps per scene, or one folder with a subfolder of each one's
     name."""
+    clouds: Annotated[tuple[Path, ...], _hint("the plan's")] = ()
+    """For methods cloud and cloud+auto: the scan of each scene, in its frame (docs/scans.md)."""
     preset: Annotated[
         PresetName | None,
         tyro.conf.arg(metavar="|".join(PRESETS), help_behavior_hint="(default: none)"),
@@ -165,6 +167,8 @@ def parse_plan(arguments: Sequence[str]) -> tuple[Options, Asked]:
     plan = dataclasses.replace(asked.plan, **_changes(options))
     if options.depth:
         plan = dataclasses.replace(plan, scenes=_with_depth(plan.scenes, options.depth))
+    if options.clouds:
+        plan = dataclasses.replace(plan, scenes=_with_clouds(plan.scenes, options.clouds))
     if not plan.scenes:
         raise ParameterError(
             "--scenes DIR..., --preset or --plan",
@@ -254,4 +258,19 @@ def _with_depth(
         )
     return tuple(
         dataclasses.replace(scene, depth=depth) for scene, depth in zip(scenes, depths, strict=True)
+    )
+
+
+def _with_clouds(scenes: Sequence[PlannedScene], files: Sequence[Path]) -> tuple[PlannedScene, ...]:
+    """The scenes with their scans."""
+    if len(files) != len(scenes):
+        raise ParameterError(
+            f"--clouds with a scan for each of {len(scenes)} scenes",
+            found=f"{len(files)} files",
+            fix="Name one per scene, in their order; in a plan (see --dry-run), only some scenes "
+            "may have one.",
+        )
+    return tuple(
+        dataclasses.replace(scene, cloud=str(file))
+        for scene, file in zip(scenes, files, strict=True)
     )

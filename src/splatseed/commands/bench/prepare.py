@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatseed.bench.planning.plan import DEPTH, Plan, PlannedScene, plan_runs
-from splatseed.bench.planning.records import SFM, RunSpec
+from splatseed.bench.planning.records import SFM, RunSpec, needs_cloud
 from splatseed.bench.planning.scenes import SceneFacts, survey
 from splatseed.bench.running.environment import package_version
 from splatseed.bench.running.folder import DEMO_FACTS, make_demo_scene
@@ -83,8 +83,14 @@ def _survey(scene: PlannedScene, plan: Plan, made: Path | None, progress: Progre
         images=scene.images,
         depth=Path(scene.depth) if scene.depth else None,
         with_depth=DEPTH in plan.methods,
+        cloud=Path(scene.cloud) if scene.cloud and _scans(plan) else None,
         progress=progress,
     )
+
+
+def _scans(plan: Plan) -> bool:
+    """Whether an arm needs the scenes' scans."""
+    return any(map(needs_cloud, plan.methods))
 
 
 def _notes(plan: Plan, scenes: Sequence[SceneFacts]) -> Iterator[str]:
@@ -94,6 +100,12 @@ def _notes(plan: Plan, scenes: Sequence[SceneFacts]) -> Iterator[str]:
     if DEPTH in plan.methods and bare:
         names = ", ".join(bare)
         yield f"without depth maps, and so without the method depth: {names} (--depth DIR)"
+    unscanned = [scene.name for scene in scenes if not scene.cloud_digest]
+    if _scans(plan) and unscanned:
+        names = ", ".join(unscanned)
+        yield f"without a scan, and so without the methods that need one: {names} (--clouds FILE)"
+    if not _scans(plan) and any(scene.cloud for scene in plan.scenes):
+        yield "No method needs the scans: name cloud or cloud+auto among --methods."
     if SFM not in plan.methods:
         yield "Without sfm among the methods there is nothing to compare with."
     if len(plan.profiles) > 1:

@@ -15,6 +15,8 @@ from splatseed.errors import ParameterError
 from splatseed.io.output.staging import atomic_file
 from splatseed.io.recentring import check_precision, offset_of, recentred
 from splatseed.io.transform_file import read_cloud_transform
+from splatseed.literal import visible
+from splatseed.process.memory import words_of
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
@@ -22,6 +24,7 @@ from splatseed.similarity import Similarity
 if TYPE_CHECKING:
     from splatseed.seeding.alignment.align import Alignment
     from splatseed.seeding.clouds.method import Cloud
+    from splatseed.seeding.clouds.streaming import MemoryPlan
 
 __all__ = ["CLOUD", "Bringing", "Brought", "bring_clouds", "settle_cloud"]
 
@@ -40,6 +43,8 @@ class Bringing(NamedTuple):
     transform: Path | None = None
     align: bool = False
     recenter: bool = False
+    memory: int | None = None
+    """Most bytes of memory."""
 
     @property
     def provenance(self) -> dict[str, object]:
@@ -49,6 +54,7 @@ class Bringing(NamedTuple):
             "transform": None if self.transform is None else str(self.transform.resolve()),
             "align": self.align,
             "recenter": self.recenter,
+            "memory": self.memory,
         }
 
 
@@ -64,7 +70,7 @@ def settle_cloud(options: Any, arguments: Sequence[str]) -> Any:
     """
     given = options.cloud_files
     if not given:
-        unused = options.cloud_transform is not None or options.recenter
+        unused = options.cloud_transform is not None or options.align or options.recenter
         if unused or options.method == CLOUD:
             raise ParameterError("--cloud FILE", found="none", fix="Name the scan.")
         return options
@@ -80,11 +86,10 @@ def settle_cloud(options: Any, arguments: Sequence[str]) -> Any:
         raise ParameterError(
             "--format colmap with --recenter", found="transforms", fix="Leave --format out."
         )
-    asked = "--align" in arguments
-    if asked and options.cloud_transform is not None:
+    if options.align and options.cloud_transform is not None:
         raise ParameterError("--align or --transform", found="both", fix="Leave one of them out.")
     layout = "colmap" if options.recenter else options.format
-    return dataclasses.replace(options, method=method, cloud_align=asked, format=layout)
+    return dataclasses.replace(options, method=method, format=layout)
 
 
 class Brought(NamedTuple):
@@ -96,6 +101,17 @@ class Brought(NamedTuple):
     alignment: Alignment | None = None
     offset: Float64[np.ndarray, " 3"] | None = None
     """What was subtracted from all coordinates of the scene."""
+    files: tuple[Path, ...] = ()
+    plan: MemoryPlan | None = None
+    """What the clouds take."""
+
+    @property
+    def takes(self) -> str:
+        """What the clouds take, as a line below others; empty without clouds."""
+        if self.plan is None:
+            return ""
+        most = f"at most {self.plan.capacity:,} voxels, {words_of(self.plan.memory)} of memory"
+        return f"\n  -> {', '.join(visible(path) for path in self.files)}: {most}"
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -121,11 +137,13 @@ class Brought(NamedTuple):
         if self.alignment is not None:
             from splatseed.preview import preview_alignment  # noqa: PLC0415  (Pillow)
 
-            found = self.alignment
-            _write_json(folder / ALIGNMENT, found.report)
-            off = found.residuals / (2 * CLOSE * found.extent)
+            alignment = self.alignment
+            _write_json(folder / ALIGNMENT, alignment.report)
+            off = alignment.residuals / (2 * CLOSE * alignment.extent)
             picture = folder / "preview_alignment.png"
-            preview_alignment(self.scene, found.sample, found.rgb, found.marks, off, picture)
+            preview_alignment(
+                self.scene, alignment.sample, alignment.rgb, alignment.marks, off, picture
+            )
 
 
 def _write_json(path: Path, content: Mapping[str, object]) -> None:
@@ -137,13 +155,14 @@ def bring_clouds(bringing: Bringing, scene: Scene, method: Cloud, progress: Prog
     """The scene, recentred if so asked, and the method ``cloud`` with its files in its frame.
 
     Raises:
-        ParameterError: The scene's coordinates need recentring.
+        ParameterError: The scene's coordinates need recentring, or the memory is not enough.
         PointCloudError: An alignment is not sure.
         SceneNotFoundError: A file is missing.
         SceneFormatError: One is damaged.
     """
     if not bringing.files:
         return Brought(scene, method)
+    plan = method.of(*bringing.files, memory=bringing.memory).plan(scene)
     transform = None
     if bringing.transform is not None:
         transform = read_cloud_transform(bringing.transform, scene)
@@ -160,4 +179,5 @@ def bring_clouds(bringing: Bringing, scene: Scene, method: Cloud, progress: Prog
 
         alignment = align(scene, bringing.files, progress)
         transform = alignment.scene_from_cloud
-    return Brought(scene, method.of(*bringing.files, transform=transform), alignment, offset)
+    given = method.of(*bringing.files, transform=transform, memory=bringing.memory)
+    return Brought(scene, given, alignment, offset, bringing.files, plan)

@@ -94,9 +94,8 @@ class Options:
     """What their values are: planar depth, distance along the ray, or inverse depth."""
     depth_scale: Annotated[float | None, number_flag(float, "what the folder says")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
-    align: bool = True
-    """With --cloud, --align finds the transform to the scene's own points; for --method depth,
-    --no-align takes metric depth and poses as given (--depth.no-align)."""
+    no_align: tyro.conf.FlagCreatePairsOff[bool] = False
+    """For --method depth: take metric depth and poses as given (--depth.no-align)."""
     cloud_files: Annotated[
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),
@@ -109,11 +108,13 @@ class Options:
     ] = None
     """For --cloud: a 4x4 matrix from its frame to the scene's, as text or JSON, or nerfstudio's
     dataparser_transforms.json."""
+    align: tyro.conf.FlagCreatePairsOff[bool] = False
+    """For --cloud: find the transform from its frame to the scene's, by the scene's own points."""
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
-    cloud_align: tyro.conf.Suppress[bool] = False
     memory: Annotated[str | None, memory_flag()] = None
-    """Most memory. A cloud that takes more is worked on in tiles on disk, with the same result."""
+    """Most memory for points. A cloud that takes more is upsampled in tiles on disk, with the same
+    result; the points of --cloud are merged in larger voxels."""
     jobs: Annotated[int | None, number_flag(int, "1; with Ray, as many as fit")] = None
     """Tiles at a time, each in a process of its own."""
     executor: Literal["local", "ray"] = "local"
@@ -138,15 +139,21 @@ class Options:
     """Replace an output folder that splatseed wrote before."""
 
     @property
+    def memory_bytes(self) -> int | None:
+        """Most bytes of memory, if the user says so."""
+        return None if self.memory is None else bytes_of(self.memory)
+
+    @property
     def tiling(self) -> Tiling:
         """The options about memory and who works."""
-        memory = None if self.memory is None else bytes_of(self.memory)
-        return Tiling(memory, self.jobs, self.executor, self.address, self.tile_points)
+        return Tiling(self.memory_bytes, self.jobs, self.executor, self.address, self.tile_points)
 
     @property
     def bringing(self) -> Bringing:
         """The options about clouds."""
-        return Bringing(self.cloud_files, self.cloud_transform, self.cloud_align, self.recenter)
+        return Bringing(
+            self.cloud_files, self.cloud_transform, self.align, self.recenter, self.memory_bytes
+        )
 
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
@@ -159,7 +166,7 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
         # The profile sets the defaults of other flags, so it is parsed first.
         options = _parse_with({name: configure(name, "paper") for name in METHODS}, arguments)
     methods = {name: getattr(options, name) for name in METHODS}
-    if not options.align:
+    if options.no_align:
         methods["depth"] = dataclasses.replace(methods["depth"], align=False)
     return settle_cloud(options, arguments), methods
 
@@ -221,7 +228,7 @@ def run(arguments: list[str]) -> None:
         notes += brought.notes
         method = methods[options.method]
         total = _planned(options, method, len(scene.points))
-    _announce(options, scene, method, total, _idle(options, methods))
+    _announce(options, scene, method, total, _idle(options, methods), brought.takes)
     with stage_display(clock):
         beside = methods[CLOUD] if options.cloud_files and options.method != CLOUD else None
         seeds = _make(options, scene, method, beside, total, clock, notes)
@@ -311,9 +318,14 @@ def _read(options: Options, method: Upsampler) -> Scene:
 
 
 def _announce(
-    options: Options, scene: Scene, method: Upsampler, total: int | None, idle: Sequence[str]
+    options: Options,
+    scene: Scene,
+    method: Upsampler,
+    total: int | None,
+    idle: Sequence[str],
+    takes: str,
 ) -> None:
-    """Print what will be done, and which flags have no effect."""
+    """Print what will be done, what a cloud takes, and which flags have no effect."""
     for warning in scene.warnings:
         print_note(warning)
     for name in idle:
@@ -324,7 +336,7 @@ def _announce(
     OUT.print(
         f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} "
         f"points)\n  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n  "
-        f"-> {visible(options.output)} ({number}, seed {options.seed})",
+        f"-> {visible(options.output)} ({number}, seed {options.seed}){takes}",
         soft_wrap=True,
     )
 
@@ -355,7 +367,7 @@ def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
 def _parameters(method: Upsampler) -> dict[str, object]:
     """The parameters of a method; a cloud's files are told elsewhere."""
     given = dataclasses.asdict(method)  # type: ignore[call-overload]  # a method is a dataclass
-    return {name: given[name] for name in given if name not in {"files", "transform"}}
+    return {name: given[name] for name in given if name not in {"files", "transform", "memory"}}
 
 
 def _provenance(options: Options, method: Upsampler) -> dict[str, object]:

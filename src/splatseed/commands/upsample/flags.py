@@ -46,7 +46,9 @@ def budget_flag() -> Any:
 def memory_flag() -> Any:
     """How an amount of memory appears in the help."""
     return tyro.conf.arg(
-        constructor=str, metavar="BYTES|4G", help_behavior_hint="(default: what is free)"
+        constructor=str,
+        metavar="BYTES|4G",
+        help_behavior_hint="(default: what is free; for --cloud at most 4G)",
     )
 
 

@@ -21,14 +21,14 @@ from splatseed.console import (
     print_pairs,
     stage_display,
 )
-from splatseed.errors import OutputError, ParameterError
+from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
 from splatseed.io import WriteReport, load_scene, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap.scene import find_model
 from splatseed.io.output.point_stream import PointStream
 from splatseed.literal import visible
 from splatseed.pointcloud import PointCloud
-from splatseed.process.memory import free_memory
+from splatseed.process.memory import free_memory, option_of, words_of
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for
@@ -46,6 +46,8 @@ CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz"
 """Files of points that only ``open_cloud`` reads."""
 PROCESS, PER_POINT, PER_NEIGHBOR = 300 << 20, 120, 20
 """Bytes that the process takes, a cloud in memory for each original, and for each neighbour."""
+READ = 2.5
+"""Bytes that a scene takes for each byte of COLMAP's files."""
 WHOLE = ("budget", "cover_cell", "verify", "preview", "gaussians", "depth_maps", "cloud_files")
 """Options that need all points in memory."""
 
@@ -89,7 +91,7 @@ def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | 
         OutputError: It has attributes that tiles do not.
     """
     tiling, path = options.tiling, options.scene
-    if path.is_dir() and not tiling.asked and tiling.memory is None:
+    if not tiling.asked and (options.cloud_files or (path.is_dir() and tiling.memory is None)):
         return None
     from splatseed.tiles import FileSource, SceneSource  # noqa: PLC0415  (Numba)
 
@@ -101,10 +103,32 @@ def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | 
         return file if tiling.asked or _is_large(options, method, file.count or 0) else None
     if not tiling.asked and tiling.memory is None:  # a file that holds no cloud alone
         return None
+    _check_model(path, tiling.bound)
     scene = load_scene(path)
     scene = scene.replace(points=scene.points.originals)
     large = tiling.asked or _is_large(options, method, len(scene.points))
     return SceneSource(scene) if large else None
+
+
+def _check_model(path: Path, bound: int | None) -> None:
+    """Refuse a scene whose own points and tracks do not fit into memory, before it is read.
+
+    Raises:
+        ParameterError: They do not.
+    """
+    places = (path / "sparse" / "0", path / "sparse", path, path / "0")
+    model = find_model(*places) if path.is_dir() else None
+    names = [f"{each}{end}" for each in ("images", "points3D") for end in (".bin", ".txt")]
+    files = [] if model is None else [model / name for name in names]
+    needed = PROCESS + round(READ * sum(each.stat().st_size for each in files if each.is_file()))
+    if model is None or bound is None or needed <= bound:
+        return
+    raise ParameterError(
+        f"at least {words_of(needed, up=True)} of memory for the points and tracks of {path}, which"
+        " are read whole",
+        found=words_of(bound),
+        fix=f"Pass {option_of(needed)}; or name a file of its points alone, such as points3D.ply.",
+    )
 
 
 def _is_large(options: Options, method: Upsampler, count: int) -> bool:
@@ -176,9 +200,11 @@ def _check_options(options: Options, source: Source) -> None:
         flag = {"cover_cell": "cover", "depth_maps": "depth", "cloud_files": "cloud"}
         names = ", ".join(f"--{flag.get(name, name)}" for name in given)
         raise ParameterError(
-            "no option that needs all points in memory while a cloud is worked on in tiles",
+            "no option that looks at all points at once while a cloud is worked on in tiles",
             found=names,
-            fix=f"Leave out {names}, or give it more memory.",
+            fix=f"Leave {'it' if len(given) == 1 else 'them'} out (fewer points: --ratio or "
+            "--num-points), or work in memory: without --memory, --jobs, --executor and "
+            "--tile-points.",
         )
     scene = source.scene if isinstance(source, SceneSource) else None
     read = scene.source.format if scene is not None and scene.source is not None else "ply"
@@ -219,8 +245,9 @@ def _plan(options: Options, method: Upsampler, source: Source, processes: int) -
     if tiling.executor == "ray" and tiling.memory is not None:
         memory = tiling.memory  # of each task, wherever it runs
     return plan_tiles(
-        method, count, new, memory, processes=processes, tile_points=tiling.tile_points
-    )
+        method, count, new, memory, processes=processes, tile_points=tiling.tile_points,
+        held=source.held,
+    )  # fmt: skip
 
 
 def _announce(
@@ -258,7 +285,7 @@ def _write(
 
     code, made = source_code(options.method), {"tiles": tiled.tiles, "origin": tiled.origin}
     about: dict[str, Any] = {**provenance, **made}
-    repeated = len(tiled.repeated)
+    repeated = tiled.num_repeated
     num_new = tiled.num_new - repeated
     if isinstance(source, SceneSource):
         scene = source.scene
@@ -312,9 +339,15 @@ def _summarise(
 
 @contextmanager
 def _kept(path: Path) -> Iterator[None]:
-    """Say that what is done is kept, if the block is interrupted or the disk is full."""
+    """Say that what is done is kept, if the block is interrupted or the disk is full.
+
+    Of an input that is damaged or empty nothing is kept: mended, it is another.
+    """
     try:
         yield
+    except (PointCloudError, SceneFormatError):
+        shutil.rmtree(path, ignore_errors=True)
+        raise
     except KeyboardInterrupt:
         ERR.print(f"\nFinished tiles are kept in {path}; the same command goes on from there.")
         raise

@@ -193,8 +193,8 @@ def _colors_of(members: dict[str, _Member], count: int) -> tuple[_Member | None,
 
 def _of_size(members: dict[str, _Member], names: tuple[str, ...], count: int) -> _Member | None:
     """The first array of these names that has one value per point."""
-    found = (members[name] for name in names if name in members)
-    return next((m for m in found if np.prod(m.shape, dtype=np.int64) == count), None)
+    there = (members[name] for name in names if name in members)
+    return next((m for m in there if np.prod(m.shape, dtype=np.int64) == count), None)
 
 
 def _damaged(path: Path, error: Exception) -> SceneFormatError:

@@ -115,7 +115,8 @@ def _guarded(path: Path, read: Callable[[], Any]) -> Any:
     except MemoryError:
         raise
     except Exception as error:  # noqa: BLE001  (laspy and lazrs raise errors of many kinds)
-        raise _cut_short(path, " ".join(str(error).split())[:160] or type(error).__name__) from None
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise _cut_short(path, f"one that is cut short or damaged ({reason})") from None
 
 
 def _cut_short(path: Path, found: str) -> SceneFormatError:

@@ -80,8 +80,8 @@ class Painter:
         self.columns = columns
         self.of_trained = columns.rgb == SH_NAMES
         if columns.rgb and not self.of_trained:
-            found = np.stack([sample(name) for name in columns.rgb], axis=1)
-            self.color = ColorRange.of(found)
+            colors = np.stack([sample(name) for name in columns.rgb], axis=1)
+            self.color = ColorRange.of(colors)
         elif columns.intensity:
             self.grey = GreyRange.of(sample(columns.intensity))
 

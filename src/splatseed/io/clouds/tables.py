@@ -145,8 +145,8 @@ class TextTable:
         with open_file(self.path) as file:
             for place in places:
                 file.seek(place)
-                found = file.read(SAMPLE_BYTES).decode("latin-1").split("\n")
-                lines += numbers(found[place > first : -1] or found[:1])
+                block = file.read(SAMPLE_BYTES).decode("latin-1").split("\n")
+                lines += numbers(block[place > first : -1] or block[:1])
         return lines
 
 

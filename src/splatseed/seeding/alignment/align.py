@@ -138,14 +138,16 @@ def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> A
         unit.similarity.points(xyz)
         for unit, xyz in ((unit_of_marks, marks), (unit_of_cloud, sample.xyz))
     )
-    best, *others = _candidates(_surface_of(cloud), cloud, small, progress)
-    likeness = _likeness(best, cloud, small, sample, brightness)
+    surface = _surface_of(cloud)
+    best, *others = _candidates(surface, small, progress)
+    likeness = _likeness(best, surface, small, sample.rgb, brightness)
     rival = next((each for each in others if _differs(best.fitted, each.fitted)), None)
     unlike = (
         rival is not None
         and likeness is not None
         and (
-            likeness > LIKE and (_likeness(rival, cloud, small, sample, brightness) or 0.0) < UNLIKE
+            likeness > LIKE
+            and (_likeness(rival, surface, small, sample.rgb, brightness) or 0.0) < UNLIKE
         )
     )
     error = _error(best.fitted, small)
@@ -188,13 +190,12 @@ def _marks_of(scene: Scene) -> tuple[Float64[np.ndarray, "M 3"], Float64[np.ndar
 def _surface_of(cloud: Float64[np.ndarray, "N 3"]) -> Surface:
     from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
 
-    normals, _ = normals_of(cloud)
-    return Surface(cloud, normals, cKDTree(cloud, balanced_tree=False))
+    tree = cKDTree(cloud, balanced_tree=False)
+    return Surface(cloud, normals_of(cloud, tree), tree)
 
 
 def _candidates(
     surface: Surface,
-    cloud: Float64[np.ndarray, "N 3"],
     marks: Float64[np.ndarray, "M 3"],
     progress: Progress,
 ) -> list[_Candidate]:
@@ -203,29 +204,29 @@ def _candidates(
     Raises:
         PointCloudError: None holds.
     """
-    starts = find_starts(cloud, marks, ROUNDS[0][0], progress)
+    starts = find_starts(surface.xyz, marks, ROUNDS[0][0], progress)
     rows = zip(starts.scale, starts.rotation, starts.shift, strict=True)
     waiting = [Similarity(float(scale), rotation, shift) for scale, rotation, shift in rows]
-    found: list[_Candidate] = []
+    candidates: list[_Candidate] = []
     for stage, (num, count, rounds, far, least, close) in enumerate(ROUNDS):
         some = marks[:: -(-len(marks) // count)]
-        found = []
+        candidates = []
         for i, start in enumerate(waiting[:num]):
             fitted = fit(surface, some, start, far, rounds, least)
             if fitted is not None and 0.3 < fitted.cloud_from_scene.scale < 3.0:
-                found.append(_Candidate(fitted, float(np.mean(fitted.residuals < close))))
+                candidates.append(_Candidate(fitted, float(np.mean(fitted.residuals < close))))
             progress("align", (stage + (i + 1) / len(waiting[:num])) / len(ROUNDS))
-        found = _different(sorted(found, key=lambda each: -each.share))
-        waiting = [each.fitted.cloud_from_scene for each in found]
-    if not found:
+        candidates = _different(sorted(candidates, key=lambda each: -each.share))
+        waiting = [each.fitted.cloud_from_scene for each in candidates]
+    if not candidates:
         raise _unsure("no way to lay one on the other")
-    return found
+    return candidates
 
 
-def _different(found: list[_Candidate]) -> list[_Candidate]:
+def _different(candidates: list[_Candidate]) -> list[_Candidate]:
     """The best of each group of like alignments."""
     kept: list[_Candidate] = []
-    for each in found:
+    for each in candidates:
         if all(_differs(each.fitted, other.fitted) for other in kept):
             kept.append(each)
     return kept
@@ -243,21 +244,19 @@ def _differs(first: Fitted, second: Fitted) -> bool:
 
 def _likeness(
     candidate: _Candidate,
-    cloud: Float64[np.ndarray, "N 3"],
+    surface: Surface,
     marks: Float64[np.ndarray, "M 3"],
-    sample: CloudSample,
+    rgb: UInt8[np.ndarray, "N 3"] | None,
     brightness: Float64[np.ndarray, " M"],
 ) -> float | None:
     """Correlation of brightness between marks and their nearest cloud points."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
-
-    if sample.rgb is None or brightness.std() == 0:
+    if rgb is None or brightness.std() == 0:
         return None
     on = candidate.fitted.residuals < CLOSE
     if np.count_nonzero(on) < LEAST_MARKS // 2:
         return None
-    idx = cKDTree(cloud).query(candidate.fitted.cloud_from_scene.points(marks[on]))[1]
-    there = sample.rgb[idx].astype(np.float64).mean(axis=1)
+    idx = surface.tree.query(candidate.fitted.cloud_from_scene.points(marks[on]))[1]
+    there = rgb[idx].astype(np.float64).mean(axis=1)
     return float(np.corrcoef(there, brightness[on])[0, 1]) if there.std() > 0 else None
 
 

@@ -89,16 +89,16 @@ def fit(
     Returns:
         The alignment; None where too few marks are within reach, or nothing holds them.
     """
-    found, reach = start, far
+    similarity, reach = start, far
     for _ in range(rounds):
-        step = _step(surface, marks, found, reach)
+        step = _step(surface, marks, similarity, reach)
         if step is None:
             return None
-        found, moved = step
+        similarity, moved = step
         if moved < STILL and reach <= least:
             break
         reach = max(reach * SHRINK, least)
-    return _result(surface, marks, found, reach)
+    return _result(surface, marks, similarity, reach)
 
 
 def _pairs(
@@ -115,10 +115,10 @@ def _pairs(
 
 
 def _step(
-    surface: Surface, marks: Float64[np.ndarray, "M 3"], found: Similarity, reach: float
+    surface: Surface, marks: Float64[np.ndarray, "M 3"], start: Similarity, reach: float
 ) -> tuple[Similarity, float] | None:
     """One round: the better similarity, and how far it moved."""
-    q, limit = found.points(marks), reach * found.scale
+    q, limit = start.points(marks), reach * start.scale
     normals, off, distance = _pairs(surface, q, 2 * limit)
     near = np.isfinite(distance)
     if np.count_nonzero(near) < LEAST:
@@ -134,7 +134,7 @@ def _step(
         x = np.linalg.solve(normal, -(A * weights[:, None]).T @ off)
     except np.linalg.LinAlgError:
         return None
-    return _moved(found, center, x), float(np.abs(x).max())
+    return _moved(start, center, x), float(np.abs(x).max())
 
 
 def _design(around: np.ndarray, normals: np.ndarray) -> Float64[np.ndarray, "M 7"]:
@@ -143,11 +143,11 @@ def _design(around: np.ndarray, normals: np.ndarray) -> Float64[np.ndarray, "M 7
     return np.column_stack([np.cross(around, normals), normals, along])
 
 
-def _moved(found: Similarity, center: np.ndarray, x: np.ndarray) -> Similarity:
+def _moved(start: Similarity, center: np.ndarray, x: np.ndarray) -> Similarity:
     """A similarity followed by a small one about a centre."""
     turn, grow = _rotation(x[:3]), float(np.exp(np.clip(x[6], -0.2, 0.2)))
-    rotation, scale = turn @ found.rotation, grow * found.scale
-    moved = grow * turn @ (found.translation - center) + center + x[3:6]
+    rotation, scale = turn @ start.rotation, grow * start.scale
+    moved = grow * turn @ (start.translation - center) + center + x[3:6]
     return Similarity(scale, rotation, moved)
 
 
@@ -162,9 +162,9 @@ def _rotation(w: np.ndarray) -> Float64[np.ndarray, "3 3"]:
 
 
 def _result(
-    surface: Surface, marks: Float64[np.ndarray, "M 3"], found: Similarity, reach: float
+    surface: Surface, marks: Float64[np.ndarray, "M 3"], similarity: Similarity, reach: float
 ) -> Fitted | None:
-    q, limit = found.points(marks), reach * found.scale
+    q, limit = similarity.points(marks), reach * similarity.scale
     normals, off, distance = _pairs(surface, q)
     inside = (np.abs(off) < limit) & (distance < 2 * limit)
     if np.count_nonzero(inside) < LEAST:
@@ -175,5 +175,5 @@ def _result(
         covariance = np.linalg.inv(A.T @ A) * float(np.mean(off[inside] ** 2))
     except np.linalg.LinAlgError:
         return None
-    residuals = np.where(inside, np.abs(off), distance) / found.scale
-    return Fitted(found, residuals, reach, covariance, center)
+    residuals = np.where(inside, np.abs(off), distance) / similarity.scale
+    return Fitted(similarity, residuals, reach, covariance, center)

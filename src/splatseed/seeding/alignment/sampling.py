@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -18,6 +19,9 @@ from splatseed.errors import PointCloudError
 from splatseed.io.clouds import open_cloud
 from splatseed.progress import Progress
 from splatseed.seeding.clouds.voxels import EvenVoxels
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 __all__ = ["CloudSample", "normals_of", "sample_cloud"]
 
@@ -86,18 +90,19 @@ def sample_cloud(paths: Sequence[Path], progress: Progress) -> CloudSample:
 
 
 def normals_of(
-    xyz: Float64[np.ndarray, "N 3"], num: int = NEIGHBORS
-) -> tuple[Float64[np.ndarray, "N 3"], Float64[np.ndarray, " N"]]:
-    """Unit normals of either sign, and how flat the cloud is there: 1 on a plane, 0 in a volume."""
-    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
+    xyz: Float64[np.ndarray, "N 3"], tree: cKDTree, num: int = NEIGHBORS
+) -> Float64[np.ndarray, "N 3"]:
+    """Unit normals of either sign: the last principal axis of each point's neighbours.
 
-    tree = cKDTree(xyz, balanced_tree=False)
-    normals, flat = np.empty_like(xyz), np.empty(len(xyz))
+    Args:
+        xyz: The points.
+        tree: Of them.
+        num: How many neighbours, the point itself among them.
+    """
+    normals = np.empty_like(xyz)
     for start in range(0, len(xyz), CHUNK // 16):
         part = slice(start, start + CHUNK // 16)
         idx = tree.query(xyz[part], min(num, len(xyz)))[1]
         near = xyz[idx] - xyz[idx].mean(axis=1, keepdims=True)
-        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
-        normals[part] = vectors[:, :, 0]
-        flat[part] = 1.0 - np.sqrt(values[:, 0].clip(0) / values[:, 1].clip(1e-300))
-    return normals, flat
+        normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
+    return normals

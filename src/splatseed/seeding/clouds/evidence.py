@@ -4,9 +4,9 @@ Notation: a view's *surface* is the depth of its cells (``coverage.cell_depths``
 which a typical cell holds ``FILLED`` points, so that walls have no holes. A view *sees* points in
 front of its surface, and up to ``BEHIND`` of the depth behind it. The *samples* of a point are its
 pixels in the ``CLOSEST`` views that see it; their *agreement* is the share within ``ALIKE`` grey
-levels of their median, channel by channel. A tracked point of Structure-from-Motion proves that the
-ray to it is free: a cloud point in the same cell of the same view, clearly nearer, is *seen
-through*, and *confirmed* if it is about as far.
+levels of their median, channel by channel. A tracked point of Structure-from-Motion, or a depth of
+stereo, proves that the ray to it is free: a cloud point in the same cell of the same view, clearly
+nearer, is *seen through*, and *confirmed* if it is about as far.
 Promise: depends neither on the order of the points nor on the threads.
 """
 
@@ -50,25 +50,38 @@ Surface = Float32[np.ndarray, "rows cols"]
 
 @dataclass(frozen=True, eq=False)
 class FreeRays:
-    """Where tracked points prove that rays are free, in each view.
+    """How far rays are known to be free, in each view.
 
     Args:
-        depths: For each view, the least depth of its tracked points per cell of ``RAY_CELL``
-            pixels, float32; infinite where there is none.
+        depths: For each view, the least depth per cell of about ``RAY_CELL`` pixels, float32;
+            infinite where none is known.
     """
 
     depths: tuple[Surface, ...]
 
     @classmethod
-    def of(cls, views: Sequence[View], seen: Sequence[Float64[np.ndarray, "M 3"]]) -> FreeRays:
-        """The free rays of views that each see some points for certain."""
-        depths = (_nearest(view, xyz) for view, xyz in zip(views, seen, strict=True))
-        return cls(tuple(depths))
+    def of(
+        cls,
+        views: Sequence[View],
+        seen: Sequence[Float64[np.ndarray, "M 3"]],
+        depths: Sequence[Surface] | None = None,
+    ) -> FreeRays:
+        """The free rays of some views.
+
+        Args:
+            views: The views.
+            seen: The points that each sees for certain, world.
+            depths: What stereo knows of each, infinite where it knows nothing.
+        """
+        if depths is None:
+            depths = [_nothing(view) for view in views]
+        known = zip(views, seen, depths, strict=True)
+        return cls(tuple(_nearest(view, xyz, depth) for view, xyz, depth in known))
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What N points have speaking for and against them.
+    """The evidence for and against N points.
 
     Args:
         seen: In how many views each is visible, uint16 [N].
@@ -107,8 +120,8 @@ def _choose_cell(views: Sequence[View], xyz: Float32[np.ndarray, "N 3"]) -> int:
     some = views[:: -(-len(views) // 8)]
     for cell in CELLS[:-1]:
         counts = [count[count > 0] for view in some if len(count := cell_counts(view, xyz, cell))]
-        found = np.concatenate(counts)
-        if len(found) and np.median(found) >= FILLED:
+        filled = np.concatenate(counts)
+        if len(filled) and np.median(filled) >= FILLED:
             return cell
     return CELLS[-1]
 
@@ -132,7 +145,7 @@ def find_evidence(
         progress: Told how far it is.
     """
     num = len(xyz)
-    found = Evidence(
+    evidence = Evidence(
         np.zeros(num, np.uint16),
         np.full((num, 3), 128, np.uint8),
         np.full(num, np.nan, np.float32),
@@ -151,11 +164,12 @@ def find_evidence(
             _observe(
                 block, grid_from_world(view, 1), np.sqrt(abs(view.K[0, 0] * view.K[1, 1])),
                 view.width, view.height, surfaces[v], behind, free, view.photograph, _mask(view),
-                closeness, samples, found.seen[part], found.through[part], found.confirmed[part],
+                closeness, samples, evidence.seen[part], evidence.through[part],
+                evidence.confirmed[part],
             )  # fmt: skip
             progress("look at photographs", (b * len(views) + v + 1) / steps)
-        _summarise(closeness, samples, found.rgb[part], found.agreement[part])
-    return found
+        _summarise(closeness, samples, evidence.rgb[part], evidence.agreement[part])
+    return evidence
 
 
 def surface_agreement(
@@ -186,11 +200,16 @@ def _mask(view: View) -> Bool[np.ndarray, "H W"]:
     return np.ones((1, 1), np.bool_) if view.mask is None else view.mask
 
 
-def _nearest(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Surface:
-    """The least depth of points per cell of ``RAY_CELL`` pixels."""
+def _nothing(view: View) -> Surface:
+    """No depth in any cell of ``RAY_CELL`` pixels."""
     shape = -(-view.height // RAY_CELL), -(-view.width // RAY_CELL)
-    nearest = np.full(shape, np.inf, np.float32)
-    rows, cols, depth = _cells(view, xyz, shape)
+    return np.full(shape, np.inf, np.float32)
+
+
+def _nearest(view: View, xyz: Float64[np.ndarray, "M 3"], known: Surface) -> Surface:
+    """The least depth per cell, of points and of what is known."""
+    nearest = np.array(known, np.float32)
+    rows, cols, depth = _cells(view, xyz, nearest.shape)
     np.minimum.at(nearest, (rows, cols), depth.astype(np.float32))
     return nearest
 

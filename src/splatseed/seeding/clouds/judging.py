@@ -1,9 +1,9 @@
-"""Which voxels of a cloud stay: those that a photograph sees and nothing speaks against.
+"""Which voxels of a cloud stay: those that a photograph sees and nothing contradicts.
 
-Notation: against a voxel speaks that views *see past* it (``evidence``), that the photographs that
-see it do not *agree* on its colour, that they show *another colour* than the cloud, or that it lies
-*alone*: its support (``support``) is below ``ALONE`` of the median. Ghosts also hide what is behind
-them, so where many voxels go, the others are judged once more without them.
+Notation: four things contradict a voxel. Views *see past* it (``evidence``); the photographs that
+see it do not *agree* on its colour, although no ray ends there; they show *another colour* than the
+cloud; or it lies *alone*: its support (``support``) is below ``ALONE`` of the median. Ghosts also
+hide what is behind them, so where many voxels go, the others are judged once more without them.
 Promise: depends neither on the order of the points nor on the threads.
 """
 
@@ -36,6 +36,8 @@ AGREES = 0.5
 ASKED = 4
 THROUGH = 2
 """Views that see past a voxel from which on it is not there, if fewer confirm it."""
+CONFIRMED = 2
+"""Views that confirm a voxel from which on the photographs need not agree on its colour."""
 OTHER = 64
 """Grey levels by which colours differ clearly, beside ``LIKELY`` times what they differ by
 anyway."""
@@ -74,7 +76,7 @@ def judge(
     progress: Progress,
     *,
     clean: bool = True,
-    tracked: bool = True,
+    rays: FreeRays | None = None,
 ) -> Judged:
     """Judge the voxels of a cloud.
 
@@ -84,13 +86,12 @@ def judge(
         voxels: The cloud.
         colors: Its own colours, where it has some.
         progress: Told how far it is.
-        clean: Whether voxels go that something speaks against, or only those that are hidden.
-        tracked: Whether ``seen`` is certain, from tracks.
+        clean: Whether contradicted voxels go, or only hidden ones.
+        rays: Where rays are known to be free.
 
     Raises:
         PointCloudError: No photograph sees any voxel.
     """
-    rays = FreeRays.of(views, seen) if tracked else None
     reasons: Counter[str] = Counter()
     active = np.arange(len(voxels))
     if clean:
@@ -103,8 +104,8 @@ def judge(
         evidence = find_evidence(views, xyz, surfaces, cell, rays, progress)
         against = np.zeros(len(active), bool)
         if clean:
-            against, found = _against(evidence, None if colors is None else colors[active])
-            reasons.update(found)
+            against, counts = _against(evidence, None if colors is None else colors[active])
+            reasons.update(counts)
         if last or np.count_nonzero(against) <= AGAIN * len(active):
             break
         active = active[~against]
@@ -128,9 +129,10 @@ def _alone(voxels: Voxels) -> Bool[np.ndarray, " N"]:
 def _against(
     evidence: Evidence, colors: UInt8[np.ndarray, "N 3"] | None
 ) -> tuple[Bool[np.ndarray, " N"], dict[str, int]]:
-    """Which voxels something speaks against, and how many by reason; the first counts."""
+    """Which voxels are contradicted, and how many by reason; the first counts."""
     past = (evidence.through >= THROUGH) & (evidence.through > evidence.confirmed)
     torn = (evidence.seen >= ASKED) & (evidence.agreement < AGREES)  # NaN compares false
+    torn &= evidence.confirmed < CONFIRMED  # what shines looks different from all sides
     other = np.zeros_like(past)
     known = ~np.isnan(evidence.agreement)
     if colors is not None and known.any():

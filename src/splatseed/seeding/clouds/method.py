@@ -1,9 +1,9 @@
 """The method ``cloud``: seeds from scans and dense clouds, as many as the photographs resolve.
 
 Points stream into voxels (``voxels``); of these, those stay that a photograph sees and nothing
-speaks against (``evidence``): no ray of Structure-from-Motion passes through them, the photographs
-that see them agree on a colour, and they do not float alone. A budget thins them afterwards, as
-those of every method.
+contradicts (``evidence``, ``judging``): no ray of Structure-from-Motion or stereo passes through
+them, the photographs that see them agree on a colour, and they do not float alone. A budget thins
+them afterwards, as those of every method.
 Promise: memory does not grow with the clouds; a cloud that is nowhere near the cameras, or does not
 fit the scene's own points, is refused with the reason.
 """
@@ -28,13 +28,13 @@ from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
+    from splatseed.seeding.clouds.evidence import FreeRays
     from splatseed.seeding.clouds.judging import Judged
-    from splatseed.seeding.clouds.streaming import Streamed
+    from splatseed.seeding.clouds.streaming import MemoryPlan, Streamed
     from splatseed.views.view import View
 
 __all__ = ["Cloud", "GivenClouds"]
 
-GIGABYTE = 1e9
 FITS = 0.2
 """Below this share of the scene's own points at the cloud's depth it is another's: a cloud of
 another place has 0 to 0.1, one in the right place 0.36 (red kitchen, noisy) to 0.92 (room0)."""
@@ -46,6 +46,10 @@ UNKNOWN = 0.5
 CORNER = 0.5
 """Below this share of the photographs' cells, a note says how little the cloud covers."""
 CELL = 8
+DEGREES = 0.01
+"""Extent to the sides over height, below which coordinates may be degrees: a degree is 100 km."""
+TWO = 2
+"""Photographs that stereo compares at least."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +62,8 @@ class Cloud:
     """Take colours from the photographs even if the cloud has some."""
     clean: bool = True
     """Leave out points that the photographs contradict, and points that float alone."""
-    memory: float = 4.0
-    """Most memory, in gigabytes; voxels grow where they do not fit."""
+    hold_out: int = 0
+    """Leave out every n-th image by name, as trainers do for testing (8); 0 = use all."""
 
     name: ClassVar[str] = "cloud"
     traits: ClassVar[Traits] = Traits(frozenset({"cloud"}), chooses_number=True)
@@ -67,17 +71,22 @@ class Cloud:
     def __post_init__(self) -> None:
         check_fields(self)
         require(0.25 <= self.pixels <= 64, "cloud.pixels from 0.25 to 64", self.pixels)
-        require(self.memory >= 1, "cloud.memory of at least 1 gigabyte", self.memory)
+        held = self.hold_out
+        require(held != 1 and held >= 0, "cloud.hold_out of 0 or 2 and more", held)
 
-    def of(self, *files: Path | str, transform: Similarity | None = None) -> GivenClouds:
+    def of(
+        self, *files: Path | str, transform: Similarity | None = None, memory: int | None = None
+    ) -> GivenClouds:
         """The method for some files.
 
         Args:
             files: The clouds, in one frame.
             transform: From their frame to the scene's; the same frame when None.
+            memory: Most bytes of memory; voxels grow where they do not fit. 4 GB when None.
         """
         known = {field.name: getattr(self, field.name) for field in fields(Cloud)}
-        return GivenClouds(**known, files=tuple(map(str, files)), transform=transform)
+        paths = tuple(map(str, files))
+        return GivenClouds(**known, files=paths, transform=transform, memory=memory)
 
     def __call__(
         self,
@@ -104,12 +113,24 @@ class GivenClouds(Cloud):
     """The clouds."""
     transform: Similarity | None = None
     """From their frame to the scene's; the same frame when None."""
+    memory: int | None = None
+    """Most bytes of memory; 4 GB when None, and never more than is free."""
+
+    def plan(self, scene: Scene) -> MemoryPlan:
+        """What it will take for a scene.
+
+        Raises:
+            ParameterError: The scene has no cameras, or the memory is not enough.
+        """
+        from splatseed.seeding.clouds.streaming import plan_memory  # noqa: PLC0415  (loads Numba)
+
+        return plan_memory(self.memory, _frames(scene))
 
     def __call__(
         self,
         scene: Scene,
         num_new: int,  # noqa: ARG002  (the photographs determine the number)
-        rng: np.random.Generator,  # noqa: ARG002  (nothing is random)
+        rng: np.random.Generator,
         progress: Progress,
     ) -> NewPoints:
         """Seeds from the clouds.
@@ -118,37 +139,42 @@ class GivenClouds(Cloud):
             SceneNotFoundError: A file is missing.
             SceneFormatError: One is damaged.
             PointCloudError: No point is in view, or the cloud does not fit the scene.
+            ParameterError: The scene has no cameras, or the memory is not enough.
         """
-        from splatseed.seeding.clouds.streaming import capacity_of, stream  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.clouds.streaming import stream  # noqa: PLC0415  (loads Numba)
 
-        frames = _frames(scene)
-        capacity = capacity_of(self.memory * GIGABYTE)
+        frames, capacity = _frames(scene), self.plan(scene).capacity
         paths = [Path(each) for each in self.files]
         streamed = stream(paths, self.transform, frames, self.pixels, capacity, progress)
         _check_in_view(streamed, scene)
-        return self._choose(scene, streamed, progress)
+        return self._choose(scene, streamed, rng, progress)
 
-    def _choose(self, scene: Scene, streamed: Streamed, progress: Progress) -> NewPoints:
+    def _choose(
+        self, scene: Scene, streamed: Streamed, rng: np.random.Generator, progress: Progress
+    ) -> NewPoints:
         """The points that stay, their colours, and notes."""
         from splatseed.seeding.clouds.judging import judge  # noqa: PLC0415  (loads Numba)
         from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
-        voxels, images = streamed.voxels, _images(scene)
+        voxels, images = streamed.voxels, _images(scene, self.hold_out)
         views = _views(scene, images, progress)
         visibility = find_visibility(scene)
         nothing = np.empty((0, 3))
         seen = [visibility.of(image) if len(visibility.xyz) else nothing for image in images]
         colored = all(file.has_color for file in streamed.files)
         own = voxels.rgb if any(file.colors != "none" for file in streamed.files) else None
+        rays = _free_rays(scene, images, views, seen, rng, progress) if self.clean else None
         judged = judge(
-            views, seen, voxels, own if colored else None, progress,
-            clean=self.clean, tracked=scene.tracks is not None,
-        )  # fmt: skip
+            views, seen, voxels, own if colored else None, progress, clean=self.clean, rays=rays
+        )
         xyz, evidence = voxels.xyz[judged.kept], judged.evidence
         rgb = evidence.rgb if own is None else own[judged.kept]
         if scene.has_photographs and (self.recolor or not colored):
             rgb = evidence.rgb
         notes = (*_read_notes(streamed), *_check_fit(judged), *_fates(judged, len(voxels)))
+        if scene.has_photographs and not colored:
+            lacks = "no colours" if own is None else "intensity only"
+            notes = (*notes, f"The cloud has {lacks}: colours are those of the photographs.")
         return NewPoints(
             xyz, rgb, (*notes, *_note_on_cover(scene, xyz)),
             confidence=np.nan_to_num(evidence.agreement, nan=UNKNOWN),
@@ -166,8 +192,8 @@ def _frames(scene: Scene) -> tuple[View, ...]:
     return frames_of(scene)
 
 
-def _images(scene: Scene) -> tuple[Image, ...]:
-    return photographed(scene) if scene.has_photographs else scene.images
+def _images(scene: Scene, hold_out: int) -> tuple[Image, ...]:
+    return photographed(scene, hold_out) if scene.has_photographs else scene.images
 
 
 def _views(scene: Scene, images: Sequence[Image], progress: Progress) -> tuple[View, ...]:
@@ -175,6 +201,30 @@ def _views(scene: Scene, images: Sequence[Image], progress: Progress) -> tuple[V
     if scene.has_photographs:
         return read_views(scene, images, MAX_SIZE, progress)
     return frames_of(scene)
+
+
+def _free_rays(
+    scene: Scene,
+    images: Sequence[Image],
+    views: Sequence[View],
+    seen: Sequence[Float64[np.ndarray, "M 3"]],
+    rng: np.random.Generator,
+    progress: Progress,
+) -> FreeRays | None:
+    """Where rays are known to be free: up to tracked points, and up to what stereo confirms."""
+    from splatseed.seeding.clouds.evidence import FreeRays  # noqa: PLC0415  (loads Numba)
+
+    certain = seen if scene.tracks is not None else [np.empty((0, 3))] * len(views)
+    if not scene.has_photographs or len(views) < TWO:
+        return FreeRays.of(views, certain) if scene.tracks is not None else None
+    from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
+    from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
+    from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415  (loads with its use)
+
+    seed, visibility = int(rng.integers(1 << 32)), known_visibility(scene)
+    stereo = find_stereo(views, images, visibility, StereoSettings(), seed, progress)
+    maps = [stereo.map(i).depth for i in range(len(views))]
+    return FreeRays.of(views, certain, [np.nan_to_num(depth, nan=np.inf) for depth in maps])
 
 
 def _check_in_view(streamed: Streamed, scene: Scene) -> None:
@@ -186,18 +236,33 @@ def _check_in_view(streamed: Streamed, scene: Scene) -> None:
     if len(streamed.voxels):
         return
     centers = np.array([image.camera.center for image in scene.images])
+    fix = "They are in different frames: find the transform with --align, or give it with "
+    fix += "--transform FILE."
+    if _like_degrees(streamed.low, streamed.high):
+        fix = "They look like longitude and latitude: export the cloud in metres, then --align it."
     raise PointCloudError(
         "points of the cloud in view of the scene's cameras, which stand "
         f"{_span(centers.min(axis=0), centers.max(axis=0))}",
         found=f"none of {streamed.voxels.total:,}, which lie {_span(streamed.low, streamed.high)}",
-        fix="They are in different frames: find the transform with --align, or give it with "
-        "--transform FILE.",
+        fix=fix,
     )
 
 
+def _like_degrees(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> bool:
+    """Whether a cloud is flat as a sheet on edge, as metres above degrees are."""
+    across, up = (high - low)[:2].max(), (high - low)[2]
+    within = max(abs(low[0]), abs(high[0])) <= 180 and max(abs(low[1]), abs(high[1])) <= 90
+    return bool(within and across < DEGREES * up)
+
+
 def _span(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> str:
-    first, last = (", ".join(f"{value:.6g}" for value in each) for each in (low, high))
+    first, last = (", ".join(_plain(value) for value in each) for each in (low, high))
     return f"from ({first}) to ({last})"
+
+
+def _plain(value: float) -> str:
+    """A coordinate without an exponent where its digits matter."""
+    return f"{value:.0f}" if 1e5 <= abs(value) < 1e12 else f"{value:.6g}"
 
 
 def _check_fit(judged: Judged) -> tuple[str, ...]:
@@ -216,7 +281,7 @@ def _check_fit(judged: Judged) -> tuple[str, ...]:
             fix="It is in another frame (try --align, or give --transform FILE), or of another "
             "place.",
         )
-    doubt = ": check its frame" if judged.fit < DOUBTFUL else ""
+    doubt = ": check its frame and its unit" if judged.fit < DOUBTFUL else ""
     return (f"The cloud fits: {found}, within 3%{doubt}.",)
 
 
@@ -238,7 +303,7 @@ def _read_notes(streamed: Streamed) -> tuple[str, ...]:
     if voxels.coarser:
         told.append(
             f"The cloud was merged at {2**voxels.coarser} times the spacing asked for, to stay "
-            "within the memory: --cloud.memory raises it."
+            "within the memory: pass more --memory."
         )
     return tuple(told)
 

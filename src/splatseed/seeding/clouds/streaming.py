@@ -13,22 +13,26 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.errors import PointCloudError
+from splatseed.errors import ParameterError, PointCloudError
 from splatseed.io.clouds import CloudChunk, CloudFile, open_cloud
-from splatseed.process.memory import check_memory, free_memory
+from splatseed.process.memory import free_memory, option_of, words_of
 from splatseed.progress import Progress
 from splatseed.seeding.clouds.voxels import BYTES_EACH, Voxels
 from splatseed.similarity import Similarity
 from splatseed.views.view import View
 
-__all__ = ["CHUNK", "Streamed", "capacity_of", "stream"]
+__all__ = ["CHUNK", "MemoryPlan", "Streamed", "plan_memory", "stream"]
 
 CHUNK = 1 << 19
 """Points in memory at a time: 50 MB with all that is computed of them."""
 FEWEST, MOST = 1 << 16, 1 << 24
 """Least and greatest number of voxels."""
-RESERVED = 0.7e9
+DEFAULT = 4 << 30
+"""Most bytes of memory, unless the user says so."""
+RESERVED = 700_000_000
 """Bytes for the program, its libraries and a chunk."""
+PER_PIXEL = 8
+"""Bytes for each pixel of the photographs: the pixel, grey as well, and what stereo knows of it."""
 TEXT_ROW = 40
 """Bytes of a line of text, to tell how far reading is where the number of lines is not known."""
 
@@ -52,21 +56,43 @@ class Streamed:
     high: Float64[np.ndarray, " 3"]
 
 
-def capacity_of(memory: float) -> int:
-    """The number of voxels that fit into some bytes of memory.
+@dataclass(frozen=True)
+class MemoryPlan:
+    """What seeds from a cloud will take.
+
+    Args:
+        capacity: Most voxels.
+        memory: Most bytes.
+    """
+
+    capacity: int
+    memory: int
+
+
+def plan_memory(most: int | None, views: Sequence[View]) -> MemoryPlan:
+    """How many voxels fit into memory, beside photographs.
+
+    Args:
+        most: Most bytes; ``DEFAULT`` when None. Never more than is free.
+        views: The views.
 
     Raises:
-        ParameterError: The program itself does not fit, or so much is not free.
+        ParameterError: The program, the photographs and the fewest voxels do not fit.
     """
     free = free_memory()
-    wanted = min(memory, free) if free is not None else memory
-    check_memory(
-        round(RESERVED + FEWEST * BYTES_EACH),
-        1,
-        "bytes",
-        fix="Free some memory, or run on a machine with more.",
-    )
-    return int(np.clip((wanted - RESERVED) / BYTES_EACH, FEWEST, MOST))
+    allowed = min(DEFAULT if most is None else most, free if free is not None else DEFAULT)
+    fixed = RESERVED + PER_PIXEL * sum(view.width * view.height for view in views)
+    needed = fixed + FEWEST * BYTES_EACH
+    if allowed < needed:
+        asked = most is not None and allowed == most
+        raise ParameterError(
+            f"at least {words_of(needed, up=True)} of memory for a cloud and {len(views):,} "
+            "photographs",
+            found=words_of(allowed) + ("" if asked else ", which are free"),
+            fix=f"Pass {option_of(needed)}." if asked else "Free some, or use a larger machine.",
+        )
+    capacity = min((allowed - fixed) // BYTES_EACH, MOST)
+    return MemoryPlan(capacity, fixed + capacity * BYTES_EACH)
 
 
 def stream(
