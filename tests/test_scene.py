@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from splatseed.camera import Intrinsics, rotation_from_quat
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Observations, Scene, Tracks
+from splatseed.scene import NO_POINT, Image, Observations, Scene, Tracks
 
 INTRINSICS = Intrinsics(1, "PINHOLE", 64, 48, (50.0, 50.0, 32.0, 24.0))
 
@@ -61,14 +63,33 @@ def test_tracks_stay_with_the_points_they_belong_to(scene):
 def test_tracks_do_not_pass_to_other_points(scene):
     points = scene.points
     for other in (
-        points.select(slice(1, None)),
         points.select(np.arange(5)[::-1]),
+        PointCloud.concatenate(points.select([4]), points.select(slice(4))),
         points.replace(xyz=points.xyz + 1),
         points.select(slice(0)),
     ):
         changed = scene.replace(points=other)
         assert changed.tracks is None
         assert scene.tracks is not None
+
+
+def test_originals_that_stay_keep_their_tracks(scene):
+    keep = np.array([True, False, True, True, False])
+    more = PointCloud(np.full((3, 3), 7.5, np.float32), np.zeros((3, 3), np.uint8), np.full(3, 4))
+    changed = scene.replace(points=PointCloud.concatenate(scene.points.select(keep), more))
+    assert changed.tracks.lengths.tolist() == [2, 2, 4]
+    np.testing.assert_array_equal(changed.tracks.point_ids, scene.tracks.point_ids[keep])
+    np.testing.assert_array_equal(changed.tracks.xyz, scene.tracks.xyz[keep])
+
+
+def test_features_of_points_that_went_belong_to_none(scene):
+    seen = Observations(np.zeros((4, 2)), np.array([0, 1, NO_POINT, 4]))
+    scene = scene.replace(images=(dataclasses.replace(_image("a"), observations=seen),))
+    kept = scene.replace(points=scene.points.select([0, 2, 4]))
+    ids = kept.images[0].observations.point_ids
+    np.testing.assert_array_equal(ids, [0, NO_POINT, NO_POINT, 4])
+    others = scene.replace(points=scene.points.replace(xyz=scene.points.xyz + 1))
+    assert (others.images[0].observations.point_ids == NO_POINT).all()
 
 
 def test_tracks_given_with_the_points_are_kept(scene):

@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64, UInt32
+from jaxtyping import Bool, Float32, Float64, Int64, UInt32, UInt64
 
 from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.depthmap import DepthMaps
-from splatseed.pointcloud import PointCloud
+from splatseed.pointcloud import ORIGINAL, PointCloud
 
 __all__ = [
+    "NO_POINT",
     "Image",
     "LeftOut",
     "Observations",
@@ -31,6 +32,9 @@ __all__ = [
     "Tracks",
 ]
 
+NO_POINT = -1
+"""The point id of a feature that belongs to no point."""
+
 SceneFormat = Literal["colmap", "transforms", "ply", "rgbd"]
 
 
@@ -40,7 +44,7 @@ class Observations:
 
     Args:
         xy: Pixel coordinates, float64 [M, 2].
-        point_ids: Id of the 3D point each feature belongs to, int64 [M]; -1 = none.
+        point_ids: Id of the 3D point each feature belongs to, int64 [M]; ``NO_POINT`` = none.
     """
 
     xy: Float64[np.ndarray, "M 2"]
@@ -48,6 +52,11 @@ class Observations:
 
     def __len__(self) -> int:
         return len(self.point_ids)
+
+    def without(self, point_ids: Int64[np.ndarray, " P"] | None) -> Observations:
+        """The same features, of which those of some points, or of all, belong to none."""
+        gone = True if point_ids is None else np.isin(self.point_ids, point_ids)
+        return Observations(self.xy, np.where(gone, NO_POINT, self.point_ids))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +124,18 @@ class Tracks:
     def lengths(self) -> Int64[np.ndarray, " N"]:
         """Observations per point, int64 [N]."""
         return np.diff(self.offsets)
+
+    def select(self, keep: Bool[np.ndarray, " N"]) -> Tracks:
+        """The tracks of some points, in their order."""
+        observed = np.repeat(keep, self.lengths)
+        return Tracks(
+            point_ids=self.point_ids[keep],
+            xyz=self.xyz[keep],
+            errors=self.errors[keep],
+            offsets=np.concatenate([[0], np.cumsum(self.lengths[keep])]).astype(np.int64),
+            image_ids=self.image_ids[observed],
+            point2d_idx=self.point2d_idx[observed],
+        )
 
 
 @dataclass(frozen=True)
@@ -201,15 +222,28 @@ class Scene:
     def replace(self, **changes: Any) -> Scene:
         """A copy with some fields replaced.
 
-        When ``points`` are replaced and ``tracks`` are not, the tracks stay only if the new cloud
-        still begins with the very points they belong to; otherwise they are dropped.
+        When ``points`` are replaced and ``tracks`` are not, the originals among the new points
+        keep their tracks if they stand first and in the same order, as ``upsample`` puts them.
+        Features of other points then belong to none.
         """
-        tracks = self.tracks
-        if "points" in changes and "tracks" not in changes and tracks is not None:
-            kept = changes["points"].xyz[: len(tracks)]
-            if not np.array_equal(kept, self.points.xyz[: len(tracks)], equal_nan=True):
-                changes["tracks"] = None
+        if "points" in changes and "tracks" not in changes and self.tracks is not None:
+            kept = self._kept_originals(changes["points"])
+            if not kept.all():
+                gone = self.tracks.point_ids[~kept] if kept.any() else None
+                changes["tracks"] = self.tracks.select(kept) if kept.any() else None
+                changes.setdefault("images", tuple(_without(im, gone) for im in self.images))
         return dataclass_replace(self, **changes)
+
+    def _kept_originals(self, points: PointCloud) -> Bool[np.ndarray, " N"]:
+        """Which of the points with tracks begin another cloud; none if it begins otherwise."""
+        tracked = self.points.xyz[: len(self.tracks or ())]
+        if np.array_equal(points.xyz[: len(tracked)], tracked, equal_nan=True):
+            return np.ones(len(tracked), bool)
+        first_new = int(np.append(points.source != ORIGINAL, True).argmax())
+        kept = np.isin(_keys(tracked), _keys(points.xyz[:first_new]))
+        first = points.xyz[: np.count_nonzero(kept)]
+        same = np.array_equal(tracked[kept], first, equal_nan=True)
+        return kept if same else np.zeros(len(tracked), bool)
 
     @property
     def has_photographs(self) -> bool:
@@ -226,3 +260,16 @@ class Scene:
             return train, test
         train = tuple(image for i, image in enumerate(ordered) if i % test_every)
         return train, tuple(ordered[::test_every])
+
+
+def _without(image: Image, point_ids: Int64[np.ndarray, " P"] | None) -> Image:
+    if image.observations is None:
+        return image
+    return dataclass_replace(image, observations=image.observations.without(point_ids))
+
+
+def _keys(xyz: Float32[np.ndarray, "n 3"]) -> UInt64[np.ndarray, " n"]:
+    """A number for each position, the same for the same bits; others seldom share one."""
+    bits = np.ascontiguousarray(xyz, np.float32).view(np.uint32).astype(np.uint64)
+    # Odd factors spread the bits over 64; a shared number only costs tracks, for rows are compared.
+    return bits @ np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)

@@ -360,3 +360,11 @@ def test_links_survive_moving_source_and_output_together(scene_dir, tmp_path):
     link = moved / "deep/er/again/images"
     assert Path(os.readlink(link)) == moved.resolve() / "scene/images"  # noqa: PTH115  (the real files)
     assert load_scene(moved / "deep/er/again").has_photographs
+
+
+def test_originals_that_a_budget_leaves_keep_their_tracks(room, tmp_path):
+    keep = np.arange(len(room.points)) % 3 > 0
+    report = write_scene(room.replace(points=room.points.select(keep)), tmp_path / "OUT")
+    back = load_scene(tmp_path / "OUT")
+    np.testing.assert_array_equal(back.tracks.lengths, room.tracks.lengths[keep])
+    assert not report.notes

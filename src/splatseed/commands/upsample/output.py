@@ -161,10 +161,7 @@ def summarise(
     if (output / "images").is_symlink():
         where = (output / "images").resolve()
         rows.append(("images", f"linked, not copied: {where}; --copy-images to move OUT elsewhere"))
-    if report.dropped_nonfinite + report.dropped_duplicates:
-        left_out = (
-            f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate"
-        )
+    if left_out := _left_out(scene, report):
         rows.insert(2, ("left out", left_out))
     if pictures:
         drawn = [output / name for name in PICTURES if (output / name).is_file()]
@@ -178,6 +175,18 @@ def summarise(
         )
     if scene.images and scene.source is not None and scene.source.image_dir is not None:
         print_commands("train it with", training_commands(output, report.layout))
+
+
+def _left_out(scene: Scene, report: WriteReport) -> str:
+    """How many points of the input the output lacks, and why; empty if it has all."""
+    thinned = scene.points.num_original - report.num_original
+    parts = []
+    if report.dropped_nonfinite + report.dropped_duplicates:
+        parts += [f"{report.dropped_nonfinite:,} not finite"]
+        parts += [f"{report.dropped_duplicates:,} duplicate"]
+    if thinned > 0:
+        parts += [f"{thinned:,} originals, for the budget, where they crowd"]
+    return ", ".join(parts)
 
 
 def _origins(seeds: PointCloud) -> str:

@@ -22,7 +22,6 @@ from splatseed.errors import OutputError
 from splatseed.io.binary import ByteReader
 from splatseed.io.colmap.model import (
     EXPORT_AGAIN,
-    NO_POINT,
     UNKNOWN_ERROR,
     by_camera_id,
     check_names,
@@ -33,7 +32,7 @@ from splatseed.io.colmap.model import (
     point_columns,
 )
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Observations, Tracks
+from splatseed.scene import NO_POINT, Image, Observations, Tracks
 
 __all__ = [
     "point_rows",

@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int64
 
 from splatseed.errors import PointCloudError
-from splatseed.io.colmap.model import NO_POINT
-from splatseed.scene import Image, Observations, Scene, Tracks
+from splatseed.scene import NO_POINT, Image, Observations, Scene, Tracks
 
 __all__ = ["Renumbered", "renumber", "without_points"]
 
@@ -52,11 +51,10 @@ def without_points(scene: Scene, keep: Bool[np.ndarray, " N"]) -> Scene:
         return replace(scene, points=points)
     _check_tracks(scene, tracks)
     keep = keep[: len(tracks)]
-    point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
     ids = _feature_ids(scene.images)
     ids[np.isin(ids, tracks.point_ids[~keep])] = NO_POINT
-    kept = _selected(tracks, keep, keep[point_idx], point_idx)
-    return replace(scene, points=points, tracks=kept, images=_with_point_ids(scene.images, ids))
+    images = _with_point_ids(scene.images, ids)
+    return replace(scene, points=points, tracks=tracks.select(keep), images=images)
 
 
 def renumber(scene: Scene) -> Renumbered:
@@ -86,7 +84,7 @@ def renumber(scene: Scene) -> Renumbered:
     unconfirmed = (old_ids != NO_POINT) & ~confirmed
     return Renumbered(
         replace(
-            _selected(tracks, np.ones(len(tracks), bool), agreed, point_idx),
+            _confirmed(tracks, agreed, point_idx),
             point_ids=np.arange(1, len(tracks) + 1, dtype=np.int64),
         ),
         _with_point_ids(scene.images, new_ids),
@@ -128,20 +126,16 @@ def _slots(images: Sequence[Image], tracks: Tracks) -> Int64[np.ndarray, " T"]:
     return np.where(exists, firsts[image_idx] + feature_idx, -1)
 
 
-def _selected(
-    tracks: Tracks,
-    keep: Bool[np.ndarray, " N"],
-    kept_elements: Bool[np.ndarray, " T"],
-    point_idx: Int64[np.ndarray, " T"],
+def _confirmed(
+    tracks: Tracks, agreed: Bool[np.ndarray, " T"], point_idx: Int64[np.ndarray, " T"]
 ) -> Tracks:
-    lengths = np.bincount(point_idx[kept_elements], minlength=len(tracks))[keep]
-    return Tracks(
-        point_ids=tracks.point_ids[keep],
-        xyz=tracks.xyz[keep],
-        errors=tracks.errors[keep],
+    """The tracks with only those elements that features agree with."""
+    lengths = np.bincount(point_idx[agreed], minlength=len(tracks))
+    return replace(
+        tracks,
         offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
-        image_ids=tracks.image_ids[kept_elements],
-        point2d_idx=tracks.point2d_idx[kept_elements],
+        image_ids=tracks.image_ids[agreed],
+        point2d_idx=tracks.point2d_idx[agreed],
     )
 
 

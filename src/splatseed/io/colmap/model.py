@@ -22,7 +22,6 @@ from splatseed.scene import Image, Observations, Tracks
 __all__ = [
     "EXPORT_AGAIN",
     "MAX_ID",
-    "NO_POINT",
     "UNKNOWN_ERROR",
     "by_camera_id",
     "check_unique",
@@ -35,8 +34,6 @@ __all__ = [
 EXPORT_AGAIN = "Copy the file again, or export the model again with COLMAP."
 MAX_ID = 2**32 - 1
 """Camera ids, image ids and feature indices are 32-bit in COLMAP's binary form."""
-NO_POINT = -1
-"""The point id of a feature that belongs to no 3D point."""
 UNKNOWN_ERROR = -1.0
 """COLMAP's reprojection error of a point that has none yet."""
 

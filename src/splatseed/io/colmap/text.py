@@ -20,7 +20,6 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.colmap.model import (
     EXPORT_AGAIN,
     MAX_ID,
-    NO_POINT,
     by_camera_id,
     check_names,
     check_unique,
@@ -30,7 +29,7 @@ from splatseed.io.colmap.model import (
 )
 from splatseed.io.files import read_bytes
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Observations, Tracks
+from splatseed.scene import NO_POINT, Image, Observations, Tracks
 
 __all__ = [
     "read_cameras",

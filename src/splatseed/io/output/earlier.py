@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 from splatseed.io.output.seeds_npz import read_seeds
 from splatseed.io.output.staging import MANIFEST
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
-from splatseed.scene import Scene, Tracks
+from splatseed.scene import Scene
 
 __all__ = ["number_of_originals", "recall_seeds"]
 
@@ -33,7 +33,9 @@ def recall_seeds(scene: Scene) -> Scene:
     notes = tuple(filter(None, (known.warning, _added_note(points))))
     # Tracks belong to the first points, and a new point has none.
     first_new = int(np.append(points.source != ORIGINAL, True).argmax())
-    tracks = None if scene.tracks is None else _first(scene.tracks, first_new)
+    tracks = scene.tracks
+    if tracks is not None:
+        tracks = tracks.select(np.arange(len(tracks)) < first_new)
     return replace(scene, points=points, tracks=tracks, warnings=(*scene.warnings, *notes))
 
 
@@ -76,18 +78,3 @@ def _num_original(manifest: Path, total: int) -> int:
         return total  # no manifest, or somebody else's file of that name
     fits = num_points == total and isinstance(num_original, int) and 0 < num_original < total
     return num_original if fits else total
-
-
-def _first(tracks: Tracks, n: int) -> Tracks:
-    """The tracks of the first ``n`` points."""
-    if n >= len(tracks):
-        return tracks
-    end = int(tracks.offsets[n])
-    return Tracks(
-        tracks.point_ids[:n],
-        tracks.xyz[:n],
-        tracks.errors[:n],
-        tracks.offsets[: n + 1],
-        tracks.image_ids[:end],
-        tracks.point2d_idx[:end],
-    )

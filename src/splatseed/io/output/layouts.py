@@ -157,7 +157,7 @@ def _model_notes(scene: Scene, model: Renumbered) -> list[str]:
     notes = []
     if model.num_broken:
         notes.append(
-            f"{model.num_broken} references between features and points were removed: the other"
+            f"{model.num_broken:,} references between features and points were removed: the other"
             " side did not confirm them."
         )
     if not scene.images:
