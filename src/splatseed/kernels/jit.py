@@ -20,6 +20,7 @@ import numba
 from numba.core import config, event
 
 from splatseed.kernels.compilation import tell
+from splatseed.kernels.sharing import compile_once
 from splatseed.kernels.sources import source_digest
 
 __all__ = ["always_inline", "inline", "kernel", "parallel_range"]
@@ -70,6 +71,7 @@ def _compile(function: F, **options: bool) -> F:
     njit: Any = numba.njit  # its annotations list every option by name
     compiled = njit(cache=True, error_model="numpy", nogil=True, **options)(function)
     _key_on_sources(compiled, function)
+    compile_once(compiled)
     return cast("F", compiled)
 
 
