@@ -1,4 +1,4 @@
-"""Which Gaussians of a model to keep: those within a box, those opaque enough."""
+"""The Gaussians of a model to keep: within a box, and opaque enough."""
 
 from __future__ import annotations
 

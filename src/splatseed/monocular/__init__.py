@@ -41,7 +41,7 @@ def load_network(
             Hugging Face's cache holds.
         kind: What it predicts; None: what its configuration says.
         device: Where to run it; auto takes a usable GPU if there is one.
-        preparation: How the input of an ONNX network is made, where its file leaves that open.
+        preparation: How the input of an ONNX network is made, where its file does not say.
 
     Raises:
         MissingDependencyError: A package that runs it is not installed.

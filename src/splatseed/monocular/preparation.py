@@ -1,4 +1,4 @@
-"""How photographs become the input of an ONNX network, whose file does not say.
+"""How photographs become the input of an ONNX network, which its file does not say.
 
 Notation: a photograph of H x W pixels becomes (pixel / 255 - mean) / std for each channel, at h x
 w.

@@ -45,7 +45,7 @@ class ViewMaps(Protocol):
 
     @property
     def normal(self) -> Float[np.ndarray, "H W 3"]:
-        """Unit, in the camera's axes; NaN where unknown."""
+        """Unit vectors in the camera's axes; NaN where unknown."""
 
     @property
     def confidence(self) -> Float[np.ndarray, "H W"]:

@@ -176,7 +176,7 @@ def _coefficients(base: Tensor, rest: Tensor | None) -> tuple[np.ndarray, np.nda
 
 
 def _resized(array: np.ndarray, count: int) -> np.ndarray:
-    """Padded with zeros or cut along axis 1; unchanged if it has that length already."""
+    """Padded with zeros or cut to ``count`` along axis 1; not copied if that changes nothing."""
     kept = array[:, :count]
     missing = count - kept.shape[1]
     return np.ascontiguousarray(np.pad(kept, ((0, 0), (0, missing), (0, 0))) if missing else kept)

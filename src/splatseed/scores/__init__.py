@@ -1,4 +1,4 @@
-"""Scores: how well test views were rendered; the types of results wherever there are any."""
+"""Scores: how well test views were rendered, and the types in which all rooms hand results on."""
 
 from splatseed.scores.results import (
     NOT_ASKED,

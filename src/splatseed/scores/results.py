@@ -1,4 +1,4 @@
-"""Scores: how well test views were rendered, at the end of a run and during it.
+"""Scores: how well test views were rendered, during a run and at its end.
 
 Notation: PSNR in dB, SSIM and LPIPS without unit; seconds are wall time. Promise: results have
 these types from evaluation through training to a benchmark's ledger; means are means over images of

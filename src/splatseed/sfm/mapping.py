@@ -26,7 +26,7 @@ _ADVICE = (
 
 
 def map_images(run: Run, names: Sequence[str]) -> Path:
-    """Solve for poses, lenses and points, and keep the model with most images.
+    """Solve for poses, lenses and points, and keep the model with the most images.
 
     Raises:
         ReconstructionError: No model was found, or it has fewer than half of the images ``names``.

@@ -113,7 +113,7 @@ def _serve(commands: BinaryIO, replies: BinaryIO, *, verbose: bool) -> None:
 
 
 def serve() -> None:
-    """Be the child: communicate over standard input and output."""
+    """Act as the child: communicate over standard input and output."""
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # whatever the C++ libraries print goes to the log
     _serve(sys.stdin.buffer, replies, verbose=sys.argv[1] == "1")

@@ -63,7 +63,7 @@ def initial_gaussians(
     flatness: float = 0.1,
     harmonics: Float32[np.ndarray, "N 4 3"] | None = None,
 ) -> Gaussians:
-    """One Gaussian per seed, with the seed's size or else that of the gap to its 3 neighbours.
+    """One Gaussian per seed, as large as the seed or, if that is unknown, the gap to 3 neighbours.
 
     It is round, or a disc perpendicular to the seed's normal if that is known.
 
@@ -107,7 +107,7 @@ def initial_gaussians(
 
 
 def _first_sizes(seeds: PointCloud) -> Float64[np.ndarray, " N"]:
-    """Each seed's own size if known, else that of the gap around it."""
+    """Each seed's own size if known, else the size of the gap around it."""
     gaps = neighbor_distances(seeds.xyz)
     if seeds.sizes is None:
         return gaps

@@ -94,7 +94,7 @@ def usable_seeds(
 ) -> PointCloud:
     """The finite points that a run begins with, thinned if there are more than the cap.
 
-    Points in crowded parts of the views go first, new points before originals of equal use.
+    Points in crowded parts of the views are dropped first, and new points before originals.
 
     Args:
         points: The scene's points.

@@ -88,7 +88,7 @@ class TrainSettings:
     """Lower all opacities from time to time, as 3DGS does (strategy default; gsplat 1.5.3 does
     not)."""
     seed_sizes: bool = False
-    """Start with the sizes in the scene's seeds.npz, not those of the gaps between seeds."""
+    """Start with the sizes in the scene's seeds.npz instead of the gaps between seeds."""
     seed_normals: bool = False
     """Start with flat discs where the scene's seeds.npz has normals."""
     seed_colors: bool = False

@@ -28,7 +28,7 @@ MEMORY = 0.5
 
 
 class FrameLoop:
-    """Draws a frame whenever it is told that something has changed.
+    """Draws a frame after each call of ``change``.
 
     Args:
         draw: Draws and sends a picture at a scale; returns the number of pixels drawn, 0 for none.

@@ -162,7 +162,7 @@ def views_from(world: Similarity, views: Sequence[View]) -> list[View]:
     """Views of another world, transformed into the model's.
 
     Args:
-        world: From the model's world to that of the views.
+        world: From the model's world to the views' world.
         views: The views in that world.
     """
     back = world.inverse

@@ -191,7 +191,7 @@ class Session:
             self._restyle()
 
     def _affordable_points(self) -> int:
-        """How many points the browser draws in reasonable time, judging by those it has."""
+        """How many points the browser can draw in reasonable time, measured on its first points."""
         try:
             without, with_points = (self._seconds_of_a_picture(points=on) for on in (False, True))
         finally:  # it may not have answered
