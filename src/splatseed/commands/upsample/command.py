@@ -113,7 +113,7 @@ class Options:
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
     memory: Annotated[str | None, memory_flag()] = None
-    """Most memory: larger clouds are upsampled in tiles on disk; --cloud merges points."""
+    """Most memory: larger clouds are upsampled in tiles on disk; --cloud merges more points."""
     jobs: Annotated[int | None, number_flag(int, "1; with Ray, as many as fit")] = None
     """Tiles at a time, each in a process of its own."""
     executor: Literal["local", "ray"] = "local"
