@@ -100,8 +100,8 @@ class Options:
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),
     ] = ()
-    """Seeds from a scan or a dense cloud (docs/scans.md); alone, or beside those of --method auto,
-    stereo, cover or depth."""
+    """Seeds from a scan or dense cloud (docs/scans.md), alone or beside --method auto, stereo,
+    cover or depth."""
     cloud_transform: Annotated[
         Path | None,
         tyro.conf.arg(name="transform", constructor=Path, help_behavior_hint="(default: none)"),
@@ -109,12 +109,11 @@ class Options:
     """For --cloud: a 4x4 matrix from its frame to the scene's, as text or JSON, or nerfstudio's
     dataparser_transforms.json."""
     align: tyro.conf.FlagCreatePairsOff[bool] = False
-    """For --cloud: find the transform from its frame to the scene's, by the scene's own points."""
+    """For --cloud: find that matrix, by the scene's own points."""
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
     memory: Annotated[str | None, memory_flag()] = None
-    """Most memory for points. A cloud that takes more is upsampled in tiles on disk, with the same
-    result; the points of --cloud are merged in larger voxels."""
+    """Most memory: larger clouds are upsampled in tiles on disk; --cloud merges more points."""
     jobs: Annotated[int | None, number_flag(int, "1; with Ray, as many as fit")] = None
     """Tiles at a time, each in a process of its own."""
     executor: Literal["local", "ray"] = "local"

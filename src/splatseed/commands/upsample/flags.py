@@ -48,7 +48,7 @@ def memory_flag() -> Any:
     return tyro.conf.arg(
         constructor=str,
         metavar="BYTES|4G",
-        help_behavior_hint="(default: what is free; for --cloud at most 4G)",
+        help_behavior_hint="(default: what is free; --cloud: at most 4G)",
     )
 
 
