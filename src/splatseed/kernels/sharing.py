@@ -44,7 +44,7 @@ def compile_once(compiled: Any) -> None:
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """Hold a lock, if files can be locked there; waiting counts as compiling for those who watch."""
+    """Hold a lock, if files can be locked there; waiting counts as compiling."""
     lock = FileLock(path)
     with suppress(OSError, NotImplementedError):  # a folder that is read-only, or on a network
         path.parent.mkdir(parents=True, exist_ok=True)
