@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import socket
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -175,9 +176,14 @@ def _unanswered(session, points):
 
 
 @needs_browser
-def test_switches_of_the_page_act(viewer, tmp_path):
-    with served_page(tmp_path, viewer.url) as page:
+def test_switches_of_the_page_act_and_what_is_compared_is_there(run_folder, tmp_path):
+    port = free_port("127.0.0.1", 0)
+    one = open_shown(run_folder)
+    viewer = Viewer([one, replace(one, name="other")], "127.0.0.1", port, beside=1)
+    with served_page(tmp_path, f"http://127.0.0.1:{port}") as page:
         session = _session(viewer)
+        assert session._second.value == "other: Gaussians"
+        assert session._split.visible
         assert waits_for(lambda: "Show cameras" in text(page))
         before = session._cameras_on.value
         toggle(page, "Show cameras")
@@ -187,6 +193,7 @@ def test_switches_of_the_page_act(viewer, tmp_path):
         click_text(page, "Screenshot", "button")
         assert waits_for(lambda: shots)
         assert shots[0][1].startswith(b"\x89PNG")
+    viewer.stop()
 
 
 @needs_browser

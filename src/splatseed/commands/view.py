@@ -68,12 +68,14 @@ def run(arguments: list[str]) -> None:
     port = free_port(options.host, options.port)
     with stage_display() as clock:
         clock("read", 0.0)
-        opened = _opened(options)
+        opened, beside = _opened(options)
         device = pick_device(options.backend)
-        viewer = Viewer(opened, options.host, port, device, most_points=options.max_points)
+        viewer = Viewer(
+            opened, options.host, port, device, most_points=options.max_points, beside=beside
+        )
         clock("prepare", 0.0)
         viewer.entries[0].warm_up()
-    _announce(options, port, opened)
+    _announce(options, port, opened, beside)
     try:
         while True:
             time.sleep(3600)
@@ -83,13 +85,14 @@ def run(arguments: list[str]) -> None:
         viewer.stop()
 
 
-def _opened(options: Options) -> list[Shown]:
-    """What to show, under names that tell them apart."""
+def _opened(options: Options) -> tuple[list[Shown], int | None]:
+    """What to show, under names that tell them apart; and which is compared with the first."""
     from dataclasses import replace  # noqa: PLC0415  (loads with its use)
 
     from splatseed.viewer.shown import open_shown  # noqa: PLC0415  (loads with its use)
 
     paths = _within(options.what)
+    beside = None if options.compare is None else len(paths)
     if options.compare is not None:
         paths += _within(options.compare)
     names = [path.name for path in paths]
@@ -97,7 +100,7 @@ def _opened(options: Options) -> list[Shown]:
     for path in paths:
         name = path.name if names.count(path.name) == 1 else f"{path.parent.name}/{path.name}"
         opened.append(replace(open_shown(path, options.scene), name=name or str(path)))
-    return opened
+    return opened, beside
 
 
 def _within(path: Path) -> list[Path]:
@@ -135,11 +138,13 @@ def _is_shown(path: Path) -> bool:
     return True
 
 
-def _announce(options: Options, port: int, opened: list[Shown]) -> None:
+def _announce(options: Options, port: int, opened: list[Shown], beside: int | None) -> None:
     """Say where to look; flushed, because whoever started us may be waiting for it."""
     host = "localhost" if options.host in LOCAL | {"0.0.0.0"} else options.host  # noqa: S104  (compared, not bound)
     url = f"http://{host}:{port}"
     rows = [(shown.name, _contents(shown)) for shown in opened]
+    if beside is not None:
+        rows.append(("side by side", f"{opened[0].name} left, {opened[beside].name} right"))
     print_pairs("splatseed view", rows)
     commands = [("open in a browser", url)]
     if options.host in LOCAL:

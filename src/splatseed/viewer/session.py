@@ -40,6 +40,8 @@ FLIGHT_SECONDS, FLIGHT_STEPS = 0.5, 15
 _LOG = logging.getLogger(__name__)
 ARRIVED = 1e-3
 NO_SECOND = "nothing"
+CLEAR_OF_CONTROLS = 0.38
+"""Where the border between two pictures begins: the controls cover the right of the window."""
 JPEG_MOVING, JPEG_STILL = 70, 92
 
 
@@ -50,10 +52,18 @@ class Session:
         client: viser's handle of the browser.
         entries: What was opened; at least one.
         most_points: The most points that the browser draws.
+        beside: The entry whose model is shown beside that of the first, from the beginning.
     """
 
-    def __init__(self, client: Any, entries: list[Entry], most_points: int = MOST_POINTS) -> None:
+    def __init__(
+        self,
+        client: Any,
+        entries: list[Entry],
+        most_points: int = MOST_POINTS,
+        beside: Entry | None = None,
+    ) -> None:
         self._most_points = most_points
+        self._beside = beside
         self._client = client
         self._entries = {entry.name: entry for entry in entries}
         self._goal: Image | None = None
@@ -92,8 +102,11 @@ class Session:
             "Picture", kinds, initial_value=kinds[1 if first.has_model else 0]
         )
         seconds = self._second_choices()
-        self._second = gui.add_dropdown("Beside it", seconds)
-        self._split = gui.add_slider("Border at", 0.05, 0.95, 0.01, 0.5, visible=False)
+        second = self._second_at_first()
+        self._second = gui.add_dropdown("Beside it", seconds, initial_value=second)
+        border = 0.5 if second == NO_SECOND else CLEAR_OF_CONTROLS
+        shown = second != NO_SECOND
+        self._split = gui.add_slider("Border at", 0.05, 0.95, 0.01, border, visible=shown)
         self._note = gui.add_markdown("", visible=False)
         shot = gui.add_button("Screenshot")
         with gui.add_folder("Points"):
@@ -126,6 +139,13 @@ class Session:
             f"{entry.name}: {kind}" if several else kind: (entry, kind) for entry, kind in pairs
         }
         return (NO_SECOND, *self._seconds)
+
+    def _second_at_first(self) -> str:
+        """The picture of the entry that was asked for beside the first."""
+        if self._beside is None or not self._beside.has_model:
+            return NO_SECOND
+        pictures = (self._beside, self._beside.kinds[0])
+        return next(name for name, pair in self._seconds.items() if pair == pictures)
 
     @property
     def _entry(self) -> Entry:

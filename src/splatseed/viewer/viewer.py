@@ -64,6 +64,7 @@ class Viewer:
         device: Where to render; the CPU when left out.
         entries: The entries to show instead of one per item of ``opened``.
         most_points: The most points that a browser draws.
+        beside: Which of the entries a browser begins with beside the first.
 
     Raises:
         MissingDependencyError: viser is absent.
@@ -77,6 +78,7 @@ class Viewer:
         device: torch.device | None = None,
         entries: list[Entry] | None = None,
         most_points: int = MOST_POINTS,
+        beside: int | None = None,
     ) -> None:
         require("viser")
         import viser  # noqa: PLC0415  (of the extra view)
@@ -84,6 +86,7 @@ class Viewer:
         self.frame = stage_frame(opened[0])
         self.entries = entries or [Entry(shown, self.frame, device) for shown in opened]
         self._most_points = most_points
+        self._beside = None if beside is None else self.entries[beside]
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
         # A browser may disconnect at any moment: no warning that it missed the rest.
@@ -121,7 +124,7 @@ class Viewer:
         """Called for each new browser; subclasses add controls here."""
 
     def _welcome(self, client: Any) -> None:
-        session = Session(client, self.entries, self._most_points)
+        session = Session(client, self.entries, self._most_points, self._beside)
         self.greet(session)
         with self._lock:
             self._sessions[client.client_id] = session
