@@ -49,7 +49,7 @@ def test_a_budget_is_gaussians_per_pixel_as_trained(room_path, tmp_path, capsys)
 
 def test_without_a_strategy_the_length_of_the_run_says_which(room_path, tmp_path, capsys):
     run = tmp_path / "run"
-    words = (room_path, "--max-steps", "3", "--data-factor", "2", "-o", run)
+    words = (room_path, "--max-steps", "3", "--long-side", "48", "-o", run)
     assert _run(*words) == 0
     said = capsys.readouterr().out
     assert "auto (grow)" in said
@@ -109,6 +109,8 @@ def test_interrupted_it_saves_and_says_how_to_go_on(room_path, tmp_path):
         (("--max-steps", "0"), "--max-steps"),
         (("--strategy", "magic"), "strategy"),
         (("--data-factor", "50"), "data-factor"),
+        (("--data-factor", "2", "--long-side", "48"), "--long-side or --data-factor"),
+        (("--long-side", "0"), "--long-side of 1 or more"),
     ],
 )
 def test_bad_words_end_in_one_line(room_path, tmp_path, capsys, words, said):

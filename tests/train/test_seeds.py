@@ -24,20 +24,23 @@ def points(rng) -> PointCloud:
     return PointCloud(xyz, np.zeros((ORIGINALS + NEW, 3), np.uint8), source)
 
 
-def thinned(points: PointCloud, cap: int, seed: int = 0) -> tuple[PointCloud, list[str]]:
+def thinned(
+    points: PointCloud, cap: int, seed: int = 0, **settings
+) -> tuple[PointCloud, list[str]]:
     notes: list[str] = []
-    settings = TrainSettings(cap_max=cap, seed=seed)
-    return usable_seeds(points, settings, notes.append), notes
+    asked = TrainSettings(cap_max=cap, seed=seed, **settings)
+    return usable_seeds(points, asked, notes.append), notes
 
 
 def test_more_than_the_cap_are_thinned_and_told_of(points):
     seeds, notes = thinned(points, 70)
-    assert len(seeds) == 70
+    assert len(seeds) == 49  # seven tenths: default adds the rest
     assert np.isin(seeds.xyz, points.xyz).all()
-    told = f"100 seeds were thinned to --cap-max 70, {seeds.num_original} of them originals."
-    assert notes == [f"{told} They leave densification no room."]
-    usable_seeds(points, TrainSettings(cap_max=70, strategy="none"), notes.append)
-    assert notes[1:] == [told]
+    told = f"100 seeds were thinned to 49, {seeds.num_original} of them originals"
+    assert notes == [f"{told}: there may be 70 Gaussians; strategy default adds the rest."]
+    seeds = usable_seeds(points, TrainSettings(cap_max=70, strategy="none"), notes.append)
+    told = f"100 seeds were thinned to 70, {seeds.num_original} of them originals"
+    assert notes[1:] == [f"{told}: there may be 70 Gaussians."]
 
 
 def test_what_crowds_goes_first(points):
@@ -45,7 +48,7 @@ def test_what_crowds_goes_first(points):
     xyz = np.concatenate([points.xyz[:ORIGINALS], points.xyz[:ORIGINALS] + np.float32(1e-4)])
     source = np.repeat([0, 4], ORIGINALS).astype(np.uint8)
     pairs = PointCloud(xyz, np.zeros((2 * ORIGINALS, 3), np.uint8), source)
-    seeds, _ = thinned(pairs, ORIGINALS)
+    seeds, _ = thinned(pairs, ORIGINALS, strategy="none")
     assert np.array_equal(seeds.xyz, points.xyz[:ORIGINALS])
 
 

@@ -25,10 +25,15 @@ from splatseed.views.view import View
 if TYPE_CHECKING:
     from splatseed.stereo.result import Stereo
 
-__all__ = ["SEEDS_SHARE", "seeded", "seeds_digest", "usable_seeds"]
+__all__ = ["SEEDS_SHARE", "most_seeds", "seeded", "seeds_digest", "usable_seeds"]
 
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
 """Most seeds as a fraction of the cap, for strategies that add Gaussians; others may use it all."""
+
+
+def most_seeds(settings: TrainSettings, cap: int) -> int:
+    """How many seeds a run begins with at most, if there may be ``cap`` Gaussians."""
+    return max(2, round(SEEDS_SHARE.get(settings.densification, 1.0) * cap))
 
 
 def seeded(
@@ -62,12 +67,11 @@ def seeded(
             return results[-1]
 
     start = time.perf_counter()
-    part = SEEDS_SHARE.get(settings.densification, 1.0)
     size = stereo_size(scene.split(settings.test_every)[0], settings)
     cloud = upsample(
         scene,
         Remembering(hold_out=settings.test_every, max_size=size),
-        budget=None if settings.cap is None else max(2, round(part * settings.cap)),
+        budget=None if settings.cap is None else most_seeds(settings, settings.cap),
         progress=progress,
         note=note,
     )
@@ -94,7 +98,8 @@ def usable_seeds(
 ) -> PointCloud:
     """The finite points that a run begins with, thinned if there are more than the cap.
 
-    Points in crowded parts of the views are dropped first, and new points before originals.
+    Points in crowded parts of the views are dropped first, and new points before originals. For a
+    strategy that adds Gaussians, thinning leaves it the room for them (``SEEDS_SHARE``).
 
     Args:
         points: The scene's points.
@@ -122,12 +127,12 @@ def _within_cap(
 
     # Thinning takes the earlier of equals: originals first.
     points = points.select(np.argsort(points.source != ORIGINAL, kind="stable"))
-    first = points.num_original
-    seeds = points.select(thin(points.xyz, views, cap, first=first, priority=points.confidence))
+    first, most = points.num_original, most_seeds(settings, cap)
+    seeds = points.select(thin(points.xyz, views, most, first=first, priority=points.confidence))
+    room = "" if most == cap else f"; strategy {settings.densification} adds the rest"
     note(
-        f"{len(points):,} seeds were thinned to --cap-max {cap:,}, {seeds.num_original:,} of them "
-        "originals."
-        + (" They leave densification no room." if settings.densification == "default" else "")
+        f"{len(points):,} seeds were thinned to {most:,}, {seeds.num_original:,} of them originals:"
+        f" there may be {cap:,} Gaussians{room}."
     )
     return seeds
 

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Literal, Self
 
 from splatseed.scores import CurvePoint, EvalResult
-from splatseed.train.seeds import SEEDS_SHARE
+from splatseed.train.seeds import most_seeds
 from splatseed.train.settings import StrategyName, TrainSettings
 from splatseed.upsample import Profile
 
@@ -159,8 +159,7 @@ class RunSpec:
         """The number that seeds are thinned to under a budget; None without one."""
         if not self.arm.budget or self.training.cap_max is None:
             return None
-        share = SEEDS_SHARE.get(self.settings.densification, 1.0)
-        return max(2, round(share * self.training.cap_max))
+        return most_seeds(self.settings, self.training.cap_max)
 
     def to_json(self) -> str:
         """As one line of JSON."""

@@ -28,7 +28,7 @@ from splatseed.seeding.advice import (
     stereo_agreement,
 )
 from splatseed.train.schedule import FULL_RUN
-from splatseed.train.seeds import SEEDS_SHARE
+from splatseed.train.seeds import most_seeds
 from splatseed.train.settings import BUDGET, TrainSettings
 
 __all__ = ["Planned", "advice_commands", "advice_for", "advice_rows", "run_advice"]
@@ -74,8 +74,7 @@ class Planned:
 
             number = max(2, points_within(scene, budget))
         settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
-        share = SEEDS_SHARE.get(settings.densification, 1.0)
-        return cls(number, max_steps, settings.densification, max(2, round(share * number)))
+        return cls(number, max_steps, settings.densification, most_seeds(settings, number))
 
 
 def advice_for(

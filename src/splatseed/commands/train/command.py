@@ -72,6 +72,12 @@ class Options:
     ] = None
     """Most Gaussians: a number, or 0.25rho for a quarter of the pixels of a photograph at training
     size."""
+    long_side: Annotated[
+        int | None,
+        tyro.conf.arg(constructor=int, metavar="INT", help_behavior_hint="(default: none)"),
+    ] = None
+    """Instead of --data-factor: downsample by the least whole factor that leaves at most this many
+    pixels on a photograph's longer side."""
     seeds: Annotated[
         Seeding | None,
         tyro.conf.arg(
@@ -140,7 +146,7 @@ def _prepare(
         note(warning)
     if scene.listed is not None:
         note(scene.listed.sentence)
-    settings = _within_budget(options, settings, scene, note)
+    settings = _within_budget(options, _sized(options, settings, scene), scene, note)
     how = RunOptions(
         resume=options.resume,
         overwrite=options.overwrite,
@@ -148,6 +154,20 @@ def _prepare(
         cache_dir=user_cache_dir(),
     )
     return prepare_run(scene, options.output, settings, how, note=note, progress=clock)
+
+
+def _sized(options: Options, settings: TrainSettings, scene: Scene) -> TrainSettings:
+    """The settings, with the factor that --long-side amounts to in this scene."""
+    if options.long_side is None:
+        return settings
+    if settings.data_factor != 1:
+        raise ParameterError("--long-side or --data-factor", found="both", fix="Leave one out.")
+    if options.long_side < 1:
+        raise ParameterError(
+            "--long-side of 1 or more", found=f"{options.long_side}", fix="Try 800."
+        )
+    sizes = [max(im.intrinsics.width, im.intrinsics.height) for im in scene.images]
+    return replace(settings, data_factor=max(1, -(-max(sizes, default=1) // options.long_side)))
 
 
 def _within_budget(
