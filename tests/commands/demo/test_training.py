@@ -26,7 +26,7 @@ def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
         metrics = json.loads((out / f"run_{name}/metrics.json").read_text())
         config = json.loads((out / f"run_{name}/config.json").read_text())
         assert metrics["steps"] == 44
-        assert config["strategy"] == "grow"
+        assert config["strategy"] == "default"
         assert config["cap_max"] == seeded["num_points"]
         counts[name] = metrics["num_gaussians"]
         assert f"{metrics['psnr']:.2f}" in run.out

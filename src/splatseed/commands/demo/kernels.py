@@ -148,7 +148,7 @@ def _train(scene: Path) -> None:
     from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
 
     arm = Arm("", scene, scene.with_name("run"))
-    train_arm(arm, TrainSettings(strategy="grow", cap_max=2000, max_steps=4), StageClock())
+    train_arm(arm, TrainSettings(cap_max=2000, max_steps=4), StageClock())
 
 
 def _has_pytorch() -> bool:
