@@ -72,12 +72,10 @@ def variant_of(spec: RunSpec) -> Variant:
     """
     if spec.arm.method == SFM:
         return BASELINE
-    told = dict(spec.parameters)
-    if (
-        told.get("hold_out") == spec.training.test_every
-    ):  # what a plan always asks of the method depth
-        del told["hold_out"]
-    words = tuple(f"{name}={value}" for name, value in sorted(told.items()))
+    # A plan asks every method that looks at photographs to hold out the test views.
+    usual = [("hold_out", spec.training.test_every), ("cloud.hold_out", spec.training.test_every)]
+    told = [each for each in sorted(spec.parameters.items()) if each not in usual]
+    words = tuple(f"{name}={value}" for name, value in told)
     return Variant(spec.arm.method, spec.arm.profile, float(spec.arm.ratio), words)
 
 
