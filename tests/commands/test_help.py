@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 from importlib.metadata import version
@@ -43,6 +44,10 @@ def test_upsamples_help_is_short_and_says_where_the_rest_is(splatseed):
     assert "--method" in short.out
     assert "--mls.k" not in short.out
     assert "--help-all" in short.out
+    assert "None" not in short.out  # of choices: their defaults are in words
+    words = " ".join(re.sub("[│|]", " ", short.out).split())
+    assert "The scene folder to write. (without it: a recommendation, nothing is written)" in words
+    assert ".laz, .e57" in words
     one = splatseed("upsample", "--method", "mls", "--help").out
     assert "--mls.k" in one
     assert "--spline.k" not in one

@@ -22,6 +22,7 @@ from splatseed.commands.upsample.flags import (
     depth_folder_flag,
     memory_flag,
     number_flag,
+    output_flag,
 )
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
 from splatseed.commands.upsample.start import check_start, write_start
@@ -60,6 +61,8 @@ if TYPE_CHECKING:
 __all__ = ["Options", "parse", "run"]
 
 HELP_ALL = "--help-all"
+OUTPUT = Path("OUT")
+"""Stands for an output where the help is shown."""
 
 
 @dataclass(frozen=True)
@@ -67,19 +70,17 @@ class Options:
     """Upsample the points of a scene, ready for any 3DGS trainer."""
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """A COLMAP scene folder, a folder with transforms.json, or a .ply."""
-    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """A COLMAP folder, one with transforms.json, or a cloud (.ply, .las, .laz, .e57, .xyz ...)."""
+    output: Annotated[Path, output_flag()]
     """The scene folder to write."""
     method: str = DEFAULT_METHOD
-    """The method that makes new points; the flags of each are below. auto uses the
-    photographs."""
+    """The method that makes new points; --method NAME --help shows its flags."""
     ratio: Annotated[float | None, number_flag(float, "4, unless --num-points is given")] = None
     """Points in all, as a multiple of the originals, for methods that interpolate."""
     num_points: Annotated[int | None, number_flag(int, "by the ratio")] = None
     """Points in all, instead of a ratio."""
     budget: Annotated[str | None, budget_flag()] = None
-    """Most points in all: a number, or 0.25rho for a quarter of the pixels of one photograph at
-    full size."""
+    """Most points in all: a number, or 0.25rho for a quarter of a full photograph's pixels."""
     cover_cell: Annotated[int | None, cover_flag()] = None
     """Side in pixels of the parts of the photographs that get a seed if no point falls in."""
     verify: bool = False
@@ -87,10 +88,12 @@ class Options:
     seed: int = 0
     """The same seed gives the same bytes."""
     profile: Profile = "default"
-    """Defaults of the method flags below: improved ones, or those of the paper's text."""
+    """Defaults of the methods' flags: improved ones, or those of the paper's text."""
     depth_maps: Annotated[Path | None, depth_folder_flag()] = None
     """For --method depth: a folder of depth maps, in any layout that docs/formats.md lists."""
-    depth_kind: Annotated[DepthKind | None, default_flag("what the folder says, else z")] = None
+    depth_kind: Annotated[
+        DepthKind | None, default_flag("what the folder says, else z", "{z,ray,inverse}")
+    ] = None
     """What their values are: planar depth, distance along the ray, or inverse depth."""
     depth_scale: Annotated[float | None, number_flag(float, "what the folder says")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
@@ -118,18 +121,18 @@ class Options:
     """Tiles at a time, each in a process of its own."""
     executor: Literal["local", "ray"] = "local"
     """Who works on tiles: this machine, or a Ray cluster that shares its disk."""
-    address: Annotated[str | None, default_flag("a cluster on this machine")] = None
+    address: Annotated[str | None, default_flag("a cluster on this machine", "HOST:PORT|auto")] = (
+        None
+    )
     """The cluster's address, or auto on one of its nodes."""
     tile_points: Annotated[int | None, number_flag(int, "by the memory")] = None
     """Most points in a tile."""
     preview: bool = False
-    """Also write pictures: before and after, every method, seeds by origin, cells covered, stereo's
-    maps."""
+    """Also write pictures: before and after, every method, origins, cells covered, stereo maps."""
     gaussians: Annotated[
         Path | None, tyro.conf.arg(constructor=Path, help_behavior_hint="(default: none)")
     ] = None
-    """Also write the initial Gaussians of training, as a 3DGS .ply, for trainers that start from
-    one."""
+    """Also write the initial Gaussians as a 3DGS .ply, for trainers that start from one."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write; auto keeps the input's."""
     copy_images: bool = False
@@ -188,6 +191,8 @@ def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
     ]
+    if "--help" in arguments:  # with a default, -o is not called required, which it is not alone
+        fields.append(("output", Annotated[Path, output_flag()], dataclasses.field(default=OUTPUT)))
     full = dataclasses.make_dataclass(
         "UpsampleOptions",
         [("method", Literal[names], dataclasses.field(default=DEFAULT_METHOD)), *fields],

@@ -14,6 +14,7 @@ __all__ = [
     "depth_folder_flag",
     "memory_flag",
     "number_flag",
+    "output_flag",
 ]
 
 
@@ -52,9 +53,16 @@ def memory_flag() -> Any:
     )
 
 
-def default_flag(stands_in: str) -> Any:
-    """How an optional choice appears in the help: with its default in words."""
-    return tyro.conf.arg(help_behavior_hint=f"(default: {stands_in})")
+def default_flag(stands_in: str, metavar: str) -> Any:
+    """How an optional choice appears in the help: without None, with its default in words."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {stands_in})")
+
+
+def output_flag() -> Any:
+    """The flag --output; a scene alone is a question for advice."""
+    return tyro.conf.arg(
+        aliases=["-o"], help_behavior_hint="(without it: a recommendation, nothing is written)"
+    )
 
 
 def depth_folder_flag() -> Any:
