@@ -12,6 +12,7 @@ from splatseed.bench.analysis.arms.tables import (
     arm_table,
     scene_arm_table,
     seconds_table,
+    unequal_numbers,
 )
 from splatseed.bench.analysis.study import studies
 from splatseed.bench.analysis.tables import to_markdown
@@ -83,6 +84,7 @@ def test_tables_and_sentences_can_be_read():
     assert "sfm + default" in said
     assert "seeding counted" in said
     assert "at most 5,000 Gaussians" in study.description
+    assert unequal_numbers(study) is None
 
 
 def test_lpips_reaches_the_tables_where_it_was_measured():

@@ -103,9 +103,13 @@ def test_a_whole_ledger(tmp_path):
             "gain_by_ratio.png", "gain_by_strategy.png"} <= figures  # fmt: skip
     assert (report.tables * 3, report.figures) == (len(names) - 1, len(figures) - 2)
     said = " ".join(report.summary)
-    assert "mls 8x most (+0.50 ± 0.01 dB)" in said
+    assert "mls 8x most (+0.50 dB, ± 0.01 by the repeats of all variants)" in said
     assert "comes out best" in said
+    assert re.search(r"\(± \d\.\d\d over scenes\) more than sfm \+ default", said)
     said = text_of(bench)
+    assert "At equal cost" not in said  # nobody asked for it
+    assert "The arms end with 5,000 to 14,142 Gaussians" in said
+    assert "mean over scenes and 95% interval for scenes like these" in said
     assert "splatseed bench --scenes <A> 'b c'" in said
     assert "abacus" in said
 
@@ -216,6 +220,8 @@ def test_the_command_says_what_it_found(tmp_path, capsys):
     main(["bench", "report", str(bench), "--no-from-scenes"])
     said = " ".join(capsys.readouterr().out.split())
     assert "1 scene: yes, 3 of 4 variants gain more than noise" in said
+    assert "over repeats) more than sfm" in said
+    assert "over repeats and 95% interval for this scene trained again" in text_of(bench)
     assert str(bench / REPORT) in said
 
 

@@ -36,9 +36,9 @@ def summary(study: Study, strategy: StrategyName) -> tuple[str, ...]:
 
 
 def decibels(gain: Difference) -> str:
-    """A gain with its standard error, in words."""
-    spread = "" if math.isnan(gain.se) else f" ± {gain.se:.2f}"
-    return f"{gain.mean:+.2f}{spread} dB"
+    """A gain in words, with the noise of training again as its standard error."""
+    spread = "" if math.isnan(gain.se) else f", ± {gain.se:.2f} by the repeats of all variants"
+    return f"{gain.mean:+.2f} dB{spread}"
 
 
 def _answer(gained: Gains, best: Variant) -> str:

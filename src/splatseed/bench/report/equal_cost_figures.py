@@ -139,9 +139,13 @@ def arm_figure(study: Study) -> Plot | None:
     axes.set_ylim(len(others) - 0.5, -0.5)
     axes.set_xlabel(f"gain over {base.label}, dB")
     axes.grid(visible=True, axis="x", alpha=0.25)
+    alone = all(len(each.scenes) == 1 for each in others)
+    of = "repeats and 95% interval for this scene trained again" if alone else (
+        "scenes and 95% interval for scenes like these"
+    )  # fmt: skip
     return Plot(
         "gain_arms",
-        f"Gain over {base.label} of every arm: mean over scenes and 95% interval for scenes like "
-        "these (of each comparison alone, not adjusted for their number).",
+        f"Gain over {base.label} of every arm: mean over {of} (of each comparison alone, not "
+        "adjusted for their number).",
         png(figure),
     )

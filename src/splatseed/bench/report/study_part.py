@@ -10,7 +10,12 @@ from dataclasses import dataclass, field, replace
 
 from splatseed.bench.analysis.arms.advice import advice_table, score_advice
 from splatseed.bench.analysis.arms.compared import compared_arms
-from splatseed.bench.analysis.arms.tables import arm_table, scene_arm_table, seconds_table
+from splatseed.bench.analysis.arms.tables import (
+    arm_table,
+    scene_arm_table,
+    seconds_table,
+    unequal_numbers,
+)
 from splatseed.bench.analysis.comparisons import equal_count_table, ratio_table, strategy_table
 from splatseed.bench.analysis.convergence import convergence_table
 from splatseed.bench.analysis.costs import cost_table, quality_table
@@ -88,7 +93,8 @@ def study_report(
     """
     report = StudyReport(prefix, title)
     strategies = study.strategies
-    report.add("cost", "At equal cost", _equal_cost(study))
+    title = "At equal cost" if study.settings["budget"] else "All arms"
+    report.add("cost", title, _all_arms(study))
     report.add("scores", "Scores", _scores(study))
     if not study.variants:
         report.add("gains", "Gains", [NO_GAINS])
@@ -100,9 +106,10 @@ def study_report(
     return report
 
 
-def _equal_cost(study: Study) -> Iterable[Table | Plot | None]:
+def _all_arms(study: Study) -> Iterable[Table | Plot | str | None]:
     """All arms beside one baseline, whatever their strategy."""
     if len(compared_arms(study)) > 1:
+        yield unequal_numbers(study)
         yield arm_table(study)
         yield arm_figure(study)
         yield scene_arm_table(study)

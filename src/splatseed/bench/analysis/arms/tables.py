@@ -15,7 +15,11 @@ from splatseed.bench.analysis.study import BASELINE, Study
 from splatseed.bench.analysis.tables import Cell, Table, number, words
 from splatseed.bench.planning.records import RunResult
 
-__all__ = ["answer_at_equal_cost", "arm_table", "scene_arm_table", "seconds_table"]
+__all__ = ["answer_at_equal_cost", "arm_table", "scene_arm_table", "seconds_table",
+           "unequal_numbers"]  # fmt: skip
+
+EQUAL = 0.01
+"""Numbers of Gaussians that differ by no more than this share count as equal."""
 
 GAIN_NOTE = (
     "Gains are over {base}, paired by scene and repeat: mean ± standard error over scenes (over "
@@ -158,6 +162,21 @@ def _share_of_time(sooner: Difference | None) -> Cell:
     return Cell(math.exp(sooner.mean), digits=2, mark=mark)
 
 
+def unequal_numbers(study: Study) -> str | None:
+    """A warning that the arms end with different numbers of Gaussians; None if they do not.
+
+    Args:
+        study: The study.
+    """
+    numbers = [each.num_gaussians for each in compared_arms(study)]
+    if not numbers or max(numbers) <= min(numbers) * (1 + EQUAL):
+        return None
+    return (
+        f"The arms end with {min(numbers):,.0f} to {max(numbers):,.0f} Gaussians, and more of them "
+        "alone can bring a gain: --budgets gives every arm the same number."
+    )
+
+
 def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
     """The conclusions on the arms, for a reader who has not seen the tables.
 
@@ -188,7 +207,8 @@ def _against(each: Compared, base: Arm) -> str:
     """A gain in words."""
     gain = each.gain
     more = "more" if gain.mean >= 0 else "less"
-    spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f})"
+    over = "scenes" if len(each.scenes) > 1 else "repeats"
+    spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {over})"
     doubt = {
         "within noise": ", which may be chance",
         "unknown": ", which a single run cannot confirm",
