@@ -59,24 +59,11 @@ def main() -> None:
         scene = scene.replace(depths=find_depths(scene, Path(folder) / "room"))
         clouds = {n: ss.upsample(scene, n, ratio=RATIO, seed=0) for n in methods_for(scene)}
         draw_lifting(capture, scene, clouds["depth"])
-    draw_before_after(capture, clouds["mls"])
     draw_overview(capture, clouds)
     draw_errors(capture, clouds)
     for name in methods_for(capture.scene):
         draw_method(capture.scene, name, clouds[name])
     draw_depth()
-
-
-def draw_before_after(capture: Capture, upsampled: ss.PointCloud) -> None:
-    """The README's picture: photograph, points, upsampled points."""
-    points, width = capture.scene.points, 390
-    clouds = {
-        f"SfM: {len(points):,} points": points,
-        f"splatseed, mls {RATIO}x: {len(upsampled):,} points": upsampled,
-    }
-    panels = [Panel("photograph", photograph(capture, width))]
-    panels += cloud_panels(clouds, choose_camera(capture.scene), width, point_size=1.7)
-    write_grid([panels], HERE / "before_after.png", colors=160)
 
 
 def draw_overview(capture: Capture, clouds: Mapping[str, ss.PointCloud]) -> None:
