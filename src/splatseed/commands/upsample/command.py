@@ -24,6 +24,7 @@ from splatseed.commands.upsample.flags import (
     number_flag,
 )
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
+from splatseed.commands.upsample.plan_line import method_words, number_words, parameters_of
 from splatseed.commands.upsample.start import check_start, write_start
 from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
 from splatseed.console import (
@@ -42,6 +43,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.process.memory import bytes_of
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import photographed
+from splatseed.seeding.thinning import points_within
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
 from splatseed.upsample import (
     METHODS,
@@ -227,7 +229,9 @@ def run(arguments: list[str]) -> None:
         notes += brought.notes
         method = methods[options.method]
         total = _planned(options, method, len(scene.points))
-    _announce(options, scene, method, total, _idle(options, methods), brought.takes)
+        most = None if options.budget is None else points_within(scene, options.budget)
+    number = number_words(total, most)
+    _announce(options, scene, method, number, _idle(options, methods), brought.takes)
     with stage_display(clock):
         beside = methods[CLOUD] if options.cloud_files and options.method != CLOUD else None
         seeds = _make(options, scene, method, beside, total, clock, notes)
@@ -320,7 +324,7 @@ def _announce(
     options: Options,
     scene: Scene,
     method: Upsampler,
-    total: int | None,
+    number: str,
     idle: Sequence[str],
     takes: str,
 ) -> None:
@@ -330,11 +334,9 @@ def _announce(
     for name in idle:
         print_note(f"The flags of {name} have no effect with --method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
-    parameters = ", ".join(f"{k}={v}" for k, v in _parameters(method).items())
-    number = "as many as the photographs need" if total is None else f"{total:,} points"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} "
-        f"points)\n  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n  "
+        f"points)\n  -> {method_words(options.method, method, options.profile)}\n  "
         f"-> {visible(options.output)} ({number}, seed {options.seed}){takes}",
         soft_wrap=True,
     )
@@ -363,19 +365,13 @@ def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
     )
 
 
-def _parameters(method: Upsampler) -> dict[str, object]:
-    """The parameters of a method; a cloud's files are told elsewhere."""
-    given = dataclasses.asdict(method)  # type: ignore[call-overload]  # a method is a dataclass
-    return {name: given[name] for name in given if name not in {"files", "transform", "memory"}}
-
-
 def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
     """How the output was made, for ``splatseed.json``."""
     return {
         "command": "upsample",
         "method": options.method,
         "profile": options.profile,
-        "parameters": _parameters(method),
+        "parameters": parameters_of(method),
         "cloud": options.bringing.provenance if options.cloud_files else None,
         "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
         "ratio": options.ratio,
