@@ -9,11 +9,14 @@ import sys
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 
 from splatseed import requirements
 from splatseed.commands.train import Options
 from splatseed.errors import MissingDependencyError
+from splatseed.io.ply.points import write_ply
+from splatseed.pointcloud import PointCloud
 from splatseed.train.record.config import resumed_settings
 
 from ..command_line import exit_code
@@ -119,6 +122,16 @@ def test_bad_words_end_in_one_line(room_path, tmp_path, capsys, words, said):
     assert said in error
     assert error.count("error:") == 1
     assert not (tmp_path / "run").exists()
+
+
+def test_a_cloud_alone_cannot_be_trained(tmp_path, capsys):
+    write_ply(tmp_path / "room.ply", PointCloud(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8)))
+    for output in (tmp_path / "run", tmp_path):  # beside the cloud there is nothing wrong
+        assert _run(tmp_path / "room.ply", "-o", output) == 2
+        error = capsys.readouterr().err
+        assert f"found points alone ({tmp_path / 'room.ply'})" in error
+        assert "apart from the input" not in error
+    assert [each.name for each in tmp_path.iterdir()] == ["room.ply"]
 
 
 def test_missing_packages_are_named_with_the_command(monkeypatch):

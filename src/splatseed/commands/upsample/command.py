@@ -305,7 +305,7 @@ def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, floa
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
     scene = load_scene(options.scene, require_points="points" in traits_of(method).needs)
-    scene = scene.replace(points=scene.points.originals)
+    scene = _originals(scene)
     if options.depth_maps is not None:
         maps = find_depths(
             scene, options.depth_maps, kind=options.depth_kind, scale=options.depth_scale
@@ -318,6 +318,18 @@ def _read(options: Options, method: Upsampler) -> Scene:
             fix="Name the folder.",
         )
     return scene
+
+
+def _originals(scene: Scene) -> Scene:
+    """The scene without the points that splatseed added before, and a warning if it had any."""
+    points = scene.points.originals
+    if len(points) == len(scene.points):
+        return scene
+    note = (
+        f"Only the {len(points):,} originals are used: the {len(scene.points) - len(points):,} "
+        "points that splatseed added before are replaced."
+    )
+    return scene.replace(points=points, warnings=(*scene.warnings, note))
 
 
 def _announce(

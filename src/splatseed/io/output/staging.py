@@ -145,7 +145,7 @@ def check_apart(path: Path, protect: Sequence[Path]) -> None:
         if target == source or source in target.parents or target in source.parents:
             raise OutputError(
                 "an output folder apart from the input",
-                found=f"{target}, which is, holds or lies in the input {source}",
+                found=f"{target}, which {_relation(target, source)} {source}",
                 fix="Choose a folder beside the input.",
             )
     here = Path.cwd()
@@ -155,6 +155,12 @@ def check_apart(path: Path, protect: Sequence[Path]) -> None:
             found=f"{target}, which holds the working directory",
             fix="Name a new folder.",
         )
+
+
+def _relation(target: Path, source: Path) -> str:
+    if target == source:
+        return "is the input"
+    return "lies in the input" if source in target.parents else "holds the input"
 
 
 def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
