@@ -73,7 +73,11 @@ def is_baseline(arm: Arm) -> bool:
 
 
 def plan_rungs(
-    num_arms: int, seconds: float, most_steps: int, cost: Callable[[Sequence[Rung]], float]
+    num_arms: int,
+    seconds: float,
+    most_steps: int,
+    cost: Callable[[Sequence[Rung]], float],
+    least_steps: int = 0,
 ) -> tuple[Rung, ...]:
     """The longest rungs that fit into a time.
 
@@ -82,6 +86,7 @@ def plan_rungs(
         seconds: The time.
         most_steps: Most steps of the last rung.
         cost: Estimates the seconds of some rungs.
+        least_steps: Fewest steps of the first rung.
 
     Returns:
         The shortest rungs, if not even these fit.
@@ -95,7 +100,8 @@ def plan_rungs(
             for i, count in enumerate(counts)
         )
 
-    low, high = LEAST_STEPS, max(most_steps >> (len(KEPT) - 1), LEAST_STEPS)
+    low = max(LEAST_STEPS, least_steps)
+    high = max(most_steps >> (len(KEPT) - 1), low)
     while high - low > max(LEAST_STEPS // 10, 1):
         middle = (low + high) // 2
         low, high = (middle, high) if cost(rungs(middle)) <= seconds else (low, middle)
