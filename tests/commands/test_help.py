@@ -9,6 +9,10 @@ from importlib.metadata import version
 import pytest
 
 
+OF_UNDISTORT = {"-h", "--help", "-o", "--output", "--threads", "--overwrite", "--no-overwrite",
+                "--verbose", "--no-verbose"}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -59,7 +63,18 @@ def test_upsamples_help_is_short_and_says_where_the_rest_is(splatseed):
         (["info", "--pi"], {"--picture"}),
         (["train", "x", "--max-s"], {"--max-steps"}),
         (["bench", "--exec"], {"--executor"}),
+        (["undistort", "-"], OF_UNDISTORT),
+        (["train", "x", "-o", "y", "--data-f"], {"--data-factor"}),
+        (["sfm", "--poses"], {"--poses-from"}),
+        (["upsample", "x", "--mls.k"], {"--mls.k"}),
+        (["upsample", "--help-"], {"--help-all"}),
+        (["bench", "re"], {"report"}),
+        (["bench", "compare", "a", "b", "--out"], {"--output"}),
+        (["bench", "report", "--from"], {"--from-scenes"}),
+        (["bench", "-o", "re"], set()),
         (["train", "sc"], set()),  # files, by the shell itself
+        (["train", "a", "b", "c", "d", "e", "f", "g", "h", "i", "''"], set()),
+        (["train", "a", "b", "c", "d", "e", "f", "g", "h", "i", "a-b"], set()),
     ],
 )
 def test_a_shell_completes_verbs_and_options(words, offered, splatseed):

@@ -24,7 +24,9 @@ Options = TypeVar("Options")
 
 COLOR = re.compile(r"\x1b\[[0-9;]*m")
 RULE = re.compile("[─-]{5,}")
-OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
+DEFINED = re.compile(r"^(?:│ | {2})(-\S.*?)(?: {2}| ?│?$)", re.MULTILINE)
+"""A line of tyro's help that defines options; help itself is indented further."""
+OPTION = re.compile(r"(?<![\w-])--?[a-z](?:[\w.-]*\w)?(?![\w-])")
 CHOICE = re.compile(r"invalid choice '([^']*)'.*?one of \(([^)]*)\)")
 TRIED = "Got errors:"
 """Marks the start of tyro's attempts to read a value, meant for its own developers."""
@@ -62,11 +64,12 @@ def parse_options(
 
 
 def known_options(kind: type[Any]) -> list[str]:
-    """All options of a dataclass's command line, such as ``--ratio``."""
+    """All options of a dataclass's command line, such as ``--ratio`` and ``-o``."""
     shown = io.StringIO()
     with redirect_stdout(shown), suppress(SystemExit):
         tyro.cli(kind, args=["--help"])
-    return sorted(set(OPTION.findall(COLOR.sub("", shown.getvalue()))))
+    defined = DEFINED.findall(COLOR.sub("", shown.getvalue()))
+    return sorted({option for line in defined for option in OPTION.findall(line)})
 
 
 def _suggestion(kind: type[Any], said: str, arguments: Sequence[str]) -> str:

@@ -59,7 +59,7 @@ from splatseed.upsample import (
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.method import Cloud
 
-__all__ = ["Options", "parse", "run"]
+__all__ = ["HELP_ALL", "Options", "full_options", "parse", "run"]
 
 HELP_ALL = "--help-all"
 
@@ -179,13 +179,24 @@ def _help(arguments: list[str]) -> None:
         _parse_with({name: configure(name) for name in named}, ["--help"])
     OUT.print(
         f"\nsplatseed upsample {HELP_ALL} shows the flags of all methods,"
-        " --method mls --help those of one method."
+        " --method mls --help those of one method.",
+        soft_wrap=True,
     )
     raise SystemExit(0)
 
 
 def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
-    """Options with one more field per method, whose default is the method given."""
+    """The options, with those of the methods given."""
+    return parse_options(_with_methods(methods), "upsample", arguments)
+
+
+def full_options() -> type[Any]:
+    """The options with those of every method."""
+    return _with_methods({name: configure(name) for name in METHODS})
+
+
+def _with_methods(methods: dict[str, Upsampler]) -> type[Any]:
+    """The options with one more field per method, whose default is the method given."""
     names = tuple(METHODS)
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
@@ -197,7 +208,7 @@ def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
         frozen=True,
     )
     full.__doc__ = Options.__doc__
-    return parse_options(full, "upsample", arguments)
+    return full
 
 
 def run(arguments: list[str]) -> None:
