@@ -8,13 +8,16 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatseed import requirements
 from splatseed.commands.train import Options
+from splatseed.commands.train.command import _next_commands
 from splatseed.errors import MissingDependencyError
+from splatseed.evaluate.lpips import LPIPS_NETS
 from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.train.record.config import resumed_settings
@@ -31,7 +34,7 @@ def test_trains_and_says_what_and_where(room_path, tmp_path, capsys):
     assert _run(*words) == 0
     said = capsys.readouterr()
     assert "test PSNR" in said.out
-    assert f"splatseed evaluate {run}" in said.out
+    assert f"splatseed view {run}" in said.out
     assert not said.err
     metrics = json.loads((run / "metrics.json").read_text())
     assert {"psnr", "ssim", "per_image", "train_seconds", "tests"} <= metrics.keys()
@@ -122,6 +125,16 @@ def test_bad_words_end_in_one_line(room_path, tmp_path, capsys, words, said):
     assert said in error
     assert error.count("error:") == 1
     assert not (tmp_path / "run").exists()
+
+
+def test_lpips_is_offered_only_where_its_weights_are(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.hub.get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr("splatseed.evaluate.lpips.require", lambda *_: None)
+    assert _next_commands(Path("my run")) == [("look at it", "splatseed view 'my run'")]
+    weights = tmp_path / "checkpoints" / LPIPS_NETS["vgg"].file
+    weights.parent.mkdir()
+    weights.touch()
+    assert _next_commands(Path("r"))[1] == ("score again, with LPIPS", "splatseed evaluate r")
 
 
 def test_a_cloud_alone_cannot_be_trained(tmp_path, capsys):

@@ -294,5 +294,14 @@ def _summarise(options: Options, result: TrainingResult) -> None:
             f"memory held the run at {held:,} Gaussians; results may differ on another machine. "
             f"Pass --cap-max {held} for the same result everywhere."
         )
-    output = quoted(options.output)
-    print_commands("next", [("score again, with LPIPS", f"splatseed evaluate {output}")])
+    print_commands("next", _next_commands(options.output))
+
+
+def _next_commands(output: Path) -> list[tuple[str, str]]:
+    """What to do with a finished run; LPIPS only where its weights are."""
+    from splatseed.evaluate.lpips import lpips_is_here  # noqa: PLC0415  (imports PyTorch)
+
+    commands = [("look at it", f"splatseed view {quoted(output)}")]
+    if lpips_is_here():
+        commands.append(("score again, with LPIPS", f"splatseed evaluate {quoted(output)}"))
+    return commands
