@@ -75,8 +75,7 @@ def test_rungs_fit_the_time_as_long_as_they_can():
 
 
 def test_the_first_rung_is_long_enough():
-    free = lambda rungs: 0.0
-    assert plan_rungs(15, 600.0, 400, free, 300)[0].steps == 300
+    assert plan_rungs(15, 600.0, 400, lambda _: 0.0, 300)[0].steps == 300
     assert plan_rungs(15, 600.0, 4000, lambda _: 1e9, 300)[0].steps == 300
 
 

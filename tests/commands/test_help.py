@@ -8,7 +8,6 @@ from importlib.metadata import version
 
 import pytest
 
-
 OF_UNDISTORT = {"-h", "--help", "-o", "--output", "--threads", "--overwrite", "--no-overwrite",
                 "--verbose", "--no-verbose"}  # fmt: skip
 
@@ -29,6 +28,22 @@ def test_a_slip_gets_a_suggestion(words, says, splatseed):
     run = splatseed(*words)
     assert (run.code, run.err.count("\n")) == (2, 1)
     assert says in run.err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--strategy", "defalt"], "none-3dgs; found 'defalt'. Did you mean default?"),
+        (["--strategy", "zzz"], "found 'zzz'. Run splatseed train --help to see what each is."),
+        (["--max-steps", "many"], "expected --max-steps as a whole number; found 'many'."),
+        (["--frobnicate"], "found unrecognized option"),
+    ],
+)
+def test_a_value_that_cannot_be_is_told_with_its_option(words, says, splatseed):
+    run = splatseed("train", "x", "-o", "y", *words)
+    assert (run.code, run.err.count("\n")) == (2, 1)
+    assert says in run.err
+    assert "Expected one of" not in run.err
 
 
 def test_what_is_like_nothing_gets_none(splatseed):

@@ -354,7 +354,7 @@ def test_without_pycolmap_the_error_says_what_to_install(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(MissingDependencyError, match=r'pip install .*"pycolmap>=4\.0"'):
+    with pytest.raises(MissingDependencyError, match=r"-m pip install .*'pycolmap>=4\.0'"):
         reconstruct(photos, tmp_path / "scene")
 
 
@@ -405,5 +405,7 @@ def test_of_points_at_one_place_the_longest_track_stays(room_path):
 
 
 def test_what_is_neither_photographs_nor_a_video_is_told_of_both(tmp_path):
-    with pytest.raises(SceneNotFoundError, match=r"or a video at .*nope\.mp4; found nothing.*\.mov"):
+    with pytest.raises(
+        SceneNotFoundError, match=r"or a video at .*nope\.mp4; found nothing.*\.mov"
+    ):
         reconstruct(tmp_path / "nope.mp4", tmp_path / "out")

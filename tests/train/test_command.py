@@ -58,7 +58,7 @@ def test_without_a_strategy_the_length_of_the_run_says_which(room_path, tmp_path
     words = (room_path, "--max-steps", "3", "--long-side", "48", "-o", run)
     assert _run(*words) == 0
     said = capsys.readouterr().out
-    assert "auto (grow)" in said
+    assert "-> strategy grow (auto)," in said
     assert f"At most {48 * 36:,} Gaussians" in said
     config = json.loads((run / "config.json").read_text())
     assert (config["strategy"], config["cap_max"]) == ("auto", 48 * 36)
@@ -138,7 +138,9 @@ def test_lpips_is_offered_only_where_its_weights_are(tmp_path, monkeypatch):
 
 
 def test_a_cloud_alone_cannot_be_trained(tmp_path, capsys):
-    write_ply(tmp_path / "room.ply", PointCloud(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8)))
+    write_ply(
+        tmp_path / "room.ply", PointCloud(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8))
+    )
     for output in (tmp_path / "run", tmp_path):  # beside the cloud there is nothing wrong
         assert _run(tmp_path / "room.ply", "-o", output) == 2
         error = capsys.readouterr().err
@@ -152,7 +154,7 @@ def test_missing_packages_are_named_with_the_command(monkeypatch):
     monkeypatch.setattr(
         requirements, "find_spec", lambda name: None if name == "gsplat" else find_spec
     )
-    with pytest.raises(MissingDependencyError, match=r"pip install 'gsplat>=1.5.3,<1.6'"):
+    with pytest.raises(MissingDependencyError, match=r"-m pip install 'gsplat>=1.5.3,<1.6'"):
         requirements.require("torch", "gsplat")
 
 

@@ -21,8 +21,9 @@ __all__ = ["drop_repeats", "export_scene"]
 def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
     """Write the model of ``model_dir`` to ``staging`` with distortion removed.
 
-    With ``distinct``, points that COLMAP put exactly where another is are left out. Images whose camera is PINHOLE already are copied byte for byte, except that an EXIF
-    orientation is cleared: cameras describe the pixels as stored.
+    With ``distinct``, points that COLMAP put exactly where another is are left out. Images whose
+    camera is PINHOLE already are copied byte for byte, except that an EXIF orientation is cleared:
+    cameras describe the pixels as stored.
     """
     pycolmap = run.pycolmap
     dense = run.work / "dense"

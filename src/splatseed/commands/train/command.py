@@ -207,8 +207,9 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
 
 def _strategy(settings: TrainSettings) -> str:
     """The strategy's name, and what ``auto`` chose."""
-    chosen = settings.strategy == BEST
-    return f"{BEST} ({settings.densification})" if chosen else settings.strategy
+    if settings.strategy == BEST:
+        return f"strategy {settings.densification} ({BEST})"
+    return f"strategy {settings.strategy}"
 
 
 @contextmanager

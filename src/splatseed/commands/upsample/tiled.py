@@ -258,8 +258,9 @@ def _announce(
     """Print what will be done, and what it takes."""
     count = "unknown" if source.count is None else f"{source.count:,}"
     OUT.print(
-        f"{visible(options.scene)} ({count} points)\n  -> "
-        f"{method_words(options.method, method, options.profile)}, in {plan.words}\n  -> {visible(options.output)}"
+        f"{visible(options.scene)} ({count} points)\n"
+        f"  -> {method_words(options.method, method, options.profile)}, in {plan.words}\n"
+        f"  -> {visible(options.output)}"
         f" (seed {options.seed}, {tasks.words})",
         soft_wrap=True,
     )

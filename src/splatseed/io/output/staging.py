@@ -40,9 +40,9 @@ def output_folder(
 ) -> Iterator[Path]:
     """A folder to write into that appears at ``path`` when the block ends without an error.
 
-    Missing parents are made. An empty folder at ``path`` is used; a full one is replaced only with
-    ``overwrite``, and only if its ``splatseed.json`` says that the same kind wrote it and lists
-    everything in it. The new folder's own manifest is written at the end.
+    A missing parent is made if its own parent exists. An empty folder at ``path`` is used; a full
+    one is replaced only with ``overwrite``, and only if its ``splatseed.json`` says that the same
+    kind wrote it and lists everything in it. The new folder's own manifest is written at the end.
 
     Args:
         path: Where the output should be.
@@ -61,7 +61,7 @@ def output_folder(
     target = _resolved(path)
     remove_leftovers(target)
     partial = _partial_name(target)
-    with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
+    with _oserror_as_output_error(target), _parent(target.parent), held(partial) as hold:
         try:
             partial.mkdir()
             hold()
@@ -79,10 +79,11 @@ def check_output(
     """Refuse what ``output_folder`` would refuse, before any work is done; arguments as there.
 
     Raises:
-        OutputError: ``path`` is taken or protected.
+        OutputError: ``path`` is taken or protected, or too many of its parents are missing.
     """
     check_apart(path, protect)
     target = _resolved(path)
+    _check_parents(target)
     _check_replaceable(target, kind, overwrite=overwrite)
 
 
@@ -90,8 +91,8 @@ def check_output(
 def atomic_file(path: Path) -> Iterator[Path]:
     """A file to write to; it appears at ``path`` when the block ends without an error.
 
-    Its name keeps the suffix, by which image writers choose the format. Missing parents are made,
-    and an existing file is replaced.
+    Its name keeps the suffix, by which image writers choose the format. A missing parent is made if
+    its own parent exists, and an existing file is replaced.
 
     Args:
         path: Where the file should be.
@@ -100,15 +101,17 @@ def atomic_file(path: Path) -> Iterator[Path]:
         The name of the partial file, which is empty.
 
     Raises:
-        OutputError: ``path`` is a folder or a device, or writing failed.
+        OutputError: ``path`` is a folder or a device, too many of its parents are missing, or
+            writing failed.
     """
     target = _resolved(path)
+    _check_parents(target)
     if target.exists() and not target.is_file():  # a device would be replaced by a file
         other = "a folder" if target.is_dir() else "a device or a pipe"
         raise OutputError(f"a file name at {target}", found=other, fix="Choose another name.")
     partial = _partial_name(target, target.suffix)
     remove_leftovers(target)
-    with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
+    with _oserror_as_output_error(target), _parent(target.parent), held(partial) as hold:
         try:
             partial.touch()
             hold()
@@ -163,6 +166,18 @@ def _relation(target: Path, source: Path) -> str:
     return "lies in the input" if source in target.parents else "holds the input"
 
 
+def _check_parents(target: Path) -> None:
+    """Refuse a place whose parent's parent is missing: the path is probably mistyped."""
+    with _oserror_as_output_error(target):
+        missing = [each for each in target.parents if not each.exists()]
+    if len(missing) > 1:
+        raise OutputError(
+            f"a folder for {target.name}, or at least the folder above it",
+            found=f"no {missing[-1]}",
+            fix="Check the path, or make the folder first.",
+        )
+
+
 def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
     with _oserror_as_output_error(target):
         if not target.exists() or (target.is_dir() and not any(target.iterdir())):
@@ -181,16 +196,16 @@ def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
 
 
 @contextmanager
-def _parents(folder: Path) -> Iterator[None]:
-    """Make ``folder`` and its parents; remove the new ones again on an error."""
-    missing = [each for each in (folder, *folder.parents) if not each.exists()]
+def _parent(folder: Path) -> Iterator[None]:
+    """Make ``folder`` if it is missing; remove it again on an error."""
+    missing = not folder.exists()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(exist_ok=True)
         yield
     except BaseException:
-        for each in missing:
+        if missing:
             with suppress(OSError):
-                each.rmdir()
+                folder.rmdir()
         raise
 
 
