@@ -28,7 +28,6 @@ from splatseed.io.rgbd.replica import load_rgbd
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.sfm import reconstruct, triangulate, worker
-from splatseed.sfm.export import drop_repeats
 from splatseed.sfm.orientation import clear_orientation
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -388,24 +387,3 @@ def test_triangulated_points_lie_on_a_real_depth_map(scenes: Path, tmp_path: Pat
     error = np.abs(measured[row, column] - depth[inside])
     assert len(error) > 100
     assert np.median(error) < 0.02  # metres
-
-
-def test_of_points_at_one_place_the_longest_track_stays(room_path):
-    model = pycolmap.Reconstruction(room_path / "sparse" / "0")
-    by_length = sorted(model.point3D_ids(), key=lambda each: model.point3D(each).track.length())
-    short, long = by_length[0], by_length[-1]
-    model.point3D(short).xyz = model.point3D(long).xyz
-    count = model.num_points3D()
-    drop_repeats(model)
-    assert model.num_points3D() == count - 1
-    assert not model.exists_point3D(short)
-    assert model.exists_point3D(long)
-    seen = {p.point3D_id for image in model.images.values() for p in image.points2D}
-    assert short not in seen
-
-
-def test_what_is_neither_photographs_nor_a_video_is_told_of_both(tmp_path):
-    with pytest.raises(
-        SceneNotFoundError, match=r"or a video at .*nope\.mp4; found nothing.*\.mov"
-    ):
-        reconstruct(tmp_path / "nope.mp4", tmp_path / "out")

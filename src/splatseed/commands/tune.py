@@ -30,10 +30,11 @@ from splatseed.bench.tuning.halving import (
     Rung,
     Verdict,
     best_arms,
+    check_time,
     plan_rungs,
     verdict,
 )
-from splatseed.bench.tuning.reach import growth_within, steps_to_grow
+from splatseed.bench.tuning.reach import most_grown, steps_to_grow
 from splatseed.bench.tuning.validation import make_validation_scene
 from splatseed.commands.bench.display import run_display, spoken_time
 from splatseed.commands.bench.machine import Machine, open_machine
@@ -51,8 +52,6 @@ __all__ = ["Options", "run"]
 TUNING = "tune.json"
 SCENE = "scene"
 MINUTE = 60.0
-OVERTIME = 1.1
-"""By how much the estimated time may exceed the time given."""
 EQUAL = 0.99
 """Least part of the most Gaussians that counts as as many."""
 METHODS = (SFM, "mls", "stereo", "cover", "auto")
@@ -136,8 +135,7 @@ class _Study:
         """The number of Gaussians that every arm gets."""
         if "grow" not in self.options.strategies:
             return self._asked_for
-        reached = math.floor(self.facts.num_points * growth_within(self.options.max_steps))
-        return min(self._asked_for, max(2, reached))
+        return min(self._asked_for, most_grown(self.facts.num_points, self.options.max_steps))
 
     @property
     def _asked_for(self) -> int:
@@ -253,26 +251,11 @@ def _rungs(study: _Study) -> tuple[Rung, ...]:
     num_arms = len({spec.arm for spec in study.specs(Rung(100, 0, 1))})
     seconds = study.options.minutes * MINUTE
     rungs = plan_rungs(num_arms, seconds, study.options.max_steps, cost, study.least_steps)
-    _check_time(cost(rungs), seconds)
+    check_time(cost(rungs), seconds)
     content = {"asked": asked, "rungs": [asdict(each) for each in rungs]}
     with atomic_file(path) as partial:
         partial.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
     return rungs
-
-
-def _check_time(needed: float, seconds: float) -> None:
-    """Refuse a time in which not even the shortest sensible runs end.
-
-    Raises:
-        ParameterError: They take longer.
-    """
-    if needed > OVERTIME * seconds:
-        raise ParameterError(
-            f"--minutes {math.ceil(needed / MINUTE)} or more: the shortest runs in which all arms "
-            "come to one number of Gaussians take that long",
-            found=f"--minutes {seconds / MINUTE:g}",
-            fix="Give it more time, or name fewer --methods or --strategies.",
-        )
 
 
 def _asked(options: Options) -> dict[str, Any]:

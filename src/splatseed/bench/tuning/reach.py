@@ -6,11 +6,12 @@ rounds: from few points it would end below the budget, and arms of unequal numbe
 
 from __future__ import annotations
 
+import math
 from itertools import count
 
 from splatseed.train.schedule import FULL_RUN, make_schedule
 
-__all__ = ["growth_within", "steps_to_grow"]
+__all__ = ["growth_within", "most_grown", "steps_to_grow"]
 
 
 def growth_within(steps: int) -> float:
@@ -21,6 +22,11 @@ def growth_within(steps: int) -> float:
     rounds = schedule.refine_stop // schedule.refine_every
     # One round makes up for the Gaussians that are removed.
     return float((1 + FASTEST) ** max(0, rounds - 1))
+
+
+def most_grown(num_points: int, steps: int) -> int:
+    """The most Gaussians that ``grow`` is sure to reach from so many points in so many steps."""
+    return max(2, math.floor(num_points * growth_within(steps)))
 
 
 def steps_to_grow(factor: float) -> int:

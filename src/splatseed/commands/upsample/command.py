@@ -24,7 +24,12 @@ from splatseed.commands.upsample.flags import (
     number_flag,
 )
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
-from splatseed.commands.upsample.plan_line import method_words, number_words, parameters_of
+from splatseed.commands.upsample.plan_line import (
+    method_words,
+    number_words,
+    only_originals,
+    parameters_of,
+)
 from splatseed.commands.upsample.start import check_start, write_start
 from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
 from splatseed.console import (
@@ -316,7 +321,7 @@ def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, floa
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
     scene = load_scene(options.scene, require_points="points" in traits_of(method).needs)
-    scene = _originals(scene)
+    scene = only_originals(scene)
     if options.depth_maps is not None:
         maps = find_depths(
             scene, options.depth_maps, kind=options.depth_kind, scale=options.depth_scale
@@ -329,18 +334,6 @@ def _read(options: Options, method: Upsampler) -> Scene:
             fix="Name the folder.",
         )
     return scene
-
-
-def _originals(scene: Scene) -> Scene:
-    """The scene without the points that splatseed added before, and a warning if it had any."""
-    points = scene.points.originals
-    if len(points) == len(scene.points):
-        return scene
-    note = (
-        f"Only the {len(points):,} originals are used: the {len(scene.points) - len(points):,} "
-        "points that splatseed added before are replaced."
-    )
-    return scene.replace(points=points, warnings=(*scene.warnings, note))
 
 
 def _announce(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
+from splatseed.scene import Scene
 from splatseed.upsample import Profile, Upsampler, configure
 
-__all__ = ["method_words", "number_words", "parameters_of"]
+__all__ = ["method_words", "number_words", "only_originals", "parameters_of"]
 
 TOLD_ELSEWHERE = {"files", "transform", "memory"}
 """Parameters of a cloud that other lines tell."""
@@ -46,3 +47,15 @@ def number_words(total: int | None, most: int | None) -> str:
     if most is not None and (total is None or total > most):
         return f"at most {most:,} points"
     return "as many points as the photographs need" if total is None else f"{total:,} points"
+
+
+def only_originals(scene: Scene) -> Scene:
+    """The scene without the points that splatseed added before, and a warning if it had any."""
+    points = scene.points.originals
+    if len(points) == len(scene.points):
+        return scene
+    note = (
+        f"Only the {len(points):,} originals are used: the {len(scene.points) - len(points):,} "
+        "points that splatseed added before are replaced."
+    )
+    return scene.replace(points=points, warnings=(*scene.warnings, note))
