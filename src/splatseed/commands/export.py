@@ -20,6 +20,7 @@ from splatseed.export import (
     read_model,
     write_model,
 )
+from splatseed.io.output.staging import check_parents
 from splatseed.literal import quoted
 from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import TrainSettings
@@ -70,6 +71,7 @@ def run(arguments: list[str]) -> None:
 def _check_output(options: Options, source: Path) -> None:
     """Refuse what must not be replaced before any work is done."""
     target = options.output
+    check_parents(target)
     if target.exists() and (not options.overwrite or target.samefile(source)):
         fix = "Choose another name."
         if not options.overwrite:

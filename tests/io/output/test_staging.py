@@ -11,7 +11,13 @@ from pathlib import Path
 import pytest
 
 from splatseed.errors import OutputError
-from splatseed.io.output.staging import MANIFEST, atomic_file, check_output, output_folder
+from splatseed.io.output.staging import (
+    MANIFEST,
+    atomic_file,
+    check_output,
+    check_parents,
+    output_folder,
+)
 
 
 def listing(folder: Path) -> list[str]:
@@ -38,10 +44,10 @@ def test_a_mistyped_path_makes_no_folders(tmp_path):
     deep = tmp_path / "nope" / "x" / "y" / "out"
     with pytest.raises(OutputError, match=missing), output_folder(deep, kind="test"):
         pass
-    with pytest.raises(OutputError, match=missing), atomic_file(deep):
-        pass
     with pytest.raises(OutputError, match=missing):
         check_output(deep, kind="test")
+    with pytest.raises(OutputError, match=missing):
+        check_parents(deep)
     assert listing(tmp_path) == []
 
 

@@ -26,6 +26,7 @@ __all__ = [
     "atomic_file",
     "check_apart",
     "check_output",
+    "check_parents",
     "kind_of",
     "output_folder",
 ]
@@ -61,7 +62,7 @@ def output_folder(
     target = _resolved(path)
     remove_leftovers(target)
     partial = _partial_name(target)
-    with _oserror_as_output_error(target), _parent(target.parent), held(partial) as hold:
+    with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
         try:
             partial.mkdir()
             hold()
@@ -83,7 +84,7 @@ def check_output(
     """
     check_apart(path, protect)
     target = _resolved(path)
-    _check_parents(target)
+    check_parents(target)
     _check_replaceable(target, kind, overwrite=overwrite)
 
 
@@ -91,8 +92,8 @@ def check_output(
 def atomic_file(path: Path) -> Iterator[Path]:
     """A file to write to; it appears at ``path`` when the block ends without an error.
 
-    Its name keeps the suffix, by which image writers choose the format. A missing parent is made if
-    its own parent exists, and an existing file is replaced.
+    Its name keeps the suffix, by which image writers choose the format. Missing parents are made,
+    and an existing file is replaced.
 
     Args:
         path: Where the file should be.
@@ -101,17 +102,15 @@ def atomic_file(path: Path) -> Iterator[Path]:
         The name of the partial file, which is empty.
 
     Raises:
-        OutputError: ``path`` is a folder or a device, too many of its parents are missing, or
-            writing failed.
+        OutputError: ``path`` is a folder or a device, or writing failed.
     """
     target = _resolved(path)
-    _check_parents(target)
     if target.exists() and not target.is_file():  # a device would be replaced by a file
         other = "a folder" if target.is_dir() else "a device or a pipe"
         raise OutputError(f"a file name at {target}", found=other, fix="Choose another name.")
     partial = _partial_name(target, target.suffix)
     remove_leftovers(target)
-    with _oserror_as_output_error(target), _parent(target.parent), held(partial) as hold:
+    with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
         try:
             partial.touch()
             hold()
@@ -166,8 +165,13 @@ def _relation(target: Path, source: Path) -> str:
     return "lies in the input" if source in target.parents else "holds the input"
 
 
-def _check_parents(target: Path) -> None:
-    """Refuse a place whose parent's parent is missing: the path is probably mistyped."""
+def check_parents(path: Path) -> None:
+    """Refuse a place that a user names whose parent's parent is missing: probably a slip.
+
+    Raises:
+        OutputError: It is.
+    """
+    target = _resolved(path)
     with _oserror_as_output_error(target):
         missing = [each for each in target.parents if not each.exists()]
     if len(missing) > 1:
@@ -196,16 +200,16 @@ def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
 
 
 @contextmanager
-def _parent(folder: Path) -> Iterator[None]:
-    """Make ``folder`` if it is missing; remove it again on an error."""
-    missing = not folder.exists()
+def _parents(folder: Path) -> Iterator[None]:
+    """Make ``folder`` and its parents; remove the new ones again on an error."""
+    missing = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         yield
     except BaseException:
-        if missing:
+        for each in missing:
             with suppress(OSError):
-                folder.rmdir()
+                each.rmdir()
         raise
 
 
