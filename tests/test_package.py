@@ -19,7 +19,8 @@ import pytest
 
 import splatseed
 from splatseed.cli import VERBS
-from splatseed.requirements import INSTALL
+from splatseed.errors import MissingDependencyError
+from splatseed.requirements import INSTALL, install_command, require
 
 ROOT = Path(__file__).parents[1]
 SOURCE = Path(splatseed.__file__).parent
@@ -99,12 +100,26 @@ def test_what_errors_tell_to_install_is_what_the_package_asks_for():
     assert all(wanted.startswith(name.replace("_", "-")) for name, wanted in INSTALL.items())
 
 
+def test_what_to_install_is_for_this_python_and_for_the_whole_extra(monkeypatch):
+    monkeypatch.setattr("splatseed.requirements.find_spec", lambda _: None)
+    monkeypatch.setattr("sys.executable", "/my venv/python")
+    start = r"'/my venv/python' -m pip install"
+    with pytest.raises(MissingDependencyError, match="the package torch; found no torch") as caught:
+        require("torch")
+    wanted = "'torch>=2.4' 'gsplat>=1.5.3,<1.6' 'torchmetrics>=1.4'"
+    assert caught.value.fix.startswith(f"Install it: {start} {wanted}.")
+    upgraded = install_command("pycolmap", upgrade=True)
+    assert upgraded == f"{start} --upgrade 'pycolmap>=4.0' 'imageio-ffmpeg>=0.6'"
+
+
 def test_nothing_is_to_be_installed_that_is_not_published():
     """An index has no splatseed yet, so its extras can be had from its own folder only."""
     root = SOURCE.parents[1]
     for path in (*root.glob("*.md"), *root.glob("docs/*.md"), *SOURCE.rglob("*.py")):
         text = " ".join(path.read_text("utf-8").split())
         assert not re.search(r"pip install [\"']?splatseed", text), path
+        if path.suffix == ".py":  # messages name this Python's own pip; docstrings need not
+            assert not re.search(r"(?<!-m )(?<!``)pip install", text), path
 
 
 def test_every_part_has_its_place():

@@ -98,6 +98,8 @@ def test_finite_needs_all_three():
         (np.zeros((4, 3), bool), np.zeros((4, 3), np.uint8), None, "bool"),
         (np.full((4, 3), "a"), np.zeros((4, 3), np.uint8), None, "xyz as numbers"),
         (np.zeros((4, 3)), np.zeros((4, 3)), None, "float64"),
+        (np.zeros((4, 3)), None, None, "found None"),
+        (None, np.zeros((4, 3), np.uint8), None, "found None"),
         (np.zeros((4, 3)), np.zeros((3, 3), np.uint8), None, r"found uint8 \[3, 3\]"),
         (np.zeros((4, 3)), np.zeros((4, 3), np.uint8), np.zeros(3, np.uint8), "one code per point"),
     ],

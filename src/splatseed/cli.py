@@ -98,7 +98,9 @@ def _run(verb: str, words: list[str]) -> None:
             f" {error.strerror or type(error).__name__}{where}. Check the disk and the path."
         )
     except KeyboardInterrupt as stop:
-        ERR.print("\ninterrupted; nothing was left half-written")
+        kept = " ".join(getattr(stop, "__notes__", ()))
+        told = f". {kept}" if kept else "; nothing was left half-written"
+        ERR.print(f"\ninterrupted{told}", soft_wrap=True)
         from splatseed.process.interruption import exit_code  # noqa: PLC0415  (as late as possible)
 
         sys.exit(TERMINATED if isinstance(stop, _Termination) else exit_code())

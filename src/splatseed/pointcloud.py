@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from splatseed.errors import PointCloudError
+from splatseed.literal import visible
 
 __all__ = ["ATTRIBUTES", "GENERATED", "ORIGINAL", "PointCloud"]
 
@@ -74,7 +75,7 @@ class PointCloud:
         xyz = np.asarray(self.xyz)
         rgb = np.asarray(self.rgb)
         source = (
-            np.full(len(xyz), ORIGINAL, np.uint8)
+            np.full(xyz.shape[:1], ORIGINAL, np.uint8)
             if self.source is None
             else np.asarray(self.source)
         )
@@ -189,13 +190,13 @@ def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:
     if xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
         raise PointCloudError(
             "xyz as numbers of shape [N, 3]",
-            found=f"{xyz.dtype} {list(xyz.shape)}",
+            found=_kind(xyz),
             fix="Pass one row x, y, z per point.",
         )
     if rgb.shape != xyz.shape or rgb.dtype != np.uint8:
         raise PointCloudError(
             f"rgb as uint8 of shape {list(xyz.shape)}",
-            found=f"{rgb.dtype} {list(rgb.shape)}",
+            found=_kind(rgb),
             fix="Scale colours to 0..255 and convert them with .astype(np.uint8).",
         )
     if source.shape != xyz.shape[:1]:
@@ -204,6 +205,13 @@ def _check_shapes(xyz: np.ndarray, rgb: np.ndarray, source: np.ndarray) -> None:
             found=f"{list(source.shape)}",
             fix="Pass one code per point, or leave it out.",
         )
+
+
+def _kind(array: np.ndarray) -> str:
+    """What an array is, or the object that NumPy made no array of, such as None."""
+    if array.dtype == object and not array.ndim:
+        return visible(repr(array.item()))[:80]
+    return f"{array.dtype} {list(array.shape)}"
 
 
 def _check_attribute(name: str, values: np.ndarray, num_points: int) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import sys
 from importlib.util import find_spec
 from shlex import quote
 
 from splatseed.errors import MissingDependencyError
+from splatseed.literal import quoted
 
-__all__ = ["INSTALL", "require"]
+__all__ = ["INSTALL", "install_command", "require"]
 
 INSTALL = {
     "torch": "torch>=2.4",
     "gsplat": "gsplat>=1.5.3,<1.6",
     "torchmetrics": "torchmetrics>=1.4",
+    "pycolmap": "pycolmap>=4.0",
     "tensorboard": "tensorboard>=2.14",
     "transformers": "transformers>=5.18",
     "onnxruntime": "onnxruntime>=1.19",
@@ -27,6 +30,16 @@ INSTALL = {
 }
 """What to ask pip for, as in pyproject.toml: splatseed's extras can only be installed from its
 folder."""
+_TRAIN = ("torch", "gsplat", "torchmetrics")
+_TOGETHER = {
+    "torch": _TRAIN,
+    "gsplat": _TRAIN,
+    "transformers": ("torch", "transformers", "onnxruntime"),
+    "onnxruntime": ("onnxruntime", "torch", "transformers"),
+    "viser": ("viser", "imageio_ffmpeg", "zstandard"),
+    "pycolmap": ("pycolmap", "imageio_ffmpeg"),
+}
+"""The packages of an extra by the one that is needed first, so that one command installs all."""
 
 
 def require(*packages: str) -> None:
@@ -40,9 +53,26 @@ def require(*packages: str) -> None:
     """
     missing = [package for package in packages if find_spec(package) is None]
     if missing:
-        advice = f"Install them: pip install {' '.join(quote(INSTALL[each]) for each in missing)}."
+        advice = f"Install {'it' if len(missing) == 1 else 'them'}: {install_command(*missing)}."
         if "torch" in missing:
             advice += " On a machine without a GPU, PyTorch's CPU build suffices."
         raise MissingDependencyError(
-            f"the packages {', '.join(packages)}", found=f"no {', no '.join(missing)}", fix=advice
+            f"the package{'s' * (len(packages) > 1)} {', '.join(packages)}",
+            found=f"no {', no '.join(missing)}",
+            fix=advice,
         )
+
+
+def install_command(*packages: str, upgrade: bool = False) -> str:
+    """The command that installs packages, and what else their extra needs, for this Python.
+
+    Args:
+        packages: Names that ``INSTALL`` has.
+        upgrade: Replace an older version.
+    """
+    wanted = dict.fromkeys(packages)
+    for package in packages:
+        others = _TOGETHER.get(package, ())
+        wanted.update(dict.fromkeys(each for each in others if find_spec(each) is None))
+    words = ["install", *(["--upgrade"] if upgrade else []), *(quote(INSTALL[w]) for w in wanted)]
+    return f"{quoted(sys.executable or 'python')} -m pip {' '.join(words)}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from contextlib import contextmanager
 
 import numpy as np
@@ -18,6 +19,7 @@ from splatseed.bench.running.job import run_job
 from splatseed.bench.running.kept import kept_folder, work_folder
 from splatseed.bench.tuning import halving
 from splatseed.bench.tuning.halving import Rung, best_arms, plan_rungs, verdict
+from splatseed.bench.tuning.reach import growth_within, steps_to_grow
 from splatseed.bench.tuning.validation import make_validation_scene
 from splatseed.cli import main
 from splatseed.commands import tune
@@ -72,6 +74,19 @@ def test_rungs_fit_the_time_as_long_as_they_can():
     assert plan_rungs(15, 0.1, 1000, cost)[0].steps == halving.LEAST_STEPS  # the least there is
 
 
+def test_the_first_rung_is_long_enough():
+    assert plan_rungs(15, 600.0, 400, lambda _: 0.0, 300)[0].steps == 300
+    assert plan_rungs(15, 600.0, 4000, lambda _: 1e9, 300)[0].steps == 300
+
+
+@pytest.mark.parametrize("factor", [1.0, 2.0, 7.0])
+def test_growth_reaches_the_budget_in_the_steps_that_it_is_given(factor):
+    steps = steps_to_grow(factor)
+    assert growth_within(steps) >= factor
+    assert steps == 10 or growth_within(steps - 10) < factor
+    assert steps_to_grow(1e6) <= 300  # a longer run has no more rounds
+
+
 @pytest.fixture(scope="module")
 def scene_path(tmp_path_factory):
     path = tmp_path_factory.mktemp("made") / "my room"
@@ -118,6 +133,23 @@ def here(monkeypatch):
     return state
 
 
+def test_too_little_time_is_refused_before_anything_begins(scene_path, tmp_path, here, splatseed):
+    run = splatseed("tune", scene_path, "--minutes", "0.01", "-o", tmp_path / "tuned")
+    assert (run.code, run.out) == (2, "")
+    least = re.search(r"expected --minutes (\d+) or more.*found --minutes 0\.01\.", run.err)
+    assert int(least[1]) >= 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_arm_has_more_than_growth_can_reach(scene_path, tmp_path, here, splatseed, monkeypatch):
+    monkeypatch.setattr(tune, "_climb", lambda *_: True)
+    words = ("--minutes", "999", "--budget", "99999", "-o", tmp_path / "tuned")
+    out = splatseed("tune", scene_path, *words).out
+    points = len(load_scene(tmp_path / "tuned" / "scene").points)
+    most = int(points * growth_within(7000))
+    assert f"All arms have {most:,} Gaussians at most" in out
+
+
 def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     scene_path, tmp_path, here, monkeypatch, capsys
 ):
@@ -125,7 +157,7 @@ def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     test = load_scene(scene_path).split(8)[1]
     for image in test:  # whoever opens one fails
         (scene_path / "images" / image.name).write_bytes(b"not a photograph")
-    words = ["tune", str(scene_path), "--minutes", "0.001", "--methods", "sfm", "cover",
+    words = ["tune", str(scene_path), "--minutes", "60", "--methods", "sfm", "cover",
              "--strategies", "default", "--budget", "70", "--max-steps", "32",
              "--long-side", "64"]  # fmt: skip
     here["most"] = 1

@@ -80,3 +80,38 @@ def test_bad_input_is_one_line(words, said, model, splatseed, tmp_path, monkeypa
     assert said in run.err
     assert run.err.count("\n") == 1
     assert not (tmp_path / "a.spz").exists()
+
+
+@pytest.fixture
+def run_of(model, tmp_path):
+    """A function that makes a run with a config around the model."""
+
+    def make(**config: object):
+        folder = tmp_path / "run"
+        folder.mkdir()
+        for name, content in (("config.json", config), ("splatseed.json", {})):
+            (folder / name).write_text(json.dumps(content))
+        model.rename(folder / "point_cloud.ply")
+        return folder
+
+    return make
+
+
+@pytest.mark.parametrize("named", ["", "point_cloud.ply"])
+def test_the_command_that_scores_a_run_has_its_scene_and_size(named, run_of, splatseed, tmp_path):
+    folder = run_of(scene="/data/my scene", data_factor=2, test_every=5)
+    out = tmp_path / "out.spz"
+    said = " ".join(splatseed("export", folder / named, "-o", out).out.split())
+    assert f"{out} --scene '/data/my scene' --data-factor 2 --test-every 5" in said
+
+
+def test_the_command_that_scores_a_run_leaves_defaults_out(run_of, splatseed, tmp_path):
+    folder = run_of(scene="/data/room", data_factor=1, test_every=8)
+    said = splatseed("export", folder, "-o", tmp_path / "out.spz").out
+    assert said.rstrip().endswith("--scene /data/room")
+
+
+def test_what_a_bare_file_cannot_tell_is_left_as_a_word(model, splatseed, tmp_path):
+    run = splatseed("export", model, "-o", tmp_path / "out.spz")
+    assert run.out.rstrip().endswith("--scene SCENE --data-factor N")
+    assert "size of training" in run.out + run.err

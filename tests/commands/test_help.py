@@ -9,6 +9,9 @@ from importlib.metadata import version
 
 import pytest
 
+OF_UNDISTORT = {"-h", "--help", "-o", "--output", "--threads", "--overwrite", "--no-overwrite",
+                "--verbose", "--no-verbose"}  # fmt: skip
+
 
 @pytest.mark.parametrize(
     ("words", "says"),
@@ -26,6 +29,22 @@ def test_a_slip_gets_a_suggestion(words, says, splatseed):
     run = splatseed(*words)
     assert (run.code, run.err.count("\n")) == (2, 1)
     assert says in run.err
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--strategy", "defalt"], "none-3dgs; found 'defalt'. Did you mean default?"),
+        (["--strategy", "zzz"], "found 'zzz'. Run splatseed train --help to see what each is."),
+        (["--max-steps", "many"], "expected --max-steps as a whole number; found 'many'."),
+        (["--frobnicate"], "found unrecognized option"),
+    ],
+)
+def test_a_value_that_cannot_be_is_told_with_its_option(words, says, splatseed):
+    run = splatseed("train", "x", "-o", "y", *words)
+    assert (run.code, run.err.count("\n")) == (2, 1)
+    assert says in run.err
+    assert "Expected one of" not in run.err
 
 
 def test_what_is_like_nothing_gets_none(splatseed):
@@ -64,7 +83,18 @@ def test_upsamples_help_is_short_and_says_where_the_rest_is(splatseed):
         (["info", "--pi"], {"--picture"}),
         (["train", "x", "--max-s"], {"--max-steps"}),
         (["bench", "--exec"], {"--executor"}),
+        (["undistort", "-"], OF_UNDISTORT),
+        (["train", "x", "-o", "y", "--data-f"], {"--data-factor"}),
+        (["sfm", "--poses"], {"--poses-from"}),
+        (["upsample", "x", "--mls.k"], {"--mls.k"}),
+        (["upsample", "--help-"], {"--help-all"}),
+        (["bench", "re"], {"report"}),
+        (["bench", "compare", "a", "b", "--out"], {"--output"}),
+        (["bench", "report", "--from"], {"--from-scenes"}),
+        (["bench", "-o", "re"], set()),
         (["train", "sc"], set()),  # files, by the shell itself
+        (["train", "a", "b", "c", "d", "e", "f", "g", "h", "i", "''"], set()),
+        (["train", "a", "b", "c", "d", "e", "f", "g", "h", "i", "a-b"], set()),
     ],
 )
 def test_a_shell_completes_verbs_and_options(words, offered, splatseed):

@@ -353,7 +353,7 @@ def test_without_pycolmap_the_error_says_what_to_install(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(MissingDependencyError, match=r'pip install .*"pycolmap>=4\.0"'):
+    with pytest.raises(MissingDependencyError, match=r"-m pip install .*'pycolmap>=4\.0'"):
         reconstruct(photos, tmp_path / "scene")
 
 

@@ -8,12 +8,18 @@ import subprocess
 import sys
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from splatseed import requirements
 from splatseed.commands.train import Options
+from splatseed.commands.train.command import _next_commands
 from splatseed.errors import MissingDependencyError
+from splatseed.evaluate.lpips import LPIPS_NETS
+from splatseed.io.ply.points import write_ply
+from splatseed.pointcloud import PointCloud
 from splatseed.train.record.config import resumed_settings
 
 from ..command_line import exit_code
@@ -28,7 +34,7 @@ def test_trains_and_says_what_and_where(room_path, tmp_path, capsys):
     assert _run(*words) == 0
     said = capsys.readouterr()
     assert "test PSNR" in said.out
-    assert f"splatseed evaluate {run}" in said.out
+    assert f"splatseed view {run}" in said.out
     assert not said.err
     metrics = json.loads((run / "metrics.json").read_text())
     assert {"psnr", "ssim", "per_image", "train_seconds", "tests"} <= metrics.keys()
@@ -52,7 +58,7 @@ def test_without_a_strategy_the_length_of_the_run_says_which(room_path, tmp_path
     words = (room_path, "--max-steps", "3", "--long-side", "48", "-o", run)
     assert _run(*words) == 0
     said = capsys.readouterr().out
-    assert "auto (grow)" in said
+    assert "-> strategy grow (auto)," in said
     assert f"At most {48 * 36:,} Gaussians" in said
     config = json.loads((run / "config.json").read_text())
     assert (config["strategy"], config["cap_max"]) == ("auto", 48 * 36)
@@ -121,12 +127,34 @@ def test_bad_words_end_in_one_line(room_path, tmp_path, capsys, words, said):
     assert not (tmp_path / "run").exists()
 
 
+def test_lpips_is_offered_only_where_its_weights_are(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.hub.get_dir", lambda: str(tmp_path))
+    monkeypatch.setattr("splatseed.evaluate.lpips.require", lambda *_: None)
+    assert _next_commands(Path("my run")) == [("look at it", "splatseed view 'my run'")]
+    weights = tmp_path / "checkpoints" / LPIPS_NETS["vgg"].file
+    weights.parent.mkdir()
+    weights.touch()
+    assert _next_commands(Path("r"))[1] == ("score again, with LPIPS", "splatseed evaluate r")
+
+
+def test_a_cloud_alone_cannot_be_trained(tmp_path, capsys):
+    write_ply(
+        tmp_path / "room.ply", PointCloud(np.eye(3, dtype=np.float32), np.zeros((3, 3), np.uint8))
+    )
+    for output in (tmp_path / "run", tmp_path):  # beside the cloud there is nothing wrong
+        assert _run(tmp_path / "room.ply", "-o", output) == 2
+        error = capsys.readouterr().err
+        assert f"found points alone ({tmp_path / 'room.ply'})" in error
+        assert "apart from the input" not in error
+    assert [each.name for each in tmp_path.iterdir()] == ["room.ply"]
+
+
 def test_missing_packages_are_named_with_the_command(monkeypatch):
     find_spec = importlib.util.find_spec
     monkeypatch.setattr(
         requirements, "find_spec", lambda name: None if name == "gsplat" else find_spec
     )
-    with pytest.raises(MissingDependencyError, match=r"pip install 'gsplat>=1.5.3,<1.6'"):
+    with pytest.raises(MissingDependencyError, match=r"-m pip install 'gsplat>=1.5.3,<1.6'"):
         requirements.require("torch", "gsplat")
 
 

@@ -35,29 +35,51 @@ def completion_script(words: Sequence[str], verbs: Sequence[str]) -> str:
             found=" ".join(words) or "no shell",
             fix='For bash: eval "$(splatseed --completion bash)" in ~/.bashrc.',
         )
-    options = {verb: known_options(_options_of(verb)) for verb in verbs}
-    return (ZSH if words[0] == "zsh" else "") + _bash(options)
+    options = {verb: _options_of(verb) for verb in verbs}
+    for name, kind in _reports().items():
+        options[f"bench {name}"] = known_options(kind)
+    return (ZSH if words[0] == "zsh" else "") + _bash(verbs, options)
 
 
-def _options_of(verb: str) -> type:
-    options: type = import_module(f"splatseed.commands.{verb}").Options
-    return options
+def _options_of(verb: str) -> list[str]:
+    if verb == "upsample":
+        from splatseed.commands.upsample.command import HELP_ALL, full_options  # noqa: PLC0415
+
+        return [*known_options(full_options()), HELP_ALL]
+    return known_options(import_module(f"splatseed.commands.{verb}").Options)
 
 
-def _bash(options: Mapping[str, Sequence[str]]) -> str:
+def _reports() -> Mapping[str, type]:
+    """The words that may follow ``bench``, with their options."""
+    from splatseed.commands.bench.report import CompareOptions, ReportOptions  # noqa: PLC0415
+
+    return {"report": ReportOptions, "compare": CompareOptions}
+
+
+def _bash(verbs: Sequence[str], options: Mapping[str, Sequence[str]]) -> str:
+    """A function for bash.
+
+    Args:
+        verbs: All verbs.
+        options: By verb, and by "VERB WORD" where a word follows the verb.
+    """
+    two = [name for name in options if " " in name]  # the longer patterns come first
     cases = "".join(
-        f"    {verb}) words='{' '.join(known)}' ;;\n" for verb, known in options.items()
+        f"    '{name} '*) words='{' '.join(options[name])}' ;;\n" for name in [*two, *verbs]
+    )
+    follow = "".join(
+        f"  if [ \"$COMP_CWORD:${{COMP_WORDS[1]}}\" = '2:{verb}' ]; then words+=' {word}'; fi\n"
+        for verb, _, word in (name.partition(" ") for name in two)
     )
     return f"""\
 _splatseed() {{
   local current=${{COMP_WORDS[COMP_CWORD]}} words=''
-  case ${{COMP_WORDS[1]}} in
+  case "${{COMP_WORDS[*]:1:2}} " in
 {cases}  esac
-  if [ "$COMP_CWORD" -eq 1 ]; then words='{" ".join(options)} --help --version'; fi
-  case $COMP_CWORD$current in
-    1*|*-*) COMPREPLY=($(compgen -W "$words" -- "$current")) ;;
-    *) COMPREPLY=() ;;
-  esac
+{follow}\
+  if [ "$COMP_CWORD" -eq 1 ]; then words='{" ".join(verbs)} --help --version'; fi
+  COMPREPLY=($(compgen -W "$words" -- "$current"))
+  if [ -z "$current" ] && [ "$COMP_CWORD" -gt 1 ]; then COMPREPLY=(); fi
 }}
 {FILES}
 """

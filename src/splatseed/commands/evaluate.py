@@ -18,7 +18,7 @@ from splatseed.errors import (
     ParameterError,
     SceneNotFoundError,
 )
-from splatseed.io.output.staging import atomic_file, check_output, output_folder
+from splatseed.io.output.staging import atomic_file, check_output, check_parents, output_folder
 from splatseed.requirements import require
 from splatseed.train.settings import Backend, TrainSettings
 from splatseed.views.photographs import user_cache_dir
@@ -141,6 +141,8 @@ def _check_outputs(options: Options, task: _Task) -> None:
             overwrite=options.overwrite,
             protect=[task.scene, options.model],
         )
+    if options.output is not None:
+        check_parents(options.output)
     if options.output is not None and options.output.exists() and not options.overwrite:
         raise ParameterError(
             f"no file at {options.output}",

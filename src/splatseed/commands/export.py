@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from splatseed.commands.models import model_file
+from splatseed.commands.models import config_of, model_file
 from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.errors import OutputError
@@ -20,8 +20,10 @@ from splatseed.export import (
     read_model,
     write_model,
 )
+from splatseed.io.output.staging import check_parents
 from splatseed.literal import quoted
 from splatseed.train.record.folder import RunFolder
+from splatseed.train.settings import TrainSettings
 
 if TYPE_CHECKING:
     from splatseed.splat.gaussians import Gaussians
@@ -69,6 +71,7 @@ def run(arguments: list[str]) -> None:
 def _check_output(options: Options, source: Path) -> None:
     """Refuse what must not be replaced before any work is done."""
     target = options.output
+    check_parents(target)
     if target.exists() and (not options.overwrite or target.samefile(source)):
         fix = "Choose another name."
         if not options.overwrite:
@@ -95,5 +98,20 @@ def _summarise(
     print_pairs("splatseed export", rows)
     if name == "splat" and gaussians.shN.size:
         print_note("A .splat has no view-dependent colour: the model's is left out.")
-    scene = " --scene SCENE"
-    print_commands("next", [("score it", f"splatseed evaluate {quoted(options.output)}{scene}")])
+    print_commands("next", [("score it", _scoring_command(options))])
+
+
+def _scoring_command(options: Options) -> str:
+    """How to score the file as its run was scored; what no run tells is left as a word."""
+    config = config_of(options.model)
+    scene, factor, every = (config.get(name) for name in ("scene", "data_factor", "test_every"))
+    words = ["splatseed evaluate", quoted(options.output)]
+    words += ["--scene", quoted(scene) if isinstance(scene, str) else "SCENE"]
+    if not isinstance(factor, int):
+        print_note("Score it at the size of training: N is the --data-factor of the run.")
+        words += ["--data-factor", "N"]
+    elif factor != TrainSettings.data_factor:
+        words += ["--data-factor", str(factor)]
+    if isinstance(every, int) and every != TrainSettings.test_every:
+        words += ["--test-every", str(every)]
+    return " ".join(words)

@@ -34,10 +34,11 @@ def model_file(path: Path) -> Path:
 
 
 def config_of(path: Path) -> Mapping[str, Any]:
-    """The config of a run; empty for a file, or a folder that is not a run.
+    """The config of a run, named by its folder or its result; empty for what belongs to no run.
 
     Raises:
         SceneFormatError: It cannot be read.
     """
-    folder = RunFolder(path)
-    return folder.read_config() if path.is_dir() and folder.is_run else {}
+    folder = RunFolder(path if path.is_dir() else path.parent)
+    named = path.is_dir() or path == folder.gaussians
+    return folder.read_config() if named and folder.is_run else {}

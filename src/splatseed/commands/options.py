@@ -24,8 +24,15 @@ Options = TypeVar("Options")
 
 COLOR = re.compile(r"\x1b\[[0-9;]*m")
 RULE = re.compile("[─-]{5,}")
-OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
-CHOICE = re.compile(r"invalid choice '([^']*)'.*?one of \(([^)]*)\)")
+DEFINED = re.compile(r"^(?:│ | {2})(-\S.*?)(?: {2}| ?│?$)", re.MULTILINE)
+"""A line of tyro's help that defines options; help itself is indented further."""
+OPTION = re.compile(r"(?<![\w-])--?[a-z](?:[\w.-]*\w)?(?![\w-])")
+CHOICE = re.compile(
+    r"invalid choice '([^']*)' for argument '([^']*)'.*?one of \(([^)]*)\)", re.IGNORECASE
+)
+NUMBER = re.compile(
+    r"error parsing (\S+): (invalid literal for int|could not convert).*?'(.*?)'", re.IGNORECASE
+)
 TRIED = "Got errors:"
 """Marks the start of tyro's attempts to read a value, meant for its own developers."""
 
@@ -52,28 +59,39 @@ def parse_options(
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise ParameterError(
-            f"the options of splatseed {verb}",
-            found=_sentence(said.getvalue()),
-            fix=f"{_suggestion(kind, said.getvalue(), arguments)}Run splatseed {verb} --help to "
-            "see them.",
-        ) from None
+        raise _complaint(kind, verb, said.getvalue(), arguments) from None
     return options
 
 
+def _complaint(kind: type[Any], verb: str, said: str, arguments: Sequence[str]) -> ParameterError:
+    """Tyro's complaint as one of ours."""
+    box = " ".join(COLOR.sub("", said).replace("│", " ").split())
+    see = f"Run splatseed {verb} --help to see"
+    if choice := CHOICE.search(box):
+        word, option, names = choice[1], choice[2], re.findall(r"'([^']+)'", choice[3])
+        fix = did_you_mean(word, names).strip() or f"{see} what each is."
+        return ParameterError(f"{option} as one of {', '.join(names)}", found=repr(word), fix=fix)
+    if number := NUMBER.search(box):
+        what = "a whole number" if "int" in number[2] else "a number"
+        return ParameterError(f"{number[1]} as {what}", found=repr(number[3]), fix=f"{see} it.")
+    return ParameterError(
+        f"the options of splatseed {verb}",
+        found=_sentence(said),
+        fix=f"{_suggestion(kind, arguments)}{see} them.",
+    )
+
+
 def known_options(kind: type[Any]) -> list[str]:
-    """All options of a dataclass's command line, such as ``--ratio``."""
+    """All options of a dataclass's command line, such as ``--ratio`` and ``-o``."""
     shown = io.StringIO()
     with redirect_stdout(shown), suppress(SystemExit):
         tyro.cli(kind, args=["--help"])
-    return sorted(set(OPTION.findall(COLOR.sub("", shown.getvalue()))))
+    defined = DEFINED.findall(COLOR.sub("", shown.getvalue()))
+    return sorted({option for line in defined for option in OPTION.findall(line)})
 
 
-def _suggestion(kind: type[Any], said: str, arguments: Sequence[str]) -> str:
-    """What the user may have meant by an unknown option or choice; empty if unclear."""
-    box = " ".join(COLOR.sub("", said).replace("│", " ").split())
-    if choice := CHOICE.search(box):
-        return did_you_mean(choice[1], re.findall(r"'([^']+)'", choice[2]))
+def _suggestion(kind: type[Any], arguments: Sequence[str]) -> str:
+    """What the user may have meant by an unknown option; empty if unclear."""
     known = known_options(kind)
     unknown = [word.partition("=")[0] for word in arguments if word.startswith("--")]
     return next((did_you_mean(word, known) for word in unknown if word not in known), "")

@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import shutil
 import sys
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import Annotated, Any
 
 import tyro
@@ -22,14 +25,23 @@ from splatseed.bench.running.environment import describe_environment, package_ve
 from splatseed.bench.running.folder import check_bench_folder, make_bench_folder
 from splatseed.bench.running.job import JobOptions
 from splatseed.bench.running.ledger import LEDGER, Ledger
-from splatseed.bench.tuning.halving import Rung, Verdict, best_arms, plan_rungs, verdict
+from splatseed.bench.tuning.halving import (
+    LAST_REPEATS,
+    Rung,
+    Verdict,
+    best_arms,
+    check_time,
+    plan_rungs,
+    verdict,
+)
+from splatseed.bench.tuning.reach import most_grown, steps_to_grow
 from splatseed.bench.tuning.validation import make_validation_scene
 from splatseed.commands.bench.display import run_display, spoken_time
 from splatseed.commands.bench.machine import Machine, open_machine
 from splatseed.commands.bench.options import Options as BenchOptions
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_commands, print_note, print_table, stage_display
-from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.errors import ParameterError, SceneFormatError, SplatseedError
 from splatseed.io.output.staging import atomic_file
 from splatseed.literal import quoted, visible
 from splatseed.process.interruption import exit_code
@@ -40,6 +52,8 @@ __all__ = ["Options", "run"]
 TUNING = "tune.json"
 SCENE = "scene"
 MINUTE = 60.0
+EQUAL = 0.99
+"""Least part of the most Gaussians that counts as as many."""
 METHODS = (SFM, "mls", "stereo", "cover", "auto")
 STRATEGIES: tuple[StrategyName, ...] = ("default", "grow", "mcmc")
 TEST_EVERY = 8
@@ -104,6 +118,33 @@ class _Study:
     machine: Machine
     ledger: Ledger
 
+    @property
+    def budget(self) -> str:
+        """The budget asked for, or what growth from the scene's own points can reach if less."""
+        return self.options.budget if self._most == self._asked_for else str(self._most)
+
+    @property
+    def least_steps(self) -> int:
+        """The fewest steps in which every arm can reach the budget."""
+        if "grow" not in self.options.strategies:
+            return 0
+        return steps_to_grow(self._most / max(1, self.facts.num_points))
+
+    @property
+    def _most(self) -> int:
+        """The number of Gaussians that every arm gets."""
+        if "grow" not in self.options.strategies:
+            return self._asked_for
+        return min(self._asked_for, most_grown(self.facts.num_points, self.options.max_steps))
+
+    @property
+    def _asked_for(self) -> int:
+        """The number of Gaussians that the user's budget comes to."""
+        from splatseed.seeding.budget import parse_budget  # noqa: PLC0415  (loads Numba)
+
+        factor = max(1, -(-self.facts.long_side // self.options.long_side))
+        return parse_budget(self.options.budget, self.facts.pixels / factor**2)
+
     def specs(self, rung: Rung, arms: Collection[Arm] | None = None) -> list[RunSpec]:
         """The runs of a rung, for these arms or for all."""
         options = self.options
@@ -111,7 +152,7 @@ class _Study:
             scenes=(PlannedScene(self.facts.path, self.facts.name),),
             methods=options.methods,
             ratios=(),
-            budgets=(options.budget,),
+            budgets=(self.budget,),
             strategies=options.strategies,
             repeats=rung.repeats,
             training=TrainSettings(max_steps=rung.steps, test_every=TEST_EVERY),
@@ -139,13 +180,26 @@ def run(arguments: list[str]) -> None:
     check_bench_folder(folder, [options.scene])
     asked = BenchOptions(jobs=options.jobs, threads=options.threads)
     with open_machine(asked, options.backend) as machine:
-        study = _open(options, folder, machine, arguments)
-        rungs = _rungs(study)
+        with _kept_if_begun(folder):
+            study = _open(options, folder, machine, arguments)
+            rungs = _rungs(study)
         _announce(study, rungs)
         ended = _climb(study, rungs)
     _report(study, rungs)
     if not ended:
         sys.exit(exit_code())
+
+
+@contextmanager
+def _kept_if_begun(folder: Path) -> Iterator[None]:
+    """Remove the folder again if the block refuses to begin in it."""
+    before = folder.exists()
+    try:
+        yield
+    except SplatseedError:
+        if not before:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def _check(options: Options) -> None:
@@ -196,7 +250,8 @@ def _rungs(study: _Study) -> tuple[Rung, ...]:
 
     num_arms = len({spec.arm for spec in study.specs(Rung(100, 0, 1))})
     seconds = study.options.minutes * MINUTE
-    rungs = plan_rungs(num_arms, seconds, study.options.max_steps, cost)
+    rungs = plan_rungs(num_arms, seconds, study.options.max_steps, cost, study.least_steps)
+    check_time(cost(rungs), seconds)
     content = {"asked": asked, "rungs": [asdict(each) for each in rungs]}
     with atomic_file(path) as partial:
         partial.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
@@ -232,10 +287,10 @@ def _announce(study: _Study, rungs: Sequence[Rung]) -> None:
         f"about {spoken_time(seconds)}; {study.machine.words}\n  -> {visible(study.folder)}",
         soft_wrap=True,
     )
-    if seconds > 1.5 * study.options.minutes * MINUTE:
+    if study.budget != study.options.budget:
         print_note(
-            "The shortest runs that say anything take longer than that: name fewer --methods or "
-            "--strategies."
+            f"All arms have {int(study.budget):,} Gaussians at most: growth from "
+            f"{facts.num_points:,} points reaches no more."
         )
 
 
@@ -272,9 +327,15 @@ def _report(study: _Study, rungs: Sequence[Rung]) -> None:
     if said is None:
         print_note("Nothing can be said yet: repeat the command to continue.")
         return
-    rows = [(arm.label, arm.strategy, f"{psnr:.2f}") for arm, psnr in said.ranking]
+    counts = _counts(study, said)
+    rows = [
+        (arm.label, arm.strategy, f"{counts[arm]:,}", f"{psnr:.2f}") for arm, psnr in said.ranking
+    ]
     views = f"{said.views} validation views, {said.steps:,} steps"
-    print_table(f"\n{views}", ("seeds", "strategy", "PSNR, dB"), rows)
+    print_table(f"\n{views}", ("seeds", "strategy", "Gaussians", "PSNR, dB"), rows)
+    most = max(counts.values())
+    if few := [arm.label + " + " + arm.strategy for arm in counts if counts[arm] < EQUAL * most]:
+        print_note(f"Compare with care: {', '.join(few)} ended with fewer Gaussians.")
     OUT.print(_sentence(said), soft_wrap=True)
     print_commands("next", _commands(study, said))
 
@@ -287,6 +348,15 @@ def _verdict(study: _Study, rungs: Sequence[Rung]) -> Verdict | None:
         if said is not None:
             return said
     return None
+
+
+def _counts(study: _Study, said: Verdict) -> dict[Arm, int]:
+    """The mean number of Gaussians with which each arm of the verdict's rung ended."""
+    most = max(LAST_REPEATS, said.repeats)
+    results = study.results(study.specs(Rung(said.steps, 0, most)))
+    return {
+        arm: round(fmean(r.num_gaussians for r in results[arm].values())) for arm, _ in said.ranking
+    }
 
 
 def _sentence(said: Verdict) -> str:

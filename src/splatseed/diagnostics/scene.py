@@ -100,11 +100,13 @@ def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatisti
             np.nan,
         )
     cloud = prepare(scene.points.replace(source=np.zeros(len(xyz), np.uint8)), progress=progress)
-    spacing, isolated = np.array([np.nan]), 0
-    if len(cloud) > 1:
-        neighbors = cloud.neighbors(16)
-        spacing = neighbors.spacing
-        isolated = int((sound_bases(cloud, neighbors) == 0).sum())
+    # Only originals start new points; alone they are spaced otherwise than among added ones.
+    added = 0 < scene.points.num_original < len(xyz)
+    originals = prepare(scene.points) if added else cloud
+    spacing = cloud.neighbors(16).spacing if len(cloud) > 1 else np.array([np.nan])
+    isolated = 0
+    if len(originals) > 1:
+        isolated = int((sound_bases(originals, originals.neighbors(16)) == 0).sum())
     greatest = np.abs(finite).max().astype(np.float32)
     return CloudStatistics(
         num_points=total,

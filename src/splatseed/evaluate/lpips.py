@@ -25,10 +25,10 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
-from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
 from splatseed.requirements import require
 
-__all__ = ["LPIPS_NETS", "Backbone", "Conv", "Lpips", "LpipsNet", "load_lpips"]
+__all__ = ["LPIPS_NETS", "Backbone", "Conv", "Lpips", "LpipsNet", "load_lpips", "lpips_is_here"]
 
 LpipsNet = Literal["vgg", "alex"]
 
@@ -169,6 +169,16 @@ def load_lpips(net: LpipsNet = "vgg", weights: Path | None = None) -> Lpips:
     state, heads = _read_state(path), _read_heads(net)
     _check(path, net, state, heads)
     return Lpips(net, {key: state[key].float() for key in LPIPS_NETS[net].keys}, heads)
+
+
+def lpips_is_here(net: LpipsNet = "vgg") -> bool:
+    """Whether all that ``load_lpips`` needs is on this machine; no file is opened."""
+    try:
+        require("torchmetrics")
+        _weights_path(LPIPS_NETS[net], None)
+    except (MissingDependencyError, SceneNotFoundError):
+        return False
+    return True
 
 
 def _weights_path(backbone: Backbone, given: Path | None) -> Path:

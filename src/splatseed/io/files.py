@@ -16,9 +16,9 @@ from typing import BinaryIO
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.process.memory import free_memory
 
-__all__ = ["is_video", "open_file", "read_bytes", "read_file"]
+__all__ = ["VIDEO_SUFFIXES", "is_video", "open_file", "read_bytes", "read_file"]
 
-_VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 
 _KINDS = (
     (stat.S_ISDIR, errno.EISDIR, "a folder"),
@@ -31,7 +31,7 @@ _WAIT_NOT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr
 
 def is_video(path: Path) -> bool:
     """Whether a path is a video file, by its name."""
-    return path.suffix.lower() in _VIDEO_SUFFIXES and path.is_file()
+    return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
 
 
 def open_file(path: Path) -> BinaryIO:

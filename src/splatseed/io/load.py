@@ -7,6 +7,7 @@ becomes a sentence in ``Scene.warnings``, anything else raises one error.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from splatseed.io.files import is_video
 from splatseed.io.nerfstudio.blender import is_blender, read_blender
 from splatseed.io.nerfstudio.scene import read_transforms_scene
 from splatseed.io.output.earlier import recall_seeds
-from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.output.manifest import MANIFEST, kind_of
 from splatseed.io.ply.foreign import refuse_foreign
 from splatseed.io.ply.points import read_ply
 from splatseed.io.rgbd.tum import is_tum, load_tum
@@ -129,6 +130,8 @@ def _read_file(path: Path) -> Scene:
 
 
 def _no_scene(path: Path) -> SceneNotFoundError:
+    if kind_of(path) == "train":
+        raise _is_run(path)
     scenes = [each.name for each in sorted(path.iterdir()) if _is_scene(each)]
     files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
     near = sorted(files - {MANIFEST})
@@ -144,6 +147,20 @@ def _no_scene(path: Path) -> SceneNotFoundError:
         f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt in {path}",
         found=inside,
         fix=fix,
+    )
+
+
+def _is_run(path: Path) -> SceneNotFoundError:
+    try:
+        scene = json.loads((path / "config.json").read_text("utf-8"))["scene"]
+    except (OSError, ValueError, TypeError, KeyError):
+        scene = None
+    named = isinstance(scene, str)
+    run = quoted(path)
+    return SceneNotFoundError(
+        f"a scene at {path}",
+        found="a run of splatseed train" + (f" on the scene {scene}" if named else ""),
+        fix=f"Look at it: splatseed view {run}. Score it: splatseed evaluate {run}.",
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -30,6 +31,7 @@ from splatseed.errors import (
     SceneNotFoundError,
     SplatseedError,
 )
+from splatseed.literal import quoted
 from splatseed.monocular.network import DeviceName, Meaning, meaning_of, one_line
 from splatseed.process.torch_device import pick_torch_device
 
@@ -246,7 +248,8 @@ def _unloadable(model: str, error: Exception) -> SplatseedError:
         return MissingDependencyError(
             f"torchvision, which the image processor of {model} needs",
             found="none",
-            fix="Install it for your version of PyTorch: pip install torchvision.",
+            fix="Install it for your version of PyTorch: "
+            f"{quoted(sys.executable or 'python')} -m pip install torchvision.",
         )
     return _misfit(model, one_line(error))
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from splatseed.errors import MissingDependencyError
-from splatseed.requirements import INSTALL, require
+from splatseed.requirements import install_command, require
 
 try:
     import torch  # noqa: F401  (imported first, for one clear error if it is absent)
@@ -20,7 +20,7 @@ except ModuleNotFoundError as error:
     raise MissingDependencyError(
         "PyTorch for rendering and training",
         found="no module named 'torch'",
-        fix=f"Install it with: pip install '{INSTALL['torch']}'.",
+        fix=f"Install it: {install_command('torch')}.",
     ) from error
 
 from splatseed.render.rasterize import rasterization

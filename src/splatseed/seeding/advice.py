@@ -25,6 +25,7 @@ from splatseed.scene import Scene
 __all__ = [
     "AS_IT_IS",
     "ROOM",
+    "SEEDED",
     "Advice",
     "Layout",
     "Measured",
@@ -37,6 +38,8 @@ __all__ = [
 Layout: TypeAlias = Literal["facing one way", "around something", "through a place"]
 AS_IT_IS = "sfm"
 """The advice to leave the points as they are."""
+SEEDED = "seeded"
+"""The advice to train: splatseed has made the points already."""
 ROOM = 1.1
 """Least room at which new points are worth making. On validation views fox, with a room of 1.17,
 gained 0.41 dB (two seeds), and scenes with a room of 1.0 lost; nothing was measured between."""
@@ -94,7 +97,7 @@ class Advice:
     """What to do, and why.
 
     Args:
-        method: The method for new points, or ``AS_IT_IS``.
+        method: The method for new points, ``AS_IT_IS`` or ``SEEDED``.
         reasons: A sentence each.
     """
 
@@ -104,6 +107,8 @@ class Advice:
     @property
     def sentence(self) -> str:
         """What to do, in a few words."""
+        if self.method == SEEDED:
+            return "train it"
         if self.method == AS_IT_IS:
             return "leave the points as they are"
         return f"add points by method {self.method}"

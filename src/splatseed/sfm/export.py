@@ -7,19 +7,23 @@ pycolmap's undistortion leaves ``sparse/*.bin`` beside files for dense stereo; t
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from splatseed.errors import OutputError
 from splatseed.sfm.features import Run
 from splatseed.sfm.orientation import clear_orientation
 
-__all__ = ["export_scene"]
+__all__ = ["drop_repeats", "export_scene"]
 
 
-def export_scene(run: Run, model_dir: Path, staging: Path) -> None:
+def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
     """Write the model of ``model_dir`` to ``staging`` with distortion removed.
 
-    Images whose camera is PINHOLE already are copied byte for byte, except that an EXIF
-    orientation is cleared: cameras describe the pixels as stored.
+    With ``distinct``, points that COLMAP put exactly where another is are left out. Images whose
+    camera is PINHOLE already are copied byte for byte, except that an EXIF orientation is cleared:
+    cameras describe the pixels as stored.
     """
     pycolmap = run.pycolmap
     dense = run.work / "dense"
@@ -40,7 +44,7 @@ def export_scene(run: Run, model_dir: Path, staging: Path) -> None:
     (dense / "sparse").rename(staging / "sparse" / "0")
     (dense / "images").rename(staging / "images")
     clear_orientation(staging / "images")
-    _refresh_errors(run, staging / "sparse" / "0")
+    _finish_points(run, staging / "sparse" / "0", distinct=distinct)
 
 
 def _count_files(folder: Path) -> int:
@@ -57,8 +61,30 @@ def _check_written(folder: Path, num_images: int) -> None:
         )
 
 
-def _refresh_errors(run: Run, model_dir: Path) -> None:
+def _finish_points(run: Run, model_dir: Path, *, distinct: bool) -> None:
     """Restate the points' reprojection errors in pixels of the undistorted images."""
     model = run.pycolmap.Reconstruction(model_dir)
+    if distinct:
+        drop_repeats(model)
     model.update_point_3d_errors()
     model.write(model_dir)
+
+
+def drop_repeats(model: Any) -> None:
+    """Of the points at one float32 position, keep the one with the longest track.
+
+    Args:
+        model: A ``pycolmap.Reconstruction``, which is changed.
+    """
+    kept: dict[bytes, int] = {}
+    for each in sorted(model.point3D_ids()):
+        point = model.point3D(each)
+        place = (np.asarray(point.xyz, np.float32) + np.float32(0)).tobytes()  # -0.0 equals 0.0
+        other = kept.get(place)
+        if other is None:
+            kept[place] = each
+        elif point.track.length() > model.point3D(other).track.length():
+            kept[place] = each
+            model.delete_point3D(other)
+        else:
+            model.delete_point3D(each)

@@ -114,7 +114,7 @@ class UndistortJob:
     def run(self, stages: Stages) -> Outcome:
         """Do it, in this process."""
         run = Run(stages, self.settings, self.image_dir, self.staging / ".work")
-        export_scene(run, self.model_dir, self.staging)
+        export_scene(run, self.model_dir, self.staging, distinct=False)
         return _outcome(run, self.staging)
 
 

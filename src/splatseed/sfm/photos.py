@@ -15,7 +15,7 @@ from PIL import Image as PilImage
 
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import open_file
+from splatseed.io.files import VIDEO_SUFFIXES, open_file
 from splatseed.scene import Image, Scene
 
 __all__ = ["Photo", "find_photos", "match_poses", "name_some"]
@@ -110,9 +110,10 @@ def name_some(names: Sequence[str]) -> str:
 def _image_names(image_dir: Path) -> list[str]:
     if not image_dir.is_dir():
         raise SceneNotFoundError(
-            f"a folder of images at {image_dir}",
-            found="a file" if image_dir.exists() else "nothing",
-            fix="Give the folder that holds the photographs.",
+            f"a folder of photographs or a video at {image_dir}",
+            found="a file that is neither" if image_dir.exists() else "nothing",
+            fix="Name the folder that holds the photographs, or a video "
+            f"({', '.join(sorted(VIDEO_SUFFIXES))}).",
         )
     relative = [path.relative_to(image_dir) for path in image_dir.rglob("*") if path.is_file()]
     files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]

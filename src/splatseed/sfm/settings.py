@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from splatseed.camera import CAMERA_MODELS
 from splatseed.errors import MissingDependencyError, ParameterError
+from splatseed.requirements import install_command
 
 __all__ = [
     "DeviceName",
@@ -27,7 +28,6 @@ MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 DeviceName: TypeAlias = Literal["auto", "cpu", "cuda"]
 
 _OLDEST = 4  # the first to pose an image and its rig in one call
-_INSTALL = 'Run: pip install --upgrade "pycolmap>=4.0"'
 _MAX_SEED = 2**31 - 1  # pycolmap takes a 32-bit int
 
 
@@ -62,11 +62,15 @@ class Settings:
             _check_range("threads", self.threads, 1, 4096)
 
 
+def _advice() -> str:
+    return f"Install it: {install_command('pycolmap', upgrade=True)}."
+
+
 def check_installed() -> None:
     """Raise MissingDependencyError unless pycolmap is installed; does not import it."""
     if importlib.util.find_spec("pycolmap") is None:
         raise MissingDependencyError(
-            "pycolmap to be installed", found="no such package", fix=_INSTALL
+            "pycolmap to be installed", found="no such package", fix=_advice()
         )
 
 
@@ -83,11 +87,11 @@ def require_pycolmap() -> Any:
         pycolmap = importlib.import_module("pycolmap")
     except (ImportError, RuntimeError) as error:  # RuntimeError: its C++ part does not load
         raise MissingDependencyError(
-            "pycolmap to load", found=str(error).strip(), fix=_INSTALL
+            "pycolmap to load", found=str(error).strip(), fix=_advice()
         ) from error
     if int(pycolmap.__version__.split(".")[0]) < _OLDEST:
         raise MissingDependencyError(
-            f"pycolmap {_OLDEST} or newer", found=f"pycolmap {pycolmap.__version__}", fix=_INSTALL
+            f"pycolmap {_OLDEST} or newer", found=f"pycolmap {pycolmap.__version__}", fix=_advice()
         )
     return pycolmap
 

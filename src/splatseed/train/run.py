@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseed.errors import OutputError
+from splatseed.errors import OutputError, SceneNotFoundError
 from splatseed.evaluate.ssim import WINDOW
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
@@ -105,6 +105,7 @@ def prepare_run(
         MissingDependencyError: TensorBoard is asked for and absent.
     """
     options = options or RunOptions()
+    _check_images(scene)
     folder = _checked_folder(output, scene, options)
     begun = folder.read_config() if options.resume and folder.is_run else None
     settings = resumed_settings(begun, settings)
@@ -312,6 +313,18 @@ class TrainingRun:
             picture = beside_photograph(view.photograph, self.trainer.render(view).cpu().numpy())
             write_picture(staged.renders / name, picture)
             progress("write", (i + 1) / len(views))
+
+
+def _check_images(scene: Scene) -> None:
+    """Refuse a cloud alone before the folder is looked at: its mistake is the greater one."""
+    if not scene.images:
+        where = f" ({scene.source.points_path})" if scene.source else ""
+        raise SceneNotFoundError(
+            "a scene with photographs to train on",
+            found=f"points alone{where}",
+            fix="Name the scene's folder. To begin with the points of a scan, add them to it: "
+            "splatseed upsample SCENE --cloud FILE -o OUT.",
+        )
 
 
 def _checked_folder(output: Path, scene: Scene, options: RunOptions) -> RunFolder:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from splatseed.io.output.staging import kind_of
+from splatseed.io.output.earlier import was_upsampled
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
@@ -54,7 +54,7 @@ def seeded(
         SceneFormatError: One is damaged.
     """
     as_it_is = settings.seeding == "scene" or settings.strategy.endswith(AS_3DGS)
-    if as_it_is or _was_seeded(scene):
+    if as_it_is or was_upsampled(scene):
         return scene, None
     from splatseed.seeding.photographs import Auto  # noqa: PLC0415  (loads with its use)
     from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
@@ -82,12 +82,6 @@ def seeded(
         "they are."
     )
     return scene.replace(points=cloud), results[-1] if results else None
-
-
-def _was_seeded(scene: Scene) -> bool:
-    """Whether ``splatseed upsample`` made or thinned these points."""
-    written = scene.source is not None and kind_of(scene.source.root) == "upsample"
-    return written or scene.points.num_original < len(scene.points)
 
 
 def usable_seeds(

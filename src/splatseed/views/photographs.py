@@ -95,5 +95,7 @@ def _reduce(path: Path, original: PilImage.Image, factor: int) -> PilImage.Image
 
 
 def _keep(photograph: PilImage.Image, path: Path) -> None:
-    with suppress(OutputError), atomic_file(path) as partial:
-        photograph.save(partial, compress_level=1)
+    with suppress(OutputError, OSError):  # a cache that cannot be written is done without
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as partial:
+            photograph.save(partial, compress_level=1)

@@ -56,13 +56,41 @@ def test_the_default_looks_at_the_photographs(room, tmp_path, splatseed):
     out = tmp_path / "out"
     run = splatseed("upsample", room, "--budget", 2000, "-o", out)
     assert (run.code, run.err) == (0, "")
-    assert "as many as the photographs need" in run.out
+    assert "at most 2,000 points" in run.out
     assert re.search(r"[\d,]+ original, [\d,]+ stereo, [\d,]+ cover", run.out)
     assert re.search(r"covered +[\d.]+% of the 8 x 8 pixel cells", run.out)
     written = _manifest(out)
     assert (written["method"], written["budget"]) == ("auto", "2000")
     assert len(load_scene(out).points) <= 2000
     assert pycolmap.Reconstruction(out / "sparse/0").num_images() == 12
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--budget", "300"), "at most 300 points, seed 0"),
+        (("--method", "mls", "--budget", "1k"), "at most 1,000 points, seed 0"),
+        (("--method", "mls", "--budget", "9k"), "-> mls ->"),
+        (("--method", "mls", "--mls.k", "12", "--budget", "300"), "-> mls (k=12) ->"),
+        (("--method", "linear", "--profile", "paper"), "-> linear (profile paper) ->"),
+    ],
+)
+def test_the_plan_has_the_number_and_what_was_changed(
+    words, said, room, tmp_path, splatseed, monkeypatch
+):
+    def leave(*_):
+        raise SystemExit(0)
+
+    monkeypatch.setattr("splatseed.commands.upsample.command._make", leave)  # only the plan
+    run = splatseed("upsample", room, "-o", tmp_path / "out", *words)
+    assert said in " ".join(run.out.split())
+    assert "as the photographs need" not in run.out
+
+
+def test_a_bad_budget_is_refused_before_anything_is_said(room, tmp_path, splatseed):
+    run = splatseed("upsample", room, "-o", tmp_path / "out", "--budget", "500kk")
+    assert (run.code, run.out) == (2, "")
+    assert "found '500kk'" in run.err
 
 
 def test_without_photographs_the_default_interpolates_and_says_so(own_room, tmp_path, splatseed):

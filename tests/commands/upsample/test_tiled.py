@@ -128,6 +128,23 @@ def test_a_model_larger_than_the_memory_is_refused_before_it_is_read(
     assert not list(tmp_path.glob("out*"))
 
 
+def test_interrupted_it_says_what_is_kept_and_goes_on(cloud, tmp_path, splatseed, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    words = ("upsample", cloud, "--method", "linear", "-o", tmp_path / "out", "--tile-points", 120)
+    with monkeypatch.context() as context:
+        context.setattr("splatseed.tiles.run.place", interrupted)
+        run = splatseed(*words)
+    assert run.code != 0
+    told = f"Finished tiles are kept in {tmp_path / 'out.tiles'}; the same command goes on"
+    assert run.err.strip().startswith(f"interrupted. {told}")
+    assert "half-written" not in run.err
+    run = splatseed(*words)
+    assert f"Going on with the work in {tmp_path / 'out.tiles'}" in run.out
+    assert "0 " not in run.out[run.out.index("Going on") :].splitlines()[0]
+
+
 def test_amounts_of_memory():
     assert bytes_of("4G") == bytes_of("4GB") == bytes_of(" 4gib ") == 4 << 30
     assert (bytes_of("500M"), bytes_of("123"), bytes_of("1.5K")) == (500 << 20, 123, 1536)

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import sys
 from pathlib import Path
 
 import pytest
 
 from splatseed.errors import OutputError
-from splatseed.io.output.staging import MANIFEST, atomic_file, output_folder
+from splatseed.io.output.staging import (
+    MANIFEST,
+    atomic_file,
+    check_output,
+    check_parents,
+    output_folder,
+)
 
 
 def listing(folder: Path) -> list[str]:
@@ -22,14 +29,26 @@ def write_output(path: Path, text: str, **options) -> None:
         (partial / "text").write_text(text)
 
 
-def test_folder_is_hidden_until_the_end_and_parents_are_made(tmp_path):
-    target = tmp_path / "a" / "b" / "out"
+def test_folder_is_hidden_until_the_end_and_its_parent_is_made(tmp_path):
+    target = tmp_path / "a" / "out"
     with output_folder(target, kind="test") as partial:
         assert partial.parent == target.parent
         assert partial.name.startswith(".out.partial-")
         assert not target.exists()
         (partial / "file").write_text("x")
-    assert listing(tmp_path) == ["a", "a/b", "a/b/out", "a/b/out/file", f"a/b/out/{MANIFEST}"]
+    assert listing(tmp_path) == ["a", "a/out", "a/out/file", f"a/out/{MANIFEST}"]
+
+
+def test_a_mistyped_path_makes_no_folders(tmp_path):
+    missing = rf"found no {re.escape(str(tmp_path / 'nope'))}\. Check the path"
+    deep = tmp_path / "nope" / "x" / "y" / "out"
+    with pytest.raises(OutputError, match=missing), output_folder(deep, kind="test"):
+        pass
+    with pytest.raises(OutputError, match=missing):
+        check_output(deep, kind="test")
+    with pytest.raises(OutputError, match=missing):
+        check_parents(deep)
+    assert listing(tmp_path) == []
 
 
 @pytest.mark.parametrize(

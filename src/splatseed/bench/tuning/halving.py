@@ -18,8 +18,19 @@ import numpy as np
 
 from splatseed.bench.analysis.statistics import Difference, over_scenes
 from splatseed.bench.planning.records import SFM, Arm, RunResult
+from splatseed.errors import ParameterError
 
-__all__ = ["BASELINE", "Rung", "Verdict", "best_arms", "is_baseline", "plan_rungs", "verdict"]
+__all__ = [
+    "BASELINE",
+    "LAST_REPEATS",
+    "Rung",
+    "Verdict",
+    "best_arms",
+    "check_time",
+    "is_baseline",
+    "plan_rungs",
+    "verdict",
+]
 
 BASELINE = (SFM, "default")
 """Method and strategy of the baseline."""
@@ -27,6 +38,9 @@ KEPT = (1.0, 1 / 3, 1 / 6)
 """Share of the arms in each rung; the last rung repeats its runs."""
 LAST_REPEATS = 2
 LEAST_STEPS = 100
+MINUTE = 60.0
+OVERTIME = 1.1
+"""By how much the estimated time may exceed the time given."""
 Results = Mapping[Arm, Mapping[int, RunResult]]
 """Results by arm and repeat."""
 
@@ -73,7 +87,11 @@ def is_baseline(arm: Arm) -> bool:
 
 
 def plan_rungs(
-    num_arms: int, seconds: float, most_steps: int, cost: Callable[[Sequence[Rung]], float]
+    num_arms: int,
+    seconds: float,
+    most_steps: int,
+    cost: Callable[[Sequence[Rung]], float],
+    least_steps: int = 0,
 ) -> tuple[Rung, ...]:
     """The longest rungs that fit into a time.
 
@@ -82,6 +100,7 @@ def plan_rungs(
         seconds: The time.
         most_steps: Most steps of the last rung.
         cost: Estimates the seconds of some rungs.
+        least_steps: Fewest steps of the first rung.
 
     Returns:
         The shortest rungs, if not even these fit.
@@ -95,11 +114,31 @@ def plan_rungs(
             for i, count in enumerate(counts)
         )
 
-    low, high = LEAST_STEPS, max(most_steps >> (len(KEPT) - 1), LEAST_STEPS)
+    low = max(LEAST_STEPS, least_steps)
+    high = max(most_steps >> (len(KEPT) - 1), low)
     while high - low > max(LEAST_STEPS // 10, 1):
         middle = (low + high) // 2
         low, high = (middle, high) if cost(rungs(middle)) <= seconds else (low, middle)
     return rungs(low)
+
+
+def check_time(needed: float, seconds: float) -> None:
+    """Refuse a time in which not even the shortest sensible rungs end.
+
+    Args:
+        needed: Estimated seconds of the planned rungs.
+        seconds: The time given.
+
+    Raises:
+        ParameterError: They take longer.
+    """
+    if needed > OVERTIME * seconds:
+        raise ParameterError(
+            f"--minutes {math.ceil(needed / MINUTE)} or more: the shortest runs in which all arms "
+            "come to one number of Gaussians take that long",
+            found=f"--minutes {seconds / MINUTE:g}",
+            fix="Give it more time, or name fewer --methods or --strategies.",
+        )
 
 
 def best_arms(results: Results, count: int) -> tuple[Arm, ...]:

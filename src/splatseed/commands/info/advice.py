@@ -16,11 +16,13 @@ from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_commands, print_pairs, stage_display
 from splatseed.diagnostics.scene import empty_regions
 from splatseed.io import load_scene
+from splatseed.io.output.earlier import was_upsampled
 from splatseed.literal import quoted
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.advice import (
     AS_IT_IS,
+    SEEDED,
     Advice,
     Measured,
     advise,
@@ -52,12 +54,14 @@ class Planned:
         max_steps: Training steps.
         strategy: The strategy that ``splatseed train`` chooses for these steps.
         most_seeds: Most seeds with which training begins.
+        flags: The options of ``splatseed train`` that differ from its defaults.
     """
 
     budget: int
     max_steps: int
     strategy: str
     most_seeds: int
+    flags: str = ""
 
     @classmethod
     def of(cls, scene: Scene, budget: str | None, max_steps: int) -> Planned:
@@ -74,7 +78,9 @@ class Planned:
 
             number = max(2, points_within(scene, budget))
         settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
-        return cls(number, max_steps, settings.densification, most_seeds(settings, number))
+        flags = "" if budget is None else f"--cap-max {number} "
+        flags += "" if max_steps == FULL_RUN else f"--max-steps {max_steps} "
+        return cls(number, max_steps, settings.densification, most_seeds(settings, number), flags)
 
 
 def advice_for(
@@ -90,11 +96,20 @@ def advice_for(
             is room for new points.
     """
     measured = measure(scene, empty)
+    if was_upsampled(scene) and len(scene.points):
+        return _seeded(scene), measured
     said = advise(measured, planned.most_seeds, strategy=planned.strategy)
     if progress is not None and said.method == "auto" and measured.num_points:
         measured = replace(measured, agreement=stereo_agreement(scene, progress=progress))
         said = advise(measured, planned.most_seeds, strategy=planned.strategy)
     return said, measured
+
+
+def _seeded(scene: Scene) -> Advice:
+    """The advice for a scene that ``splatseed upsample`` wrote."""
+    kept = scene.points.num_original
+    made = f"splatseed upsample made {len(scene.points) - kept:,} of its points and kept {kept:,}."
+    return Advice(SEEDED if scene.has_photographs else AS_IT_IS, (made,))
 
 
 def advice_rows(advice: Advice, measured: Measured, planned: Planned) -> list[tuple[str, str]]:
@@ -113,6 +128,8 @@ def advice_commands(scene: Path, advice: Advice, planned: Planned) -> list[tuple
     source = quoted(scene)
     training = f"--cap-max {planned.budget} --max-steps {planned.max_steps} -o RUN"
     tune = ("or ask by experiment", f"splatseed tune {source} --minutes 30")
+    if advice.method == SEEDED:
+        return [("train", f"splatseed train {source} {planned.flags}-o RUN")]
     if advice.method == AS_IT_IS:
         return [("train", f"splatseed train {source} --seeds scene {training}"), tune]
     if advice.method == "auto":

@@ -26,6 +26,7 @@ from splatseed.diagnostics.scene import (
 )
 from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
+from splatseed.io.output.earlier import was_upsampled
 from splatseed.literal import quoted
 from splatseed.scene import Scene
 from splatseed.train.schedule import FULL_RUN
@@ -91,9 +92,11 @@ def run(arguments: list[str]) -> None:
         cloud = cloud_statistics(scene, clock)
         tracks = track_statistics(scene)
         regions = empty_regions(scene, clock)
+        # An empty part is reason to upsample, which was done.
+        problems = find_problems(scene, cloud, None if was_upsampled(scene) else regions)
         alignments = _alignments(options, scene, clock)
     if options.json:
-        print_json(scene, cloud, tracks, regions, alignments, find_problems(scene, cloud, regions))
+        print_json(scene, cloud, tracks, regions, alignments, problems)
         return
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
     rows += _advice_rows(options, scene, regions)
@@ -102,7 +105,6 @@ def run(arguments: list[str]) -> None:
         from splatseed.commands.info.depth_numbers import print_depth  # noqa: PLC0415  (loads Numba)
 
         print_depth(str(options.depth or "depth"), scene, alignments, list_all=options.list_all)
-    problems = find_problems(scene, cloud, regions)
     OUT.print("\nproblems" if problems else "\nno problems found", style="bold" if problems else "")
     for problem in problems:
         OUT.print(f"  - {problem}", soft_wrap=True)
@@ -151,6 +153,8 @@ def _next_command(options: Options, scene: Scene) -> str:
     if len(scene.points) and scene.has_photographs:
         planned = Planned.of(scene, options.budget, options.max_steps)
         return advice_commands(options.scene, advice_for(scene, planned, None)[0], planned)[0][1]
+    if len(scene.points) and was_upsampled(scene):
+        return f"splatseed view {scene_dir}"
     if len(scene.points):
         return f"splatseed upsample {scene_dir} --method mls --ratio 8 -o OUT"
     images = scene.source.image_dir if scene.source else None

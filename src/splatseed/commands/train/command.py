@@ -207,8 +207,9 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
 
 def _strategy(settings: TrainSettings) -> str:
     """The strategy's name, and what ``auto`` chose."""
-    chosen = settings.strategy == BEST
-    return f"{BEST} ({settings.densification})" if chosen else settings.strategy
+    if settings.strategy == BEST:
+        return f"strategy {settings.densification} ({BEST})"
+    return f"strategy {settings.strategy}"
 
 
 @contextmanager
@@ -294,5 +295,14 @@ def _summarise(options: Options, result: TrainingResult) -> None:
             f"memory held the run at {held:,} Gaussians; results may differ on another machine. "
             f"Pass --cap-max {held} for the same result everywhere."
         )
-    output = quoted(options.output)
-    print_commands("next", [("score again, with LPIPS", f"splatseed evaluate {output}")])
+    print_commands("next", _next_commands(options.output))
+
+
+def _next_commands(output: Path) -> list[tuple[str, str]]:
+    """What to do with a finished run; LPIPS only where its weights are."""
+    from splatseed.evaluate.lpips import lpips_is_here  # noqa: PLC0415  (imports PyTorch)
+
+    commands = [("look at it", f"splatseed view {quoted(output)}")]
+    if lpips_is_here():
+        commands.append(("score again, with LPIPS", f"splatseed evaluate {quoted(output)}"))
+    return commands

@@ -86,7 +86,7 @@ def _unreadable(path: Path, found: str) -> SceneFormatError:
 
 
 def _unknown(path: Path, key: str, known: Sequence[str]) -> ParameterError:
-    options = {option.removeprefix("--").replace("-", "_") for option in known}
+    options = {each.removeprefix("--").replace("-", "_") for each in known if len(each) > 2}
     return ParameterError(
         f"options of splatseed train in {path}",
         found=repr(key),

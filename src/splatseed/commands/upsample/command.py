@@ -25,6 +25,12 @@ from splatseed.commands.upsample.flags import (
     output_flag,
 )
 from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
+from splatseed.commands.upsample.plan_line import (
+    method_words,
+    number_words,
+    only_originals,
+    parameters_of,
+)
 from splatseed.commands.upsample.start import check_start, write_start
 from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
 from splatseed.console import (
@@ -43,6 +49,7 @@ from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.process.memory import bytes_of
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import photographed
+from splatseed.seeding.thinning import points_within
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
 from splatseed.upsample import (
     METHODS,
@@ -58,7 +65,7 @@ from splatseed.upsample import (
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.method import Cloud
 
-__all__ = ["Options", "parse", "run"]
+__all__ = ["HELP_ALL", "Options", "full_options", "parse", "run"]
 
 HELP_ALL = "--help-all"
 OUTPUT = Path("OUT")
@@ -180,13 +187,24 @@ def _help(arguments: list[str]) -> None:
         _parse_with({name: configure(name) for name in named}, ["--help"])
     OUT.print(
         f"\nsplatseed upsample {HELP_ALL} shows the flags of all methods,"
-        " --method mls --help those of one method."
+        " --method mls --help those of one method.",
+        soft_wrap=True,
     )
     raise SystemExit(0)
 
 
 def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
-    """Options with one more field per method, whose default is the method given."""
+    """The options, with those of the methods given."""
+    return parse_options(_with_methods(methods), "upsample", arguments)
+
+
+def full_options() -> type[Any]:
+    """The options with those of every method."""
+    return _with_methods({name: configure(name) for name in METHODS})
+
+
+def _with_methods(methods: dict[str, Upsampler]) -> type[Any]:
+    """The options with one more field per method, whose default is the method given."""
     names = tuple(METHODS)
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
@@ -200,7 +218,7 @@ def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
         frozen=True,
     )
     full.__doc__ = Options.__doc__
-    return parse_options(full, "upsample", arguments)
+    return full
 
 
 def run(arguments: list[str]) -> None:
@@ -232,7 +250,9 @@ def run(arguments: list[str]) -> None:
         notes += brought.notes
         method = methods[options.method]
         total = _planned(options, method, len(scene.points))
-    _announce(options, scene, method, total, _idle(options, methods), brought.takes)
+        most = None if options.budget is None else points_within(scene, options.budget)
+    number = number_words(total, most)
+    _announce(options, scene, method, number, _idle(options, methods), brought.takes)
     with stage_display(clock):
         beside = methods[CLOUD] if options.cloud_files and options.method != CLOUD else None
         seeds = _make(options, scene, method, beside, total, clock, notes)
@@ -306,7 +326,7 @@ def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, floa
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
     scene = load_scene(options.scene, require_points="points" in traits_of(method).needs)
-    scene = scene.replace(points=scene.points.originals)
+    scene = only_originals(scene)
     if options.depth_maps is not None:
         maps = find_depths(
             scene, options.depth_maps, kind=options.depth_kind, scale=options.depth_scale
@@ -325,7 +345,7 @@ def _announce(
     options: Options,
     scene: Scene,
     method: Upsampler,
-    total: int | None,
+    number: str,
     idle: Sequence[str],
     takes: str,
 ) -> None:
@@ -335,11 +355,9 @@ def _announce(
     for name in idle:
         print_note(f"The flags of {name} have no effect with --method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
-    parameters = ", ".join(f"{k}={v}" for k, v in _parameters(method).items())
-    number = "as many as the photographs need" if total is None else f"{total:,} points"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} "
-        f"points)\n  -> {options.method} ({options.profile}: {parameters or 'no parameters'})\n  "
+        f"points)\n  -> {method_words(options.method, method, options.profile)}\n  "
         f"-> {visible(options.output)} ({number}, seed {options.seed}){takes}",
         soft_wrap=True,
     )
@@ -368,19 +386,13 @@ def _write(options: Options, scene: Scene, method: Upsampler) -> WriteReport:
     )
 
 
-def _parameters(method: Upsampler) -> dict[str, object]:
-    """The parameters of a method; a cloud's files are told elsewhere."""
-    given = dataclasses.asdict(method)  # type: ignore[call-overload]  # a method is a dataclass
-    return {name: given[name] for name in given if name not in {"files", "transform", "memory"}}
-
-
 def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
     """How the output was made, for ``splatseed.json``."""
     return {
         "command": "upsample",
         "method": options.method,
         "profile": options.profile,
-        "parameters": _parameters(method),
+        "parameters": parameters_of(method),
         "cloud": options.bringing.provenance if options.cloud_files else None,
         "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
         "ratio": options.ratio,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatseed.errors import OutputError, ParameterError
+from splatseed.io.output.staging import check_parents
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views
@@ -30,6 +31,7 @@ def check_start(path: Path, output: Path, *, overwrite: bool) -> None:
     """
     if path.suffix.lower() != ".ply":
         raise ParameterError("--gaussians FILE.ply", found=str(path), fix="Name a .ply file.")
+    check_parents(path)
     target, folder = path.resolve(), output.resolve()
     if folder == target or folder in target.parents:
         raise OutputError(

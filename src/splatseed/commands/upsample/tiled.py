@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from splatseed.commands.upsample.plan_line import method_words
 from splatseed.console import (
-    ERR,
     OUT,
     StageClock,
     print_commands,
@@ -182,7 +182,9 @@ def run_tiled(
         plan = _plan(options, method, source, tasks.processes)
         check_disk(path, plan.disk, _size_of(path))
         with _kept(path), open_work(path, request.job(source)) as (work, resumed):
-            _announce(options, source, plan, tasks, path if resumed else None)
+            _announce(options, method, source, plan, tasks)
+            if resumed:
+                print_note(_resuming(path))
             with stage_display(clock, remaining=True):
                 from splatseed.tiles import make_tiled  # noqa: PLC0415  (Numba)
 
@@ -251,26 +253,26 @@ def _plan(options: Options, method: Upsampler, source: Source, processes: int) -
 
 
 def _announce(
-    options: Options,
-    source: Source,
-    plan: TilePlan,
-    tasks: Tasks,
-    resumed: Path | None,
+    options: Options, method: Upsampler, source: Source, plan: TilePlan, tasks: Tasks
 ) -> None:
     """Print what will be done, and what it takes."""
     count = "unknown" if source.count is None else f"{source.count:,}"
     OUT.print(
-        f"{visible(options.scene)} ({count} points)\n  -> {options.method}"
-        f" ({options.profile}), in {plan.words}\n  -> {visible(options.output)}"
+        f"{visible(options.scene)} ({count} points)\n"
+        f"  -> {method_words(options.method, method, options.profile)}, in {plan.words}\n"
+        f"  -> {visible(options.output)}"
         f" (seed {options.seed}, {tasks.words})",
         soft_wrap=True,
     )
-    if resumed is not None:
-        done = {name: len(list((resumed / name).glob("*[0-9]"))) for name in ("weighed", "made")}
-        print_note(
-            f"Going on with the tiles in {visible(resumed)}:"
-            f" {sum(done.values()):,} of them were weighed, {done['made']:,} are done."
-        )
+
+
+def _resuming(path: Path) -> str:
+    """How much an earlier run left to go on from."""
+    weighed, made = (len(list((path / name).glob("*[0-9]"))) for name in ("weighed", "made"))
+    place = f"Going on with the work in {visible(path)}"
+    if made:
+        return f"{place}: {made:,} tiles are done."
+    return f"{place}: {weighed:,} tiles are prepared." if weighed else f"{place}."
 
 
 def _write(
@@ -348,8 +350,8 @@ def _kept(path: Path) -> Iterator[None]:
     except (PointCloudError, SceneFormatError):
         shutil.rmtree(path, ignore_errors=True)
         raise
-    except KeyboardInterrupt:
-        ERR.print(f"\nFinished tiles are kept in {path}; the same command goes on from there.")
+    except KeyboardInterrupt as stop:
+        stop.add_note(f"Finished tiles are kept in {path}; the same command goes on from there.")
         raise
     except OSError as error:
         raise OutputError(

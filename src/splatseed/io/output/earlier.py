@@ -16,11 +16,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from splatseed.io.output.seeds_npz import read_seeds
-from splatseed.io.output.staging import MANIFEST
-from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
+from splatseed.io.output.staging import MANIFEST, kind_of
+from splatseed.pointcloud import GENERATED, ORIGINAL
 from splatseed.scene import Scene
 
-__all__ = ["number_of_originals", "recall_seeds"]
+__all__ = ["number_of_originals", "recall_seeds", "was_upsampled"]
 
 
 def recall_seeds(scene: Scene) -> Scene:
@@ -30,7 +30,7 @@ def recall_seeds(scene: Scene) -> Scene:
     known = read_seeds(scene.source.root, scene.points)
     source = known.points.source if known.has_source else _by_manifest(scene)
     points = known.points.replace(source=source if (source == ORIGINAL).any() else None)
-    notes = tuple(filter(None, (known.warning, _added_note(points))))
+    notes = (known.warning,) if known.warning else ()
     # Tracks belong to the first points, and a new point has none.
     first_new = int(np.append(points.source != ORIGINAL, True).argmax())
     tracks = scene.tracks
@@ -58,15 +58,10 @@ def number_of_originals(root: Path, total: int) -> int:
     return _num_original(root / MANIFEST, total)
 
 
-def _added_note(points: PointCloud) -> str:
-    """A note for the user about points that are not originals; empty if all are."""
-    added = len(points) - points.num_original
-    if not added:
-        return ""
-    return (
-        f"splatseed added {added:,} of the points to {points.num_original:,} originals;"
-        " upsampling again would replace them."
-    )
+def was_upsampled(scene: Scene) -> bool:
+    """Whether ``splatseed upsample`` made or thinned these points."""
+    written = scene.source is not None and kind_of(scene.source.root) == "upsample"
+    return written or scene.points.num_original < len(scene.points)
 
 
 def _num_original(manifest: Path, total: int) -> int:

@@ -26,6 +26,7 @@ __all__ = [
     "atomic_file",
     "check_apart",
     "check_output",
+    "check_parents",
     "kind_of",
     "output_folder",
 ]
@@ -40,9 +41,9 @@ def output_folder(
 ) -> Iterator[Path]:
     """A folder to write into that appears at ``path`` when the block ends without an error.
 
-    Missing parents are made. An empty folder at ``path`` is used; a full one is replaced only with
-    ``overwrite``, and only if its ``splatseed.json`` says that the same kind wrote it and lists
-    everything in it. The new folder's own manifest is written at the end.
+    A missing parent is made if its own parent exists. An empty folder at ``path`` is used; a full
+    one is replaced only with ``overwrite``, and only if its ``splatseed.json`` says that the same
+    kind wrote it and lists everything in it. The new folder's own manifest is written at the end.
 
     Args:
         path: Where the output should be.
@@ -79,10 +80,11 @@ def check_output(
     """Refuse what ``output_folder`` would refuse, before any work is done; arguments as there.
 
     Raises:
-        OutputError: ``path`` is taken or protected.
+        OutputError: ``path`` is taken or protected, or too many of its parents are missing.
     """
     check_apart(path, protect)
     target = _resolved(path)
+    check_parents(target)
     _check_replaceable(target, kind, overwrite=overwrite)
 
 
@@ -145,7 +147,7 @@ def check_apart(path: Path, protect: Sequence[Path]) -> None:
         if target == source or source in target.parents or target in source.parents:
             raise OutputError(
                 "an output folder apart from the input",
-                found=f"{target}, which is, holds or lies in the input {source}",
+                found=f"{target}, which {_relation(target, source)} {source}",
                 fix="Choose a folder beside the input.",
             )
     here = Path.cwd()
@@ -154,6 +156,29 @@ def check_apart(path: Path, protect: Sequence[Path]) -> None:
             "an output folder that can be renamed into place",
             found=f"{target}, which holds the working directory",
             fix="Name a new folder.",
+        )
+
+
+def _relation(target: Path, source: Path) -> str:
+    if target == source:
+        return "is the input"
+    return "lies in the input" if source in target.parents else "holds the input"
+
+
+def check_parents(path: Path) -> None:
+    """Refuse a place that a user names whose parent's parent is missing: probably a slip.
+
+    Raises:
+        OutputError: It is.
+    """
+    target = _resolved(path)
+    with _oserror_as_output_error(target):
+        missing = [each for each in target.parents if not each.exists()]
+    if len(missing) > 1:
+        raise OutputError(
+            f"a folder for {target.name}, or at least the folder above it",
+            found=f"no {missing[-1]}",
+            fix="Check the path, or make the folder first.",
         )
 
 

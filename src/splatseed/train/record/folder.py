@@ -134,6 +134,7 @@ class RunFolder:
         """
         staged = RunFolder(self.path / f".results.partial-{secrets.token_hex(4)}")
         try:
+            staged.path.mkdir()
             yield staged
             each = sorted(staged.path.iterdir(), key=lambda path: path.name == self.metrics.name)
             for path in each:

@@ -1,0 +1,61 @@
+"""The words in which ``splatseed upsample`` says what it will do."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from splatseed.scene import Scene
+from splatseed.upsample import Profile, Upsampler, configure
+
+__all__ = ["method_words", "number_words", "only_originals", "parameters_of"]
+
+TOLD_ELSEWHERE = {"files", "transform", "memory"}
+"""Parameters of a cloud that other lines tell."""
+
+
+def parameters_of(method: Upsampler) -> dict[str, object]:
+    """The parameters of a method by name; a cloud's files are told elsewhere."""
+    given = dataclasses.asdict(method)  # type: ignore[call-overload]  # a method is a dataclass
+    return {name: value for name, value in given.items() if name not in TOLD_ELSEWHERE}
+
+
+def method_words(name: str, method: Upsampler, profile: Profile) -> str:
+    """A method with what the user changed about it.
+
+    Example:
+        >>> method_words("mls", configure("mls", "paper", k=12), "paper")
+        'mls (profile paper, k=12)'
+    """
+    plain = parameters_of(configure(name, profile))
+    changed = [f"{k}={v}" for k, v in parameters_of(method).items() if v != plain[k]]
+    words = [] if profile == "default" else [f"profile {profile}"]
+    told = ", ".join([*words, *changed])
+    return f"{name} ({told})" if told else name
+
+
+def number_words(total: int | None, most: int | None) -> str:
+    """How many points there will be.
+
+    Args:
+        total: Points in all; None if the photographs determine the number.
+        most: The budget, if there is one.
+
+    Example:
+        >>> number_words(None, 50_000), number_words(800, 1000)
+        ('at most 50,000 points', '800 points')
+    """
+    if most is not None and (total is None or total > most):
+        return f"at most {most:,} points"
+    return "as many points as the photographs need" if total is None else f"{total:,} points"
+
+
+def only_originals(scene: Scene) -> Scene:
+    """The scene without the points that splatseed added before, and a warning if it had any."""
+    points = scene.points.originals
+    if len(points) == len(scene.points):
+        return scene
+    note = (
+        f"Only the {len(points):,} originals are used: the {len(scene.points) - len(points):,} "
+        "points that splatseed added before are replaced."
+    )
+    return scene.replace(points=points, warnings=(*scene.warnings, note))
