@@ -171,7 +171,7 @@ def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     rungs = [Rung(**each) for each in json.loads((folder / "tune.json").read_text())["rungs"]]
     assert [rung.arms for rung in rungs] == [2, 2, 2]
     assert here["done"] == 2 + 2 + 4
-    assert "2 validation views" in out
+    assert "\n2 validation views" in out
     assert "splatseed train" in out
     assert "--cap-max 70 --max-steps 32" in out
     main(words)

@@ -332,7 +332,7 @@ def _report(study: _Study, rungs: Sequence[Rung]) -> None:
         (arm.label, arm.strategy, f"{counts[arm]:,}", f"{psnr:.2f}") for arm, psnr in said.ranking
     ]
     views = f"{said.views} validation views, {said.steps:,} steps"
-    print_table(f"\n{views}", ("seeds", "strategy", "Gaussians", "PSNR, dB"), rows)
+    print_table(views, ("seeds", "strategy", "Gaussians", "PSNR, dB"), rows)
     most = max(counts.values())
     if few := [arm.label + " + " + arm.strategy for arm in counts if counts[arm] < EQUAL * most]:
         print_note(f"Compare with care: {', '.join(few)} ended with fewer Gaussians.")

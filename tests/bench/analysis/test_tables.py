@@ -189,7 +189,9 @@ def test_parameters_and_profiles_are_variants_of_their_own():
 
 
 def test_what_a_plan_always_asks_of_depth_is_no_part_of_its_name():
-    held = rows(scenes=("fox",), gains={("depth", 4): 0.1}, parameters={"hold_out": 8, "cloud.hold_out": 8})
+    held = rows(
+        scenes=("fox",), gains={("depth", 4): 0.1}, parameters={"hold_out": 8, "cloud.hold_out": 8}
+    )
     other = rows(scenes=("fox",), gains={("depth", 4): 0.1}, parameters={"hold_out": 4})
     study = one([*rows(scenes=("fox",), repeats=2), *held, *other])
     labels = [variant.label for variant in study.variants if variant.method == "depth"]

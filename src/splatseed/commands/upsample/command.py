@@ -195,7 +195,7 @@ def _help(arguments: list[str]) -> None:
 
 def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
     """The options, with those of the methods given."""
-    return parse_options(_with_methods(methods), "upsample", arguments)
+    return parse_options(_with_methods(methods, "--help" in arguments), "upsample", arguments)
 
 
 def full_options() -> type[Any]:
@@ -203,13 +203,13 @@ def full_options() -> type[Any]:
     return _with_methods({name: configure(name) for name in METHODS})
 
 
-def _with_methods(methods: dict[str, Upsampler]) -> type[Any]:
+def _with_methods(methods: dict[str, Upsampler], asked_for_help: bool = False) -> type[Any]:
     """The options with one more field per method, whose default is the method given."""
     names = tuple(METHODS)
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
     ]
-    if "--help" in arguments:  # with a default, -o is not called required, which it is not alone
+    if asked_for_help:  # with a default, -o is not called required, which it is not alone
         fields.append(("output", Annotated[Path, output_flag()], dataclasses.field(default=OUTPUT)))
     full = dataclasses.make_dataclass(
         "UpsampleOptions",
