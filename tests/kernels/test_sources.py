@@ -100,7 +100,7 @@ def test_a_file_reaches_what_it_imports_directly_and_by_way_of_others(tiny):
     ours = {path.stem for path in reached if path.parent == tiny}
     assert ours == {"kernels", "middle", "__init__", "numbers"}
     assert reached - set(tiny.iterdir()) == {
-        SOURCE / f"kernels/{name}.py" for name in ("jit", "sources", "compilation")
+        SOURCE / f"kernels/{name}.py" for name in ("jit", "sharing", "sources", "compilation")
     }
 
 
@@ -123,4 +123,4 @@ def test_a_script_reaches_splatseed_only(tmp_path):
     script = tmp_path / "script.py"
     script.write_text("import numpy\nimport splatseed.kernels.simd as simd\nfrom . import gone\n")
     names = {path.name for path in reached_files(script, "__main__")}
-    assert names == {"script.py", "simd.py", "jit.py", "sources.py", "compilation.py"}
+    assert names == {"script.py", "simd.py", "jit.py", "sharing.py", "sources.py", "compilation.py"}

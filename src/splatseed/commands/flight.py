@@ -14,6 +14,7 @@ from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_pairs, stage_display
 from splatseed.errors import OutputError, ParameterError
 from splatseed.export import keep_gaussians, parse_crop
+from splatseed.io.output.staging import check_parents
 from splatseed.requirements import require
 from splatseed.train.settings import Backend
 from splatseed.viewer.video import check_video_name, even_size, write_video
@@ -112,6 +113,7 @@ def run(arguments: list[str]) -> None:
 def _check(options: Options) -> None:
     """Check what can be checked before any work starts."""
     check_video_name(options.output)
+    check_parents(options.output)
     if options.output.exists() and not options.overwrite:
         fix = "Pass --overwrite to replace it, or choose another name."
         raise OutputError(f"no file at {options.output}", found="one", fix=fix)

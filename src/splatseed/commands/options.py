@@ -69,6 +69,7 @@ def _complaint(kind: type[Any], verb: str, said: str, arguments: Sequence[str]) 
     see = f"Run splatseed {verb} --help to see"
     if choice := CHOICE.search(box):
         word, option, names = choice[1], choice[2], re.findall(r"'([^']+)'", choice[3])
+        names = sorted({*names} - {"None"})  # tyro's order changes; None is what is not given
         fix = did_you_mean(word, names).strip() or f"{see} what each is."
         return ParameterError(f"{option} as one of {', '.join(names)}", found=repr(word), fix=fix)
     if number := NUMBER.search(box):

@@ -88,7 +88,7 @@ WRONG = [
     (["--depth-kind", "ray"], "--depth DIR, which"),
     (["--depth-scale", "2"], "--depth DIR, which"),
     (["--depth", "ROOM", "--depth-scale", "0"], "above 0"),
-    (["--depth", "ROOM", "--depth-kind", "zet"], "invalid choice"),
+    (["--depth", "ROOM", "--depth-kind", "zet"], "as one of inverse, ray, z; found 'zet'"),
     (["--depth", "ROOM", "--depth.tolerance", "2"], "tolerance between 0 and 1"),
     (["--depth", "ROOM", "--depth-scale", "5", "--no-align"], "times that of the SfM points"),
     (["--depth", "ROOM", "--ratio", "3000"], "no other view looks through"),

@@ -27,6 +27,7 @@ from splatseed.diagnostics.scene import (
 from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.output.earlier import was_upsampled
+from splatseed.io.output.staging import check_parents
 from splatseed.literal import quoted
 from splatseed.scene import Scene
 from splatseed.train.schedule import FULL_RUN
@@ -116,6 +117,8 @@ def run(arguments: list[str]) -> None:
 
 def _read(options: Options) -> Scene:
     """The scene, with the depth maps that the user names, else with its own."""
+    if options.picture is not None:
+        check_parents(options.picture)
     scene = load_scene(options.scene, require_points=False)
     if options.depth is not None:
         maps = find_depths(scene, options.depth, kind=options.depth_kind, scale=options.depth_scale)

@@ -41,7 +41,7 @@ def output_folder(
 ) -> Iterator[Path]:
     """A folder to write into that appears at ``path`` when the block ends without an error.
 
-    A missing parent is made if its own parent exists. An empty folder at ``path`` is used; a full
+    Missing parents are made. An empty folder at ``path`` is used; a full
     one is replaced only with ``overwrite``, and only if its ``splatseed.json`` says that the same
     kind wrote it and lists everything in it. The new folder's own manifest is written at the end.
 
@@ -58,8 +58,9 @@ def output_folder(
     Raises:
         OutputError: ``path`` is taken or protected, or writing failed.
     """
-    check_output(path, kind=kind, overwrite=overwrite, protect=protect)
+    check_apart(path, protect)
     target = _resolved(path)
+    _check_replaceable(target, kind, overwrite=overwrite)
     remove_leftovers(target)
     partial = _partial_name(target)
     with _oserror_as_output_error(target), _parents(target.parent), held(partial) as hold:
@@ -78,6 +79,8 @@ def check_output(
     path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
 ) -> None:
     """Refuse what ``output_folder`` would refuse, before any work is done; arguments as there.
+
+    A folder that a user names is also refused if too many of its parents are missing.
 
     Raises:
         OutputError: ``path`` is taken or protected, or too many of its parents are missing.
