@@ -26,7 +26,11 @@ def _untold_compilation(monkeypatch):
 
 
 def pytest_collection_modifyitems(items) -> None:
-    """Slow tests last: what fails is known before they begin."""
+    """Slow tests last: what fails is known before they begin.
+
+    The viewer's first: they mostly wait for browsers, which other processes can compute beside.
+    """
+    items.sort(key=lambda item: "viewer" not in item.path.parts)
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
 
 
