@@ -28,9 +28,11 @@ def _untold_compilation(monkeypatch):
 def pytest_collection_modifyitems(items) -> None:
     """Slow tests last: what fails is known before they begin.
 
-    The viewer's first: they mostly wait for browsers, which other processes can compute beside.
+    Long files first, so that no process is left alone with one: the viewer's, which mostly wait for
+    browsers, and two that compile or train in processes of their own.
     """
-    items.sort(key=lambda item: "viewer" not in item.path.parts)
+    long = {"viewer", "test_determinism.py", "test_examples.py"}
+    items.sort(key=lambda item: long.isdisjoint(item.path.parts))
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
 
 
