@@ -28,10 +28,10 @@ def _untold_compilation(monkeypatch):
 def pytest_collection_modifyitems(items) -> None:
     """Slow tests last: what fails is known before they begin.
 
-    Long files first, so that no process is left alone with one: the viewer's, which mostly wait for
-    browsers, and two that compile or train in processes of their own.
+    First two long files that compile or train in processes of their own, so that no process is left
+    alone with one.
     """
-    long = {"viewer", "test_determinism.py", "test_examples.py"}
+    long = {"test_determinism.py", "test_examples.py"}
     items.sort(key=lambda item: long.isdisjoint(item.path.parts))
     items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
 
