@@ -213,14 +213,13 @@ def test_the_memory_for_repeats_is_that_of_a_tile(tiles, tmp_path, monkeypatch):
         tracemalloc.stop()
 
     monkeypatch.setattr(run, "find_repeats", watched)
-    for side in (8, 8, 24):  # the first loads and compiles what the others use
+    for side in (24, 24, 48):  # the first loads what the others use; most tiles have tiles around
         grid = np.stack(np.meshgrid(*[np.arange(side)] * 2, [0]), axis=-1).reshape(-1, 3)
         cloud = PointCloud((grid + 2**24).astype(np.float32), np.zeros(grid.shape, np.uint8))
         tiles.path = tmp_path / f"{len(peaks)}.tiles"
         tiles(cloud, "linear", LINEAR, most=40, ratio=40)
         assert tiles.tiled.num_repeated > 0.9 * tiles.tiled.num_new
-    # Nine times the points; a tile's memory is 0.1 MB, beside which the interpreter's own counts.
-    assert peaks[2] < 3 * peaks[1]
+    assert peaks[2] < 1.5 * peaks[1]
 
 
 def test_more_processes_share_the_memory():
