@@ -56,7 +56,7 @@ class Options:
     limit: int = 100_000_000
     """Points of the cloud."""
     in_memory: int = 4_000_000
-    """Points of the runs in memory, and of those by one and two workers."""
+    """Points of the runs in memory."""
     methods: tuple[Literal["linear", "triangle", "mls", "spline", "voronoi"], ...] = (
         "linear",
         "mls",
@@ -66,8 +66,8 @@ class Options:
     """The bound."""
     threads: int = 2
     """Threads of a run."""
-    workers: bool = True
-    """Also compare two Ray workers with one."""
+    workers: int = 16_000_000
+    """Points of the runs by one and by two Ray workers, at most the limit; 0 leaves them out."""
 
 
 @dataclass(frozen=True)
@@ -189,16 +189,16 @@ def _warm_up(options: Options, small: Path, method: str) -> None:
 
 def compare_workers(options: Options) -> None:
     """Print a table of one and of two Ray workers."""
-    cloud = make_cloud(options.work / f"room_{options.in_memory}.ply", options.in_memory)
+    count = min(options.workers, options.limit)
+    cloud = make_cloud(options.work / f"room_{count}.ply", count)
     rows = []
     for method in options.methods:
-        words = ["--executor", "ray", "--tile-points", str(options.in_memory // 16)]
+        words = ["--executor", "ray", "--tile-points", str(count // 16)]
         one, two = (
-            upsample(cloud, options.in_memory, method, 1, [*words, "--jobs", str(jobs)])
-            for jobs in (1, 2)
+            upsample(cloud, count, method, 1, [*words, "--jobs", str(jobs)]) for jobs in (1, 2)
         )
         rows.append((
-            method, f"{options.in_memory:,}", f"{one.in_tiles:.1f}", f"{two.in_tiles:.1f}",
+            method, f"{count:,}", f"{one.in_tiles:.1f}", f"{two.in_tiles:.1f}",
             f"{one.in_tiles / two.in_tiles:.2f}", f"{one.wall:.1f}", f"{two.wall:.1f}",
             f"{one.wall / two.wall:.2f}",
         ))  # fmt: skip
