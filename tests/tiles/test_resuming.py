@@ -17,7 +17,7 @@ import pytest
 from splatseed.errors import OutputError, ParameterError, PointCloudError
 from splatseed.pointcloud import PointCloud
 from splatseed.process.tasks import HereTasks
-from splatseed.tiles import check_disk, check_tileable, plan_tiles, run
+from splatseed.tiles import check_disk, check_tileable, choose_jobs, plan_tiles, run
 from splatseed.tiles.reading import origin_of
 from splatseed.tiles.repeats import find_repeats
 from splatseed.upsample import configure, upsample
@@ -227,6 +227,28 @@ def test_more_processes_share_the_memory():
     three = plan_tiles(configure("mls"), 10**8, 10**8, 2 << 30, processes=3)
     assert three.tile_points < one.tile_points
     assert three.memory <= 2 << 30
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "memory", "cores", "jobs"),
+    [
+        ("mls", 10**8, 4 << 30, 2, 2),
+        ("mls", 10**8, 64 << 30, 8, 8),
+        ("mls", 10**8, 4 << 30, 64, 2),  # what the memory holds, beside the one that hands out
+        ("mls", None, 4 << 30, 2, 2),
+        ("mls", 10**8, 1 << 30, 2, 1),  # better one process with full tiles
+        ("mls", 7 * 10**6, 4 << 30, 2, 1),  # not worth the start of another
+        ("random", 10**8, 4 << 30, 2, 1),  # without work on tiles
+    ],
+)
+def test_processes_are_as_many_as_are_worth_it(name, count, memory, cores, jobs):
+    method, num_new = configure(name), None if count is None else 3 * count
+    assert choose_jobs(method, count, num_new, memory, cores=cores) == jobs
+    if jobs > 1:
+        plan = plan_tiles(method, count, num_new, memory, processes=1 + jobs)
+        alone = plan_tiles(method, count, num_new, memory)
+        assert plan.tile_points == alone.tile_points
+        assert plan.memory <= memory
 
 
 def test_a_small_disk_is_refused_beforehand(tmp_path):

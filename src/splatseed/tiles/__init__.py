@@ -6,7 +6,7 @@ makes the new points of each tile; ``assembly`` puts all points in order. Promis
 in memory, whatever the size of the tiles and whoever works on them.
 """
 
-from splatseed.tiles.planning import TilePlan, check_disk, plan_tiles
+from splatseed.tiles.planning import TilePlan, check_disk, choose_jobs, plan_tiles
 from splatseed.tiles.run import Request, Tiled, check_tileable, make_tiled
 from splatseed.tiles.sources import FileSource, SceneSource, Source
 from splatseed.tiles.work import WorkFolder, open_work, work_path
@@ -21,6 +21,7 @@ __all__ = [
     "WorkFolder",
     "check_disk",
     "check_tileable",
+    "choose_jobs",
     "make_tiled",
     "open_work",
     "plan_tiles",

@@ -14,7 +14,7 @@ from splatseed.process.memory import option_of, words_of
 from splatseed.tiles.work import free_space
 from splatseed.upsample.nearest import NearestMethod
 
-__all__ = ["TilePlan", "check_disk", "plan_tiles"]
+__all__ = ["TilePlan", "check_disk", "choose_jobs", "plan_tiles"]
 
 PROCESS = 300 << 20
 """Memory of a process before it holds any points: libraries, compiled kernels, and their slack."""
@@ -22,6 +22,8 @@ PER_POINT, PER_NEIGHBOR, PER_NEW = 200, 20, 100
 """Bytes that a tile takes for each point, for each neighbour of each, and for each new point."""
 MOST, LEAST = 1 << 20, 1 << 13
 """Larger tiles are no faster; smaller ones spend their time on their borders."""
+WORTH = 4
+"""Tiles of each process, from which on it is worth its start."""
 AT_ONCE = 1 << 19
 """Rows of a pass over the disk."""
 PER_ROW = 250
@@ -83,10 +85,7 @@ def plan_tiles(
     Raises:
         ParameterError: The memory is not enough.
     """
-    neighbors = method.num_queried if isinstance(method, NearestMethod) else 0
-    ratio = 4.0 if count is None or num_new is None else num_new / max(count, 1)
-    each = int(PER_POINT + PER_NEIGHBOR * neighbors + PER_NEW * ratio)
-    fixed = held + (0 if isinstance(method, NearestMethod) else 3 * (count or 0))  # its colours
+    each, fixed = _costs(method, count, num_new, held)
     needed = processes * (PROCESS + LEAST * each) + fixed
     if memory < needed:
         raise ParameterError(
@@ -103,6 +102,46 @@ def plan_tiles(
     held = min(most, count or most)  # points of a tile
     peak = processes * PROCESS + max(processes * held * each, at_once * PER_ROW) + fixed
     return TilePlan(int(most), int(at_once), tiles, disk, min(int(peak), memory))
+
+
+def choose_jobs(
+    method: object,
+    count: int | None,
+    num_new: int | None,
+    memory: int,
+    *,
+    cores: int,
+    held: int = 0,
+) -> int:
+    """How many processes are to work on tiles, where the user leaves it open.
+
+    One for each core, if each gets several tiles and the memory holds full ones for all: much of
+    the work on a tile is done by one thread.
+
+    Args:
+        method: The method.
+        count: Points of the cloud, if known.
+        num_new: New points, if known.
+        memory: Bytes that all processes may take together.
+        cores: Most processes.
+        held: Bytes that the source keeps in memory all the while.
+    """
+    if not isinstance(method, NearestMethod):
+        return 1
+    each, fixed = _costs(method, count, num_new, held)
+    fits = (memory - fixed) // (PROCESS + MOST * each) - 1  # one is the process that hands out
+    enough = cores if count is None else count // (WORTH * MOST)
+    return max(1, min(cores, fits, enough))
+
+
+def _costs(method: object, count: int | None, num_new: int | None, held: int) -> tuple[int, int]:
+    """Bytes for each point of a tile, and for all tiles together."""
+    neighbors = method.num_queried if isinstance(method, NearestMethod) else 0
+    ratio = 4.0 if count is None or num_new is None else num_new / max(count, 1)
+    each = int(PER_POINT + PER_NEIGHBOR * neighbors + PER_NEW * ratio)
+    return each, held + (
+        0 if isinstance(method, NearestMethod) else 3 * (count or 0)
+    )  # its colours
 
 
 def _disk(method: object, count: int, num_new: int) -> int:

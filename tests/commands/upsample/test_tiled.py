@@ -8,9 +8,11 @@ import re
 import numpy as np
 import pytest
 
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply.points import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
+from splatseed.process import tasks, threads
 from splatseed.process.memory import bytes_of
+from splatseed.tiles import planning
 
 
 def files(folder):
@@ -46,6 +48,34 @@ def test_a_bare_cloud_in_tiles_gives_the_files_of_memory(cloud, tmp_path, splats
     assert (told["num_points"], told["num_original"]) == (900, 300)
     assert (told["tiles"], told["source"]) == (3, str(cloud))
     assert not (tmp_path / "out.tiles").exists()
+
+
+def test_large_clouds_are_shared_among_processes(cloud, tmp_path, splatseed, monkeypatch):
+    class Processes(tasks.HereTasks):
+        """As many as asked for, all of them this one."""
+
+        def __init__(self, jobs, threads):
+            self.words, self.processes = f"{jobs} processes of {threads} thread", 1 + jobs
+
+    monkeypatch.setattr(tasks, "ProcessTasks", Processes)
+    monkeypatch.setattr(threads, "cores", lambda: 2)
+    monkeypatch.setattr(planning, "MOST", 30)  # a large cloud has at least 8 tiles of this size
+    words = ("upsample", npz(cloud), "--method", "linear", "--ratio", 3)
+    for given, told in (
+        ((), "2 processes of 1 thread"),
+        (("--jobs", 1), "this process"),
+        (("--tile-points", 30), "this process"),
+    ):
+        run = splatseed(*words, "-o", tmp_path / "out", "--overwrite", *given)
+        assert (run.code, run.err) == (0, "")
+        assert f"(seed 0, {told})" in run.out
+
+
+def npz(cloud):
+    """The same as .npz, which is always cut into tiles."""
+    points = read_ply(cloud)
+    np.savez(cloud.with_suffix(".npz"), xyz=points.xyz, rgb=points.rgb)
+    return cloud.with_suffix(".npz")
 
 
 def test_new_points_that_fall_together_are_left_out_as_in_memory(tmp_path, splatseed):

@@ -124,7 +124,7 @@ class Options:
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
     memory: Annotated[str | None, memory_flag()] = None
     """Most memory: larger clouds are upsampled in tiles on disk; --cloud merges more points."""
-    jobs: Annotated[int | None, number_flag(int, "1; with Ray, as many as fit")] = None
+    jobs: Annotated[int | None, number_flag(int, "as many as cores and memory allow")] = None
     """Tiles at a time, each in a process of its own."""
     executor: Literal["local", "ray"] = "local"
     """Who works on tiles: this machine, or a Ray cluster that shares its disk."""

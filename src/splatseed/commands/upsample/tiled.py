@@ -46,6 +46,8 @@ CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz"
 """Files of points that only ``open_cloud`` reads."""
 PROCESS, PER_POINT, PER_NEIGHBOR = 300 << 20, 120, 20
 """Bytes that the process takes, a cloud in memory for each original, and for each neighbour."""
+MEMORY = 4 << 30
+"""Bytes that may be used where neither user nor system says."""
 READ = 2.5
 """Bytes that a scene takes for each byte of COLMAP's files."""
 WHOLE = ("budget", "cover_cell", "verify", "preview", "gaussians", "depth_maps", "cloud_files")
@@ -58,7 +60,7 @@ class Tiling:
 
     Args:
         memory: Most bytes of memory, if the user says so.
-        jobs: Tiles at a time; None for one, or on a cluster as many as fit.
+        jobs: Tiles at a time; None for as many as cores and memory allow, on a cluster as fit.
         executor: Who works on them.
         address: The cluster's address.
         tile_points: Most points in a tile, if the user says so.
@@ -178,7 +180,7 @@ def run_tiled(
     check_tileable(options.method, method)
     request = Request(options.method, method, options.ratio, options.num_points, options.seed)
     path, clock = work_path(options.output), StageClock()
-    with _tasks(options.tiling) as tasks:
+    with _tasks(options, method, source) as tasks:
         plan = _plan(options, method, source, tasks.processes)
         check_disk(path, plan.disk, _size_of(path))
         with _kept(path), open_work(path, request.job(source)) as (work, resumed):
@@ -219,36 +221,46 @@ def _check_options(options: Options, source: Source) -> None:
 
 
 @contextmanager
-def _tasks(tiling: Tiling) -> Iterator[Tasks]:
+def _tasks(options: Options, method: Upsampler, source: Source) -> Iterator[Tasks]:
     """Who works on tiles, while the block runs."""
     from splatseed.process import tasks  # noqa: PLC0415  (processes)
     from splatseed.process.ray_tasks import ray_cluster  # noqa: PLC0415  (an extra)
     from splatseed.process.threads import cores  # noqa: PLC0415  (loads with its use)
 
+    tiling = options.tiling
     if tiling.executor == "ray":
         with ray_cluster(tiling.address):
             yield tasks.RayTasks(1, tiling.jobs)
-    elif (tiling.jobs or 1) > 1:
-        jobs = tiling.jobs or 1
+    elif (jobs := tiling.jobs or _jobs(options, method, source, cores())) > 1:
         yield tasks.ProcessTasks(jobs, max(1, cores() // jobs))
     else:
         yield tasks.HereTasks()
 
 
+def _jobs(options: Options, method: Upsampler, source: Source, cores: int) -> int:
+    from splatseed.tiles import choose_jobs  # noqa: PLC0415  (Numba)
+
+    if options.tiling.tile_points is not None:
+        return 1
+    new, memory = _num_new(options, source), options.tiling.bound or MEMORY
+    return choose_jobs(method, source.count, new, memory, cores=cores, held=source.held)
+
+
+def _num_new(options: Options, source: Source) -> int | None:
+    count = source.count
+    return None if count is None else planned_size(count, options.ratio, options.num_points) - count
+
+
 def _plan(options: Options, method: Upsampler, source: Source, processes: int) -> TilePlan:
     from splatseed.tiles import plan_tiles  # noqa: PLC0415  (Numba)
 
-    count = source.count
-    new = None
-    if count is not None:
-        new = planned_size(count, options.ratio, options.num_points) - count
     tiling = options.tiling
-    memory = tiling.bound or 4 << 30
+    memory = tiling.bound or MEMORY
     if tiling.executor == "ray" and tiling.memory is not None:
         memory = tiling.memory  # of each task, wherever it runs
     return plan_tiles(
-        method, count, new, memory, processes=processes, tile_points=tiling.tile_points,
-        held=source.held,
+        method, source.count, _num_new(options, source), memory, processes=processes,
+        tile_points=tiling.tile_points, held=source.held,
     )  # fmt: skip
 
 
