@@ -34,11 +34,11 @@ from splatseed.process.interpreter import child_command, child_environment
 __all__: list[str] = []
 
 PROGRAM = """
-import sys
+import resource, sys
 from splatseed.cli import main
 from splatseed.process.peak import peak_bytes
 main(sys.argv[1:])
-print("peak", peak_bytes())
+print(peak_bytes(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024)
 """
 CHUNK = 1_000_000
 NOISE, GHOSTS = 0.002, 0.003
@@ -65,7 +65,7 @@ class Options:
     memory: str = "4G"
     """The bound."""
     threads: int = 2
-    """Threads of a run."""
+    """Threads of a run, or processes of one each."""
     workers: int = 16_000_000
     """Points of the runs by one and by two Ray workers, at most the limit; 0 leaves them out."""
 
@@ -78,7 +78,7 @@ class Run:
         points: Points that it started from.
         wall: Seconds.
         busy: Seconds of all its threads and processes.
-        peak: Bytes of its process at most.
+        peak: Bytes of its processes at most, were all at their peaks at once.
         stages: Seconds of each stage.
     """
 
@@ -141,7 +141,8 @@ def upsample(cloud: Path, points: int, method: str, threads: int, words: Sequenc
         raise SystemExit(f"{' '.join(command)} ended with {code}")
     told = re.search(r"^  seconds +(.*)$", text, re.MULTILINE)
     stages = {} if told is None else dict(_stages(told[1]))
-    return Run(points, wall, busy, int(text.split()[-1]), stages)
+    own, each = map(int, text.split()[-2:])
+    return Run(points, wall, busy, own + threads * each, stages)
 
 
 def _children_seconds() -> float:
@@ -166,7 +167,7 @@ def compare(options: Options) -> None:
     for method in options.methods:
         _warm_up(options, small, method)
         whole = upsample(small, options.in_memory, method, options.threads, [])
-        words = ["--memory", options.memory, *pieces]
+        words = ["--memory", options.memory, "--jobs", str(options.threads), *pieces]
         tiled = upsample(large, options.limit, method, options.threads, words)
         for name, run in (("in memory", whole), ("tiles", tiled)):
             rows.append((
