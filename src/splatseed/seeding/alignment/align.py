@@ -4,8 +4,9 @@ Notation: *marks* are the scene's own points; *extent* is their root mean square
 their median. The *share* is the fraction of marks within ``CLOSE`` extents of the cloud's surface.
 A *rival* is another alignment, turned by more than ``TURNED`` degrees, scaled by more than
 ``SCALED`` or shifted by more than ``SHIFTED`` extents. The *error* is the standard error of the
-alignment at the farthest corner of the marks, by least squares: it is large where the cloud lets
-the scene slide.
+alignment at the farthest corner of the marks, whatever their variances: it is large where the cloud
+lets the scene slide. It is that of the marks: a principal point that is off moves all of them at
+once, and the *sway* is how far half a pixel of it would turn the alignment.
 Promise: an alignment is returned only if most marks lie on the cloud, no rival is nearly as good,
 and the error is small; else the reason is told.
 """
@@ -20,18 +21,17 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from splatseed.errors import PointCloudError
-from splatseed.pointcloud import ORIGINAL
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.alignment.coarse import Unit, find_starts
 from splatseed.seeding.alignment.icp import Fitted, Surface, fit
+from splatseed.seeding.alignment.marks import LEAST_MARKS, MOST_MARKS, Marks, find_marks
+from splatseed.seeding.alignment.polish import polish
 from splatseed.seeding.alignment.sampling import CloudSample, normals_of, sample_cloud
 from splatseed.similarity import Similarity
 
 __all__ = ["Alignment", "align"]
 
-LEAST_MARKS = 200
-MOST_MARKS = 6000
 ROUNDS = (
     (150, 250, 10, 0.25, 0.04, 0.04),
     (16, 1500, 15, 0.1, 0.02, 0.02),
@@ -51,6 +51,8 @@ LIKE, UNLIKE = 0.5, 0.25
 """Correlations of colours at the marks that tell an alignment from its rival."""
 SURE = 0.003
 """Greatest error, in extents."""
+EXACT = 0.1
+"""Degrees that the alignment should not be off by: a doubt that is greater is told."""
 _FIX = "Give the transform with --transform FILE, or bring more of the scene in both."
 
 
@@ -63,6 +65,8 @@ class Alignment:
         share: Of the marks, those on the cloud's surface.
         residual: Median distance of these from the surface, scene units.
         error: Standard error at the farthest corner, scene units.
+        turn: Standard error of the rotation, degrees.
+        sway: Degrees that it would be turned by were the principal points off by half a pixel.
         extent: Of the marks, scene units.
         likeness: Correlation of brightness between marks and cloud, -1 to 1; None without colours.
         rival: Share of the best rival; 0 without one.
@@ -76,6 +80,8 @@ class Alignment:
     share: float
     residual: float
     error: float
+    turn: float
+    sway: float
     extent: float
     likeness: float | None
     rival: float
@@ -94,6 +100,8 @@ class Alignment:
             "share_of_points_on_the_cloud": self.share,
             "median_residual": self.residual,
             "standard_error": self.error,
+            "standard_error_degrees": self.turn,
+            "degrees_by_half_a_pixel": self.sway,
             "extent": self.extent,
             "likeness_of_colours": self.likeness,
             "share_of_next_best": self.rival,
@@ -105,8 +113,22 @@ class Alignment:
         return (
             f"Aligned at scale {self.scene_from_cloud.scale:.6g}: {self.share:.0%} of the scene's "
             f"points lie on the cloud, {self.residual:.3g} from it in the median, standard "
-            f"error {self.error:.2g} (the scene's unit)."
+            f"error {self.error:.2g} (the scene's unit) and {self.turn:.2g} degrees."
+            f"{self._doubts}"
         )
+
+    @property
+    def _doubts(self) -> str:
+        """What may be more wrong than ``EXACT``, as further sentences."""
+        doubts = ""
+        if 2 * self.turn > EXACT:
+            doubts += f" Warning: it may be turned by more than {EXACT:g} degrees."
+        if self.sway > EXACT / 2:
+            doubts += (
+                " The photographs stand so close together that principal points half a pixel off "
+                f"would turn it by {self.sway:.2g} degrees."
+            )
+        return doubts
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,61 +152,27 @@ def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> A
         SceneNotFoundError: A file is missing.
         SceneFormatError: One is damaged.
     """
-    marks, brightness = _marks_of(scene)
+    marks = find_marks(scene)
     sample = sample_cloud(paths, progress)
     progress("align", 0.0)
-    unit_of_marks, unit_of_cloud = Unit.of(marks), Unit.of(sample.xyz)
-    small, cloud = (
-        unit.similarity.points(xyz)
-        for unit, xyz in ((unit_of_marks, marks), (unit_of_cloud, sample.xyz))
-    )
-    surface = _surface_of(cloud)
-    best, *others = _candidates(surface, small, progress)
-    likeness = _likeness(best, surface, small, sample.rgb, brightness)
+    unit_of_marks, unit_of_cloud = Unit.of(marks.xyz), Unit.of(sample.xyz)
+    small = marks.through(unit_of_marks.similarity)
+    surface = _surface_of(unit_of_cloud.similarity.points(sample.xyz))
+    first, *others = _candidates(surface, small.xyz, progress)
+    best, sway = _polished(surface, small, first)
     rival = next((each for each in others if _differs(best.fitted, each.fitted)), None)
-    unlike = (
-        rival is not None
-        and likeness is not None
-        and (
-            likeness > LIKE
-            and (_likeness(rival, surface, small, sample.rgb, brightness) or 0.0) < UNLIKE
-        )
-    )
-    error = _error(best.fitted, small)
-    _check(best, None if unlike else rival, error)
+    told = rival is not None and _unlike(best, rival, surface, small, sample.rgb)
+    error = _error(best.fitted, small.xyz)
+    _check(best, None if told else rival, error)
     to_unit = _recentred(sample, unit_of_cloud).then(best.fitted.cloud_from_scene.inverse)
     to_scene = to_unit.then(unit_of_marks.similarity.inverse)
-    on = best.fitted.residuals < CLOSE
+    extent, residuals = unit_of_marks.extent, best.fitted.residuals
     return Alignment(
-        to_scene, best.share, float(np.median(best.fitted.residuals[on])) * unit_of_marks.extent,
-        error * unit_of_marks.extent, unit_of_marks.extent, likeness,
-        rival.share if rival else 0.0, marks, best.fitted.residuals * unit_of_marks.extent,
-        to_scene.points(sample.xyz + sample.offset), sample.rgb,
+        to_scene, best.share, float(np.median(residuals[residuals < CLOSE])) * extent,
+        error * extent, np.degrees(best.fitted.turn), np.degrees(sway), extent,
+        _likeness(best, surface, small, sample.rgb), rival.share if rival else 0.0, marks.xyz,
+        residuals * extent, to_scene.points(sample.xyz + sample.offset), sample.rgb,
     )  # fmt: skip
-
-
-def _marks_of(scene: Scene) -> tuple[Float64[np.ndarray, "M 3"], Float64[np.ndarray, " M"]]:
-    """The scene's own points, an even choice of them, and their brightness.
-
-    Raises:
-        PointCloudError: There are too few.
-    """
-    points = scene.points
-    own = (points.source == ORIGINAL) & points.distinct
-    if scene.tracks is not None:
-        own[: len(scene.tracks)] &= scene.tracks.lengths >= 3  # two rays may meet by chance
-    if np.count_nonzero(own) < LEAST_MARKS:
-        raise PointCloudError(
-            f"at least {LEAST_MARKS} points of the scene's own, to align a cloud with",
-            found=f"{np.count_nonzero(own):,}",
-            fix="Make some: splatseed sfm IMAGES --poses-from SCENE; or give --transform FILE.",
-        )
-    which = np.flatnonzero(own)
-    which = which[:: -(-len(which) // MOST_MARKS)]
-    xyz = points.xyz[which].astype(np.float64)
-    if scene.tracks is not None and which[-1] < len(scene.tracks):
-        xyz = scene.tracks.xyz[which]
-    return xyz, points.rgb[which].astype(np.float64).mean(axis=1)
 
 
 def _surface_of(cloud: Float64[np.ndarray, "N 3"]) -> Surface:
@@ -223,6 +211,29 @@ def _candidates(
     return candidates
 
 
+def _polished(surface: Surface, marks: Marks, candidate: _Candidate) -> tuple[_Candidate, float]:
+    """A candidate after the last stage, and its sway in radians; as it was where that fails."""
+    polished = polish(surface, marks, candidate.fitted.cloud_from_scene, CLOSE)
+    if polished is None:
+        return candidate, 0.0
+    share = float(np.mean(polished.fitted.residuals < CLOSE))
+    return _Candidate(polished.fitted, share), float(np.linalg.norm(polished.sway)) / 2
+
+
+def _unlike(
+    best: _Candidate,
+    rival: _Candidate,
+    surface: Surface,
+    marks: Marks,
+    rgb: UInt8[np.ndarray, "N 3"] | None,
+) -> bool:
+    """Whether colours tell the best from its rival."""
+    likeness = _likeness(best, surface, marks, rgb)
+    if likeness is None or likeness <= LIKE:
+        return False
+    return (_likeness(rival, surface, marks, rgb) or 0.0) < UNLIKE
+
+
 def _different(candidates: list[_Candidate]) -> list[_Candidate]:
     """The best of each group of like alignments."""
     kept: list[_Candidate] = []
@@ -245,19 +256,18 @@ def _differs(first: Fitted, second: Fitted) -> bool:
 def _likeness(
     candidate: _Candidate,
     surface: Surface,
-    marks: Float64[np.ndarray, "M 3"],
+    marks: Marks,
     rgb: UInt8[np.ndarray, "N 3"] | None,
-    brightness: Float64[np.ndarray, " M"],
 ) -> float | None:
     """Correlation of brightness between marks and their nearest cloud points."""
-    if rgb is None or brightness.std() == 0:
+    if rgb is None or marks.brightness.std() == 0:
         return None
     on = candidate.fitted.residuals < CLOSE
     if np.count_nonzero(on) < LEAST_MARKS // 2:
         return None
-    idx = surface.tree.query(candidate.fitted.cloud_from_scene.points(marks[on]))[1]
+    idx = surface.tree.query(candidate.fitted.cloud_from_scene.points(marks.xyz[on]))[1]
     there = rgb[idx].astype(np.float64).mean(axis=1)
-    return float(np.corrcoef(there, brightness[on])[0, 1]) if there.std() > 0 else None
+    return float(np.corrcoef(there, marks.brightness[on])[0, 1]) if there.std() > 0 else None
 
 
 def _error(fitted: Fitted, marks: Float64[np.ndarray, "M 3"]) -> float:

@@ -7,7 +7,8 @@ reach falls from round to round. Residuals are in the cloud's units, and divided
 alignments are compared. The last reach is far below the marks' noise: their errors are long-tailed
 and to one side, so the mode of the residuals is more exact than their mean (red kitchen: 7 mm
 instead of 36).
-Promise: the covariance of the seven unknowns is that of least squares at the last round.
+Promise: the covariance of the seven unknowns is that of least squares at the last round. It takes
+marks for equally exact; ``polish.py`` does not.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from splatseed.similarity import Similarity
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-__all__ = ["Fitted", "Surface", "fit"]
+__all__ = ["LEAST", "Fitted", "Surface", "design", "fit", "moved", "residuals_of"]
 
 SHRINK = 0.75
 """Factor of the reach from round to round."""
@@ -67,6 +68,11 @@ class Fitted:
     covariance: Float64[np.ndarray, "7 7"]
     center: Float64[np.ndarray, " 3"]
 
+    @property
+    def turn(self) -> float:
+        """Standard error of the rotation, radians."""
+        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+
 
 def fit(
     surface: Surface,
@@ -94,8 +100,8 @@ def fit(
         step = _step(surface, marks, similarity, reach)
         if step is None:
             return None
-        similarity, moved = step
-        if moved < STILL and reach <= least:
+        similarity, shift = step
+        if shift < STILL and reach <= least:
             break
         reach = max(reach * SHRINK, least)
     return _result(surface, marks, similarity, reach)
@@ -128,22 +134,22 @@ def _step(
     if np.count_nonzero(weights) < LEAST:
         return None
     center = np.average(q, axis=0, weights=weights)
-    A = _design(q - center, normals)
+    A = design(q - center, normals)
     normal = (A * weights[:, None]).T @ A
     try:
         x = np.linalg.solve(normal, -(A * weights[:, None]).T @ off)
     except np.linalg.LinAlgError:
         return None
-    return _moved(start, center, x), float(np.abs(x).max())
+    return moved(start, center, x), float(np.abs(x).max())
 
 
-def _design(around: np.ndarray, normals: np.ndarray) -> Float64[np.ndarray, "M 7"]:
+def design(around: np.ndarray, normals: np.ndarray) -> Float64[np.ndarray, "M 7"]:
     """Rows of n . (w x a + t + d a) for the rotation w, the shift t and the change of scale d."""
     along = np.einsum("ij,ij->i", normals, around)
     return np.column_stack([np.cross(around, normals), normals, along])
 
 
-def _moved(start: Similarity, center: np.ndarray, x: np.ndarray) -> Similarity:
+def moved(start: Similarity, center: np.ndarray, x: np.ndarray) -> Similarity:
     """A similarity followed by a small one about a centre."""
     turn, grow = _rotation(x[:3]), float(np.exp(np.clip(x[6], -0.2, 0.2)))
     rotation, scale = turn @ start.rotation, grow * start.scale
@@ -161,6 +167,16 @@ def _rotation(w: np.ndarray) -> Float64[np.ndarray, "3 3"]:
     return np.asarray(np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K)
 
 
+def residuals_of(
+    surface: Surface, marks: Float64[np.ndarray, "M 3"], similarity: Similarity, reach: float
+) -> Float64[np.ndarray, " M"]:
+    """Distances of marks from the cloud, as ``Fitted`` has them, in the scene's units."""
+    limit = reach * similarity.scale
+    _, off, distance = _pairs(surface, similarity.points(marks))
+    inside = (np.abs(off) < limit) & (distance < 2 * limit)
+    return np.where(inside, np.abs(off), distance) / similarity.scale
+
+
 def _result(
     surface: Surface, marks: Float64[np.ndarray, "M 3"], similarity: Similarity, reach: float
 ) -> Fitted | None:
@@ -170,10 +186,10 @@ def _result(
     if np.count_nonzero(inside) < LEAST:
         return None
     center = q[inside].mean(axis=0)
-    A = _design(q[inside] - center, normals[inside])
+    A = design(q[inside] - center, normals[inside])
     try:
         covariance = np.linalg.inv(A.T @ A) * float(np.mean(off[inside] ** 2))
     except np.linalg.LinAlgError:
         return None
-    residuals = np.where(inside, np.abs(off), distance) / similarity.scale
+    residuals = residuals_of(surface, marks, similarity, reach)
     return Fitted(similarity, residuals, reach, covariance, center)
