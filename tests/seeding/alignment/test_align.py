@@ -18,9 +18,9 @@ from splatseed.similarity import Similarity
 
 MOVE = Similarity(0.37, spread_rotations(500)[321], np.array([5.6e5, 5.9e6, -80.0]))
 QUICK = (
-    (60, 150, 10, 0.25, 0.04, 0.04),
-    (6, 600, 15, 0.1, 0.02, 0.02),
-    (3, 1500, 40, 0.04, 0.005, 0.01),
+    (60, 150, 10, 0.25, 0.04, 0.04, 0.75),
+    (6, 600, 15, 0.1, 0.02, 0.02, 0.75),
+    (3, 1500, 40, 0.04, 0.005, 0.01, 0.75),
 )
 """Fewer tries than for real clouds, as tests must be quick."""
 

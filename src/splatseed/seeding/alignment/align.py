@@ -33,12 +33,13 @@ from splatseed.similarity import Similarity
 __all__ = ["Alignment", "align"]
 
 ROUNDS = (
-    (150, 250, 10, 0.25, 0.04, 0.04),
-    (16, 1500, 15, 0.1, 0.02, 0.02),
-    (4, MOST_MARKS, 40, 0.04, 0.005, 0.01),
+    (100, 250, 20, 0.3, 0.04, 0.04, 0.85),
+    (16, 1500, 15, 0.1, 0.02, 0.02, 0.75),
+    (4, MOST_MARKS, 40, 0.04, 0.005, 0.01, 0.75),
 )
-"""Stages: alignments, marks, rounds of ICP, the first and the last reach, and within how much of
-the cloud marks count, in extents."""
+"""Stages: alignments, marks, rounds of ICP, the first and the last reach, within how much of the
+cloud marks count, in extents, and the factor of the reach from round to round. The first begins
+with orientations that are off by 15 degrees, so it takes its time."""
 CLOSE = 0.01
 SHARE = 0.5
 """Least share of marks on the cloud: 0.75 in a good one (room0), 0.33 of a handheld depth camera's
@@ -196,11 +197,11 @@ def _candidates(
     rows = zip(starts.scale, starts.rotation, starts.shift, strict=True)
     waiting = [Similarity(float(scale), rotation, shift) for scale, rotation, shift in rows]
     candidates: list[_Candidate] = []
-    for stage, (num, count, rounds, far, least, close) in enumerate(ROUNDS):
+    for stage, (num, count, rounds, far, least, close, shrink) in enumerate(ROUNDS):
         some = marks[:: -(-len(marks) // count)]
         candidates = []
         for i, start in enumerate(waiting[:num]):
-            fitted = fit(surface, some, start, far, rounds, least)
+            fitted = fit(surface, some, start, far, rounds, least, shrink)
             if fitted is not None and 0.3 < fitted.cloud_from_scene.scale < 3.0:
                 candidates.append(_Candidate(fitted, float(np.mean(fitted.residuals < close))))
             progress("align", (stage + (i + 1) / len(waiting[:num])) / len(ROUNDS))

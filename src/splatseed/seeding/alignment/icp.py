@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 __all__ = ["LEAST", "Fitted", "Surface", "design", "fit", "moved", "residuals_of"]
 
-SHRINK = 0.75
-"""Factor of the reach from round to round."""
 STILL = 1e-7
 LEAST = 12
 """Marks within reach that a fit needs."""
@@ -81,6 +79,7 @@ def fit(
     far: float,
     rounds: int,
     least: float,
+    shrink: float,
 ) -> Fitted | None:
     """Refine an alignment.
 
@@ -91,6 +90,7 @@ def fit(
         far: The first reach, in the scene's units.
         rounds: How many rounds.
         least: The least reach, in the scene's units.
+        shrink: Factor of the reach from round to round.
 
     Returns:
         The alignment; None where too few marks are within reach, or nothing holds them.
@@ -103,7 +103,7 @@ def fit(
         similarity, shift = step
         if shift < STILL and reach <= least:
             break
-        reach = max(reach * SHRINK, least)
+        reach = max(reach * shrink, least)
     return _result(surface, marks, similarity, reach)
 
 
