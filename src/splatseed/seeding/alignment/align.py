@@ -34,12 +34,13 @@ __all__ = ["Alignment", "align"]
 
 ROUNDS = (
     (100, 250, 20, 0.3, 0.04, 0.04, 0.85),
-    (16, 1500, 15, 0.1, 0.02, 0.02, 0.75),
+    (16, 1500, 20, 0.2, 0.02, 0.02, 0.82),
     (4, MOST_MARKS, 40, 0.04, 0.005, 0.01, 0.75),
 )
 """Stages: alignments, marks, rounds of ICP, the first and the last reach, within how much of the
 cloud marks count, in extents, and the factor of the reach from round to round. The first begins
-with orientations that are off by 15 degrees, so it takes its time."""
+with orientations that are off by 15 degrees and the second with some that still are by 10, so their
+reach is wide and falls slowly."""
 CLOSE = 0.01
 SHARE = 0.5
 """Least share of marks on the cloud: 0.75 in a good one (room0), 0.33 of a handheld depth camera's
