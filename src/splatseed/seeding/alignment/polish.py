@@ -195,6 +195,6 @@ def _result(
         sway = -np.linalg.solve(problem.normal, problem.A.T @ (problem.weight[:, None] * swayed))
     except np.linalg.LinAlgError:
         return None
-    residuals = residuals_of(surface, marks.xyz, similarity, reach / 2)
+    residuals = residuals_of(surface, marks.xyz, similarity, reach / 2)  # as of the stage before
     fitted = Fitted(similarity, residuals, reach, covariance, problem.center)
     return Polished(fitted, sway[:3])
