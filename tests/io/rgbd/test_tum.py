@@ -112,7 +112,7 @@ def test_camera_file_goes_first(capture, where):
     camera = {"w": 640, "h": 480, "fx": 500, "fy": 510, "cx": 319.5, "cy": 239.5, "scale": 1000}
     (capture / where / "cam_params.json").write_text(json.dumps({"camera": camera}))
     scene = load_tum(capture)
-    assert scene.intrinsics[0].params == (500, 510, 320, 240)
+    assert scene.intrinsics[0].params == (500, 510, 319.5, 239.5)
     assert scene.depths.scale == 1000
     assert find_depths(scene, capture).scale == 1000
     assert find_depths(scene, capture, scale=2000).scale == 2000

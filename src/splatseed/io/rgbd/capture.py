@@ -26,7 +26,7 @@ def find_camera_file(root: Path) -> Path | None:
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
-    """The pinhole camera in a camera file, whose first pixel has its centre at (0, 0).
+    """The pinhole camera in a camera file, whose corner is at (0, 0), as in COLMAP.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -49,7 +49,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
             found=f"w={width} h={height} fx={fx} fy={fy} cx={cx} cy={cy}",
             fix="Write them in pixels.",
         )
-    return Intrinsics(1, "PINHOLE", width, height, (fx, fy, cx + 0.5, cy + 0.5))
+    return Intrinsics(1, "PINHOLE", width, height, (fx, fy, cx, cy))
 
 
 def check_size(path: Path, intrinsics: Intrinsics) -> None:

@@ -4,9 +4,10 @@ A folder holds ``results/frame*.jpg`` (or .png) and ``results/depth*.png``, ``tr
 row-major 4x4 ``world_from_cam`` in OpenCV axes and metres per line, a line per frame in the order
 of the frames' numbers, and ``cam_params.json``, here or one folder up.
 
-The layout's principal point takes the centre of the top-left pixel as (0, 0): Replica's 1200 pixel
-wide images have cx = 599.5. COLMAP, and so splatseed, puts it at (0.5, 0.5), hence half a pixel is
-added. Promise: every image returned exists, has its camera's size and a rigid, finite pose.
+The layout's principal point counts from the corner of the image, as COLMAP's does. Replica's own
+renderer gives OpenGL (w - 1) / 2, so the 1200 pixel wide images have cx = 599.5, half a pixel from
+their middle; their depth maps agree with each other there (0.04 mm, and 0.12 with cx = 600).
+Promise: every image returned exists, has its camera's size and a rigid, finite pose.
 """
 
 from __future__ import annotations
