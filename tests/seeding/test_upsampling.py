@@ -11,13 +11,15 @@ import pytest
 
 import splatseed as ss
 from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
+from splatseed.seeding.thinning import thin_to
 from splatseed.seeding.upsampling import share_covered
 from splatseed.upsample.registry import SOURCE_CODES
 from splatseed.views import view
 
 PHOTOGRAPH_METHODS = ("stereo", "cover", "auto")
-STEREO, COVER = SOURCE_CODES["stereo"], SOURCE_CODES["cover"]
+STEREO, COVER, CLOUD = (SOURCE_CODES[name] for name in ("stereo", "cover", "cloud"))
 
 
 @pytest.fixture(scope="module")
@@ -140,6 +142,19 @@ def test_a_budget_that_originals_fill_is_theirs_alone(room):
     assert "are thinned, and none are added" in notes[-1]
     made = ss.upsample(room, cover=8, budget=count // 2)  # the long way
     np.testing.assert_array_equal(made.xyz, thinned.xyz)
+
+
+def test_a_small_budget_keeps_a_part_of_a_scan(room):
+    scan = room.points.originals
+    scan = scan.replace(xyz=scan.xyz + np.float32(0.2), source=np.full(len(scan), CLOUD, np.uint8))
+    guesses = scan.replace(
+        xyz=scan.xyz + np.float32(0.2), source=np.full(len(scan), COVER, np.uint8)
+    )
+    cloud = PointCloud.concatenate(room.points.originals, scan, guesses)
+    num = room.points.num_original // 2
+    kept = thin_to(room, cloud, num, 8, 0, 0, silent)
+    assert len(kept) == num
+    assert np.count_nonzero(kept.source == CLOUD) > num // 10
 
 
 @pytest.mark.parametrize("budget", ["many", "-3", "0", "0rho", "1e3x"])

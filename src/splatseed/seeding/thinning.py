@@ -19,7 +19,7 @@ from splatseed.views.view import View, data_factor, poses_of
 
 __all__ = ["frames_of", "points_within", "thin_to"]
 
-COVER = source_code("cover")
+COVER, CLOUD = source_code("cover"), source_code("cloud")
 MOST_COVER = 0.1
 """Largest part of a budget for cover's guesses; their cells grow until they fit."""
 COARSER = 1.25
@@ -55,7 +55,8 @@ def thin_to(
 
     Cover is recomputed for what thinning leaves: a guess fills a gap, and must not replace a
     measured point. If there are at least ``num`` originals, only originals stay: they are dense
-    where there is detail, which is where few Gaussians are needed most.
+    where there is detail, which is where few Gaussians are needed most. But a scan's points, which
+    the user has asked for, are thinned together with them.
 
     Args:
         scene: The scene of the points.
@@ -73,7 +74,7 @@ def thin_to(
     if not guessed.any() or guessed.all():
         return _keep(scene, points, num)
     known = points.select(~guessed)
-    if known.num_original >= num:
+    if known.num_original >= num and not (known.source == CLOUD).any():
         return _keep(scene, known.originals, num)
     views = read_views(scene, photographed(scene, hold_out), MAX_SIZE, progress)
     # Guesses get what the measured points leave, and a tenth at least.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from splatseed.io.output.earlier import was_upsampled
+from splatseed.io.output.earlier import saw_all_photographs, was_upsampled
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
@@ -54,6 +54,11 @@ def seeded(
         SceneFormatError: One is damaged.
     """
     as_it_is = settings.seeding == "scene" or settings.strategy.endswith(AS_3DGS)
+    if saw_all_photographs(scene):
+        note(
+            "The seeds were made from all photographs, test views included, which may flatter the "
+            "score: train the scene itself, or make them with a hold-out (--auto.hold-out 8)."
+        )
     if as_it_is or was_upsampled(scene):
         return scene, None
     from splatseed.seeding.photographs import Auto  # noqa: PLC0415  (loads with its use)

@@ -129,7 +129,9 @@ def test_results_are_plain_text_and_the_rest_is_silent(room, tmp_path, splatseed
 def test_the_commands_to_train_with_name_what_is_there(room, tmp_path, splatseed):
     out = tmp_path / "my scene"
     commands = _commands(splatseed("upsample", room, "-o", out).out)
-    assert set(commands) == {"gsplat", "graphdeco", "nerfstudio", "Brush", "OpenSplat", "LichtFeld"}
+    others = {"gsplat", "graphdeco", "nerfstudio", "Brush", "OpenSplat", "LichtFeld"}
+    assert set(commands) == {"splatseed", *others}
+    assert next(iter(commands)) == "splatseed"
     for words in commands.values():
         assert str(out) in words  # one word, although it has a space
     words = commands["gsplat"]
@@ -148,7 +150,7 @@ def _commands(out):
 def test_only_what_reads_transforms_json_is_offered_for_it(room, tmp_path, splatseed):
     out = tmp_path / "out"
     run = splatseed("upsample", room, "-o", out, "--format", "transforms")
-    assert set(_commands(run.out)) == {"nerfstudio", "Brush", "OpenSplat"}
+    assert set(_commands(run.out)) == {"splatseed", "nerfstudio", "Brush", "OpenSplat"}
     assert (out / "transforms.json").is_file()
     assert not (out / "sparse").exists()
 

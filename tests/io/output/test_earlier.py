@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from splatseed import load_scene, upsample, write_scene
+from splatseed.io.output.earlier import saw_all_photographs
 from splatseed.io.output.seeds_npz import SEEDS
 from splatseed.pointcloud import GENERATED
+from splatseed.progress import silent
 from splatseed.synthetic import make_capture
+from splatseed.train.seeds import seeded
+from splatseed.train.settings import TrainSettings
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +51,26 @@ def test_where_no_point_is_an_original_all_are(scene, tmp_path):
     again = load_scene(tmp_path / "out")
     assert again.points.num_original == len(new)
     assert not any("added by" in warning for warning in again.warnings)
+
+
+@pytest.mark.parametrize(
+    ("told", "all_of_them"),
+    [
+        ({"command": "upsample", "parameters": {"hold_out": 0}}, True),
+        ({"command": "upsample", "parameters": {"hold_out": 8}}, False),
+        ({"command": "upsample", "parameters": {"k": 16}}, False),  # not made from photographs
+        ({"command": "upsample"}, False),
+        ({"command": "tune", "parameters": {"hold_out": 0}}, False),
+    ],
+)
+def test_seeds_that_saw_the_test_views_are_known(scene, tmp_path, told, all_of_them):
+    seeds = upsample(scene, "linear", ratio=2)
+    write_scene(scene.replace(points=seeds), tmp_path / "out", provenance=told)
+    again, notes = load_scene(tmp_path / "out"), []
+    assert saw_all_photographs(again) == all_of_them
+    seeded(again, TrainSettings(seeding="scene"), notes.append, silent)
+    assert any("test views included" in note for note in notes) == all_of_them
+    assert not saw_all_photographs(scene)
 
 
 @pytest.mark.parametrize("layout", ["colmap", "transforms"])

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from splatseed.commands.upsample.plan_line import method_words
+from splatseed.commands.upsample.trainers import training_commands
 from splatseed.console import (
     OUT,
     StageClock,
@@ -348,7 +349,7 @@ def _summarise(
     for note in report.notes:
         print_note(note)
     if not np.any(tiled.origin) and options.scene.is_dir():
-        print_commands("train it with", [("", f"splatseed train {options.output} -o RUN")])
+        print_commands("train it with", training_commands(options.output, report.layout))
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The commands that train a written scene with each 3DGS trainer."""
+"""The commands that train a written scene, with splatseed and with each other 3DGS trainer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["training_commands"]
 
 
 def training_commands(path: Path, written_format: SceneFormat) -> list[tuple[str, str]]:
-    """(trainer, command) for every trainer that reads the scene at ``path`` unchanged.
+    """(trainer, command) for every trainer, all of which read the scene at ``path`` unchanged.
 
     Args:
         path: The scene folder that was written.
@@ -23,16 +23,20 @@ def training_commands(path: Path, written_format: SceneFormat) -> list[tuple[str
         'python train.py -s /data/out -m /data/out-graphdeco --eval'
     """
     # Trainers are run from their own checkouts, so a relative path would miss.
-    path = path.absolute()
+    path = path.resolve()
     scene = quoted(path)
-    result = [quoted(f"{path}-{name}") for name in ("gsplat", "graphdeco", "lichtfeld")]
+    run, *result = (
+        quoted(f"{path}-{name}") for name in ("run", "gsplat", "graphdeco", "lichtfeld")
+    )
+    ours = ("splatseed", f"splatseed train {scene} -o {run}")
     brush = ("Brush", f"brush {scene} --with-viewer")
     opensplat = ("OpenSplat", f"./opensplat {scene} -n 30000")
     if written_format == "transforms":
-        return [("nerfstudio", f"ns-train splatfacto --data {scene}"), brush, opensplat]
+        return [ours, ("nerfstudio", f"ns-train splatfacto --data {scene}"), brush, opensplat]
     gsplat = f"--data_dir {scene} --data_factor 1 --result_dir {result[0]}"
     nerfstudio = "colmap --colmap-path sparse/0 --downscale-factor 1"
     return [
+        ours,
         ("gsplat", f"python examples/simple_trainer.py default {gsplat}"),
         ("graphdeco", f"python train.py -s {scene} -m {result[1]} --eval"),
         ("nerfstudio", f"ns-train splatfacto --data {scene} {nerfstudio}"),

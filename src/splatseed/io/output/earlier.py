@@ -20,7 +20,7 @@ from splatseed.io.output.staging import MANIFEST, kind_of
 from splatseed.pointcloud import GENERATED, ORIGINAL
 from splatseed.scene import Scene
 
-__all__ = ["number_of_originals", "recall_seeds", "was_upsampled"]
+__all__ = ["number_of_originals", "recall_seeds", "saw_all_photographs", "was_upsampled"]
 
 
 def recall_seeds(scene: Scene) -> Scene:
@@ -62,6 +62,17 @@ def was_upsampled(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made or thinned these points."""
     written = scene.source is not None and kind_of(scene.source.root) == "upsample"
     return written or scene.points.num_original < len(scene.points)
+
+
+def saw_all_photographs(scene: Scene) -> bool:
+    """Whether ``splatseed upsample`` made new points from photographs and held none out."""
+    if scene.source is None or kind_of(scene.source.root) != "upsample":
+        return False
+    try:
+        facts = json.loads((scene.source.root / MANIFEST).read_text(encoding="utf-8"))
+        return bool(facts["num_new"]) and facts["parameters"]["hold_out"] == 0
+    except (OSError, ValueError, TypeError, KeyError):
+        return False  # not made from photographs
 
 
 def _num_original(manifest: Path, total: int) -> int:
