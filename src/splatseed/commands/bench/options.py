@@ -108,8 +108,8 @@ class Options:
         PresetName | None,
         tyro.conf.arg(metavar="|".join(PRESETS), help_behavior_hint="(default: none)"),
     ] = None
-    """A ready-made plan: the paper's data sets, laptop (four real scenes within an hour on two
-    cores), both with --data; or quick, on a synthetic room."""
+    """A ready-made plan: the paper's data sets, laptop (four real scenes in half an hour on one
+    core), both with --data; or quick, on a synthetic room."""
     data: Annotated[Path | None, _one(Path, "none")] = None
     """The folder of a preset's scenes."""
     plan: Annotated[Path | None, _one(Path, "none")] = None
