@@ -33,7 +33,7 @@ from splatseed.upsample.nearest import NearestMethod
 
 __all__ = ["Request", "Tiled", "check_tileable", "make_tiled"]
 
-LAYOUT = 2
+LAYOUT = 3
 """Changes with the files of the work folder, so that another version's are not gone on with."""
 
 

@@ -1,8 +1,10 @@
 """Second step: the rows are sorted into tiles on disk, and what is not finite or repeats drops out.
 
-Files of the step: ``tiles/NNNNNN`` holds the points of a tile in file order, with their rows;
-``tile_of_rank`` int32 [n] the tile of each point in file order; ``dropped`` int64 the rows that
-were left out. Notation: n points are left; a point's *rank* is its place among them in file order.
+Files of the step: ``tiles/NNNNNN`` holds the points of a tile by cell, in file order in each, with
+their rows; ``tile_of_rank`` int32 [n] the tile of each point in file order; ``dropped`` int64 the
+rows that were left out. Notation: n points are left; a point's *rank* is its place among them in
+file order; the *cells* of a tile are ``CELLS`` along each side of its bounds, so that neighbouring
+tiles read only what lies near them.
 Promise: what is kept, its order and its centroid are those of the cloud in memory.
 """
 
@@ -20,10 +22,12 @@ from splatseed.tiles.cuts import Cuts, cut_up
 from splatseed.tiles.reading import Rows
 from splatseed.tiles.work import WorkFolder
 
-__all__ = ["RECORD", "split", "tile_name"]
+__all__ = ["CELLS", "RECORD", "cells_of", "split", "tile_name"]
 
 RECORD = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("row", "<i8")])
 """A point of a tile."""
+CELLS = 8
+"""Cells along each side of a tile."""
 MARGIN = 0.85
 """A sample tells the points of a tile only nearly."""
 SMALLER = 0.7
@@ -58,10 +62,12 @@ def split(work: WorkFolder, most: int, at_once: int, progress: Progress) -> None
             fix="Check that the scene holds the point cloud you meant.",
         )
     _distribute(work, rows, len(cuts), at_once, progress)
-    bounds, counts = _without_repeats(work, len(cuts), progress)
+    bounds, starts = _without_repeats(work, len(cuts), progress)
+    counts = starts[:, -1]
     center = _rank(work, rows, at_once, progress)
     n = int(counts.sum())
-    work.save("layout", {"walls": np.stack(cuts.walls), "bounds": bounds, "counts": counts})
+    arrays = {"walls": np.stack(cuts.walls), "bounds": bounds, "counts": counts, "starts": starts}
+    work.save("layout", arrays)
     work.discard("tile_of_row")
     work.finish(
         "split",
@@ -150,9 +156,15 @@ def _tile_of_row(work: WorkFolder, first: int, last: int) -> Int32[np.ndarray, "
 
 def _without_repeats(
     work: WorkFolder, num_tiles: int, progress: Progress
-) -> tuple[Float32[np.ndarray, "t 2 3"], Int64[np.ndarray, " t"]]:
-    """Drop what repeats a position of an earlier piece; returns the bounds of tiles and counts."""
-    bounds, counts = np.full((num_tiles, 2, 3), np.nan, np.float32), np.zeros(num_tiles, np.int64)
+) -> tuple[Float32[np.ndarray, "t 2 3"], Int64[np.ndarray, "t c"]]:
+    """Drop what repeats a position of an earlier piece, and sort the points of tiles by cell.
+
+    Returns:
+        The bounds of tiles; where in its file each cell of a tile begins, and the last one ends,
+        int64 [t, CELLS^3 + 1].
+    """
+    bounds = np.full((num_tiles, 2, 3), np.nan, np.float32)
+    starts = np.zeros((num_tiles, CELLS**3 + 1), np.int64)
     tile_of_row = np.memmap(work.file("tile_of_row"), np.int32, "r+")
     for tile, _ in blocks(num_tiles, 1, "tiles", progress):
         path = work.file("tiles") / tile_name(tile)
@@ -161,13 +173,33 @@ def _without_repeats(
         if not kept.all():
             tile_of_row[records["row"][~kept]] = -1
             records = records[kept]
-            records.tofile(work.partial("rest"))
-            work.file("rest.partial").replace(path)
-        counts[tile] = len(records)
         if len(records):
             bounds[tile] = records["xyz"].min(axis=0), records["xyz"].max(axis=0)
+            x, y, z = cells_of(records["xyz"], bounds[tile]).T
+            cell = ((x * CELLS + y) * CELLS + z).astype(np.uint16)
+            starts[tile, 1:] = np.cumsum(np.bincount(cell, minlength=CELLS**3))
+            records = records[np.argsort(cell, kind="stable")]  # a radix sort, of 16 bits
+        records.tofile(work.partial("rest"))
+        work.file("rest.partial").replace(path)
     tile_of_row.flush()
-    return bounds, counts
+    return bounds, starts
+
+
+def cells_of(
+    xyz: Float32[np.ndarray, "n 3"], bounds: Float32[np.ndarray, "2 3"]
+) -> Int64[np.ndarray, "n 3"]:
+    """The cells of positions in a tile, along each axis; of those outside, the nearest.
+
+    Rounding never swaps two positions, so what lies in a box lies in the cells of its corners or
+    between them.
+    """
+    low, high = bounds.astype(np.float64)
+    side = np.maximum((high - low) / CELLS, np.finfo(np.float32).tiny)
+    cells = np.empty(xyz.shape, np.int64)
+    for axis in range(3):  # column by column: NumPy is slow along short axes
+        away = (xyz[:, axis] - low[axis]) / side[axis]
+        cells[:, axis] = np.clip(away, 0, CELLS - 1)
+    return cells
 
 
 def _rank(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.tiles.reading import Rows
-from splatseed.tiles.splitting import RECORD, tile_name
+from splatseed.tiles.splitting import CELLS, RECORD, cells_of, tile_name
 from splatseed.tiles.work import WorkFolder
 from splatseed.upsample.neighbors import least_distance
 
@@ -90,6 +90,11 @@ class TileStore:
         return np.asarray(self.extent.astype(np.float64) - self.center)
 
     @cached_property
+    def _starts(self) -> Int64[np.ndarray, "t c"]:
+        """Where in the file of a tile its cells begin."""
+        return self.work.load("layout", "starts")
+
+    @cached_property
     def least(self) -> float:
         """The least distance of two points."""
         return least_distance(float(np.nanmax(np.abs(self.bounds))))
@@ -101,24 +106,38 @@ class TileStore:
             tile: Its number.
             within: Only those in this box, relative to the centroid; all when left out.
         """
-        records = np.fromfile(self.work.file("tiles") / tile_name(tile), RECORD)
-        if within is not None:
-            records = records[self._inside(records["xyz"], within)]
-        xyz = records["xyz"].astype(np.float64) - self.center
+        path = self.work.file("tiles") / tile_name(tile)
+        if within is None:
+            records = np.fromfile(path, RECORD)
+        else:
+            box = self._in_file(within)
+            records = self._near(np.memmap(path, RECORD, "r"), tile, box)
+            records = records[_inside(records["xyz"], box)]
         row = records["row"]
+        order = np.argsort(row, kind="stable")  # merges the cells, each of which is in file order
+        records, row = records[order], row[order]
+        xyz = records["xyz"].astype(np.float64) - self.center
         return Points(xyz, records["rgb"].copy(), self._ranks(row), self._rows.trusted(row))
 
-    def _inside(
-        self, xyz: Float32[np.ndarray, "n 3"], within: Float64[np.ndarray, "2 3"]
-    ) -> Bool[np.ndarray, " n"]:
-        """Which positions are in a box, and perhaps some just outside."""
+    def _in_file(self, within: Float64[np.ndarray, "2 3"]) -> Float32[np.ndarray, "2 3"]:
+        """A box in the coordinates of tiles' files, a little larger."""
         with np.errstate(over="ignore"):
             low, high = (within + self.center).astype(np.float32)
-        low, high = np.nextafter(low, np.float32(-np.inf)), np.nextafter(high, np.float32(np.inf))
-        inside = np.ones(len(xyz), bool)
-        for axis in range(3):  # column by column: NumPy is slow along short axes
-            inside &= (xyz[:, axis] >= low[axis]) & (xyz[:, axis] <= high[axis])
-        return inside
+        away = np.float32(np.inf)
+        return np.stack([np.nextafter(low, -away), np.nextafter(high, away)])
+
+    def _near(self, records: np.ndarray, tile: int, box: Float32[np.ndarray, "2 3"]) -> np.ndarray:
+        """The records of the cells that a box meets."""
+        first, last = cells_of(box, self.extent[tile])
+        starts = self._starts[tile]
+        columns = [
+            (x * CELLS + y) * CELLS
+            for x in range(first[0], last[0] + 1)
+            for y in range(first[1], last[1] + 1)
+        ]  # a column of cells lies in the file as one piece
+        return np.concatenate(
+            [records[starts[c + first[2]] : starts[c + last[2] + 1]] for c in columns]
+        )
 
     def _ranks(self, row: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
         dropped = self._dropped
@@ -128,3 +147,13 @@ class TileStore:
     def _dropped(self) -> Int64[np.ndarray, " d"]:
         path = self.work.file("dropped")
         return np.memmap(path, "<i8", "r") if path.stat().st_size else np.empty(0, np.int64)
+
+
+def _inside(
+    xyz: Float32[np.ndarray, "n 3"], box: Float32[np.ndarray, "2 3"]
+) -> Bool[np.ndarray, " n"]:
+    """Which positions are in a box."""
+    inside = np.ones(len(xyz), bool)
+    for axis in range(3):  # column by column: NumPy is slow along short axes
+        inside &= (xyz[:, axis] >= box[0, axis]) & (xyz[:, axis] <= box[1, axis])
+    return inside
