@@ -47,12 +47,15 @@ def quoted(path: Path | str) -> str:
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A question with the known word most similar to another, and a space; empty if none is.
 
+    Dashes in front, which all options share, make no words similar.
+
     Example:
         >>> did_you_mean("--ratoi", ["--ratio", "--seed"])
         'Did you mean --ratio? '
     """
-    close = get_close_matches(word.lower(), list(known), n=1, cutoff=0.6)
-    return f"Did you mean {close[0]}? " if close else ""
+    bare = {each.lstrip("-"): each for each in known}
+    close = get_close_matches(word.lower().lstrip("-"), list(bare), n=1, cutoff=0.6)
+    return f"Did you mean {bare[close[0]]}? " if close else ""
 
 
 def _shows(character: str) -> bool:

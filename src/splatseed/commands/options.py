@@ -33,6 +33,10 @@ CHOICE = re.compile(
 NUMBER = re.compile(
     r"error parsing (\S+): (invalid literal for int|could not convert).*?'(.*?)'", re.IGNORECASE
 )
+VALUE = re.compile(r"missing value for argument '([^']*)'", re.IGNORECASE)
+REQUIRED = "Missing from"
+"""Marks the start of tyro's list of required options: each below a step of 4 spaces, its help
+below 8."""
 TRIED = "Got errors:"
 """Marks the start of tyro's attempts to read a value, meant for its own developers."""
 
@@ -75,10 +79,22 @@ def _complaint(kind: type[Any], verb: str, said: str, arguments: Sequence[str]) 
     if number := NUMBER.search(box):
         what = "a whole number" if "int" in number[2] else "a number"
         return ParameterError(f"{number[1]} as {what}", found=repr(number[3]), fix=f"{see} it.")
+    known = known_options(kind)
+    # Before what is missing: tyro can take an unknown option for the end of the values.
+    if unknown := _unknown(arguments, known):
+        found = f"unrecognized option{'s' if len(unknown) > 1 else ''} {' '.join(unknown)}"
+        fix = (
+            f"{next(filter(None, (did_you_mean(word, known) for word in unknown)), '')}{see} them."
+        )
+        return ParameterError(f"the options of splatseed {verb}", found=found, fix=fix)
+    if value := VALUE.search(box):
+        return ParameterError(f"a value for {value[1]}", found="none", fix=f"{see} it.")
+    if missing := _missing(said):
+        found = {1: "none", 2: "neither"}.get(len(missing), "none of them")
+        fix = f"{see} {'it' if len(missing) == 1 else 'them'}."
+        return ParameterError(", and ".join(missing), found=found, fix=fix)
     return ParameterError(
-        f"the options of splatseed {verb}",
-        found=_sentence(said),
-        fix=f"{_suggestion(kind, arguments)}{see} them.",
+        f"the options of splatseed {verb}", found=_sentence(said), fix=f"{see} them."
     )
 
 
@@ -91,11 +107,34 @@ def known_options(kind: type[Any]) -> list[str]:
     return sorted({option for line in defined for option in OPTION.findall(line)})
 
 
-def _suggestion(kind: type[Any], arguments: Sequence[str]) -> str:
-    """What the user may have meant by an unknown option; empty if unclear."""
-    known = known_options(kind)
-    unknown = [word.partition("=")[0] for word in arguments if word.startswith("--")]
-    return next((did_you_mean(word, known) for word in unknown if word not in known), "")
+def _unknown(arguments: Sequence[str], known: Sequence[str]) -> list[str]:
+    """The options among the words that are not known."""
+    names = [word.partition("=")[0] for word in arguments]
+    return [name for name in names if OPTION.fullmatch(name.lower()) and _dashed(name) not in known]
+
+
+def _dashed(name: str) -> str:
+    """An option's name as the help shows it; tyro takes underscores for dashes."""
+    return name[:2] + name[2:].replace("_", "-")
+
+
+def _missing(box: str) -> list[str]:
+    """The required options that are missing: ``-o PATH, the folder of the run``."""
+    lines = [line[2:].rstrip(" │") for line in COLOR.sub("", box).splitlines()]
+    listed = dropwhile(lambda line: not line.startswith(REQUIRED), lines)
+    missing: list[list[str]] = []
+    for line in takewhile(lambda line: not RULE.fullmatch(line), listed):
+        if line.startswith(" " * 8):
+            missing[-1].append(line.strip())
+        elif line.startswith(" " * 4):
+            missing.append([line.strip().partition(",")[0]])
+    return [f"{name}, {_clause(' '.join(does))}" for name, *does in missing]
+
+
+def _clause(text: str) -> str:
+    """The first sentence of a help text, as a part of another."""
+    first = re.split(r"\.(?=\s|$)", text)[0]
+    return first if first[1:2].isupper() else first[:1].lower() + first[1:]
 
 
 def _sentence(box: str) -> str:
