@@ -82,20 +82,19 @@ def _complaint(kind: type[Any], verb: str, said: str, arguments: Sequence[str]) 
     known = known_options(kind)
     # Before what is missing: tyro can take an unknown option for the end of the values.
     if unknown := _unknown(arguments, known):
-        found = f"unrecognized option{'s' if len(unknown) > 1 else ''} {' '.join(unknown)}"
-        fix = (
-            f"{next(filter(None, (did_you_mean(word, known) for word in unknown)), '')}{see} them."
-        )
-        return ParameterError(f"the options of splatseed {verb}", found=found, fix=fix)
+        meant = next(filter(None, (did_you_mean(word, known) for word in unknown)), "")
+        return _unfit(verb, f"unrecognized option {' '.join(unknown)}", f"{meant}{see}")
     if value := VALUE.search(box):
         return ParameterError(f"a value for {value[1]}", found="none", fix=f"{see} it.")
     if missing := _missing(said):
         found = {1: "none", 2: "neither"}.get(len(missing), "none of them")
         fix = f"{see} {'it' if len(missing) == 1 else 'them'}."
         return ParameterError(", and ".join(missing), found=found, fix=fix)
-    return ParameterError(
-        f"the options of splatseed {verb}", found=_sentence(said), fix=f"{see} them."
-    )
+    return _unfit(verb, _sentence(said), see)
+
+
+def _unfit(verb: str, found: str, see: str) -> ParameterError:
+    return ParameterError(f"the options of splatseed {verb}", found=found, fix=f"{see} them.")
 
 
 def known_options(kind: type[Any]) -> list[str]:
