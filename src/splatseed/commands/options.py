@@ -83,7 +83,8 @@ def _complaint(kind: type[Any], verb: str, said: str, arguments: Sequence[str]) 
     # Before what is missing: tyro can take an unknown option for the end of the values.
     if unknown := _unknown(arguments, known):
         meant = next(filter(None, (did_you_mean(word, known) for word in unknown)), "")
-        return _unfit(verb, f"unrecognized option {' '.join(unknown)}", f"{meant}{see}")
+        options = "option" if len(unknown) == 1 else "options"
+        return _unfit(verb, f"unrecognized {options} {', '.join(unknown)}", f"{meant}{see}")
     if value := VALUE.search(box):
         return ParameterError(f"a value for {value[1]}", found="none", fix=f"{see} it.")
     if missing := _missing(said):
