@@ -13,8 +13,9 @@ pytest.importorskip("torch")
 from splatseed.camera import quat_from_rotation, rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.evaluate import evaluate_model, load_model
-from splatseed.evaluate.world import find_transform
+from splatseed.evaluate.world import check_world, find_transform
 from splatseed.io import load_scene, write_scene
+from splatseed.io.recentring import recentred
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.ply import write_gaussians
@@ -134,6 +135,15 @@ def test_a_wrong_transform_is_refused_too(room, gaussians, tmp_path):
     write_gaussians(tmp_path / "model.ply", gaussians)
     with pytest.raises(SceneFormatError, match="They fit with --transform none"):
         load_model(tmp_path / "model.ply", room, transform="gsplat")
+
+
+def test_a_transform_that_would_be_refused_itself_is_not_named(room, gaussians, tmp_path):
+    """A small model at the origin, to which gsplat's transform only brings a far scene nearer."""
+    scene = recentred(load_scene(room), np.array([-1000.0, 0.0, 0.0]))
+    small = dataclasses.replace(gaussians, means=gaussians.means * np.float32(0.01))
+    for given in (None, find_transform("gsplat", scene)):
+        with pytest.raises(SceneFormatError, match="No known transform fits: probably"):
+            check_world(tmp_path / "model.ply", scene, small, given)
 
 
 def test_few_large_gaussians_are_still_a_model(room, gaussians, tmp_path):

@@ -6,7 +6,7 @@ cameras these give wrong pictures, and wrong scores without a warning. *Apart* i
 distance from the scene's points to the nearest Gaussian, in units of the median distance between
 neighbouring Gaussians: in the right world about 1 (0.1 to 1.3 for seeds and trained models of five
 scenes), in a wrong one 4 to 700. Promise: Gaussians that lie apart from the scene's points are
-refused, naming a transform that fits if there is one.
+refused; if a transform is named then, it is accepted.
 """
 
 from __future__ import annotations
@@ -92,14 +92,17 @@ def check_world(
     apart = _measure(scene, gaussians)
     if apart is None or (ratio := apart(given)) <= DOUBTFUL:
         return
-    candidates = _candidates(path, scene)
-    word = next((word for word, world in candidates if apart(world) < ratio / CLOSER), None)
-    if word is None and ratio <= APART:
+    ratios = [(word, apart(world)) for word, world in _candidates(path, scene)]
+    closest = min(each for _, each in ratios)
+    if _fits(ratio, closest):
         return
+    closer = (word for word, each in ratios if each < ratio / CLOSER and _fits(each, closest))
+    word = next(closer, None)
     fix = (
         f"They fit with --transform {word}."
         if word
-        else "Name the transform that its trainer applied with --transform FILE; "
+        else "No known transform fits: probably it is a model of another scene. Else name the "
+        "transform that its trainer applied with --transform FILE; "
         f"to score it as it is, pass --transform {NO_TRANSFORM}."
     )
     raise SceneFormatError(
@@ -108,6 +111,11 @@ def check_world(
         "other: another frame, or another scene",
         fix=fix,
     )
+
+
+def _fits(ratio: float, closest: float) -> bool:
+    """Whether Gaussians so far apart are in the right world; those of another are ``closest``."""
+    return ratio <= DOUBTFUL or (ratio <= APART and ratio <= closest * CLOSER)
 
 
 def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None], float] | None:
