@@ -5,10 +5,12 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import re
 import shutil
 import subprocess
 import zipfile
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -234,6 +236,16 @@ def test_names_choose_the_format_and_others_have_a_tool(tmp_path):
     ):
         with pytest.raises(ParameterError, match=word):
             format_of_name(tmp_path / name)
+
+
+def test_what_a_format_is_said_to_keep_is_what_was_measured():
+    """And no more: which file is smallest depends on the model."""
+    page = (Path(__file__).parents[2] / "docs/formats.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(\.[\w.]+)` \| ([^|]+) \| [\d.]+ \|", page, re.MULTILINE)
+    kept = dict(rows)
+    assert set(kept) == set(SUFFIXES)
+    for each in FORMATS.values():
+        assert each.about.split(";")[0].removesuffix(", as 3DGS writes it") == kept[each.suffix]
 
 
 def test_an_unpacked_sog_is_read(files, tmp_path):
