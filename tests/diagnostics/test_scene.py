@@ -141,4 +141,6 @@ def test_problems_are_told_and_the_readers_come_first(rng):
     first, *others = find_problems(scene, _statistics(1000, 100), EmptyRegions(0.8, 0.9, "a"))
     assert first == "The reader's."
     assert [text.split()[0] for text in others] == ["100", "80%"]
+    # Not only those with surfaces: linear and triangle reject isolated points too.
+    assert "methods that interpolate start nothing from them" in others[0]
     assert "no points" in find_problems(_scene([]), _statistics(0, 0), None)[0]

@@ -157,7 +157,7 @@ def find_problems(
     if cloud.isolated > MANY_ISOLATED * max(cloud.num_points, 1):
         problems.append(
             f"{cloud.isolated:,} points ({cloud.isolated / cloud.num_points:.1%}) are isolated: "
-            "outliers or a sparse background; spline, mls and voronoi start nothing from them"
+            "outliers or a sparse background; methods that interpolate start nothing from them"
         )
     if cloud.num_points == 0:
         problems.append("there are no points to upsample")
