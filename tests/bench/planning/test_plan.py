@@ -128,7 +128,7 @@ def test_bad_files_are_refused_by_key(tmp_path, text, said):
 
 
 def test_files_that_are_not_there_and_paths_that_are_no_text(tmp_path):
-    with pytest.raises(SceneNotFoundError):
+    with pytest.raises(SceneNotFoundError, match=r"--dry-run > \S*none\.toml"):
         read_plan(tmp_path / "none.toml")
     with pytest.raises(ParameterError, match="valid text"):
         Plan(scenes=(PlannedScene("odd\udcff"),))

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
 from splatseed.bench.planning.records import SHARED
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.literal import quoted
 from splatseed.train.settings import TrainSettings
 
 __all__ = ["plan_text", "read_plan"]
@@ -133,7 +134,10 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text("utf-8"))
     except FileNotFoundError:
         raise SceneNotFoundError(
-            f"a plan at {path}", found="no such file", fix="Check the path."
+            f"a plan at {path}",
+            found="no such file",
+            fix="Check the path, or have one written: splatseed bench --scenes SCENE --dry-run > "
+            f"{quoted(path)}",
         ) from None
     except OSError as error:
         found = error.strerror or type(error).__name__
