@@ -16,8 +16,8 @@ from jaxtyping import Float64
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 
-__all__ = ["CloudStatistics", "EmptyRegions", "TrackStatistics", "cloud_statistics",
-           "empty_regions",
+__all__ = ["EMPTY_CELLS", "CloudStatistics", "EmptyRegions", "TrackStatistics",
+           "cloud_statistics", "empty_regions",
            "find_problems", "track_statistics"]  # fmt: skip
 
 PERCENTILES = (5, 25, 50, 75, 95)

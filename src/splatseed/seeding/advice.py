@@ -19,6 +19,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from splatseed.diagnostics.scene import EMPTY_CELLS
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 
@@ -142,7 +143,10 @@ def advise(
     if measured.depth_maps:
         return Advice("depth", (*reasons, "Its depth maps say where the surfaces are."))
     if measured.empty is not None:
-        reasons.append(f"No point falls in {measured.empty:.0%} of the pictures.")
+        reasons.append(
+            f"No point falls in {measured.empty:.0%} of the cells of a grid, {EMPTY_CELLS} along a "
+            "picture's longer side."
+        )
     if measured.agreement is not None:
         reasons.append(
             f"Stereo finds a confirmed depth for {measured.agreement:.0%} of the pixels."

@@ -16,6 +16,7 @@ from splatseed.commands.options import parse_options
 from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
 from splatseed.depthmap import DepthKind
 from splatseed.diagnostics.scene import (
+    EMPTY_CELLS,
     CloudStatistics,
     EmptyRegions,
     TrackStatistics,
@@ -226,9 +227,10 @@ def _advice_rows(
 def _region_rows(regions: EmptyRegions | None) -> list[tuple[str, str]]:
     if regions is None:
         return []
+    grid = f" (of cells, {EMPTY_CELLS} along the longer side)"
     return [
         (
             "image area without points",
-            f"{regions.mean:.0%} on average, {regions.worst:.0%} in {regions.worst_name}",
+            f"{regions.mean:.0%} on average, {regions.worst:.0%} in {regions.worst_name}{grid}",
         )
     ]
