@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from splatseed.camera import rotation_from_quat
+from splatseed.commands.upsample.cloud import Brought
 from splatseed.io import load_scene, write_scene
 from splatseed.io.recentring import recentred
 from splatseed.similarity import Similarity
@@ -136,6 +138,23 @@ def test_what_is_wrong_with_a_scan_is_one_line(splatseed, room, xyz, tmp_path, k
     assert re.search(says, run.err.replace("\n", " "))
     assert len([line for line in run.err.splitlines() if line.startswith("error")]) == 1
     assert not list(tmp_path.glob("out*"))
+
+
+def test_the_files_of_an_alignment_are_listed(splatseed, room, tmp_path, monkeypatch):
+    found = SimpleNamespace(
+        report={}, residuals=np.zeros(1), extent=1.0, sample=None, rgb=None, marks=None, sentence=""
+    )
+    monkeypatch.setattr(
+        "splatseed.commands.upsample.command.bring_clouds",
+        lambda *given: Brought(given[1], given[2], found),
+    )
+    monkeypatch.setattr("splatseed.preview.preview_alignment", lambda *given: given[-1].touch())
+    out = tmp_path / "out"
+    run = splatseed("upsample", room, "--method", "linear", "--ratio", 1.1, "-o", out)
+    assert run.code == 0, run.err
+    for name in ("alignment.json", "preview_alignment.png"):
+        assert (out / name).is_file()
+        assert str(out / name) in run.out
 
 
 def test_duplicates_by_the_million_change_nothing(splatseed, room, xyz, tmp_path):

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 __all__ = ["CLOUD", "Bringing", "Brought", "bring_clouds", "settle_cloud"]
 
 CLOUD = "cloud"
-RECENTER, ALIGNMENT = "recenter.json", "alignment.json"
+RECENTER = "recenter.json"
+ALIGNMENT = "alignment.json", "preview_alignment.png"
 CLOSE = 0.01
 """Residual at which a point's colour is halfway, in extents."""
 BESIDE = (CLOUD, "auto", "stereo", "cover", "depth")
@@ -122,6 +123,11 @@ class Brought(NamedTuple):
         place = ", ".join(f"{value:.0f}" for value in self.offset)
         return (*notes, f"Scene and cloud were moved by -({place}), as {RECENTER} has it.")
 
+    @property
+    def aligned(self) -> tuple[str, ...]:
+        """The files that tell of the alignment, if there is one."""
+        return () if self.alignment is None else ALIGNMENT
+
     def write(self, folder: Path) -> None:
         """Write the reports beside the scene, if there are any.
 
@@ -138,9 +144,9 @@ class Brought(NamedTuple):
             from splatseed.preview import preview_alignment  # noqa: PLC0415  (Pillow)
 
             alignment = self.alignment
-            _write_json(folder / ALIGNMENT, alignment.report)
+            told, picture = (folder / name for name in ALIGNMENT)
+            _write_json(told, alignment.report)
             off = alignment.residuals / (2 * CLOSE * alignment.extent)
-            picture = folder / "preview_alignment.png"
             preview_alignment(
                 self.scene, alignment.sample, alignment.rgb, alignment.marks, off, picture
             )

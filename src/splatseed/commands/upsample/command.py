@@ -24,7 +24,12 @@ from splatseed.commands.upsample.flags import (
     number_flag,
     output_flag,
 )
-from splatseed.commands.upsample.output import summarise, write_map_preview, write_previews
+from splatseed.commands.upsample.output import (
+    PICTURES,
+    summarise,
+    write_map_preview,
+    write_previews,
+)
 from splatseed.commands.upsample.plan_line import (
     method_words,
     number_words,
@@ -270,7 +275,8 @@ def run(arguments: list[str]) -> None:
             )
             write_map_preview(scene, method, options.seed, options.output, clock)
         seconds = clock.seconds()
-    summarise(scene, seeds, report, seconds, checks, options.output, options.preview)
+    files = {"alignment": brought.aligned, "pictures": PICTURES if options.preview else ()}
+    summarise(scene, seeds, report, seconds, checks, options.output, files)
     for sentence in notes:
         print_note(sentence)
 

@@ -20,7 +20,7 @@ from splatseed.seeding.upsampling import CELL
 from splatseed.upsample import Upsampler, chooses_number, methods_for, upsample
 from splatseed.upsample.registry import origin_name
 
-__all__ = ["summarise", "write_map_preview", "write_previews"]
+__all__ = ["PICTURES", "summarise", "write_map_preview", "write_previews"]
 
 MAPS = "preview_maps.png"
 PICTURES = (
@@ -137,7 +137,7 @@ def summarise(
     seconds: Mapping[str, float],
     checks: Mapping[str, float],
     output: Path,
-    pictures: bool,
+    files: Mapping[str, Sequence[str]],
 ) -> None:
     """Print the final table and the commands to run next.
 
@@ -149,7 +149,7 @@ def summarise(
         checks: ``far``, the share of new points far from any original; ``before`` and ``after``,
             the share of the photographs that the points cover.
         output: The scene folder.
-        pictures: Whether previews were drawn.
+        files: Names of further files in it, by label; those that are not there are left out.
     """
     rows = [
         ("points in", f"{len(scene.points):,}"),
@@ -163,9 +163,9 @@ def summarise(
         rows.append(("images", f"linked, not copied: {where}; --copy-images to move OUT elsewhere"))
     if left_out := _left_out(scene, report):
         rows.insert(2, ("left out", left_out))
-    if pictures:
-        drawn = [output / name for name in PICTURES if (output / name).is_file()]
-        rows += [("" if i else "pictures", str(path)) for i, path in enumerate(drawn)]
+    for label, names in files.items():
+        there = [output / name for name in names if (output / name).is_file()]
+        rows += [("" if i else label, str(path)) for i, path in enumerate(there)]
     print_pairs("splatseed upsample", rows)
     for note in report.notes:
         print_note(note)
