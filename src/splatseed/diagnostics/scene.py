@@ -160,13 +160,22 @@ def find_problems(
             "outliers or a sparse background; methods that interpolate start nothing from them"
         )
     if cloud.num_points == 0:
-        problems.append("there are no points to upsample")
+        problems.append(_without_points(scene))
     elif regions is not None and regions.mean > MANY_EMPTY:
         problems.append(
             f"{regions.mean:.0%} of the images' area has no point: upsampling fills between "
             "points, but only photographs or depth maps can fill a bare wall"
         )
     return tuple(problems)
+
+
+def _without_points(scene: Scene) -> str:
+    if not scene.has_photographs:
+        return "there are no points to upsample"
+    return (
+        "there are no points yet: splatseed upsample makes some from the photographs (method auto),"
+        " splatseed sfm --poses-from triangulates some"
+    )
 
 
 def _empty_share(image: Image, xyz: Float64[np.ndarray, "3 N"]) -> float:

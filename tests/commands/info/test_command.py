@@ -84,6 +84,7 @@ def test_an_rgbd_capture(tmp_path, splatseed):
     assert run.code == 0
     assert _rows(run.out)["format"] == "rgbd"
     assert f"splatseed sfm {tmp_path / 'results'}" in run.out
+    assert "no points yet: splatseed upsample makes some from the photographs" in run.out
 
 
 @pytest.mark.parametrize(
