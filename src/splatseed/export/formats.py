@@ -39,7 +39,7 @@ FORMATS = {
         Format("compressed-ply", ".compressed.ply", "all but fine detail; PlayCanvas, SuperSplat"),
         Format("splat", ".splat", "no view-dependent colour; web viewers"),
         Format("spz", ".spz", "all but fine detail; Niantic, three.js viewers, glTF tools"),
-        Format("sog", ".sog", "all but fine detail, smallest; PlayCanvas, SuperSplat"),
+        Format("sog", ".sog", "all but fine detail; PlayCanvas, SuperSplat"),
     )
 }
 """The formats by name."""
