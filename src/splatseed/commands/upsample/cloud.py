@@ -144,8 +144,8 @@ class Brought(NamedTuple):
             from splatseed.preview import preview_alignment  # noqa: PLC0415  (Pillow)
 
             alignment = self.alignment
-            told, picture = (folder / name for name in ALIGNMENT)
-            _write_json(told, alignment.report)
+            report, picture = (folder / name for name in ALIGNMENT)
+            _write_json(report, alignment.report)
             off = alignment.residuals / (2 * CLOSE * alignment.extent)
             preview_alignment(
                 self.scene, alignment.sample, alignment.rgb, alignment.marks, off, picture
