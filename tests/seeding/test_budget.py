@@ -45,6 +45,12 @@ def test_no_other_budget_is_taken(budget):
         parse_budget(budget, 2000)
 
 
+@pytest.mark.parametrize("budget", ["0.25", 0.75])
+def test_a_fraction_alone_may_have_been_meant_as_a_density(budget):
+    with pytest.raises(ParameterError, match=rf"Did you mean {budget}rho\?"):
+        parse_budget(budget, 2000)
+
+
 def test_the_median_view_counts(rng):
     views = [slow.make_view(rng, side, 10) for side in (10, 20, 90)]
     assert median_pixels(views) == 200

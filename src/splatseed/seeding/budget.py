@@ -64,11 +64,12 @@ def parse_budget(budget: str | float, pixels: float) -> int:
         number = float(text.removesuffix(unit)) * units.get(unit, 1.0)
     except ValueError:
         number = np.nan
-    if not (np.isfinite(number) and round(number) >= 1):
+    bare = not unit and 0 < number < 1
+    if bare or not (np.isfinite(number) and round(number) >= 1):
         raise ParameterError(
             "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
             found=repr(budget),
-            fix="Give a number of at least one seed.",
+            fix=f"Did you mean {text}rho?" if bare else "Give a number of at least one seed.",
         )
     return round(number)
 
