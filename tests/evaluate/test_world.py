@@ -113,7 +113,9 @@ def test_nerfstudios_transform_begins_at_colmaps_world(room, tmp_path):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("{", "JSON"),
+        ("{", "to be a transform in JSON; found its end at line 1, column 2"),
+        ("# Read me\n\nfirst", "found '# Read me' at line 1, column 1"),
+        ("", "found an empty file"),
         ("{}", "to hold a similarity"),
         ('{"transform": [[1, 2], [3, 4]]}', "to hold a similarity"),
         ("[[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]", "to hold a similarity"),

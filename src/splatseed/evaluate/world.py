@@ -157,7 +157,7 @@ def _candidates(path: Path, scene: Scene) -> Iterator[tuple[str, Similarity | No
 
 def _of_file(path: Path, scene: Scene) -> Similarity:
     """A transform from a file: a matrix, nerfstudio's ``transform`` and ``scale``, or cameras."""
-    content = read_json(path, _FIX)
+    content = read_json(path, _FIX, "a transform in JSON")
     if isinstance(content, list) and content and isinstance(content[0], dict):
         return _of_cameras(path, content, scene)
     return similarity_in(path, content, scene, _FIX)

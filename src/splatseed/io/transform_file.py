@@ -39,7 +39,8 @@ def read_cloud_transform(path: Path, scene: Scene) -> Similarity:
         return similarity_in(path, rows.tolist(), scene, _FIX)
     except (UnicodeDecodeError, ValueError):
         pass  # not plain numbers
-    found = similarity_in(path, read_json(path, _FIX), scene, _FIX)
+    content = read_json(path, _FIX, "a transform, as text or JSON")
+    found = similarity_in(path, content, scene, _FIX)
     return found.inverse if path.name == NERFSTUDIO else found
 
 
@@ -89,8 +90,13 @@ def _unapplied(scene: Scene, fix: str) -> Float64[np.ndarray, "4 4"]:
     return np.linalg.inv(np.vstack([np.array(applied, np.float64)[:3], np.eye(4)[3:]]))
 
 
-def read_json(path: Path, fix: str) -> Any:
+def read_json(path: Path, fix: str, expected: str = "JSON") -> Any:
     """The content of a JSON file.
+
+    Args:
+        path: The file.
+        fix: What errors advise.
+        expected: What errors say that the file should be.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -100,5 +106,19 @@ def read_json(path: Path, fix: str) -> Any:
         return json.loads(read_bytes(path))
     except SceneNotFoundError:
         raise SceneNotFoundError(f"a file {path}", found="none", fix=fix) from None
-    except (SceneFormatError, ValueError, RecursionError) as error:
-        raise SceneFormatError(f"{path} to be JSON", found=str(error), fix=fix) from None
+    except json.JSONDecodeError as error:
+        found = _where_it_ends(error)
+    except UnicodeDecodeError:
+        found = "bytes that are no text"
+    except (ValueError, RecursionError) as error:
+        found = str(error)
+    raise SceneFormatError(f"{path} to be {expected}", found=found, fix=fix)
+
+
+def _where_it_ends(error: json.JSONDecodeError) -> str:
+    """What stands where a text stops being JSON."""
+    if not error.doc.strip():
+        return "an empty file"
+    rest = error.doc[error.pos :].strip().splitlines()
+    there = repr(rest[0][:40]) if rest else "its end"
+    return f"{there} at line {error.lineno}, column {error.colno}"
