@@ -322,6 +322,8 @@ def test_a_taken_port_is_told(capsys, room):
         port = taken.getsockname()[1]
         with pytest.raises(ParameterError, match="--port"):
             free_port("127.0.0.1", port)
+        with pytest.raises(ParameterError, match=r"port from 0 to 65535; found 80000\. Pass"):
+            free_port("127.0.0.1", 80000)
         with pytest.raises(SystemExit) as stop:
             main(["view", str(room), "--port", str(port)])
     said = capsys.readouterr()

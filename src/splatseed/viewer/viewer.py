@@ -31,6 +31,7 @@ from splatseed.views.viewpoint import choose_camera, choose_image
 
 __all__ = ["Viewer", "free_port"]
 
+MOST_PORT = 65535
 STEP_BACK = 0.6
 """How far behind the first camera a browser begins, on the stage, so that it sees that camera."""
 
@@ -39,17 +40,21 @@ def free_port(host: str, port: int) -> int:
     """A port that can be listened on: the one asked for, or any free port for 0.
 
     Raises:
-        ParameterError: The port is taken, or the host is not this machine's.
+        ParameterError: The port is taken or out of range, or the host is not this machine's.
     """
+    if not 0 <= port <= MOST_PORT:
+        raise ParameterError(
+            f"a port from 0 to {MOST_PORT}", found=f"{port}", fix="Pass another (0: any free one)."
+        )
     try:
         with socket.socket() as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
             return int(probe.getsockname()[1])
-    except (OSError, OverflowError) as error:
+    except OSError as error:
         raise ParameterError(
             f"to listen on --host {host} --port {port}",
-            found=getattr(error, "strerror", None) or str(error),
+            found=error.strerror or str(error),
             fix="Pass another --port (0: any free one); --host 127.0.0.1 is this machine alone.",
         ) from None
 

@@ -260,7 +260,7 @@ POINT_HEADER = _header("binary_little_endian", _vertex(XYZ, 1))
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ("", "to be a PLY file"),
+        ("", "to be a PLY file: .*found an empty file"),
         ("plyx\n" + POINT_HEADER[4:], "to be a PLY file"),
         (POINT_HEADER[:-11], "to be a PLY file"),
         ("ply\nend_header\n", r"format ascii.*line 2"),

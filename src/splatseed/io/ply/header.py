@@ -88,7 +88,7 @@ def parse_header(path: Path, data: bytes) -> Header:
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
         raise SceneFormatError(
             f"{path} to be a PLY file: a line 'ply', a header, a line 'end_header'",
-            found=repr(data[:20]),
+            found=repr(data[:20]) if data else "an empty file",
             fix=EXPORT_PLY_AGAIN,
         )
     lines = _lines(path, data[: end.start()])
