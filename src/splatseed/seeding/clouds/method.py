@@ -48,6 +48,8 @@ CORNER = 0.5
 CELL = 8
 DEGREES = 0.01
 """Extent to the sides over height, below which coordinates may be degrees: a degree is 100 km."""
+GRID = 1e5
+"""Coordinates from here on, in metres, are those of a national grid."""
 TWO = 2
 """Photographs that stereo compares at least."""
 
@@ -238,6 +240,8 @@ def _check_in_view(streamed: Streamed, scene: Scene) -> None:
     centers = np.array([image.camera.center for image in scene.images])
     fix = "They are in different frames: find the transform with --align, or give it with "
     fix += "--transform FILE."
+    if max(np.abs(streamed.low).max(), np.abs(streamed.high).max()) > GRID:
+        fix += " --recenter would move both alike: it is for a scene in the cloud's own grid."
     if _like_degrees(streamed.low, streamed.high):
         fix = "They look like longitude and latitude: export the cloud in metres, then --align it."
     raise PointCloudError(
@@ -262,7 +266,7 @@ def _span(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> st
 
 def _plain(value: float) -> str:
     """A coordinate without an exponent where its digits matter."""
-    return f"{value:.0f}" if 1e5 <= abs(value) < 1e12 else f"{value:.6g}"
+    return f"{value:.0f}" if GRID <= abs(value) < 1e12 else f"{value:.6g}"
 
 
 def _check_fit(judged: Judged) -> tuple[str, ...]:
