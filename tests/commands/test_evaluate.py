@@ -90,7 +90,11 @@ def test_what_is_no_run_is_refused(name, room, splatseed, tmp_path):
 def test_a_run_that_has_not_finished_is_refused(run_folder, splatseed, tmp_path):
     for name in ("config.json", "splatseed.json"):
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())
-    _says(splatseed("evaluate", tmp_path), "has not finished")
+    _says(splatseed("evaluate", tmp_path), "has not finished", f"-o {tmp_path} --resume")
+
+
+def test_a_scene_is_to_be_trained_first(room, splatseed):
+    _says(splatseed("evaluate", room), f"found a scene. Train it first: splatseed train {room} ")
 
 
 def test_a_config_that_is_no_config_is_refused(run_folder, splatseed, tmp_path):

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from splatseed.errors import SceneNotFoundError
+from splatseed.io.load import is_scene
+from splatseed.literal import quoted
 from splatseed.train.record.folder import RunFolder
 
 __all__ = ["config_of", "model_file"]
@@ -23,13 +25,18 @@ def model_file(path: Path) -> Path:
     folder = RunFolder(path)
     if path.is_dir() and folder.gaussians.is_file():
         return folder.gaussians
-    there = "nothing there"
-    if path.is_dir():
-        there = "a run that has not finished" if folder.is_run else "a folder that is no run"
+    found, fix = "nothing there", "Check the path."
+    if folder.is_run:
+        found = "a run that has not finished"
+        fix = f"Finish it: splatseed train SCENE -o {quoted(path)} --resume."
+    elif path.is_dir() and is_scene(path):
+        found, fix = "a scene", f"Train it first: splatseed train {quoted(path)} -o RUN."
+    elif path.is_dir():
+        found, fix = "a folder that is no run", "Name a run, or the file itself."
     raise SceneNotFoundError(
         f"{path} to be a finished run of splatseed train, or a file of Gaussians (.ply, .spz, ...)",
-        found=there,
-        fix="Name a file, or finish the run: splatseed train SCENE -o RUN --resume.",
+        found=found,
+        fix=fix,
     )
 
 

@@ -26,7 +26,7 @@ from splatseed.io.split import follow_lists
 from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneSource
 
-__all__ = ["load_scene"]
+__all__ = ["is_scene", "load_scene"]
 
 _TRANSFORMS = "transforms.json"
 _TRIANGULATE = "Make points with: splatseed sfm IMAGES --poses-from SCENE -o OUT."
@@ -132,7 +132,7 @@ def _read_file(path: Path) -> Scene:
 def _no_scene(path: Path) -> SceneNotFoundError:
     if kind_of(path) == "train":
         raise _is_run(path)
-    scenes = [each.name for each in sorted(path.iterdir()) if _is_scene(each)]
+    scenes = [each.name for each in sorted(path.iterdir()) if is_scene(each)]
     files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
     near = sorted(files - {MANIFEST})
     if scenes:
@@ -164,7 +164,8 @@ def _is_run(path: Path) -> SceneNotFoundError:
     )
 
 
-def _is_scene(folder: Path) -> bool:
+def is_scene(folder: Path) -> bool:
+    """Whether a folder looks like a scene, by the names in it."""
     model_dirs = (folder / "sparse/0", folder / "sparse", folder, folder / "colmap/sparse/0")
     markers = (folder / _TRANSFORMS, folder / "traj.txt")
     if find_model(*model_dirs) is not None or is_tum(folder) or is_blender(folder):
