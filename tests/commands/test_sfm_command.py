@@ -42,6 +42,17 @@ def test_words_reach_the_reconstruction(called, tmp_path, splatseed):
     assert (kwargs["threads"], kwargs["seed"], kwargs["overwrite"]) == (2, 3, True)
 
 
+def test_the_photographs_are_counted_by_folder_first(called, tmp_path, splatseed, capsys):
+    splatseed("sfm", tmp_path, "-o", tmp_path / "out")
+    tell = called["reconstruct"][1]["on_photos"]
+    tell(["a.png", "b.png"])
+    tell(["scene/images/a.png", "run/render.png", "scene/images/b.png"])
+    assert capsys.readouterr().err.splitlines() == [
+        f"2 photographs in {tmp_path}",
+        f"3 photographs in {tmp_path}: 2 in scene/images, 1 in run",
+    ]
+
+
 def test_known_poses_are_triangulated(called, room, tmp_path, splatseed):
     run = splatseed("sfm", room / "images", "--poses-from", room, "-o", tmp_path / "out")
     assert run.code == 0

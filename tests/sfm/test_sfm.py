@@ -277,6 +277,17 @@ def test_bad_image_folders(photos: Path, tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_photographs_are_told_before_any_work(photos: Path, tmp_path: Path) -> None:
+    shutil.copytree(photos, tmp_path / "photos" / "below")
+
+    def stop(names: list[str]) -> None:
+        raise KeyError(len(names), names[0])
+
+    with pytest.raises(KeyError, match=r"6, 'below/view0\.png'"):
+        reconstruct(tmp_path / "photos", tmp_path / "scene", on_photos=stop)
+    assert not (tmp_path / "scene").exists()
+
+
 def test_a_truncated_photograph_is_refused(photos: Path, tmp_path: Path) -> None:
     shutil.copy(photos / "view0.png", tmp_path / "a.png")
     with PilImage.open(photos / "view0.png") as image:

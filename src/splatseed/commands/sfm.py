@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
+from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import tyro
 
 from splatseed.commands.options import parse_options
-from splatseed.console import StageClock, print_commands, print_note, print_pairs, stage_display
+from splatseed.console import (
+    ERR,
+    StageClock,
+    print_commands,
+    print_note,
+    print_pairs,
+    stage_display,
+)
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.output.staging import check_output
-from splatseed.literal import quoted
+from splatseed.literal import quoted, visible
 from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, triangulate
+from splatseed.sfm.photos import name_some
 from splatseed.sfm.video import pick_frames
 
 __all__ = ["run"]
@@ -103,6 +114,7 @@ def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport
         "overwrite": options.overwrite,
         "verbose": options.verbose,
         "on_progress": clock,
+        "on_photos": None if images != options.images else partial(_tell_photographs, images),
     }
     if options.poses_from is None:
         return reconstruct(
@@ -114,6 +126,14 @@ def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport
         )
     poses = load_scene(options.poses_from, require_points=False)
     return triangulate(images, poses, options.output, **common)
+
+
+def _tell_photographs(images: Path, names: Sequence[str]) -> None:
+    """Say what is read, since a folder named by mistake may hold pictures of other things below."""
+    folders = Counter(str(PurePosixPath(name).parent) for name in names)
+    shown = name_some([f"{count:,} in {folder}" for folder, count in folders.most_common()])
+    where = "" if set(folders) == {"."} else f": {shown}"
+    ERR.print(visible(f"{len(names):,} photographs in {images}{where}"), soft_wrap=True)
 
 
 def _summarise(options: Options, report: SfmReport) -> None:

@@ -6,7 +6,7 @@ Here the input is checked and the output staged; the work is done by ``worker`` 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
@@ -45,6 +45,7 @@ def reconstruct(
     overwrite: bool = False,
     verbose: bool = False,
     on_progress: Progress = silent,
+    on_photos: Callable[[Sequence[str]], None] | None = None,
 ) -> SfmReport:
     """Make a scene from photographs alone: features, matching, mapping, undistortion.
 
@@ -63,6 +64,7 @@ def reconstruct(
         overwrite: Replace ``output`` if it exists.
         verbose: Let pycolmap's log through to the terminal.
         on_progress: Called with the stage and the fraction done.
+        on_photos: Called with the photographs' names before work begins.
 
     Returns:
         What was found, and how long it took.
@@ -78,6 +80,8 @@ def reconstruct(
     images = Path(image_dir).absolute()
     photos = find_photos(images, at_least=2)
     with staged(images, Path(output), overwrite=overwrite) as staging:
+        if on_photos is not None:
+            on_photos([photo.name for photo in photos])
         job = ReconstructJob(images, staging, settings, photos, camera_model, shared_camera)
         log = staging / ".work" / "log.txt"
         outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
@@ -99,6 +103,7 @@ def triangulate(
     overwrite: bool = False,
     verbose: bool = False,
     on_progress: Progress = silent,
+    on_photos: Callable[[Sequence[str]], None] | None = None,
 ) -> SfmReport:
     """Make a scene from photographs whose poses are known: features, matching, triangulation.
 
@@ -117,6 +122,7 @@ def triangulate(
         overwrite: Replace ``output`` if it exists.
         verbose: Let pycolmap's log through to the terminal.
         on_progress: Called with the stage and the fraction done.
+        on_photos: Called with the photographs' names before work begins.
 
     Returns:
         What was found, and how long it took.
@@ -133,6 +139,8 @@ def triangulate(
     photos = find_photos(images, at_least=2)
     pairs = match_poses(photos, poses_from, images)
     with staged(images, Path(output), overwrite=overwrite) as staging:
+        if on_photos is not None:
+            on_photos([photo.name for photo in photos])
         job = TriangulateJob(images, staging, settings, pairs)
         log = staging / ".work" / "log.txt"
         outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
