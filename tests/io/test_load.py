@@ -217,6 +217,12 @@ def test_sparse_and_a_file_of_a_model_lead_to_the_scene(scene_dir):
     for name in ("points3D.bin", "images.bin"):
         with pytest.raises(SceneFormatError, match=f"Name the scene's folder: {scene_dir}$"):
             load_scene(scene_dir / "sparse/0" / name)
+    (scene_dir / "images/right").mkdir(exist_ok=True)
+    (scene_dir / "images/right/view.png").touch()
+    with pytest.raises(
+        SceneFormatError, match=f"a .png file. Name the scene's folder: {scene_dir}$"
+    ):
+        load_scene(scene_dir / "images/right/view.png")
 
 
 def test_a_ply_without_points_has_no_poses_to_triangulate_from(tmp_path):

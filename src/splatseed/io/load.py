@@ -29,6 +29,8 @@ from splatseed.scene import Scene, SceneSource
 __all__ = ["is_scene", "load_scene"]
 
 _TRANSFORMS = "transforms.json"
+_ABOVE = 3
+"""Folders above a file in which its scene is looked for: images may lie in folders of their own."""
 _TRIANGULATE = "Make points with: splatseed sfm IMAGES --poses-from SCENE -o OUT."
 
 
@@ -121,10 +123,11 @@ def _read_file(path: Path) -> Scene:
             fix=f"Name the scene's folder: {scene_root(path.parent)}",
         )
     if reader is None:
+        folder = next(filter(is_scene, path.absolute().parents[:_ABOVE]), "")
         raise SceneFormatError(
             f"{path} to be a scene folder, a .ply or a .json file",
             found=f"a {path.suffix or 'nameless'} file",
-            fix="Name the scene's folder.",
+            fix=f"Name the scene's folder: {folder}" if folder else "Name the scene's folder.",
         )
     return reader(path)
 
