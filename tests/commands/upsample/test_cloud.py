@@ -12,6 +12,7 @@ import pytest
 from splatseed.camera import rotation_from_quat
 from splatseed.commands.upsample.cloud import Brought
 from splatseed.io import load_scene, write_scene
+from splatseed.io.output.manifest import unlisted_files
 from splatseed.io.recentring import recentred
 from splatseed.similarity import Similarity
 from splatseed.synthetic import make_capture
@@ -94,6 +95,7 @@ def test_recentring_moves_scene_and_cloud_alike(splatseed, room, xyz, tmp_path):
     assert "--recenter" in refused.err
     run = splatseed(*words, "--recenter", "--overwrite")
     assert run.code == 0, run.err
+    assert unlisted_files(tmp_path / "out") == []
     offset = np.array(json.loads((tmp_path / "out" / "recenter.json").read_text())["offset"])
     assert np.abs(offset - grid).max() < 3
     out, plain = load_scene(tmp_path / "out"), load_scene(room)
@@ -155,6 +157,7 @@ def test_the_files_of_an_alignment_are_listed(splatseed, room, tmp_path, monkeyp
     for name in ("alignment.json", "preview_alignment.png"):
         assert (out / name).is_file()
         assert str(out / name) in run.out
+    assert unlisted_files(out) == []  # so that --overwrite replaces them
 
 
 def test_duplicates_by_the_million_change_nothing(splatseed, room, xyz, tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import ParameterError
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.output.staging import add_files, atomic_file
 from splatseed.io.recentring import check_precision, offset_of, recentred
 from splatseed.io.transform_file import read_cloud_transform
 from splatseed.literal import visible
@@ -124,6 +124,11 @@ class Brought(NamedTuple):
         return (*notes, f"Scene and cloud were moved by -({place}), as {RECENTER} has it.")
 
     @property
+    def written(self) -> tuple[str, ...]:
+        """The files that ``write`` writes."""
+        return (*((RECENTER,) if self.offset is not None else ()), *self.aligned)
+
+    @property
     def aligned(self) -> tuple[str, ...]:
         """The files that tell of the alignment, if there is one."""
         return () if self.alignment is None else ALIGNMENT
@@ -134,6 +139,8 @@ class Brought(NamedTuple):
         Raises:
             OutputError: One cannot be written.
         """
+        if self.written:
+            add_files(folder, self.written)  # or --overwrite would take them for the user's
         if self.offset is not None:
             told = {
                 "offset": self.offset.tolist(),
