@@ -32,7 +32,7 @@ def test_a_sparse_cloud_is_to_be_added_to(room, capsys):
     out = capsys.readouterr().out
     assert "add points by method auto" in out
     assert "room for" in out
-    assert "of the cells of a grid, 32 along a picture's longer side." in out
+    assert "of the cells of a coarse grid over the pictures." in out
     assert f"splatseed upsample {room} --budget" in out
 
 

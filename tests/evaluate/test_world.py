@@ -142,7 +142,7 @@ def test_a_wrong_transform_is_refused_too(room, gaussians, tmp_path):
 def test_a_transform_that_would_be_refused_itself_is_not_named(room, gaussians, tmp_path):
     """A small model at the origin, to which gsplat's transform only brings a far scene nearer."""
     scene = recentred(load_scene(room), np.array([-1000.0, 0.0, 0.0]))
-    small = dataclasses.replace(gaussians, means=gaussians.means * np.float32(0.01))
+    small = dataclasses.replace(gaussians, means=gaussians.means * np.float32(1e-4))
     for given in (None, find_transform("gsplat", scene)):
         with pytest.raises(SceneFormatError, match="No known transform fits: probably"):
             check_world(tmp_path / "model.ply", scene, small, given)

@@ -20,7 +20,6 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from splatseed.diagnostics.scene import EMPTY_CELLS
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 
@@ -145,8 +144,8 @@ def advise(
         return Advice("depth", (*reasons, "Its depth maps say where the surfaces are."))
     if measured.empty is not None:
         reasons.append(
-            f"No point falls in {measured.empty:.0%} of the cells of a grid, {EMPTY_CELLS} along a "
-            "picture's longer side."
+            f"No point falls in {measured.empty:.0%} of the cells of a coarse grid over the "
+            "pictures."
         )
     if measured.agreement is not None:
         reasons.append(

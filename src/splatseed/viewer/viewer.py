@@ -44,7 +44,7 @@ def free_port(host: str, port: int) -> int:
     """
     if not 0 <= port <= MOST_PORT:
         raise ParameterError(
-            f"a port from 0 to {MOST_PORT}", found=f"{port}", fix="Pass another (0: any free one)."
+            f"--port from 0 to {MOST_PORT}", found=f"{port}", fix="Pass another (0: any free one)."
         )
     try:
         with socket.socket() as probe:
