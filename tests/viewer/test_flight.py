@@ -125,4 +125,4 @@ def test_bad_input_is_one_line(words, said, run_folder, tmp_path, monkeypatch, s
 def test_a_scene_is_no_model(room, tmp_path, splatseed):
     heard = splatseed("flight", room, "-o", tmp_path / "a.mp4")
     assert heard.code == 2
-    assert "no run" in heard.err
+    assert "found a scene. Train it first" in heard.err

@@ -34,8 +34,8 @@ def without_points(room, tmp_path):
         "h": size.height,
         "fx": K[0, 0],
         "fy": K[1, 1],
-        "cx": K[0, 2] - 0.5,
-        "cy": K[1, 2] - 0.5,
+        "cx": K[0, 2],
+        "cy": K[1, 2],
         "scale": 5000.0,
     }
     (tmp_path / "rgbd/cam_params.json").write_text(json.dumps({"camera": camera}))
