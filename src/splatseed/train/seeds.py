@@ -57,7 +57,7 @@ def seeded(
     if saw_all_photographs(scene):
         note(
             "The seeds were made from all photographs, test views included, which may flatter the "
-            "score: train the scene itself, or make them with a hold-out (--auto.hold-out 8)."
+            "score: train the scene itself, or hold views out of them, as by --auto.hold-out 8."
         )
     if as_it_is or was_upsampled(scene):
         return scene, None
