@@ -1,6 +1,6 @@
 """How long a newcomer waits: ``make demo`` from a copy of the tree, nothing installed or compiled.
 
-    python benchmarks/cold_start.py [--kernels 30]
+    python -m benchmarks.cold_start [--kernels 30]
 
 It copies the files that git knows to a temporary folder, so that there is no ``.venv`` and no
 machine code, gives pip an empty cache, runs ``make demo`` there, and notes when each thing it waits
@@ -109,7 +109,8 @@ def list_kernels(tree: Path, environment: Mapping[str, str], num: int) -> None:
     """Run the demo in one process with nothing compiled, and print what compiling took."""
     with tempfile.TemporaryDirectory() as cache:
         subprocess.run(
-            [tree / ".venv/bin/python", __file__, "--inside", str(num), str(tree / "demo_again")],
+            [".venv/bin/python", "-m", "benchmarks.cold_start", "--inside", str(num), "demo_again"],
+            cwd=tree,
             env={**environment, "NUMBA_CACHE_DIR": cache},
             check=True,
         )
