@@ -2,8 +2,8 @@
 
 A made room of N points in a PLY becomes 4 N points. Every run is the command in a process of its
 own, from file to files, as a user would run it. Promise: ratios are of runs of the same program on
-the same machine, one after another; the run in memory is of as many of the same points as memory
-holds. See README.md for what was measured.
+the same machine, one after another; fewer of the same points are upsampled in memory before the
+tiles and after them, as a machine's pace changes. See README.md for what was measured.
 
     python -m benchmarks.scale.tiles WORK                       # 100 M points to 400 M
     python -m benchmarks.scale.tiles WORK --limit 2000000       # a try
@@ -44,6 +44,7 @@ CHUNK = 1_000_000
 NOISE, GHOSTS = 0.002, 0.003
 SMALL = 16_000_000
 """Fewer points than this get smaller tiles, so that there are several."""
+HEADER = ("", "points", "seconds", "CPU s", "us a point", "peak GB", "tiles to it")
 MEMORY_TARGET, RATE_TARGET, WORKERS_TARGET = 4.0, 1.5, 1.7
 
 
@@ -55,8 +56,8 @@ class Options:
     """Where files are made; outputs are removed, clouds are kept and used again."""
     limit: int = 100_000_000
     """Points of the cloud."""
-    in_memory: int = 4_000_000
-    """Points of the runs in memory."""
+    in_memory: int = 16_000_000
+    """Points of the runs in memory, which takes 9 GB for 16 million."""
     methods: tuple[Literal["linear", "triangle", "mls", "spline", "voronoi"], ...] = (
         "linear",
         "mls",
@@ -159,26 +160,27 @@ def _stages(text: str) -> Iterator[tuple[str, float]]:
 
 
 def compare(options: Options) -> None:
-    """Print a table of runs in memory and tile by tile."""
+    """Print a table of each method's runs in memory and tile by tile."""
     small = make_cloud(options.work / f"room_{options.in_memory}.ply", options.in_memory)
     large = make_cloud(options.work / f"room_{options.limit}.ply", options.limit)
     pieces = ["--tile-points", str(options.limit // 16)] if options.limit < SMALL else []
-    rows = []
     for method in options.methods:
         _warm_up(options, small, method)
-        whole = upsample(small, options.in_memory, method, options.threads, [])
+        before = upsample(small, options.in_memory, method, options.threads, [])
         words = ["--memory", options.memory, "--jobs", str(options.threads), *pieces]
         tiled = upsample(large, options.limit, method, options.threads, words)
-        for name, run in (("in memory", whole), ("tiles", tiled)):
-            rows.append((
-                method, name, f"{run.points:,}", f"{run.wall:.1f}", f"{run.busy:.1f}",
-                f"{run.rate:.2f}", f"{run.peak / 2**30:.2f}",
-                "" if run is whole else f"{run.rate / whole.rate:.2f}",
-            ))  # fmt: skip
-        print(f"{method}: {', '.join(f'{n} {s:.1f}' for n, s in tiled.stages.items())}", flush=True)
-    header = ("method", "", "points", "seconds", "CPU s", "us a point", "peak GB", "to memory")
-    print(table(header, rows))
-    print(f"Targets: peak {MEMORY_TARGET:.0f} GB, {RATE_TARGET} times the rate in memory.\n")
+        after = upsample(small, options.in_memory, method, options.threads, [])
+        runs = {"in memory, before": before, "tiles": tiled, "in memory, after": after}
+        print(f"{method}: {', '.join(f'{n} {s:.1f}' for n, s in tiled.stages.items())}\n")
+        print(table(HEADER, [_row(name, run, tiled) for name, run in runs.items()]), flush=True)
+    print(f"\nTargets: peak {MEMORY_TARGET:.0f} GB, {RATE_TARGET} times the rate in memory.\n")
+
+
+def _row(name: str, run: Run, tiled: Run) -> tuple[str, ...]:
+    return (
+        name, f"{run.points:,}", f"{run.wall:.1f}", f"{run.busy:.1f}", f"{run.rate:.2f}",
+        f"{run.peak / 2**30:.2f}", "" if run is tiled else f"{tiled.rate / run.rate:.2f}",
+    )  # fmt: skip
 
 
 def _warm_up(options: Options, small: Path, method: str) -> None:

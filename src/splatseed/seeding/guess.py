@@ -103,7 +103,6 @@ def _guess(depths, empty, back, matrices, shapes, starts, seen, guesses, reach):
     weights, point = np.empty(SECTORS), np.empty(3)
     for k in range(len(empty)):
         i, j = divmod(empty[k], depths.shape[1])
-        nearest[:], depth_of[:] = np.inf, np.inf
         _look_around(depths, i, j, nearest, depth_of)
         for s in range(SECTORS):
             weights[s] = 0.0
@@ -144,6 +143,8 @@ def _contradictions(point, matrices, shapes, starts, seen):  # type: ignore[no-u
 @inline
 def _look_around(depths, i, j, nearest, depth_of):  # type: ignore[no-untyped-def]  # Numba's types
     """The nearest covered cell of each sector, by squared distance; of equals, ring by ring."""
+    for s in range(SECTORS):
+        nearest[s] = depth_of[s] = np.inf
     rows, cols = depths.shape
     last = max(i, rows - 1 - i, j, cols - 1 - j)
     ring, seen = 1, False

@@ -82,7 +82,7 @@ def _build(xyz, idx, distance, frames, first, last, center, radius, volume, clos
         count, complete = _cut_all(
             xyz, i, idx[i], distance[i], normal, offset, triple, vertex, twin, count
         )
-        closed[i] = complete and np.all(triple[:count] >= 6)
+        closed[i] = complete and not _touches_cube(triple, count)
         volume[i] = _volume(normal, offset, triple, vertex, twin, count)
         radius[i] = _clamp(vertex, count, reach, center[i])
 
@@ -181,8 +181,15 @@ def _cut(plane, triple, vertex, twin, count, signed, fresh, place):  # type: ign
     _drop_removed(triple, vertex, twin, count, signed)
     for m in range(made):
         _set(triple, twin, kept + m, fresh[m, 0], fresh[m, 1], plane)
-        vertex[kept + m] = place[m]
+        _move(vertex, kept + m, place, m)
     return kept + made
+
+
+@inline
+def _move(target, to, source, at):  # type: ignore[no-untyped-def]  # Numba's types
+    # One by one: assigning a row to a row takes longer to compile.
+    for axis in range(3):
+        target[to, axis] = source[at, axis]
 
 
 @inline
@@ -193,8 +200,18 @@ def _drop_removed(triple, vertex, twin, count, signed):  # type: ignore[no-untyp
         if signed[v] <= 0.0:
             if kept < v:
                 _set(triple, twin, kept, triple[v, 0], triple[v, 1], triple[v, 2])
-                vertex[kept] = vertex[v]
+                _move(vertex, kept, vertex, v)
             kept += 1
+
+
+@inline
+def _touches_cube(triple, count):  # type: ignore[no-untyped-def]  # Numba's types
+    """Whether a face of the cube is left."""
+    for v in range(count):
+        for side in range(3):
+            if triple[v, side] < 6:
+                return True
+    return False
 
 
 @inline
@@ -215,7 +232,7 @@ def _volume(normal, offset, triple, vertex, twin, count):  # type: ignore[no-unt
 @inline
 def _clamp(vertex, count, reach, center):  # type: ignore[no-untyped-def]  # Numba's types
     """Clamp vertices to ``reach``; fill their mean; return the largest distance from it."""
-    center[:] = 0.0
+    center[0] = center[1] = center[2] = 0.0
     for v in range(count):
         length = math.sqrt(vertex[v, 0] ** 2 + vertex[v, 1] ** 2 + vertex[v, 2] ** 2)
         inward = min(1.0, reach / length)
