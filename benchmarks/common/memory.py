@@ -1,8 +1,8 @@
-"""Peak memory of one upsampling, measured in a process of its own.
+"""Peak memory: of one upsampling in a process of its own, and of a process with its descendants.
 
-Promise: the child loads the input, warms the method up on a small cloud, then notes its resident
-memory; the result is how far the peak of the one large run rises above that, so that the
-interpreter, the libraries, compiled code and the input itself do not count; the output does.
+Promise, of the first: the child loads the input, warms the method up on a small cloud, then notes
+its resident memory; the result is how far the peak of the one large run rises above that, so that
+the interpreter, the libraries, compiled code and the input itself do not count; the output does.
 
 The kernel's own high-water mark is reset before the run and read after it (Linux). The peak of
 ``resource.getrusage`` cannot be reset, and a child's begins at its parent's.
@@ -14,19 +14,25 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from threading import Event, Thread
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 
 import splatseed as ss
 
-__all__ = ["peak_bytes_per_output", "status_bytes"]
+__all__ = ["FamilyWatch", "peak_bytes_per_output", "status_bytes"]
 
-STATUS = Path("/proc/self/status")
-RESET = Path("/proc/self/clear_refs")
+PROCESSES = Path("/proc")
+STATUS = PROCESSES / "self/status"
+RESET = PROCESSES / "self/clear_refs"
 RESET_PEAK = "5"
 WARM_UP_POINTS = 2_000
+SAMPLE_SECONDS = 0.1
 
 
 def peak_bytes_per_output(cloud: ss.PointCloud, ratio: float, method: dict[str, Any]) -> float:
@@ -65,6 +71,59 @@ def status_bytes(field: str) -> int:
         return -1
     line = next(row for row in STATUS.read_text("ascii").splitlines() if row.startswith(field))
     return 1024 * int(line.split()[1])
+
+
+class FamilyWatch:
+    """Notes the most memory that a process and its descendants hold at a time, while a block runs.
+
+    Ten times a second it adds up what is resident. Pages that several of them share count several
+    times, as do pages of mapped files, which the system may drop. The high-water marks of
+    ``resource.getrusage`` do not serve: a child's begins at its parent's.
+
+    Args:
+        pid: The process.
+    """
+
+    def __init__(self, pid: int) -> None:
+        self.peak = 0
+        """Bytes; 0 off Linux."""
+        self._pid = pid
+        self._over = Event()
+        self._thread = Thread(target=self._sample, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _sample(self) -> None:
+        while not self._over.wait(SAMPLE_SECONDS):
+            self.peak = max(self.peak, sum(map(_resident, _family(self._pid))))
+
+
+def _family(pid: int) -> Iterator[int]:
+    """A process and its descendants, as far as they run."""
+    yield pid
+    for task in (PROCESSES / str(pid) / "task").glob("*/children"):
+        with suppress(OSError):  # it has just ended
+            for child in task.read_text("ascii").split():
+                yield from _family(int(child))
+
+
+def _resident(pid: int) -> int:
+    with suppress(OSError):
+        for row in (PROCESSES / str(pid) / "status").read_text("ascii", "replace").splitlines():
+            if row.startswith("VmRSS:"):
+                return 1024 * int(row.split()[1])
+    return 0  # it has just ended
 
 
 if __name__ == "__main__":

@@ -27,19 +27,14 @@ from benchmarks.common.children import thread_settings
 from benchmarks.common.clouds import room_surfaces
 from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
+from benchmarks.common.memory import FamilyWatch
 
 from splatseed.io.ply.points import ply_header, ply_rows
 from splatseed.process.interpreter import child_command, child_environment
 
 __all__: list[str] = []
 
-PROGRAM = """
-import resource, sys
-from splatseed.cli import main
-from splatseed.process.peak import peak_bytes
-main(sys.argv[1:])
-print(peak_bytes(), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024)
-"""
+PROGRAM = "import sys; from splatseed.cli import main; main(sys.argv[1:])"
 CHUNK = 1_000_000
 NOISE, GHOSTS = 0.002, 0.003
 SMALL = 16_000_000
@@ -79,7 +74,7 @@ class Run:
         points: Points that it started from.
         wall: Seconds.
         busy: Seconds of all its threads and processes.
-        peak: Bytes of its processes at most, were all at their peaks at once.
+        peak: Most bytes that its processes held at a time.
         stages: Seconds of each stage.
     """
 
@@ -133,7 +128,8 @@ def upsample(cloud: Path, points: int, method: str, threads: int, words: Sequenc
         env=child_environment(thread_settings(threads)),
     )  # fmt: skip
     assert process.stdout is not None  # noqa: S101  (asked for above)
-    text = process.stdout.read()
+    with FamilyWatch(process.pid) as memory:
+        text = process.stdout.read()
     before = _children_seconds()
     code = process.wait()
     wall, busy = time.perf_counter() - started, _children_seconds() - before
@@ -142,8 +138,7 @@ def upsample(cloud: Path, points: int, method: str, threads: int, words: Sequenc
         raise SystemExit(f"{' '.join(command)} ended with {code}")
     told = re.search(r"^  seconds +(.*)$", text, re.MULTILINE)
     stages = {} if told is None else dict(_stages(told[1]))
-    own, each = map(int, text.split()[-2:])
-    return Run(points, wall, busy, own + threads * each, stages)
+    return Run(points, wall, busy, memory.peak, stages)
 
 
 def _children_seconds() -> float:
