@@ -213,11 +213,12 @@ def test_the_memory_for_repeats_is_that_of_a_tile(tiles, tmp_path, monkeypatch):
         tracemalloc.stop()
 
     monkeypatch.setattr(run, "find_repeats", watched)
-    for side in (24, 24, 48):  # the first loads what the others use; most tiles have tiles around
-        grid = np.stack(np.meshgrid(*[np.arange(side)] * 2, [0]), axis=-1).reshape(-1, 3)
+    # The first loads what the others use. In a strip nearly all tiles have as many tiles around.
+    for length in (48, 48, 480):
+        grid = np.stack(np.meshgrid(np.arange(length), np.arange(6), 0), axis=-1).reshape(-1, 3)
         cloud = PointCloud((grid + 2**24).astype(np.float32), np.zeros(grid.shape, np.uint8))
         tiles.path = tmp_path / f"{len(peaks)}.tiles"
-        tiles(cloud, "linear", LINEAR, most=40, ratio=40)
+        tiles(cloud, "linear", LINEAR, most=40, ratio=40, at_once=10_000)
         assert tiles.tiled.num_repeated > 0.9 * tiles.tiled.num_new
     assert peaks[2] < 1.5 * peaks[1]
 
