@@ -203,6 +203,13 @@ def test_a_file_cut_short_is_told(suffix, files, tmp_path):
         read_model(path)
 
 
+def test_a_bound_that_is_missing_is_named(files, tmp_path):
+    content = files[".compressed.ply"].replace(b"float min_g", b"float mim_g")
+    (tmp_path / "m.ply").write_bytes(content)
+    with pytest.raises(SceneFormatError, match="no min_g"):
+        read_model(tmp_path / "m.ply")
+
+
 def test_a_count_is_not_believed(files, tmp_path):
     content = bytearray(gzip.decompress(files[".spz"]))
     content[8:12] = b"\xff\xff\xff\x7f"

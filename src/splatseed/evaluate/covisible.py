@@ -22,6 +22,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from splatseed.depthmap import DepthMap, DepthMaps
 from splatseed.errors import SceneFormatError
+from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
@@ -217,5 +218,5 @@ def read_covisible(path: Path) -> dict[str, Bool[np.ndarray, "rows cols"]] | Non
     try:
         with np.load(path, allow_pickle=False) as kept:
             return {str(name): kept[f"cells_{i}"] for i, name in enumerate(kept["names"])}
-    except (OSError, ValueError, KeyError, EOFError):
+    except ARCHIVE_FAILURES:
         return None

@@ -92,7 +92,7 @@ def decode(path: Path) -> Gaussians:
     means = _from_chunks(_unpack(vertices[PACKED[0]], VECTOR_BITS), chunks, BOUNDS[0:6], chunk)
     scales = _from_chunks(_unpack(vertices[PACKED[2]], VECTOR_BITS), chunks, BOUNDS[6:12], chunk)
     colors = _unpack(vertices[PACKED[3]], COLOR_BITS)
-    if BOUNDS[-1] in (chunks.dtype.names or ()):  # files from before 2024 have no colour bounds
+    if BOUNDS[-1] in (chunks.dtype.names or ()):
         colors = _from_chunks(colors, chunks, BOUNDS[12:18], chunk)
     turn = vertices[PACKED[1]]
     three = (_unpack(turn, THREE_BITS) - np.float32(0.5)) * np.float32(np.sqrt(2))
@@ -167,7 +167,9 @@ def _checked(
     """The tables of chunks and vertices, checked for every property that is read."""
     empty = np.empty(0, [])
     chunks, vertices = tables.get("chunk", empty), tables.get("vertex", empty)
-    missing = {*BOUNDS[:12]} - {*(chunks.dtype.names or ())}
+    bounds = {*(chunks.dtype.names or ())}
+    # Files from before 2024 have no colour bounds at all.
+    missing = {*(BOUNDS if bounds & {*BOUNDS[12:]} else BOUNDS[:12])} - bounds
     missing |= {*PACKED} - {*(vertices.dtype.names or ())}
     if missing:
         raise reader.error("the properties of a compressed PLY", f"no {', '.join(sorted(missing))}")
@@ -188,7 +190,10 @@ def _coefficients(
         return np.zeros((count, 0, 3), np.float32)
     if len(table) != count or len(names) // 3 not in SH_COUNTS or len(names) % 3:
         raise reader.error(f"{count} rows of 9, 24 or 45 f_rest", f"{len(table)} of {len(names)}")
-    values = np.stack([table[f"f_rest_{i}"] for i in range(len(names))], axis=1)
+    wanted = [f"f_rest_{i}" for i in range(len(names))]
+    if missing := set(wanted) - set(names):
+        raise reader.error("f_rest of every number", f"no {', '.join(sorted(missing))}")
+    values = np.stack([table[name] for name in wanted], axis=1)
     centers = (values.astype(np.float32) + np.float32(0.5)) / 256
     centers = np.where(values == 0, 0, np.where(values == 255, 1, centers)).astype(np.float32)
     rows = ((centers - np.float32(0.5)) * np.float32(SH_RANGE)).reshape(count, 3, -1)

@@ -28,6 +28,7 @@ from splatseed.export.packing import (
     opacity_logits,
     smallest_three,
 )
+from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.files import read_bytes
 from splatseed.progress import Progress, silent
 from splatseed.splat.gaussians import Gaussians
@@ -92,14 +93,7 @@ def decode(path: Path) -> Gaussians:
     """
     try:
         return _decoded(path, _opened(path))
-    except (
-        KeyError,
-        TypeError,
-        ValueError,
-        IndexError,
-        OverflowError,
-        zipfile.BadZipFile,
-    ) as error:
+    except ARCHIVE_FAILURES as error:
         raise _damaged(path, f"{type(error).__name__}: {error}") from None
 
 

@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
+from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -97,7 +98,7 @@ def seconds_of(kept: Path | None, took: float) -> float:
     try:
         with np.load(kept, allow_pickle=False) as file:
             return float(file["seconds"])
-    except (OSError, ValueError, KeyError, EOFError):
+    except ARCHIVE_FAILURES:
         return took
 
 
@@ -108,7 +109,7 @@ def _read(kept: Path | None) -> dict[str, Float32[np.ndarray, "h w"]] | None:
     try:
         with np.load(kept, allow_pickle=False) as file:
             return {str(name): file[f"depth_{i}"] for i, name in enumerate(file["names"])}
-    except (OSError, ValueError, KeyError, EOFError):
+    except ARCHIVE_FAILURES:
         return None
 
 

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from splatseed.bench.planning.records import RunSpec
+from splatseed.errors import PointCloudError
+from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.output.staging import atomic_file
 from splatseed.pointcloud import PointCloud
 
@@ -58,5 +60,5 @@ def read_made(path: Path) -> tuple[PointCloud, float] | None:
             arrays = {name: kept[name] for name in kept.files}
             seconds = float(arrays.pop("seconds"))
             return PointCloud(**arrays), seconds
-    except (OSError, ValueError, KeyError, TypeError, EOFError):
+    except (*ARCHIVE_FAILURES, PointCloudError):
         return None

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from splatseed.errors import SceneFormatError
+from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.clouds.cloud_file import CHUNK, CloudChunk, CloudFile
 from splatseed.io.clouds.colors import ColorRange
 from splatseed.io.clouds.rows import COPY_AGAIN
@@ -143,7 +144,7 @@ def _members(path: Path) -> dict[str, _Member]:
                     if not dtype.hasobject:
                         key = name.removesuffix(".npy")
                         members[key] = _Member(key, shape, dtype, fortran and len(shape) > 1)
-    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError) as error:
+    except ARCHIVE_FAILURES as error:
         raise _damaged(path, error) from None
     return members
 
@@ -170,10 +171,10 @@ def _parts(path: Path, member: _Member, size: int) -> Iterator[np.ndarray]:
                 count = min(size, left)
                 data = file.read(count * member.dtype.itemsize)
                 if len(data) < count * member.dtype.itemsize:
-                    raise ValueError(f"{member.name} ends early")  # noqa: TRY301  (told below)
+                    raise ValueError(f"{member.name} ends early")
                 yield np.frombuffer(data, member.dtype, count)
                 left -= count
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zipfile.zlib.error) as error:  # type: ignore[attr-defined]  # zlib's own
+    except ARCHIVE_FAILURES as error:
         raise _damaged(path, error) from None
 
 

@@ -102,8 +102,9 @@ class GlbCloud(CloudFile):
         """See ``CloudFile.chunks``."""
         for part in self._parts:
             for start in range(0, part.position.count, size):
-                xyz = part.position.read(self.path, start, size).astype(np.float64)
-                xyz = xyz @ part.matrix[:3, :3].T + part.matrix[:3, 3]
+                with np.errstate(invalid="ignore", over="ignore"):
+                    xyz = part.position.read(self.path, start, size).astype(np.float64)
+                    xyz = xyz @ part.matrix[:3, :3].T + part.matrix[:3, 3]
                 rgb = None
                 if self.colors == "rgb" and part.color is not None:
                     rgb = _bytes_of(part.color.read(self.path, start, size)[:, :3])

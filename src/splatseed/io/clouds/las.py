@@ -2,26 +2,34 @@
 
 Coordinates are float64 as the file's scale and offset have them. Colours are 16-bit by the standard
 and 8-bit by habit: the values decide. Without colours, intensity. Points that the file marks as
-withheld are left out. Promise: a LAZ file that ends early is an error, not a shorter cloud.
+withheld are left out. Promise: a LAZ file that ends early is an error, not a shorter cloud; what it
+says of its chunks is checked before lazrs, which would end the process, allocates for it.
 """
 
 from __future__ import annotations
 
+import os
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
-from splatseed.errors import SceneFormatError
+from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.clouds.cloud_file import CHUNK, CloudChunk, CloudFile
 from splatseed.io.clouds.colors import SAMPLE_ROWS, ColorRange, GreyRange, sample_starts
-from splatseed.io.clouds.rows import COPY_AGAIN
+from splatseed.io.clouds.rows import COPY_AGAIN, check_size, positions
 from splatseed.requirements import require
 
 __all__ = ["LasCloud"]
 
 _RGB = ("red", "green", "blue")
+_WHERE_POINTS, _RECORD = 96, 54
+"""Where a header has the offset of the points, followed by the number of variable length records;
+bytes of each of these, at least."""
+_MOST_BYTES = 1 << 30
+"""Of a chunk of points, unpacked; writers use 50,000 points, of 20 to some 100 bytes."""
 
 
 class LasCloud(CloudFile):
@@ -64,7 +72,7 @@ class LasCloud(CloudFile):
                     yield chunk
 
     def _chunk(self, points: Any) -> CloudChunk:
-        xyz = np.stack([np.asarray(points[name], np.float64) for name in "xyz"], axis=1)
+        xyz = positions(points.__getitem__)
         rgb = None
         if self.colors == "rgb":
             rgb = self._color.to_bytes(np.stack([np.asarray(points[n]) for n in _RGB], axis=1))
@@ -86,7 +94,10 @@ class _Opened:
     def __enter__(self) -> Any:
         import laspy  # noqa: PLC0415  (an optional package)
 
-        self.reader = _guarded(self.path, lambda: laspy.open(self.path))
+        _guarded(self.path, lambda: _check_records(self.path))
+        self.reader = _guarded(self.path, lambda: laspy.open(self.path, read_evlrs=False))
+        check = _check_chunks if self.reader.header.are_points_compressed else _check_room
+        _guarded(self.path, lambda: check(self.path, self.reader.header))
         return self.reader
 
     def __exit__(self, *_: object) -> None:
@@ -108,13 +119,77 @@ def _sample(file: Any, path: Path, count: int) -> np.ndarray:
     return np.concatenate(parts) if parts else np.empty((0, 4), np.uint16)
 
 
+def _check_records(path: Path) -> None:
+    """Refuse a header that promises more in front of the points than the file holds.
+
+    laspy makes room for all of it. Source: LAS 1.4 R15, tables 3 and 7.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(_WHERE_POINTS)
+        start, number = struct.unpack("<II", file.read(8))
+    if start > size:
+        raise _cut_short(path, f"points that begin at byte {start:,} of {size:,}")
+    if number * _RECORD > size:
+        raise _cut_short(path, f"{number:,} records in {size:,} bytes")
+
+
+def _check_room(path: Path, header: Any) -> None:
+    """Refuse a LAS file with fewer bytes than its points take."""
+    needed = header.offset_to_point_data + header.point_count * header.point_format.size
+    check_size(path, needed)
+
+
+def _check_chunks(path: Path, header: Any) -> None:
+    """Refuse a LAZ file whose description or table of chunks cannot be true.
+
+    Source: the LAZ specification (rapidlasso), "LASzip VLR" and "Chunk table".
+    """
+    import lazrs  # noqa: PLC0415  (an optional package)
+
+    if not header.point_count:
+        return  # there need not be a table
+    size, bytes_each = path.stat().st_size, header.point_format.size
+    vlr = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
+    if vlr.item_size() != bytes_each:
+        raise _cut_short(path, f"points of {vlr.item_size():,} bytes, not {bytes_each:,}")
+    with path.open("rb") as file:
+        number = _number_of_chunks(file, header.offset_to_point_data)
+        # A chunk begins with a point as it is.
+        if number * bytes_each > size:
+            raise _cut_short(path, f"{number:,} chunks in {size:,} bytes")
+        file.seek(header.offset_to_point_data)
+        chunks = np.array(lazrs.read_chunk_table(file, vlr), np.float64).reshape(number, 2)
+    points, packed = chunks.sum(axis=0)
+    if packed > size or points < header.point_count:
+        found = f"chunks of {points:,.0f} points in {packed:,.0f} bytes"
+        raise _cut_short(path, f"{found}, for {header.point_count:,} points in {size:,} bytes")
+    if chunks[:, 0].max() * bytes_each > _MOST_BYTES:
+        raise _cut_short(path, f"a chunk of {chunks[:, 0].max():,.0f} points")
+
+
+def _number_of_chunks(file: IO[bytes], start: int) -> int:
+    """The number that stands before the table of chunks."""
+    file.seek(start)
+    (offset,) = struct.unpack("<q", file.read(8))
+    if offset <= start:  # written in one go: the offset follows the table
+        file.seek(-8, os.SEEK_END)
+        (offset,) = struct.unpack("<q", file.read(8))
+    file.seek(offset)
+    _, number = struct.unpack("<II", file.read(8))
+    return int(number)
+
+
 def _guarded(path: Path, read: Callable[[], Any]) -> Any:
     """What ``read`` gives; whatever the package raises on a bad file as our error."""
     try:
         return read()
-    except MemoryError:
+    except (MemoryError, SplatseedError):
         raise
-    except Exception as error:  # noqa: BLE001  (laspy and lazrs raise errors of many kinds)
+    except BaseException as error:  # laspy and lazrs raise errors of many kinds
+        # A panic of Rust is no Exception.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise _cut_short(path, f"one that is cut short or damaged ({reason})") from None
 

@@ -7,6 +7,7 @@ be in memory whole; its size is checked against the free memory first.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,9 @@ class PcdCloud(CloudFile):
             raise _bad(path, "fields x, y and z", ", ".join(names) or "none")
         self._packed = next((name for name in _PACKED if name in names), None)
         columns = Columns() if self._packed else Columns.among(names)
+        used = {*XYZ, self._packed, *columns.rgb, columns.intensity}
+        if several := [name for name in names if name in used and self._dtype[name].shape]:
+            raise _bad(path, "fields of one value (COUNT 1)", f"another COUNT of {several[0]}")
         self.colors = "rgb" if self._packed else columns.colors
         self._table: TextTable | None = None
         if self._body == "ascii":
@@ -124,9 +128,10 @@ class PcdCloud(CloudFile):
         check_memory(_TWICE * needed, 1, "bytes of a compressed PCD", fix=fix)
         with open_file(self.path) as file:
             file.seek(self._offset)
-            sizes = np.frombuffer(file.read(8), "<u4")
-            packed = file.read(int(sizes[0])) if len(sizes) == 2 else b""
-        if len(sizes) < 2 or len(packed) < sizes[0] or sizes[1] != needed:
+            room = self.path.stat().st_size - self._offset
+            sizes = struct.unpack("<II", file.read(8)) if room >= 8 else (0, 0)
+            packed = file.read(min(sizes[0], room))
+        if len(packed) < sizes[0] or sizes[1] != needed:
             raise _bad(self.path, f"a compressed body of {needed:,} bytes", "another, or less")
         data = decompress(packed, needed)
         if data is None:

@@ -99,9 +99,10 @@ class Painter:
         return ColorRange(1.0).to_bytes(0.5 + SH0 * np.asarray(values, np.float64))
 
 
-def positions(column: Callable[[str], np.ndarray]) -> Float64[np.ndarray, "N 3"]:
-    """The positions of rows whose columns are given by name."""
-    return np.stack([np.asarray(column(name), np.float64) for name in XYZ], axis=1)
+def positions(column: Callable[[str], Any]) -> Float64[np.ndarray, "N 3"]:
+    """The positions of rows whose columns are given by name; damaged ones may not be finite."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.stack([np.asarray(column(name), np.float64) for name in XYZ], axis=1)
 
 
 def check_size(path: Path, needed: int) -> None:

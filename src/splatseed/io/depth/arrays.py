@@ -10,9 +10,7 @@ from __future__ import annotations
 import io
 import math
 import re
-import tokenize
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, get_args
 
@@ -21,6 +19,7 @@ from numpy.lib import format as npy_format
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import SceneFormatError
+from splatseed.io.archives import ARCHIVE_FAILURES, ARRAY_FAILURES
 from splatseed.io.files import read_bytes
 
 __all__ = [
@@ -44,11 +43,6 @@ _NPY_HEADERS = {
     (1, 0): npy_format.read_array_header_1_0,
     (2, 0): npy_format.read_array_header_2_0,
 }
-_NPY_FAILURES = (
-    *(ValueError, TypeError, KeyError, SyntaxError, MemoryError, RecursionError),
-    tokenize.TokenError,  # of headers that look like Python 2's
-)
-_ZIP_FAILURES = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
 _MOST_INFLATED = 100
 """How many times larger than in its archive a map can be: measured values hardly compress."""
 _SMALL = 1 << 26
@@ -98,7 +92,7 @@ def read_npz(path: Path) -> StoredDepth:
             return StoredDepth(
                 _as_map(path, _parse_npy(path, _member(path, archive, wanted))), kind
             )
-    except (*_ZIP_FAILURES, NotImplementedError) as error:
+    except ARCHIVE_FAILURES as error:
         refuse(path, "the archive of np.savez", f"{type(error).__name__}: {error}")
 
 
@@ -178,7 +172,7 @@ def _parse_npy(path: Path, data: bytes) -> np.ndarray:
     try:
         version = npy_format.read_magic(stream)
         shape, fortran, dtype = _NPY_HEADERS[version](stream)
-    except _NPY_FAILURES as error:
+    except ARRAY_FAILURES as error:
         refuse(path, "the header of a NumPy array", f"{type(error).__name__}: {error}")
     if dtype.hasobject:
         refuse(path, "real numbers", "Python objects")

@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +21,7 @@ from jaxtyping import Float32, UInt8
 from numpy.lib import format as npy_format
 
 from splatseed.errors import PointCloudError
+from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
 
 __all__ = [
@@ -49,11 +48,6 @@ _DIGEST_BYTES = 16
 _RUN = 1 << 20
 """Bytes that are compressed at once."""
 _MOST_HEADER = 4096
-_FAILURES = (
-    *(zipfile.BadZipFile, zlib.error, tokenize.TokenError, NotImplementedError),
-    *(OSError, EOFError, ValueError, TypeError, KeyError, SyntaxError, RuntimeError, MemoryError),
-    PointCloudError,
-)
 
 
 class KnownOfSeeds(NamedTuple):
@@ -145,7 +139,7 @@ def read_seeds(folder: Path, points: PointCloud) -> KnownOfSeeds:
                 return KnownOfSeeds(points, warning=told)
             arrays = _members(archive, len(points))
         return KnownOfSeeds(points.replace(**arrays), "source" in arrays)
-    except _FAILURES as error:
+    except (*ARCHIVE_FAILURES, PointCloudError) as error:
         told = f"{SEEDS} was ignored: it is damaged, or not splatseed's"
         return KnownOfSeeds(points, warning=f"{told} ({type(error).__name__}).")
 
