@@ -91,7 +91,7 @@ def test_runs_everything_once_and_a_failed_run_ends_nothing_else(bench, plan_pat
 def test_killed_at_any_moment_it_goes_on(plan_path, tmp_path):
     """SIGKILL in the middle of the second run's training."""
     folder = tmp_path / "B"
-    plan = plan_path(repeats=1, max_steps=600)
+    plan = plan_path(repeats=1, max_steps=200)
     process = _begin("--plan", plan, "-o", folder)
     assert any(line.startswith("[1/2]") for line in process.stdout)
     until = time.monotonic() + 60
