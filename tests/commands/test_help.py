@@ -21,6 +21,11 @@ OF_UNDISTORT = {"-h", "--help", "-o", "--output", "--threads", "--overwrite", "-
         (["upsample", "x", "-o", "y", "--method", "msl"], "Did you mean mls?"),
         (["train", "x", "-o", "y", "--max-step", "4"], "Did you mean --max-steps?"),
         (["train", "x", "-o", "y", "--strategy", "defalt"], "Did you mean default?"),
+        (
+            ["upsample", "x", "-o", "y", "--spline.smoothing", "gvc"],
+            "number or gcv; found 'gvc'. Did you mean gcv?",
+        ),
+        (["train", "x", "-o", "y", "--backend", "gpu"], "Did you mean cuda?"),
         (["upsmaple"], "Did you mean upsample?"),
         (["Info"], "Did you mean info?"),
     ],

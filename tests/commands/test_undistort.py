@@ -14,6 +14,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene, write_scene
+from splatseed.io.colmap.binary import write_points3d
 from splatseed.views.view import check_lens, load_views
 
 
@@ -31,6 +32,16 @@ def distorted(room, tmp_path_factory):
     names = [image.name for image in images]
     (path / "test_list.txt").write_text("\n".join(names[:2]))
     return path
+
+
+def test_points_that_go_are_told_of(distorted, tmp_path, splatseed):
+    scene = load_scene(distorted)
+    twice = scene.points.select(np.r_[0, 0, 1 : len(scene.points)])
+    path = shutil.copytree(distorted, tmp_path / "twice")
+    write_points3d(path / "sparse" / "0" / "points3D.bin", twice, None)
+    run = splatseed("undistort", path, "-o", tmp_path / "straight")
+    assert run.code == 0, run.err
+    assert "1 point repeats the position of another and was left out." in run.out
 
 
 @pytest.mark.parametrize("layout", ["colmap", "transforms"])

@@ -277,6 +277,16 @@ def test_bad_image_folders(photos: Path, tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_pictures_of_an_output_are_no_photographs(photos: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "scene"
+    (scene / "images").mkdir(parents=True)
+    shutil.copy(photos / "view0.png", scene / "preview.png")
+    shutil.copy(photos / "view1.png", scene / "preview_cells.png")
+    (scene / "splatseed.json").write_text('{"command": "upsample"}')
+    with pytest.raises(SceneNotFoundError, match=f"Name its photographs: {scene}/images"):
+        reconstruct(scene, tmp_path / "out")
+
+
 def test_photographs_are_told_before_any_work(photos: Path, tmp_path: Path) -> None:
     shutil.copytree(photos, tmp_path / "photos" / "below")
 

@@ -33,6 +33,12 @@ CHOICE = re.compile(
 NUMBER = re.compile(
     r"error parsing (\S+): (invalid literal for int|could not convert).*?'(.*?)'", re.IGNORECASE
 )
+UNION = re.compile(
+    r"error parsing (\S+): no type matching (\S+) could.*?from \['(.*?)'\]", re.IGNORECASE
+)
+"""A value that is none of several kinds: ``FLOAT|{gcv}``."""
+SYNONYMS = {"gpu": "cuda"}
+"""Words for choices that look more like other choices."""
 VALUE = re.compile(r"missing value for argument '([^']*)'", re.IGNORECASE)
 REQUIRED = "Missing from"
 """Marks the start of tyro's list of required options: each below a step of 4 spaces, its help
@@ -71,14 +77,8 @@ def _complaint(kind: type[Any], verb: str, said: str, arguments: Sequence[str]) 
     """Tyro's complaint as one of ours."""
     box = " ".join(COLOR.sub("", said).replace("│", " ").split())
     see = f"Run splatseed {verb} --help to see"
-    if choice := CHOICE.search(box):
-        word, option, names = choice[1], choice[2], re.findall(r"'([^']+)'", choice[3])
-        names = sorted({*names} - {"None"})  # tyro's order changes; None is what is not given
-        fix = did_you_mean(word, names).strip() or f"{see} what each is."
-        return ParameterError(f"{option} as one of {', '.join(names)}", found=repr(word), fix=fix)
-    if number := NUMBER.search(box):
-        what = "a whole number" if "int" in number[2] else "a number"
-        return ParameterError(f"{number[1]} as {what}", found=repr(number[3]), fix=f"{see} it.")
+    if (bad := _bad_value(box, see)) is not None:
+        return bad
     known = known_options(kind)
     # Before what is missing: tyro can take an unknown option for the end of the values.
     if unknown := _unknown(arguments, known):
@@ -92,6 +92,27 @@ def _complaint(kind: type[Any], verb: str, said: str, arguments: Sequence[str]) 
         fix = f"{see} {'it' if len(missing) == 1 else 'them'}."
         return ParameterError(", and ".join(missing), found=found, fix=fix)
     return _unfit(verb, _sentence(said), see)
+
+
+def _bad_value(box: str, see: str) -> ParameterError | None:
+    """A complaint about the value of one option."""
+    if choice := CHOICE.search(box):
+        word, option = choice[1], choice[2]
+        # Tyro's order changes; None is what is not given.
+        names = sorted({*re.findall(r"'([^']+)'", choice[3])} - {"None"})
+        what = f"one of {', '.join(names)}"
+        fix = did_you_mean(SYNONYMS.get(word.lower(), word), names) or f"{see} what each is."
+    elif union := UNION.search(box):
+        option, kinds, word = union[1], union[2].split("|"), union[3]
+        names = [each.strip("{}") for each in kinds if each.startswith("{")]
+        what = " or ".join([*("a number" for each in kinds if each.isupper()), *names])
+        fix = did_you_mean(word, names) or f"{see} it."
+    elif number := NUMBER.search(box):
+        option, word, fix = number[1], number[3], f"{see} it."
+        what = "a whole number" if "int" in number[2] else "a number"
+    else:
+        return None
+    return ParameterError(f"{option} as {what}", found=repr(word), fix=fix.strip())
 
 
 def _unfit(verb: str, found: str, see: str) -> ParameterError:

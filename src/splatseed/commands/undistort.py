@@ -57,6 +57,8 @@ def run(arguments: list[str]) -> None:
         ("output", str(options.output)),
     ]
     print_pairs("splatseed undistort", rows)
+    for warning in scene.warnings:
+        print_note(warning)
     if not any(image.intrinsics.has_distortion for image in scene.images):
         print_note("No camera had distortion: the photographs are copies.")
     print_commands("next", [("", f"splatseed upsample {quoted(options.output)} -o OUT")])

@@ -16,6 +16,8 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import VIDEO_SUFFIXES, open_file
+from splatseed.io.output.manifest import kind_of
+from splatseed.literal import quoted
 from splatseed.scene import Image, Scene
 
 __all__ = ["Photo", "find_photos", "match_poses", "name_some"]
@@ -114,6 +116,12 @@ def _image_names(image_dir: Path) -> list[str]:
             found="a file that is neither" if image_dir.exists() else "nothing",
             fix="Name the folder that holds the photographs, or a video "
             f"({', '.join(sorted(VIDEO_SUFFIXES))}).",
+        )
+    if (kind := kind_of(image_dir)) is not None and (image_dir / "images").is_dir():
+        raise SceneNotFoundError(
+            f"a folder of photographs at {image_dir}",
+            found=f"what splatseed {kind} wrote, with pictures of its own",
+            fix=f"Name its photographs: {quoted(image_dir / 'images')}.",
         )
     relative = [path.relative_to(image_dir) for path in image_dir.rglob("*") if path.is_file()]
     files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]

@@ -126,7 +126,8 @@ def test_a_partial_ledger_says_what_is_missing(tmp_path):
     finished = [dataclasses.replace(r, status="pending", result=None) if i % 5 == 2 else r
              for i, r in enumerate(rows(**GONE))]  # fmt: skip
     finished[0] = RunRow(finished[0].spec, "failed", error="expected a <b>cat</b>; found a dog")
-    write_report(write_ledger(tmp_path / "b", finished))
+    report = write_report(write_ledger(tmp_path / "b", finished))
+    assert "60 runs, 47 done, 1 failed, 12 to do" in report.notes[0]
     said = text_of(tmp_path / "b")
     assert "Failed runs: 1" in said
     assert "expected a <b>cat</b>; found a dog" in said  # as text: tags were escaped

@@ -49,6 +49,15 @@ def test_a_mistyped_path_makes_no_folders(tmp_path):
     assert listing(tmp_path) == []
 
 
+def test_a_place_in_which_nothing_can_be_made_is_refused_beforehand(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="file, which is no folder"):
+        check_output(tmp_path / "file" / "out", kind="test")
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(OutputError, match="which is write-protected"):
+        check_output(tmp_path / "out", kind="test")
+
+
 @pytest.mark.parametrize(
     "failure", [RuntimeError("x"), KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left")]
 )

@@ -126,7 +126,8 @@ def _when_as_good(steps: Difference, seconds: Difference) -> str:
         f"{math.exp(each.mean):.0%} of the {unit}" + ("" if each.p <= LEVEL else " (may be chance)")
         for each, unit in ((steps, "steps"), (seconds, "seconds"))
     ]
-    return f"To reach {base}'s final PSNR it takes {parts[0]} and {parts[1]} that {base} takes."
+    share = " and ".join(parts)
+    return f"To reach {base}'s final PSNR it takes {share} that {base} takes to first reach it."
 
 
 def _pairs(

@@ -59,7 +59,7 @@ class Report:
         tables: How many tables, each in three formats.
         figures: How many figures.
         summary: The answer, a sentence or two each.
-        notes: What could not be shown, one sentence each.
+        notes: What is missing or could not be shown, one sentence each.
     """
 
     path: Path
@@ -119,8 +119,12 @@ def write_report(bench: Path, *, from_scenes: bool = True, progress: Progress = 
     _write_figures(bench / FIGURES, images, [part.pictures for part in parts])
     with atomic_file(bench / REPORT) as partial:
         partial.write_text(_page(rows, sections), "utf-8", errors="backslashreplace")
-    notes = tuple(dict.fromkeys(note for part in parts for note in part.pictures.notes))
-    return Report(bench / REPORT, len(tables), len(images), said, notes)
+    notes = list(dict.fromkeys(note for part in parts for note in part.pictures.notes))
+    if any(row.status != "done" for row in rows):
+        notes.insert(
+            0, f"Not all runs are done, and the rest can change what is said: {counts(rows)}."
+        )
+    return Report(bench / REPORT, len(tables), len(images), said, tuple(notes))
 
 
 def _page(rows: Sequence[RunRow], sections: Iterable[Section]) -> str:

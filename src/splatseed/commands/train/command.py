@@ -88,7 +88,7 @@ class Options:
     """Start from the points that method auto makes of the training photographs, or from the scene's
     points as they are."""
     resume: bool = False
-    """Resume the run in the output folder, with its own settings."""
+    """Resume the run in the output folder, with its own settings; begin it if there is none."""
     tensorboard: bool = False
     """Also write a log for TensorBoard."""
     view: bool = False
@@ -122,6 +122,8 @@ def run(arguments: list[str]) -> None:
     require("torch", "gsplat")
     port = view_port(options.view_port) if options.view else None
     notes: list[str] = []
+    if options.resume and not RunFolder(options.output).is_run:
+        notes.append(f"No run in {options.output} to go on with: a new one begins.")
     with stage_display() as clock:
         training = _prepare(options, settings, notes.append, clock)
     _announce(options, training, notes)

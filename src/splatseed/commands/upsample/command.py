@@ -360,6 +360,10 @@ def _announce(
         print_note(warning)
     for name in idle:
         print_note(f"The flags of {name} have no effect with --method {options.method}.")
+    if options.profile == "paper" and configure(options.method, "paper") == configure(
+        options.method
+    ):
+        print_note(f"Method {options.method} is the same in profile paper.")
     kind = scene.source.format if scene.source else "memory"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} "

@@ -11,6 +11,7 @@ cannot be removed is named.
 from __future__ import annotations
 
 import errno
+import os
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -169,14 +170,24 @@ def _relation(target: Path, source: Path) -> str:
 
 
 def check_parents(path: Path) -> None:
-    """Refuse a place that a user names whose parent's parent is missing: probably a slip.
+    """Refuse a place that a user names in which nothing can be made.
+
+    So is one whose parent's parent is missing: probably a slip.
 
     Raises:
-        OutputError: It is.
+        OutputError: It is one of these.
     """
     target = _resolved(path)
     with _oserror_as_output_error(target):
         missing = [each for each in target.parents if not each.exists()]
+        above = target.parents[len(missing)]
+        known = above.is_dir()
+    if not known or not os.access(above, os.W_OK | os.X_OK):
+        raise OutputError(
+            f"a folder above {target.name} that can be written to",
+            found=f"{above}, which {'is write-protected' if known else 'is no folder'}",
+            fix="Choose another place.",
+        )
     if len(missing) > 1:
         raise OutputError(
             f"a folder for {target.name}, or at least the folder above it",
@@ -196,7 +207,8 @@ def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
         with _oserror_as_output_error(target):
             kept = why_kept(target, kind)
         if kept is None and not overwrite:
-            kept = "an earlier output", "Pass --overwrite to replace it, or choose another name."
+            replace = "Pass --overwrite (from Python, overwrite=True) to replace it"
+            kept = "an earlier output", f"{replace}, or choose another name."
     if kept is not None:
         there, fix = kept
         raise OutputError(f"no folder, or an empty one, at {target}", found=there, fix=fix)

@@ -162,6 +162,13 @@ def _share_of_time(sooner: Difference | None) -> Cell:
     return Cell(math.exp(sooner.mean), digits=2, mark=mark)
 
 
+_DOUBTS = {
+    "within noise": ", which may be chance",
+    "unknown": ", which a single run cannot confirm",
+}
+"""What follows a difference that is not shown, by verdict."""
+
+
 def unequal_numbers(study: Study) -> str | None:
     """A warning that the arms end with different numbers of Gaussians; None if they do not.
 
@@ -209,10 +216,7 @@ def _against(each: Compared, base: Arm) -> str:
     more = "more" if gain.mean >= 0 else "less"
     over = "scenes" if len(each.scenes) > 1 else "repeats"
     spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {over})"
-    doubt = {
-        "within noise": ", which may be chance",
-        "unknown": ", which a single run cannot confirm",
-    }.get(gain.verdict, "")
+    doubt = _DOUBTS.get(gain.verdict, "")
     return f"{abs(gain.mean):.2f} dB{spread} {more} than {base.label}{doubt}"
 
 
@@ -228,8 +232,11 @@ def _in_time(best: Compared, base: Arm) -> tuple[str, ...]:
         )
     if best.sooner is not None:
         share = math.exp(best.sooner.mean)
-        sooner = f"{share:.0%} of the time" if share < 1 else f"{share:.2f} times as long"
-        told.append(f"It takes {sooner} to reach {base.label}'s final PSNR.")
+        sooner = f"{share:.0%} of the time" if share < 1 else f"{share:.2f} times the time"
+        told.append(
+            f"It reaches {base.label}'s final PSNR after {sooner} of the whole run of "
+            f"{base.label}, seeding counted{_DOUBTS.get(best.sooner.verdict, '')}."
+        )
     elif best.reached < best.runs:
         told.append(f"{best.reached} of its {best.runs} runs reach {base.label}'s final PSNR.")
     return tuple(told)
