@@ -41,12 +41,10 @@ demo: $(BASE)
 demo-points: $(BASE)
 	$(BIN)/splatseed demo --output demo --overwrite --training later
 
-# A file's tests share what they make, so a file goes to one process, in the order of
-# tests/conftest.py. There is a process more than there are cores: tests wait a fifth of their time,
-# for browsers, clusters and processes.
+# A file's tests share what they make, so a file goes to one process. There is a process more than
+# there are cores: tests wait a fifth of their time, for browsers, clusters and processes.
 test: $(READY)
-	$(BIN)/python -m pytest --numprocesses $$($(BIN)/python -c 'import os; print(1 + os.cpu_count())') \
-	  --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest --numprocesses $$($(BIN)/python -c 'import os; print(1 + os.cpu_count())') --dist loadfile
 
 # The tests of the rooms that differ from SINCE, without the slow ones: under 90 seconds.
 SINCE ?= HEAD

@@ -26,20 +26,14 @@ def _untold_compilation(monkeypatch):
 
 
 def pytest_collection_modifyitems(items) -> None:
-    """Files with slow tests early, so that no process is left alone with one at the end.
+    """Slow tests last: what fails is known before they begin.
 
-    First the folders whose tests compile most kernels: slow tests wait for commands that use them,
-    with little patience. pytest-xdist would put files of many tests first: see Makefile.
+    First two long files that compile or train in processes of their own, so that no process is left
+    alone with one.
     """
-    slow = {item.path for item in items if item.get_closest_marker("slow")}
-    compiling = [Path(__file__).parent / name for name in ("render", "upsample", "seeding")]
-
-    def place(item) -> int:
-        if item.path in slow:
-            return 1
-        return 0 if any(folder in item.path.parents for folder in compiling) else 2
-
-    items.sort(key=place)
+    long = {"test_determinism.py", "test_examples.py"}
+    items.sort(key=lambda item: long.isdisjoint(item.path.parts))
+    items.sort(key=lambda item: item.get_closest_marker("slow") is not None)
 
 
 @pytest.fixture

@@ -34,7 +34,6 @@ def test_any_number_of_threads(expected: str, threads: int) -> None:
         numba.set_num_threads(before)
 
 
-@pytest.mark.slow
 def test_freshly_compiled_and_loaded_from_the_cache(expected: str, tmp_path: Path) -> None:
     """A new process with an empty cache compiles; a second one loads what the first has left."""
     assert _in_new_process(tmp_path) == expected
