@@ -70,7 +70,7 @@ from splatseed.upsample import (
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.method import Cloud
 
-__all__ = ["HELP_ALL", "Options", "full_options", "parse", "run"]
+__all__ = ["HELP_ALL", "Options", "asks_what_to_do", "full_options", "parse", "run"]
 
 HELP_ALL = "--help-all"
 OUTPUT = Path("OUT")
@@ -228,7 +228,7 @@ def _with_methods(methods: dict[str, Upsampler], asked_for_help: bool = False) -
 
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
-    if _asks_what_to_do(arguments):
+    if asks_what_to_do(arguments):
         run_advice(arguments)
         return
     options, methods = parse(arguments)
@@ -281,7 +281,7 @@ def run(arguments: list[str]) -> None:
         print_note(sentence)
 
 
-def _asks_what_to_do(arguments: Sequence[str]) -> bool:
+def asks_what_to_do(arguments: Sequence[str]) -> bool:
     """Whether neither an output nor a method is named, but a scene."""
     named = ("-o", "--output", "--method", "-h", "--help", HELP_ALL)
     return bool(arguments) and not any(word.partition("=")[0] in named for word in arguments)
