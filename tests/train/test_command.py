@@ -56,9 +56,7 @@ def test_a_budget_is_gaussians_per_pixel_as_trained(room_path, tmp_path, capsys)
 def test_resuming_nothing_is_told(room_path, tmp_path, capsys):
     words = (room_path, "--max-steps", "3", "--long-side", "48", "-o", tmp_path / "run", "--resume")
     assert _run(*words) == 0
-    assert (
-        f"No run in {tmp_path / 'run'} to go on with: a new one begins." in capsys.readouterr().out
-    )
+    assert f"no run to resume in {tmp_path / 'run'}: a new one" in capsys.readouterr().out
 
 
 def test_without_a_strategy_the_length_of_the_run_says_which(room_path, tmp_path, capsys):

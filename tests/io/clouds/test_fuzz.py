@@ -110,7 +110,7 @@ def damages(draw, data):
 @given(data=st.data())
 def test_damage_is_told_or_harmless(name, tmp_path, little_memory, data, valid):
     damaged = data.draw(damages(valid[name]))
-    # Text is read by the 16 MB.
+    # Text is read in blocks of 16 MB.
     assert_only_our_errors(drain, tmp_path / name, damaged, partial(little_memory, 64 << 20))
 
 

@@ -51,11 +51,13 @@ def test_a_mistyped_path_makes_no_folders(tmp_path):
 
 def test_a_place_in_which_nothing_can_be_made_is_refused_beforehand(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="file, which is no folder"):
+    with pytest.raises(OutputError, match="file, which is not a folder"):
         check_output(tmp_path / "file" / "out", kind="test")
     monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
     with pytest.raises(OutputError, match="which is write-protected"):
         check_output(tmp_path / "out", kind="test")
+    (tmp_path / "there").mkdir()
+    check_output(tmp_path / "there", kind="test")
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def run(arguments: list[str]) -> None:
     port = view_port(options.view_port) if options.view else None
     notes: list[str] = []
     if options.resume and not RunFolder(options.output).is_run:
-        notes.append(f"No run in {options.output} to go on with: a new one begins.")
+        notes.append(f"There is no run to resume in {options.output}: a new one begins.")
     with stage_display() as clock:
         training = _prepare(options, settings, notes.append, clock)
     _announce(options, training, notes)

@@ -363,7 +363,7 @@ def _announce(
     if options.profile == "paper" and configure(options.method, "paper") == configure(
         options.method
     ):
-        print_note(f"Method {options.method} is the same in profile paper.")
+        print_note(f"Profile paper changes nothing for method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} "

@@ -179,13 +179,16 @@ def check_parents(path: Path) -> None:
     """
     target = _resolved(path)
     with _oserror_as_output_error(target):
+        # What is there, such as a run that goes on, may lie in a folder that is write-protected.
+        if target.exists():
+            return
         missing = [each for each in target.parents if not each.exists()]
         above = target.parents[len(missing)]
         known = above.is_dir()
     if not known or not os.access(above, os.W_OK | os.X_OK):
         raise OutputError(
             f"a folder above {target.name} that can be written to",
-            found=f"{above}, which {'is write-protected' if known else 'is no folder'}",
+            found=f"{above}, which {'is write-protected' if known else 'is not a folder'}",
             fix="Choose another place.",
         )
     if len(missing) > 1:

@@ -38,6 +38,12 @@ SECONDS_NOTE = (
     "all runs get there."
 )
 
+_DOUBTS = {
+    "within noise": ", which may be chance",
+    "unknown": ", which a single run cannot confirm",
+}
+"""What follows a difference that is not shown, by verdict."""
+
 
 def arm_table(study: Study) -> Table:
     """Every arm's scores, cost and gain over the baseline, the highest gain first.
@@ -160,13 +166,6 @@ def _share_of_time(sooner: Difference | None) -> Cell:
         return Cell()
     mark = "~" if sooner.verdict == "within noise" else ""
     return Cell(math.exp(sooner.mean), digits=2, mark=mark)
-
-
-_DOUBTS = {
-    "within noise": ", which may be chance",
-    "unknown": ", which a single run cannot confirm",
-}
-"""What follows a difference that is not shown, by verdict."""
 
 
 def unequal_numbers(study: Study) -> str | None:
