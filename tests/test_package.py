@@ -20,7 +20,7 @@ import pytest
 import splatseed
 from splatseed.cli import VERBS
 from splatseed.errors import MissingDependencyError
-from splatseed.requirements import INSTALL, install_command, require
+from splatseed.requirements import _EXTRA, INSTALL, install_command, require
 
 ROOT = Path(__file__).parents[1]
 SOURCE = Path(splatseed.__file__).parent
@@ -94,22 +94,28 @@ def _files(part):
 
 def test_what_errors_tell_to_install_is_what_the_package_asks_for():
     project = tomllib.loads((SOURCE.parents[1] / "pyproject.toml").read_text("utf-8"))["project"]
-    extras = project["optional-dependencies"].values()
-    asked = {each.partition(";")[0] for extra in extras for each in extra}
-    assert set(INSTALL.values()) <= asked
+    extras = {
+        extra: {each.partition(";")[0] for each in packages}
+        for extra, packages in project["optional-dependencies"].items()
+    }
+    assert set(_EXTRA) == set(INSTALL)
+    assert all(wanted in extras[_EXTRA[name]] for name, wanted in INSTALL.items())
     assert all(wanted.startswith(name.replace("_", "-")) for name, wanted in INSTALL.items())
 
 
-def test_what_to_install_is_for_this_python_and_for_the_whole_extra(monkeypatch):
+def test_what_to_install_is_for_this_python_and_for_the_whole_extra(monkeypatch, tmp_path):
     monkeypatch.setattr("splatseed.requirements.find_spec", lambda _: None)
     monkeypatch.setattr("sys.executable", "/my venv/python")
+    tested = tmp_path / "what was tested.txt"
+    monkeypatch.setattr("splatseed.requirements._TESTED", tested)
     start = r"'/my venv/python' -m pip install"
     with pytest.raises(MissingDependencyError, match="the package torch; found no torch") as caught:
         require("torch")
     wanted = "'torch>=2.4' 'gsplat>=1.5.3,<1.6' 'torchmetrics>=1.4'"
-    assert caught.value.fix.startswith(f"Install it: {start} {wanted}.")
+    assert caught.value.fix.startswith(f"Install it (extra train): {start} {wanted}.")
+    tested.touch()
     upgraded = install_command("pycolmap", upgrade=True)
-    assert upgraded == f"{start} --upgrade 'pycolmap>=4.0' 'imageio-ffmpeg>=0.6'"
+    assert upgraded == f"{start} --upgrade -c '{tested}' 'pycolmap>=4.0' 'imageio-ffmpeg>=0.6'"
 
 
 def test_nothing_is_to_be_installed_that_is_not_published():

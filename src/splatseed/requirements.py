@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 from shlex import quote
 
 from splatseed.errors import MissingDependencyError
@@ -31,6 +32,17 @@ INSTALL = {
 """What to ask pip for, as in pyproject.toml: splatseed's extras can only be installed from its
 folder."""
 _TRAIN = ("torch", "gsplat", "torchmetrics")
+_EXTRA = {
+    **dict.fromkeys(_TRAIN, "train"),
+    **dict.fromkeys(("transformers", "onnxruntime"), "depth"),
+    **dict.fromkeys(("viser", "zstandard", "imageio_ffmpeg"), "view"),
+    **dict.fromkeys(("laspy", "lazrs", "pye57"), "scan"),
+    "pycolmap": "sfm",
+    "ray": "cluster",
+    "OpenEXR": "exr",
+    "tensorboard": "tensorboard",
+}
+"""The extra that a package is for, first of all, by the names in pyproject.toml."""
 _TOGETHER = {
     "torch": _TRAIN,
     "gsplat": _TRAIN,
@@ -40,6 +52,8 @@ _TOGETHER = {
     "pycolmap": ("pycolmap", "imageio_ffmpeg"),
 }
 """The packages of an extra by the one that is needed first, so that one command installs all."""
+_TESTED = Path(__file__).parents[2] / "constraints.txt"
+"""The versions that were tested; there only if splatseed runs from its own folder."""
 
 
 def require(*packages: str) -> None:
@@ -53,7 +67,9 @@ def require(*packages: str) -> None:
     """
     missing = [package for package in packages if find_spec(package) is None]
     if missing:
-        advice = f"Install {'it' if len(missing) == 1 else 'them'}: {install_command(*missing)}."
+        extras = " and ".join(dict.fromkeys(_EXTRA[each] for each in missing))
+        what = "it" if len(missing) == 1 else "them"
+        advice = f"Install {what} (extra {extras}): {install_command(*missing)}."
         if "torch" in missing:
             advice += " On a machine without a GPU, PyTorch's CPU build suffices."
         raise MissingDependencyError(
@@ -74,5 +90,8 @@ def install_command(*packages: str, upgrade: bool = False) -> str:
     for package in packages:
         others = _TOGETHER.get(package, ())
         wanted.update(dict.fromkeys(each for each in others if find_spec(each) is None))
-    words = ["install", *(["--upgrade"] if upgrade else []), *(quote(INSTALL[w]) for w in wanted)]
+    options = ["--upgrade"] if upgrade else []
+    if _TESTED.is_file():
+        options += ["-c", quoted(_TESTED)]
+    words = ["install", *options, *(quote(INSTALL[w]) for w in wanted)]
     return f"{quoted(sys.executable or 'python')} -m pip {' '.join(words)}"

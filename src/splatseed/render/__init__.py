@@ -20,7 +20,7 @@ except ModuleNotFoundError as error:
     raise MissingDependencyError(
         "PyTorch for rendering and training",
         found="no module named 'torch'",
-        fix=f"Install it: {install_command('torch')}.",
+        fix=f"Install it (extra train): {install_command('torch')}.",
     ) from error
 
 from splatseed.render.rasterize import rasterization

@@ -63,7 +63,7 @@ class Settings:
 
 
 def _advice() -> str:
-    return f"Install it: {install_command('pycolmap', upgrade=True)}."
+    return f"Install it (extra sfm): {install_command('pycolmap', upgrade=True)}."
 
 
 def check_installed() -> None:
