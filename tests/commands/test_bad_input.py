@@ -280,7 +280,7 @@ def test_bad_words_are_named(words, says, room, tmp_path, splatseed):
     ("words", "says"),
     [
         ([], "splatseed --help"),
-        (["upsample"], "-o PATH, the scene folder to write; found neither"),
+        (["upsample"], "a scene; found none. splatseed upsample SCENE says"),
         (["upsample", "somewhere"], "somewhere"),
         (["info"], "PATH"),
         (["info", "somewhere", "--bogus"], "--bogus"),

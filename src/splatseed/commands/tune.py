@@ -36,6 +36,7 @@ from splatseed.bench.tuning.halving import (
 )
 from splatseed.bench.tuning.reach import most_grown, steps_to_grow
 from splatseed.bench.tuning.validation import make_validation_scene
+from splatseed.budget import parse_budget
 from splatseed.commands.bench.display import run_display, spoken_time
 from splatseed.commands.bench.machine import Machine, open_machine
 from splatseed.commands.bench.options import Options as BenchOptions
@@ -140,8 +141,6 @@ class _Study:
     @property
     def _asked_for(self) -> int:
         """The number of Gaussians that the user's budget comes to."""
-        from splatseed.seeding.budget import parse_budget  # noqa: PLC0415  (loads Numba)
-
         factor = max(1, -(-self.facts.long_side // self.options.long_side))
         return parse_budget(self.options.budget, self.facts.pixels / factor**2)
 

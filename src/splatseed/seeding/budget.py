@@ -26,7 +26,7 @@ from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.seeding.coverage import check_points, grid_from_world, project_block
 from splatseed.views.view import View
 
-__all__ = ["median_pixels", "parse_budget", "thin"]
+__all__ = ["median_pixels", "thin"]
 
 CLOSEST = 4
 """Views in which a kept point is marked: enough for neighbours to share one, few enough to be
@@ -44,34 +44,6 @@ LEAST_POWER = 0.2
 """Least exponent e assumed in: number kept ~ (1 / spacing)^e; bounds a step. On surfaces e is 2."""
 ACROSS = 4096.0
 """Nominal width in pixels of a cloud without views."""
-
-
-def parse_budget(budget: str | float, pixels: float) -> int:
-    """The number of seeds that a budget asks for.
-
-    Args:
-        budget: A number such as 50000, "50000", "50k" or "0.5M", or "0.25rho" for Gaussians per
-            pixel of one image.
-        pixels: Pixels of one image; see ``median_pixels``.
-
-    Raises:
-        ParameterError: It is neither, or below one seed.
-    """
-    text = str(budget).strip().lower()
-    units = {"rho": pixels, "k": 1e3, "m": 1e6}
-    unit = next((each for each in units if text.endswith(each)), "")
-    try:
-        number = float(text.removesuffix(unit)) * units.get(unit, 1.0)
-    except ValueError:
-        number = np.nan
-    bare = not unit and 0 < number < 1
-    if bare or not (np.isfinite(number) and round(number) >= 1):
-        raise ParameterError(
-            "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
-            found=repr(budget),
-            fix=f"Did you mean {text}rho?" if bare else "Give a number of at least one seed.",
-        )
-    return round(number)
 
 
 def median_pixels(views: Sequence[View]) -> float:

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from splatseed.budget import parse_budget
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
@@ -36,7 +37,7 @@ def points_within(scene: Scene, budget: int | str) -> int:
     Raises:
         ParameterError: It is neither, or below one point.
     """
-    from splatseed.seeding.budget import median_pixels, parse_budget  # noqa: PLC0415  (loads Numba)
+    from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (loads Numba)
 
     photographs = poses_of(scene.images)
     return parse_budget(budget, median_pixels(photographs) if photographs else 0)

@@ -281,6 +281,17 @@ def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
     assert seeds == {("default", 21_000), ("default", 14_000), ("grow", 30_000), ("grow", 20_000)}
 
 
+def test_budgets_are_told_as_everywhere_else():
+    assert Plan(ratios=(), budgets=("50k", "0.5M", " 1 rho")).budgets == ("50000", "500000", "1rho")
+    with pytest.raises(ParameterError, match=r"Did you mean 0\.25rho\?"):
+        Plan(budgets=("0.25",))
+
+
+def test_a_misspelt_method_is_recognised():
+    with pytest.raises(ParameterError, match=r"found msl\. Did you mean mls\?"):
+        Plan(methods=("sfm", "msl"))
+
+
 def test_a_plan_with_budgets_survives_its_file(tmp_path):
     plan = Plan(ratios=(), budgets=("0.25rho", 20000), long_side=400)
     (tmp_path / "plan.toml").write_text(plan_text(plan))
@@ -289,8 +300,8 @@ def test_a_plan_with_budgets_survives_its_file(tmp_path):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"budgets": ("many",)}, {"budgets": ("-1rho",)}, {"budgets": (0.5,)}, {"ratios": ()},
-     {"budgets": (100, "100")}, {"budgets": (100,), "training": TrainSettings(cap_max=9)},
+    [{"budgets": ("many",)}, {"budgets": ("-1rho",)}, {"budgets": (0.5,)}, {"budgets": (1,)},
+     {"ratios": ()}, {"budgets": (100, "100")}, {"budgets": (100,), "training": TrainSettings(cap_max=9)},
      {"long_side": 3}, {"long_side": 400, "training": TrainSettings(data_factor=2)}],
 )  # fmt: skip
 def test_budgets_out_of_range_are_refused(wrong):

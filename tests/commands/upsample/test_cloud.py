@@ -204,3 +204,10 @@ def test_refusals_are_one_line_and_leave_nothing(
     assert says in run.err
     assert len([line for line in run.err.splitlines() if line.startswith("error")]) == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_wrong_file_is_told_before_anything_else(splatseed, room, tmp_path):
+    run = splatseed("upsample", room, "--cloud", "none.laz", "-o", tmp_path / "out")
+    assert run.code == 2
+    assert run.out == ""
+    assert run.err.startswith("error: expected a cloud at none.laz; found no such file")

@@ -25,16 +25,20 @@ from splatseed.bench.planning.records import (
     plain,
 )
 from splatseed.bench.planning.scenes import SceneFacts
+from splatseed.budget import RHO, parse_budget
 from splatseed.errors import ParameterError
+from splatseed.literal import did_you_mean
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, configure
 
-__all__ = ["DEMO", "Plan", "PlannedScene", "budget_number", "plan_runs"]
+__all__ = ["DEMO", "Plan", "PlannedScene", "plan_runs"]
 
 DEMO = "demo:"
 """The path of the synthetic room, which is made in the benchmark's folder on demand."""
 DEPTH = "depth"
-RHO = "rho"
+SEE = "See splatseed bench --help."
+LARGEST_IMAGE = 1e9
+"""Pixels; a budget per pixel that allows not one Gaussian of such an image is none."""
 LEAST_SIDE = 11
 """Least side of a photograph in pixels, for SSIM's window."""
 
@@ -228,35 +232,22 @@ def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> Trai
     settings = replace(plan.training, backend=backend, data_factor=factor)
     if not arm.budget:
         return settings
-    return replace(settings, cap_max=max(2, budget_number(arm.budget, scene.pixels / factor**2)))
-
-
-def budget_number(budget: str, pixels: float) -> int:
-    """The number of Gaussians that a budget allows.
-
-    Args:
-        budget: A number, or a string such as "0.25rho".
-        pixels: Of a photograph.
-    """
-    per_pixel = budget.endswith(RHO)
-    return round(float(budget.removesuffix(RHO)) * (pixels if per_pixel else 1.0))
+    return replace(settings, cap_max=max(2, parse_budget(arm.budget, scene.pixels / factor**2)))
 
 
 def _budget(given: object) -> str:
-    """A budget in the plan's form, so that 20000 and "20000.0" are the same.
+    """A budget in the plan's form, so that 20000, "20k" and "20000.0" are the same.
 
     Raises:
         ParameterError: It is not a budget.
     """
     text = str(given).strip().lower()
-    try:
-        number = float(text.removesuffix(RHO))
-    except ValueError:
-        number = math.nan
-    per_pixel = text.endswith(RHO)
-    if not (0 < number < math.inf if per_pixel else number >= 2 and number.is_integer()):
-        raise _out_of_range("budgets", "such as 20000, or 0.25rho", given)
-    return f"{number:g}{RHO}" if per_pixel else f"{number:.0f}"
+    number = parse_budget(text, pixels=LARGEST_IMAGE)
+    if text.endswith(RHO):
+        return f"{float(text.removesuffix(RHO)):g}{RHO}"
+    if number < 2:
+        raise _out_of_range("budgets", "of at least 2 Gaussians", given)
+    return f"{number}"
 
 
 def _scene_arms(plan: Plan, scenes: Sequence[SceneFacts]) -> list[tuple[SceneFacts, Arm]]:
@@ -277,7 +268,8 @@ def _check_choices(name: str, given: Sequence[str], known: Sequence[str]) -> Non
     _check_distinct(name, given)
     for each in given:
         if each not in known:
-            raise _out_of_range(name, f"among {', '.join(known)}", each)
+            see = did_you_mean(each, known) or SEE
+            raise ParameterError(f"{name} among {', '.join(known)}", found=each, fix=see.strip())
 
 
 def _check_distinct(name: str, given: Sequence[object]) -> None:
@@ -305,4 +297,4 @@ def _check_text(scene: PlannedScene) -> None:
 
 
 def _out_of_range(name: str, expected: str, found: object) -> ParameterError:
-    return ParameterError(f"{name} {expected}", found=f"{found}", fix="See splatseed bench --help.")
+    return ParameterError(f"{name} {expected}", found=f"{found}", fix=SEE)

@@ -52,7 +52,7 @@ TEXT = _Kind("text", lambda value: isinstance(value, str))
 TEXTS = _Kind("a list of texts", _all(str))
 NUMBERS = _Kind("a list of numbers", _all(_is_number))
 BUDGETS = _Kind(
-    'a list of budgets such as 20000 or "0.25rho"',
+    'a list of budgets such as 20000, "20k" or "0.25rho"',
     _all(lambda value: isinstance(value, str) or _is_number(value)),
 )
 WHOLE = _Kind("a whole number", lambda value: type(value) is int)

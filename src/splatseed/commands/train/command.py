@@ -21,6 +21,7 @@ from rich.progress import (
 )
 from rich.table import Column
 
+from splatseed.budget import parse_budget
 from splatseed.commands.options import known_options, parse_options
 from splatseed.commands.train.config import with_config
 from splatseed.commands.train.live import view_port, watched
@@ -181,7 +182,7 @@ def _within_budget(
     chosen = settings.strategy == BEST and settings.cap_max is None
     if options.budget is None and not (chosen and scene.images):
         return settings
-    from splatseed.seeding.budget import median_pixels, parse_budget  # noqa: PLC0415  (loads Numba)
+    from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (loads Numba)
 
     views = poses_of(scene.images, settings.data_factor)
     pixels = median_pixels(views) if views else 0

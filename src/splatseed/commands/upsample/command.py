@@ -48,6 +48,7 @@ from splatseed.depthmap import DepthKind
 from splatseed.diagnostics.geometry import far_share
 from splatseed.errors import ParameterError
 from splatseed.io import WriteReport, find_depths, load_scene, write_scene
+from splatseed.io.clouds import open_cloud
 from splatseed.io.output.staging import check_output
 from splatseed.literal import visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
@@ -228,6 +229,12 @@ def _with_methods(methods: dict[str, Upsampler], asked_for_help: bool = False) -
 
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
+    if not arguments:
+        raise ParameterError(
+            "a scene",
+            found="none",
+            fix="splatseed upsample SCENE says whether it needs seeds; with -o OUT it makes them.",
+        )
     if asks_what_to_do(arguments):
         run_advice(arguments)
         return
@@ -238,6 +245,8 @@ def run(arguments: list[str]) -> None:
     check_output(options.output, kind="upsample", overwrite=options.overwrite, protect=inputs)
     if options.gaussians is not None:
         check_start(options.gaussians, options.output, overwrite=options.overwrite)
+    for file in options.cloud_files:
+        open_cloud(file)  # reads headers only: what is wrong is told before work begins
     source = find_source(options, methods)
     if source is not None:
         run_tiled(options, methods, source, _provenance)

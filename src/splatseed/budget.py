@@ -1,0 +1,44 @@
+"""A budget in words: how many seeds or Gaussians there may be."""
+
+from __future__ import annotations
+
+import math
+
+from splatseed.errors import ParameterError
+
+__all__ = ["RHO", "parse_budget"]
+
+RHO = "rho"
+"""The unit of Gaussians per pixel of a photograph."""
+
+
+def parse_budget(budget: str | float, pixels: float) -> int:
+    """The number of points or Gaussians that a budget allows.
+
+    Args:
+        budget: A number such as 50000, "50000", "50k" or "0.5M", or "0.25rho" for Gaussians per
+            pixel of one image.
+        pixels: Pixels of one image.
+
+    Raises:
+        ParameterError: It is neither, or allows none.
+
+    Example:
+        >>> parse_budget("50k", 0), parse_budget("0.25rho", 800 * 600)
+        (50000, 120000)
+    """
+    text = str(budget).strip().lower()
+    units = {RHO: pixels, "k": 1e3, "m": 1e6}
+    unit = next((each for each in units if text.endswith(each)), "")
+    try:
+        number = float(text.removesuffix(unit)) * units.get(unit, 1.0)
+    except ValueError:
+        number = math.nan
+    bare = not unit and 0 < number < 1
+    if bare or not (math.isfinite(number) and round(number) >= 1):
+        raise ParameterError(
+            "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
+            found=repr(budget),
+            fix=f"Did you mean {text}rho?" if bare else "Give a number of at least 1.",
+        )
+    return round(number)
