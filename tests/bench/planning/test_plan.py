@@ -301,8 +301,9 @@ def test_a_plan_with_budgets_survives_its_file(tmp_path):
 @pytest.mark.parametrize(
     "wrong",
     [{"budgets": ("many",)}, {"budgets": ("-1rho",)}, {"budgets": (0.5,)}, {"budgets": (1,)},
-     {"ratios": ()}, {"budgets": (100, "100")}, {"budgets": (100,), "training": TrainSettings(cap_max=9)},
-     {"long_side": 3}, {"long_side": 400, "training": TrainSettings(data_factor=2)}],
+     {"ratios": ()}, {"budgets": (100, "100")}, {"long_side": 3},
+     {"budgets": (100,), "training": TrainSettings(cap_max=9)},
+     {"long_side": 400, "training": TrainSettings(data_factor=2)}],
 )  # fmt: skip
 def test_budgets_out_of_range_are_refused(wrong):
     with pytest.raises(ParameterError):
