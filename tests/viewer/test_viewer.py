@@ -110,10 +110,13 @@ def test_a_click_of_the_mouse_on_a_camera_flies_there(room, tmp_path):
     with served_page(tmp_path, f"http://127.0.0.1:{port}") as page:
         session = _session(served)
         assert waits_for(lambda: "Show cameras" in text(page))
+        assert waits_for(lambda: _camera_in_sight(session))
+        begin = session._client.camera.position, session._client.camera.wxyz
 
         def arrived():
             """Click a camera; again, as its page may not have drawn it, or still be settling."""
-            if (seen := _camera_in_sight(session)) is None:
+            if (seen := _camera_in_sight(session)) is None:  # it flew to another, and sees none
+                session._client.camera.position, session._client.camera.wxyz = begin
                 return None
             image, handle, at = seen
             for _, other in session._cameras:  # one behind it may be drawn first, and be clicked
