@@ -8,7 +8,7 @@ import tempfile
 import numpy as np
 import pytest
 
-pytest.importorskip("ray", reason="Ray is an extra: pip install 'splatseed[cluster]'")
+pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
 
 from splatseed.errors import OutputError
 from splatseed.process.ray_tasks import ray_cluster

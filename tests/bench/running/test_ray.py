@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
-pytest.importorskip("ray", reason="Ray is an extra: pip install 'splatseed[cluster]'")
+pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
 
 from ray.cluster_utils import Cluster
 
