@@ -202,7 +202,7 @@ def test_the_scene_around_a_named_model_is_protected_too(own_room, splatseed):
 def test_no_permission_to_write(room, tmp_path, splatseed):
     locked = tmp_path / "locked"
     locked.mkdir(mode=0o500)
-    _assert_refused(splatseed("upsample", room, "-o", locked / "out"), "may write to")
+    _assert_refused(splatseed("upsample", room, "-o", locked / "out"), "write-protected")
 
 
 @pytest.mark.parametrize(
