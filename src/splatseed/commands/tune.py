@@ -36,7 +36,6 @@ from splatseed.bench.tuning.halving import (
 )
 from splatseed.bench.tuning.reach import most_grown, steps_to_grow
 from splatseed.bench.tuning.validation import make_validation_scene
-from splatseed.budget import parse_budget
 from splatseed.commands.bench.display import run_display, spoken_time
 from splatseed.commands.bench.machine import Machine, open_machine
 from splatseed.commands.bench.options import Options as BenchOptions
@@ -46,6 +45,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SplatseedError
 from splatseed.io.output.staging import atomic_file
 from splatseed.literal import quoted, visible
 from splatseed.process.interruption import exit_code
+from splatseed.seeding.amounts import parse_budget
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 
 __all__ = ["Options", "run"]

@@ -10,10 +10,10 @@ import math
 
 import numpy as np
 
-from splatseed.budget import parse_budget
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
+from splatseed.seeding.amounts import parse_budget
 from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views, with_cover
 from splatseed.upsample.registry import source_code
 from splatseed.views.view import View, data_factor, poses_of

@@ -21,7 +21,6 @@ from rich.progress import (
 )
 from rich.table import Column
 
-from splatseed.budget import parse_budget
 from splatseed.commands.options import known_options, parse_options
 from splatseed.commands.train.config import with_config
 from splatseed.commands.train.live import view_port, watched
@@ -41,6 +40,7 @@ from splatseed.process.interruption import exit_code
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
+from splatseed.seeding.amounts import parse_budget
 from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import BUDGET, Seeding, StrategyName, TrainSettings
 from splatseed.views.photographs import user_cache_dir

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from splatseed.budget import parse_budget
 from splatseed.errors import ParameterError
+from splatseed.seeding.amounts import parse_budget
 
 
 @pytest.mark.parametrize(
