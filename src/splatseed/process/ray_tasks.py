@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -24,6 +25,10 @@ LOSSES = 3
 POLL_SECONDS = 0.5
 GRACE_SECONDS = 10.0
 """Seconds for cancelled tasks to end."""
+ANSWER_SECONDS = 5.0
+"""Seconds in which the machine at a cluster's address must answer."""
+ATTEMPTS = 2
+"""Ray's attempts, 40 s each, to find a cluster where something answers; its own default is 20."""
 MOST_THREADS = 8
 """Default threads of a task: with more, they wait for each other."""
 
@@ -103,6 +108,9 @@ def ray_cluster(address: str | None) -> Iterator[Cluster]:
     require("ray")
     # Otherwise Ray reports usage on each start; clusters that others started keep their settings.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if address:
+        _check_answers(address)
+        os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", str(ATTEMPTS))  # Ray's name is older
     import ray  # noqa: PLC0415  (an extra, and slow to import)
 
     options: dict[str, Any] = {} if address else {"include_dashboard": False}
@@ -114,15 +122,34 @@ def ray_cluster(address: str | None) -> Iterator[Cluster]:
             **options,
         )
     except (ConnectionError, RuntimeError, ValueError) as error:
-        raise ParameterError(
-            f"a Ray cluster at {address or 'this machine'}, of the same versions of Ray and Python",
-            found=" ".join(str(error).split()),
-            fix="Start it with: ray start --head; then pass --address auto on its node.",
-        ) from None
+        raise _no_cluster(address, " ".join(str(error).split())) from None
     try:
         yield Cluster()
     finally:
         ray.shutdown()
+
+
+def _check_answers(address: str) -> None:
+    """Refuse an address at which nothing listens: Ray would go on trying for a quarter of an hour.
+
+    Raises:
+        ParameterError: Nothing does.
+    """
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not (host and port.isdigit()):  # auto, or what Ray itself refuses at once
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), ANSWER_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise _no_cluster(address, f"no answer there ({error})") from None
+
+
+def _no_cluster(address: str | None, found: str) -> ParameterError:
+    return ParameterError(
+        f"a Ray cluster at {address or 'this machine'}, of the same versions of Ray and Python",
+        found=found,
+        fix="Start it with: ray start --head; then pass --address auto on its node.",
+    )
 
 
 @dataclass(frozen=True)
