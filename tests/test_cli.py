@@ -132,6 +132,24 @@ def test_a_reader_that_leaves_early_is_no_traceback(ply):
     assert b"Traceback" not in run.stderr
 
 
+def test_help_that_nobody_reads_on_is_no_error():
+    read, write = os.pipe()
+    os.close(read)
+    words = [sys.executable, "-m", "splatseed", "upsample", "--help"]
+    run = subprocess.run(words, stdout=write, stderr=subprocess.PIPE, check=False, timeout=60)
+    os.close(write)
+    assert run.returncode == 1
+    assert run.stderr == b""
+
+
+@pytest.mark.parametrize("closed", ["1", "2"])
+def test_a_closed_stream_is_no_error(ply, closed):
+    command = f'"{sys.executable}" -m splatseed info "{ply}" {closed}>&-'
+    run = subprocess.run(["sh", "-c", command], capture_output=True, check=False, timeout=60)
+    assert run.returncode == 0
+    assert b"Traceback" not in run.stdout + run.stderr
+
+
 def test_names_that_are_no_text(ply, tmp_path):
     odd = os.fsencode(tmp_path) + b"/odd\xff.ply"
     os.link(ply, odd)

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import version
+from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
@@ -49,6 +50,7 @@ class _Termination(KeyboardInterrupt):
 def main(arguments: list[str] | None = None) -> None:
     """Run ``splatseed VERB ...``; exits with 2 when the input is at fault."""
     words = sys.argv[1:] if arguments is None else arguments
+    _open_closed_streams()
     _show_log()
     _print_any_name()
     _let_threads_sleep()
@@ -92,6 +94,10 @@ def _run(verb: str, words: list[str]) -> None:
             "Ask for fewer points, or close other programs."
         )
     except OSError as error:
+        asks_help = any(word.startswith(("-h", "--help")) for word in words)
+        if isinstance(error, BrokenPipeError) and asks_help:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python reports it once more at exit
+            sys.exit(1)  # as Rich does: whoever reads the help has read enough
         where = f" at {error.filename}" if error.filename else ""
         _fail(
             "expected to read the input and write the output; found"
@@ -104,6 +110,14 @@ def _run(verb: str, words: list[str]) -> None:
         from splatseed.process.interruption import exit_code  # noqa: PLC0415  (as late as possible)
 
         sys.exit(TERMINATED if isinstance(stop, _Termination) else exit_code())
+
+
+def _open_closed_streams() -> None:
+    """Give a stream that the shell closed (``>&-``) somewhere to go; Python has None for it."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            stream = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115  (for good)
+            setattr(sys, name, stream)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneNotFoundError, SplatseedError
+from splatseed.literal import visible
 from splatseed.requirements import require
 from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Backend
@@ -112,9 +113,14 @@ def _within(path: Path) -> list[Path]:
     try:
         load_scene(path, require_points=False)
     except SceneNotFoundError as error:
-        shown = [each for each in sorted(path.iterdir()) if _is_shown(each)][:MOST_OPENED]
+        shown = [each for each in sorted(path.iterdir()) if _is_shown(each)]
+        if len(shown) > MOST_OPENED:
+            print_note(
+                f"{visible(path)} holds {len(shown)}; shown are the first {MOST_OPENED} by name. "
+                "To see others, name them themselves."
+            )
         if shown:
-            return shown
+            return shown[:MOST_OPENED]
         raise SceneNotFoundError(
             f"{path} to be a scene, a run or a folder of these", found=error.found, fix=error.fix
         ) from None

@@ -96,10 +96,10 @@ def check_world(
     closest = min(each for _, each in ratios)
     if _fits(ratio, closest):
         return
-    closer = (word for word, each in ratios if each < ratio / CLOSER and _fits(each, closest))
+    closer = (word for word, each in ratios if each < ratio / CLOSER and each <= DOUBTFUL)
     word = next(closer, None)
     fix = (
-        f"They fit with --transform {word}."
+        f"They fit with --transform {word}, unless it is a model of another scene."
         if word
         else "No known transform fits: probably it is a model of another scene. Else name the "
         "transform that its trainer applied with --transform FILE; "

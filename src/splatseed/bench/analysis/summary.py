@@ -105,8 +105,8 @@ def _cost(study: Study, strategy: StrategyName, best: Variant) -> str:
     longer = _times(study, strategy, best, lambda r: r.train_seconds)
     larger = _times(study, strategy, best, lambda r: float(r.num_gaussians))
     text = (
-        f"{best.label} costs {seconds:.1f} s of upsampling per scene, {longer:.2f} times "
-        f"{BASELINE.label}'s training time and {larger:.2f} times its Gaussians."
+        f"{best.label} costs {seconds:.1f} s of upsampling per scene, trains {longer:.2f} times as "
+        f"long as {BASELINE.label} and ends with {larger:.2f} times as many Gaussians."
     )
     sooner = speed(study, strategy, best)
     if sooner is None:
