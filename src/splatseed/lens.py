@@ -18,7 +18,15 @@ from jaxtyping import Float64
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.literal import quoted
 
-__all__ = ["distort", "fold_radius", "image_points", "rays_through", "undistort_first"]
+__all__ = [
+    "distort",
+    "fold_radius",
+    "image_points",
+    "rays_through",
+    "undistort_command",
+    "undistort_first",
+    "undistorted",
+]
 
 DIRECTIONS, STEPS = 8, 1024
 """Number of rays along which a fold is searched for, and of samples on each."""
@@ -38,8 +46,17 @@ def undistort_first(scene: Path | None) -> str:
     """
     if scene is None:
         return "Undistort the scene first: splatseed undistort SCENE -o OUT."
-    output = scene.with_name(f"{scene.resolve().name}_undistorted")
-    return f"Undistort the scene first: splatseed undistort {quoted(scene)} -o {quoted(output)}."
+    return f"Undistort the scene first: {undistort_command(scene)}."
+
+
+def undistort_command(scene: Path) -> str:
+    """The command that removes distortion from the scene in a folder."""
+    return f"splatseed undistort {quoted(scene)} -o {quoted(undistorted(scene))}"
+
+
+def undistorted(scene: Path) -> Path:
+    """Where that command writes: beside the scene."""
+    return scene.with_name(f"{scene.resolve().name}_undistorted")
 
 
 def image_points(lens: Intrinsics, xy: Float64[np.ndarray, "*B 2"]) -> Float64[np.ndarray, "*B 2"]:

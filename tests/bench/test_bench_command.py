@@ -284,3 +284,13 @@ def test_help_does_not_wait_for_pytorch():
         "assert 'torch' not in sys.modules and 'gsplat' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("words", [["--dry-run"], []])
+def test_a_plan_without_a_run_is_refused(words, plan_path, bench, tmp_path):
+    out = tmp_path / "out"
+    run = bench("--plan", plan_path(methods=("cloud",)), "-o", out, *words)
+    assert run.code == 2
+    assert "expected a plan with runs" in run.err
+    assert "without a scan" in run.err
+    assert not out.exists()

@@ -10,7 +10,9 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
+from splatseed.diagnostics.trainable import is_distorted
 from splatseed.io import load_scene
+from splatseed.io.image_checks import lens_warnings
 from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
 from splatseed.sfm import undistort
@@ -42,7 +44,7 @@ def run(arguments: list[str]) -> None:
     )
     with stage_display() as clock:
         clock("read", 0.0)
-        scene = load_scene(options.scene)
+        scene = load_scene(options.scene, require_points=False)
         undistorted = undistort(
             scene,
             options.output,
@@ -58,7 +60,8 @@ def run(arguments: list[str]) -> None:
     ]
     print_pairs("splatseed undistort", rows)
     for warning in scene.warnings:
-        print_note(warning)
-    if not any(image.intrinsics.has_distortion for image in scene.images):
+        if warning not in lens_warnings(scene.images):  # it is mended now
+            print_note(warning)
+    if not is_distorted(scene):
         print_note("No camera had distortion: the photographs are copies.")
     print_commands("next", [("", f"splatseed upsample {quoted(options.output)} -o OUT")])

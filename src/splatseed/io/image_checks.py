@@ -78,5 +78,5 @@ def lens_warnings(images: Sequence[Image]) -> list[str]:
     if not models:
         return []
     lenses = f"Cameras have lens distortion ({', '.join(models)})"
-    trainers = "graphdeco's trainer and OpenSplat need PINHOLE cameras"
+    trainers = "splatseed train, graphdeco's trainer and OpenSplat need PINHOLE cameras"
     return [f"{lenses}; {trainers}: undistort the scene with splatseed undistort SCENE -o OUT."]

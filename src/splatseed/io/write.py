@@ -69,6 +69,7 @@ def write_scene(
     copy_images: bool = False,
     provenance: Mapping[str, object] | None = None,
     stream: PointStream | None = None,
+    require_points: bool = True,
 ) -> WriteReport:
     """Write a scene folder for training.
 
@@ -81,6 +82,7 @@ def write_scene(
         copy_images: Copy the image folders instead of linking them.
         provenance: How the points were made, for ``splatseed.json``.
         stream: Points that follow those of the scene, more than memory holds.
+        require_points: Whether a scene without any point is refused.
 
     Returns:
         What was written.
@@ -88,11 +90,12 @@ def write_scene(
     Raises:
         OutputError: The folder is taken, protected or cannot be written, or the layout cannot hold
             the scene.
-        PointCloudError: No point is finite.
+        PointCloudError: No point is finite, or there is none although ``require_points``.
     """
     layout = _choose_layout(scene, format)
     clean = clean_scene(scene)  # a scene from load_scene is clean already
-    if not len(clean.points) and not (stream and len(stream)):
+    required = require_points or bool(len(scene.points))
+    if required and not len(clean.points) and not (stream and len(stream)):
         raise PointCloudError(
             "at least one point with finite coordinates",
             found=f"{len(scene.points)} points, none of them finite",

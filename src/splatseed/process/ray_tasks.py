@@ -148,7 +148,8 @@ def _no_cluster(address: str | None, found: str) -> ParameterError:
     return ParameterError(
         f"a Ray cluster at {address or 'this machine'}, of the same versions of Ray and Python",
         found=found,
-        fix="Start it with: ray start --head; then pass --address auto on its node.",
+        fix="Start it with: ray start --head; then pass --address auto on its node. If it asks for "
+        "a token, set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN for both.",
     )
 
 

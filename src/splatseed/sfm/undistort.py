@@ -52,7 +52,8 @@ def undistort(
     check_installed()
     images = _photographs(scene)
     with staged(images, Path(output), kind="undistort", overwrite=overwrite) as staging:
-        distorted = write_scene(scene, staging / ".work" / "distorted", format="colmap").path
+        work = staging / ".work" / "distorted"
+        distorted = write_scene(scene, work, format="colmap", require_points=False).path
         settings = Settings("exhaustive", "cpu", 3200, 0, threads)  # only threads matters
         job = UndistortJob(images, staging, settings, distorted / "sparse" / "0")
         log = staging / ".work" / "log.txt"

@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from threading import Thread
 from typing import Any, BinaryIO, cast
 
 from splatseed import errors
@@ -100,6 +101,7 @@ def _serve(commands: BinaryIO, replies: BinaryIO, *, verbose: bool) -> None:
     try:
         pycolmap = require_pycolmap()
         job = pickle.load(commands)  # noqa: S301  (our own parent)
+        Thread(target=_end_with, args=(commands.fileno(),), daemon=True).start()
         check_cuda(pycolmap, job.settings.device)
         pycolmap.logging.minloglevel = int(
             pycolmap.logging.Level.INFO if verbose else pycolmap.logging.Level.ERROR
@@ -110,6 +112,13 @@ def _serve(commands: BinaryIO, replies: BinaryIO, *, verbose: bool) -> None:
         reply("done", job.run(stages))
     except SplatseedError as error:
         reply("failed", type(error).__name__, error.expected, error.found, error.fix)
+
+
+def _end_with(parent: int) -> None:
+    """End this process when the parent does, even if it is killed: its pipe closes then."""
+    while os.read(parent, 1):
+        pass
+    os._exit(1)
 
 
 def serve() -> None:

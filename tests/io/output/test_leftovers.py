@@ -87,3 +87,11 @@ def test_a_file_that_is_being_written_is_not_removed(tmp_path):
             second.write_text("second")
         assert first.exists()
     assert (tmp_path / "a.txt").read_text() == "first"
+
+
+def test_a_run_that_was_killed_just_before_is_cleared_up_at_the_end(leftover, tmp_path, caplog):
+    os.utime(leftover)  # so lately that it might be another's who has not locked it yet
+    with caplog.at_level(logging.WARNING), output_folder(tmp_path / "out", kind="test"):
+        assert leftover.exists()
+        _age(leftover)
+    assert caplog.messages == [f"Removed {leftover}, left by a run that was killed."]

@@ -11,6 +11,7 @@ from pathlib import Path
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
+from splatseed.views.view import check_lens
 
 __all__ = ["LEAST_VIEWS", "make_validation_scene"]
 
@@ -31,12 +32,14 @@ def make_validation_scene(scene_path: Path, target: Path, test_every: int = 8) -
 
     Raises:
         SceneNotFoundError: There is no scene, or it has too few images.
-        SceneFormatError: One of its files breaks its format.
+        SceneFormatError: One of its files breaks its format, or a lens has distortion.
         OutputError: The folder cannot be written.
     """
     if target.is_dir():
         return target
     scene = load_scene(scene_path)
+    for image in scene.images:
+        check_lens(image, scene_path)
     train, _ = scene.split(test_every)
     if len(train) < LEAST_VIEWS:
         raise SceneNotFoundError(

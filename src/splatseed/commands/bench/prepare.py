@@ -13,7 +13,7 @@ from splatseed.bench.planning.scenes import SceneFacts, survey
 from splatseed.bench.running.environment import package_version
 from splatseed.bench.running.folder import DEMO_FACTS, make_demo_scene
 from splatseed.commands.bench.options import Asked
-from splatseed.errors import SceneNotFoundError
+from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.progress import Progress
 from splatseed.train.settings import Backend
 
@@ -54,6 +54,7 @@ def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progres
     Raises:
         SceneNotFoundError: A scene is not there; for a preset, none is.
         SceneFormatError: A file of one is not what its format promises.
+        ParameterError: No run is left.
     """
     notes = [f"not there: {', '.join(asked.missing)}"] if asked.missing else []
     present: list[tuple[PlannedScene, SceneFacts]] = []
@@ -69,7 +70,10 @@ def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progres
     plan = dataclasses.replace(asked.plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
     runs = plan_runs(plan, scenes, backend, package_version("splatseed"))
-    return Prepared(plan, scenes, runs, [*notes, *_notes(plan, scenes)])
+    notes += _notes(plan, scenes)
+    if not runs:
+        raise ParameterError("a plan with runs", found="; ".join(notes) or "none", fix="Change it.")
+    return Prepared(plan, scenes, runs, notes)
 
 
 def _survey(scene: PlannedScene, plan: Plan, made: Path | None, progress: Progress) -> SceneFacts:

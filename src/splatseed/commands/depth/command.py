@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from splatseed.commands.depth.next_steps import after_network
 from splatseed.commands.depth.options import Options, check_together
 from splatseed.commands.depth.stereo import provenance, run_stereo
 from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.output.staging import check_output
-from splatseed.literal import quoted
 from splatseed.monocular import (
     DepthNetwork,
     DepthReport,
@@ -18,6 +18,7 @@ from splatseed.monocular import (
     estimate_depths,
     load_network,
 )
+from splatseed.scene import Scene
 
 __all__ = ["run"]
 
@@ -57,7 +58,7 @@ def _run_network(options: Options) -> None:
             provenance={**provenance(options, PACKAGES), **_said_by(network)},
             progress=clock,
         )
-    _summarise(options, network, report)
+    _summarise(options, scene, network, report)
 
 
 def _network(options: Options) -> DepthNetwork:
@@ -72,7 +73,7 @@ def _said_by(network: DepthNetwork) -> dict[str, object]:
     return {"kind": meaning.kind, "kind_because": meaning.reason, "device": network.device}
 
 
-def _summarise(options: Options, network: DepthNetwork, report: DepthReport) -> None:
+def _summarise(options: Options, scene: Scene, network: DepthNetwork, report: DepthReport) -> None:
     small, large = (f"{width} x {height}" for width, height in report.sizes)
     each = report.seconds / report.num_images
     rows = [
@@ -92,9 +93,4 @@ def _summarise(options: Options, network: DepthNetwork, report: DepthReport) -> 
             + shown
             + (f" and {more} more" if more > 0 else "")
         )
-    scene, maps = (quoted(path) for path in (options.scene, report.path))
-    commands = [
-        ("look", f"splatseed info {scene} --depth {maps} --picture depth.png"),
-        ("use", f"splatseed upsample {scene} --method depth --depth {maps} --ratio 16 -o OUT"),
-    ]
-    print_commands("next", commands)
+    print_commands("next", after_network(options.scene, scene, report.path))

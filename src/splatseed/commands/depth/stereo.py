@@ -8,10 +8,15 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from splatseed.commands.depth.next_steps import after_stereo, look
 from splatseed.commands.depth.options import Options
 from splatseed.console import OUT, StageClock, print_commands, print_note, stage_display
+from splatseed.diagnostics.trainable import is_distorted
 from splatseed.io import load_scene
 from splatseed.io.dense import (
     DenseReport,
@@ -54,8 +59,7 @@ def run_stereo(options: Options) -> None:
         report = _write(scene, maps, options, clock)
         if options.preview:
             _draw(options, scene, maps, clock)
-    bent = any(image.intrinsics.has_distortion for image in scene.images)
-    _summarise(options, maps, report, time.perf_counter() - start, bent=bent)
+    _summarise(options, scene, maps, report, time.perf_counter() - start)
 
 
 def provenance(options: Options, packages: Sequence[str]) -> dict[str, object]:
@@ -104,11 +108,10 @@ def _draw(options: Options, scene: Scene, maps: Sequence[StereoMap], clock: Stag
 
 def _summarise(
     options: Options,
+    scene: Scene,
     maps: Sequence[StereoMap],
     report: DenseReport,
     seconds: float,
-    *,
-    bent: bool,
 ) -> None:
     OUT.print(
         f"{report.num_maps:,} depth maps of {_sizes(maps)}: {report.share_known:.0%} of their "
@@ -121,12 +124,13 @@ def _summarise(
         more = len(report.empty) - NAMES_SHOWN
         shown = ", ".join(report.empty[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
         print_note(f"no other view confirms any pixel of: {shown}")
-    if bent and not options.colmap:
+    if is_distorted(scene) and not options.colmap:
         print_note(
             "the cameras have lens distortion, and these maps belong to the undistorted "
             "photographs: --colmap writes both, as a scene to continue with"
         )
-    print_commands("next", _next(options, report, bent=bent))
+    confirmed = sum(np.count_nonzero(np.isfinite(each.depth)) for each in maps)
+    print_commands("next", _next(options, scene, report.path, int(confirmed)))
 
 
 def _sizes(maps: Sequence[StereoMap]) -> str:
@@ -136,17 +140,13 @@ def _sizes(maps: Sequence[StereoMap]) -> str:
     return " to ".join(f"{width} x {height}" for height, width in ends)
 
 
-def _next(options: Options, report: DenseReport, *, bent: bool) -> list[tuple[str, str]]:
-    # The workspace is itself a scene, without distortion.
-    shown = report.path if options.colmap else options.scene
-    scene, maps = (quoted(path) for path in (shown, report.path))
-    look = ("look", f"splatseed info {scene} --depth {maps} --picture depth.png")
+def _next(options: Options, scene: Scene, written: Path, confirmed: int) -> list[tuple[str, str]]:
     if not options.colmap:
-        seeds = f"splatseed upsample {scene} --method depth --depth {maps} --ratio 16 -o OUT"
-        return [look] if bent else [look, ("use", seeds)]
-    fused = quoted(report.path / "fused.ply")
+        return after_stereo(options.scene, scene, written, confirmed)
+    fused = quoted(written / "fused.ply")
     fuse = (
-        f"colmap stereo_fusion --workspace_path {maps} --output_path {fused}"
+        f"colmap stereo_fusion --workspace_path {quoted(written)} --output_path {fused}"
         f" --StereoFusion.min_num_pixels {MIN_PIXELS}"
     )
-    return [look, ("fuse", fuse)]
+    # The workspace is itself a scene, without distortion.
+    return [look(written, written), ("fuse", fuse)]

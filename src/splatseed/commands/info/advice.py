@@ -13,10 +13,12 @@ import numpy as np
 import tyro
 
 from splatseed.commands.options import parse_options
-from splatseed.console import OUT, print_commands, print_pairs, stage_display
+from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
 from splatseed.diagnostics.scene import empty_regions
+from splatseed.diagnostics.trainable import is_distorted, untrainable
 from splatseed.io import load_scene
 from splatseed.io.output.earlier import was_upsampled
+from splatseed.lens import undistort_command, undistorted
 from splatseed.literal import quoted
 from splatseed.progress import Progress
 from splatseed.scene import Scene
@@ -123,23 +125,36 @@ def advice_rows(advice: Advice, measured: Measured, planned: Planned) -> list[tu
     return [*layout, ("planned", plan), ("advice", advice.sentence), *why]
 
 
-def advice_commands(scene: Path, advice: Advice, planned: Planned) -> list[tuple[str, str]]:
-    """The commands that follow the advice."""
-    source = quoted(scene)
+def advice_commands(
+    path: Path, scene: Scene, advice: Advice, planned: Planned
+) -> list[tuple[str, str]]:
+    """The commands that follow the advice, each of which works on this scene.
+
+    Args:
+        path: Where the scene lies.
+        scene: The scene.
+        advice: The advice.
+        planned: How it will be trained.
+    """
+    trains, first = not untrainable(scene), []
+    if trains and is_distorted(scene):
+        first, path = [("undistort", undistort_command(path))], undistorted(path)
+    source = quoted(path)
     training = f"--cap-max {planned.budget} --max-steps {planned.max_steps} -o RUN"
-    tune = ("or ask by experiment", f"splatseed tune {source} --minutes 30")
     if advice.method == SEEDED:
-        return [("train", f"splatseed train {source} {planned.flags}-o RUN")]
-    if advice.method == AS_IT_IS:
-        return [("train", f"splatseed train {source} --seeds scene {training}"), tune]
-    if advice.method == "auto":
-        return [
-            ("seeds", f"splatseed upsample {source} --budget {planned.most_seeds} -o OUT"),
-            ("train", f"splatseed train OUT {training}"),
-            tune,
-        ]
-    seeds = f"splatseed upsample {source} --method {advice.method} --ratio 4 -o OUT"
-    return [("seeds", seeds), ("train", f"splatseed train OUT {training}")]
+        train = f"splatseed train {source} {planned.flags}-o RUN"
+    elif advice.method == AS_IT_IS:
+        train = f"splatseed train {source} --seeds scene {training}"
+    else:
+        how = f"--method {advice.method} --ratio 4"
+        how = f"--budget {planned.most_seeds}" if advice.method == "auto" else how
+        first.append(("seeds", f"splatseed upsample {source} {how} -o OUT"))
+        train = f"splatseed train OUT {training}"
+    if not trains:
+        return first or [("look", f"splatseed view {source}")]
+    tune = ("or ask by experiment", f"splatseed tune {source} --minutes 30")
+    tunes = advice.method in (AS_IT_IS, "auto") and len(scene.points)
+    return [*first, ("train", train), *([tune] if tunes else [])]
 
 
 @dataclass(frozen=True)
@@ -172,9 +187,10 @@ def run_advice(arguments: list[str]) -> None:
         empty = None if regions is None else regions.mean
         advice, measured = advice_for(scene, planned, empty, clock)
     print_pairs(str(options.scene), advice_rows(advice, measured, planned))
-    OUT.print(
-        "\nThe rules rest on runs of a few scenes (docs/methods.md); splatseed tune tests this "
-        "very scene.",
-        soft_wrap=True,
-    )
-    print_commands("next", advice_commands(options.scene, advice, planned))
+    commands = advice_commands(options.scene, scene, advice, planned)
+    tunes = any("splatseed tune" in command for _, command in commands)
+    tests = "; splatseed tune tests this very scene" if tunes else ""
+    OUT.print(f"\nThe rules rest on runs of a few scenes (docs/methods.md){tests}.", soft_wrap=True)
+    if missing := untrainable(scene):
+        print_note(missing)
+    print_commands("next", commands)

@@ -154,13 +154,10 @@ def _next_command(options: Options, scene: Scene) -> str:
     if options.depth is not None and len(scene.points):
         maps = quoted(options.depth)
         return f"splatseed upsample {scene_dir} --method depth --depth {maps} --ratio 16 -o OUT"
-    if len(scene.points) and scene.has_photographs:
-        planned = Planned.of(scene, options.budget, options.max_steps)
-        return advice_commands(options.scene, advice_for(scene, planned, None)[0], planned)[0][1]
-    if len(scene.points) and was_upsampled(scene):
-        return f"splatseed view {scene_dir}"
     if len(scene.points):
-        return f"splatseed upsample {scene_dir} --method mls --ratio 8 -o OUT"
+        planned = Planned.of(scene, options.budget, options.max_steps)
+        advice, _ = advice_for(scene, planned, None)
+        return advice_commands(options.scene, scene, advice, planned)[0][1]
     images = scene.source.image_dir if scene.source else None
     photographs = "IMAGES" if images is None else quoted(images)
     return f"splatseed sfm {photographs} --poses-from {scene_dir} -o OUT"

@@ -285,7 +285,7 @@ def run(arguments: list[str]) -> None:
             write_map_preview(scene, method, options.seed, options.output, clock)
         seconds = clock.seconds()
     files = {"alignment": brought.aligned, "pictures": PICTURES if options.preview else ()}
-    summarise(scene, seeds, report, seconds, checks, options.output, files)
+    summarise(options.scene, scene, seeds, report, seconds, checks, options.output, files)
     for sentence in notes:
         print_note(sentence)
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseed.commands.upsample.trainers import training_commands
-from splatseed.console import StageClock, print_commands, print_note, print_pairs
+from splatseed.commands.upsample.trainers import tell_training
+from splatseed.console import StageClock, print_note, print_pairs
 from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.io import WriteReport
 from splatseed.pointcloud import PointCloud
@@ -131,6 +131,7 @@ def _some_of(images: Sequence[Image]) -> list[int]:
 
 
 def summarise(
+    read_from: Path,
     scene: Scene,
     seeds: PointCloud,
     report: WriteReport,
@@ -142,6 +143,7 @@ def summarise(
     """Print the final table and the commands to run next.
 
     Args:
+        read_from: Where the scene was read.
         scene: The scene as it was read.
         seeds: The points that were written.
         report: The report of writing.
@@ -173,8 +175,7 @@ def summarise(
         print_note(
             "gsplat's examples, graphdeco's code and LichtFeld read COLMAP only: --format colmap."
         )
-    if scene.images and scene.source is not None and scene.source.image_dir is not None:
-        print_commands("train it with", training_commands(output, report.layout))
+    tell_training(read_from, scene, output, report.layout)
 
 
 def _left_out(scene: Scene, report: WriteReport) -> str:

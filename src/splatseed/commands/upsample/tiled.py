@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from splatseed.commands.upsample.plan_line import method_words
-from splatseed.commands.upsample.trainers import training_commands
+from splatseed.commands.upsample.trainers import tell_training
 from splatseed.console import (
     OUT,
     StageClock,
-    print_commands,
     print_note,
     print_pairs,
     stage_display,
@@ -349,7 +348,8 @@ def _summarise(
     for note in report.notes:
         print_note(note)
     if not np.any(tiled.origin) and options.scene.is_dir():
-        print_commands("train it with", training_commands(options.output, report.layout))
+        scene = load_scene(options.scene, require_points=False)
+        tell_training(options.scene, scene, options.output, report.layout)
 
 
 @contextmanager

@@ -74,6 +74,7 @@ def output_folder(
         except BaseException as error:
             _remove_after(error, partial)
             raise
+    remove_leftovers(target)  # what seemed to be in use before is settled now
 
 
 def check_output(

@@ -1,0 +1,178 @@
+"""The commands that verbs print as the next: each works on the scene it was printed for."""
+
+from __future__ import annotations
+
+import dataclasses
+import shlex
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.camera import Intrinsics, quat_from_rotation
+from splatseed.io import load_scene, write_scene
+from splatseed.synthetic import make_capture
+
+from ..bent import bend
+
+START, PERIOD = 1305031102.175304, 0.1
+
+
+def lines_of(out: str) -> list[list[str]]:
+    """The words after ``splatseed`` of the commands below "next"."""
+    printed = out.rpartition("\nnext\n")[2].splitlines()
+    commands = [line.partition("splatseed ")[2] for line in printed]
+    return [shlex.split(each) for each in commands if each]
+
+
+@pytest.fixture
+def bent(room, tmp_path) -> Path:
+    """The room, its lens said to have distortion."""
+    scene = load_scene(room)
+    lens = scene.intrinsics[0]
+    params = (*lens.params, 0.06, 0.0, 0.0, 0.0)
+    lens = Intrinsics(lens.camera_id, "OPENCV", lens.width, lens.height, params)
+    images = tuple(dataclasses.replace(each, intrinsics=lens) for each in scene.images)
+    path = tmp_path / "bent"
+    write_scene(scene.replace(images=images, intrinsics=(lens,)), path, copy_images=True)
+    return path
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory) -> Path:
+    """An RGB-D capture in TUM's layout: without points, and with a lens that distorts."""
+    made = bend(make_capture(0, num_views=6, width=640, height=480))
+    root = tmp_path_factory.mktemp("tum") / "rgbd_dataset_freiburg1_room"
+    poses = []
+    for kind in ("rgb", "depth"):
+        (root / kind).mkdir(parents=True)
+    for i, (image, photograph) in enumerate(zip(made.scene.images, made.images, strict=True)):
+        time = f"{START + i * PERIOD:.6f}"
+        PilImage.fromarray(photograph).save(root / "rgb" / f"{time}.png")
+        depth = np.nan_to_num(np.asarray(made.depths[i])) * 5000
+        PilImage.fromarray(depth.clip(0, 65535).astype(np.uint16)).save(root / f"depth/{time}.png")
+        pose = image.camera.world_from_cam
+        w, x, y, z = quat_from_rotation(pose[:3, :3])
+        poses.append(" ".join(map(str, (time, *pose[:3, 3], x, y, z, w))))
+    times = [line.split()[0] for line in poses]
+    for kind in ("rgb", "depth"):
+        listed = [f"{time} {kind}/{time}.png" for time in times]
+        (root / f"{kind}.txt").write_text("\n".join(listed) + "\n")
+    (root / "groundtruth.txt").write_text("\n".join(poses) + "\n")
+    return root
+
+
+def follow(out: str, splatseed) -> list[str]:
+    """Run what was printed, with few steps and no experiments, and return the verbs."""
+    verbs = []
+    for words in lines_of(out):
+        verbs.append(words[0])
+        if "--max-steps" in words:
+            words[words.index("--max-steps") + 1] = "3"
+        if words[0] != "tune":
+            run = splatseed(*words)
+            assert run.code == 0, (words, run.err)
+    return verbs
+
+
+@pytest.mark.parametrize(
+    ("kind", "verbs"),
+    [
+        ("room", ["upsample", "train", "tune"]),
+        ("bent", ["undistort", "upsample", "train", "tune"]),
+        ("capture", ["undistort", "upsample", "train"]),  # tune needs points
+    ],
+)
+def test_what_upsample_advises_works(kind, verbs, request, tmp_path, monkeypatch, splatseed):
+    pytest.importorskip("torch", reason="trains")
+    pytest.importorskip("pycolmap", reason="undistorts")
+    scene = shutil.copytree(request.getfixturevalue(kind), tmp_path / "my scene", symlinks=True)
+    if kind == "capture":  # by its folder's name the reader knows the camera
+        scene = scene.rename(tmp_path / "rgbd_dataset_freiburg1_room")
+    monkeypatch.chdir(tmp_path)
+    run = splatseed("upsample", scene)
+    assert run.code == 0, run.err
+    assert follow(run.out, splatseed) == verbs
+    assert len(load_scene("OUT").points) > 500
+
+
+def test_info_advises_what_upsample_does(bent, tmp_path, monkeypatch, splatseed):
+    monkeypatch.chdir(tmp_path)
+    first = lines_of(splatseed("upsample", bent).out)[0]
+    assert first == ["undistort", str(bent), "-o", str(bent) + "_undistorted"]
+    assert lines_of(splatseed("info", bent).out) == [first]
+
+
+@pytest.mark.parametrize("kept", ["none", "some", "no folder"])
+def test_nothing_is_to_be_trained_without_its_photographs(kept, own_room, tmp_path, splatseed):
+    images = own_room / "images"
+    gone = list(images.iterdir()) if kept == "none" else [images / "view_003.png"]
+    for each in gone:
+        each.unlink()
+    if kept == "no folder":
+        shutil.rmtree(images)
+    missing = {"none": "missing 12 of 12", "some": "view_003.png", "no folder": "beside the model"}
+    for words in (("upsample", own_room), ("upsample", own_room, "-o", tmp_path / "out")):
+        run = splatseed(*words)
+        assert run.code == 0, run.err
+        assert missing[kept] in run.out
+        assert "splatseed train" not in run.out
+        assert "splatseed tune" not in run.out
+        assert "gsplat" not in run.out
+    advised = lines_of(splatseed("upsample", own_room).out)
+    assert advised == lines_of(splatseed("info", own_room).out)
+    assert [words[0] for words in advised] == ["upsample"]
+
+
+def test_a_cloud_alone_is_advised_alike_by_both(room, tmp_path, monkeypatch, splatseed):
+    monkeypatch.chdir(tmp_path)
+    cloud = shutil.copy(room / "sparse" / "0" / "points3D.ply", tmp_path)
+    advised = splatseed("upsample", cloud)
+    assert "Points alone cannot be trained" in advised.out
+    assert lines_of(advised.out) == lines_of(splatseed("info", cloud).out)
+    assert follow(advised.out, splatseed) == ["upsample"]
+
+
+def test_only_trainers_that_undistort_are_named_for_a_distorted_scene(bent, tmp_path, splatseed):
+    run = splatseed("upsample", bent, "--method", "mls", "-o", tmp_path / "out")
+    after = run.out.partition("train it with\n")[2]
+    named = [line.split()[0] for line in after.splitlines() if line.startswith("  ")]
+    assert named == ["gsplat", "nerfstudio", "Brush"]
+    assert f"splatseed undistort {bent} -o {bent}_undistorted" in after
+
+
+def test_no_trainer_is_named_for_a_lens_that_few_know(capture, tmp_path, splatseed):
+    run = splatseed("upsample", capture, "-o", tmp_path / "out")
+    assert run.code == 0, run.err
+    assert "train it with" not in run.out
+    assert f"splatseed undistort {capture}" in run.out
+
+
+def test_undistorting_is_not_advised_again_afterwards(bent, tmp_path, splatseed):
+    pytest.importorskip("pycolmap", reason="undistorts")
+    run = splatseed("undistort", bent, "-o", tmp_path / "straight")
+    assert run.code == 0, run.err
+    assert "lens distortion" not in run.out + run.err
+
+
+def test_tune_names_the_scene_that_was_given(bent, tmp_path, splatseed):
+    pytest.importorskip("torch", reason="tune trains")
+    run = splatseed("tune", bent, "-o", tmp_path / "tuned")
+    assert run.code == 2
+    assert f"splatseed undistort {bent} -o {bent}_undistorted" in run.err
+    assert not (tmp_path / "tuned").exists()
+
+
+def test_maps_of_a_scene_without_points_are_used_without_alignment(
+    room, tmp_path, monkeypatch, splatseed
+):
+    monkeypatch.chdir(tmp_path)
+    scene = load_scene(room)
+    empty = scene.replace(points=scene.points.select(slice(0)), tracks=None)
+    path = write_scene(empty, tmp_path / "empty", require_points=False).path
+    run = splatseed("depth", path, "--stereo", "--max-size", 120, "--grid", 2, "-o", "maps")
+    assert run.code == 0, run.err
+    assert follow(run.out, splatseed) == ["info", "upsample"]
+    assert len(load_scene("OUT").points)
