@@ -137,3 +137,14 @@ def test_other_points_are_left_alone(settings, room):
     notes: list[str] = []
     assert seeded(scene, TrainSettings(**settings), notes.append, silent)[0] is scene
     assert not notes
+
+
+def test_beginning_with_its_own_points_is_not_advised_where_there_are_none(room):
+    settings = TrainSettings(seeding="auto", cap_max=500, max_steps=10)
+    notes: list[str] = []
+    empty = room.replace(points=room.points.select(slice(0)), tracks=None)
+    cloud = seeded(empty, settings, notes.append, silent)[0].points
+    assert len(cloud)
+    (said,) = [note for note in notes if note.startswith("Seeds by method auto")]
+    assert "--seeds scene" not in said
+    assert f"{len(cloud):,} points" in said

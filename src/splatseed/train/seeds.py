@@ -80,13 +80,18 @@ def seeded(
         progress=progress,
         note=note,
     )
-    new = len(cloud) - cloud.num_original
-    note(
-        f"Seeds by method auto: {cloud.num_original:,} points of the scene and {new:,} new ones, "
-        f"in {time.perf_counter() - start:.0f} s. --seeds scene begins with the scene's points as "
-        "they are."
-    )
+    note(_made(scene, cloud, time.perf_counter() - start))
     return scene.replace(points=cloud), results[-1] if results else None
+
+
+def _made(scene: Scene, cloud: PointCloud, seconds: float) -> str:
+    if not len(scene.points):
+        return f"Seeds by method auto: {len(cloud):,} points, in {seconds:.0f} s."
+    kept = cloud.num_original
+    return (
+        f"Seeds by method auto: {kept:,} points of the scene and {len(cloud) - kept:,} new ones, "
+        f"in {seconds:.0f} s. --seeds scene begins with the scene's points as they are."
+    )
 
 
 def usable_seeds(
