@@ -148,6 +148,18 @@ def test_a_transform_that_would_be_refused_itself_is_not_named(room, gaussians, 
             check_world(tmp_path / "model.ply", scene, small, given)
 
 
+def test_a_model_that_lies_a_little_apart_is_scored_with_a_doubt(room, gaussians, tmp_path):
+    """As another scene's does in a transform that happens to bring it near."""
+    scene = load_scene(room)
+    assert not check_world(tmp_path / "model.ply", scene, gaussians)
+    gap = np.median(np.linalg.norm(np.diff(gaussians.means, axis=0), axis=1))
+    beside = dataclasses.replace(gaussians, means=gaussians.means + np.float32([0, 0, 0.4 * gap]))
+    write_gaussians(tmp_path / "model.ply", beside)
+    model = load_model(tmp_path / "model.ply", room)
+    assert "times as far from the nearest Gaussian" in model.doubt
+    assert not load_model(tmp_path / "model.ply", room, transform="none").doubt
+
+
 def test_few_large_gaussians_are_still_a_model(room, gaussians, tmp_path):
     few = {name: array[::8] for name, array in gaussians.arrays().items()}
     few["scales"] = few["scales"] + np.float32(np.log(2.0))

@@ -99,8 +99,10 @@ def run(arguments: list[str]) -> None:
     _check_outputs(options, task)
     lpips, reason = _lpips(options)
     with stage_display() as clock:
-        result = _evaluate(options, task, lpips, reason, clock)
+        result, doubt = _evaluate(options, task, lpips, reason, clock)
     _summarise(options, task, result)
+    if doubt:
+        print_note(doubt)
 
 
 def _task(options: Options) -> _Task:
@@ -165,8 +167,11 @@ def _lpips(options: Options) -> tuple[Lpips | None, str]:
 
 def _evaluate(
     options: Options, task: _Task, lpips: Lpips | None, reason: str, clock: StageClock
-) -> EvalResult:
-    """Read the model and its scene, score the test views, and write what was asked for."""
+) -> tuple[EvalResult, str]:
+    """Read the model and its scene, score the test views, and write what was asked for.
+
+    Also returns why the model may be another scene's, if it may.
+    """
     from splatseed.evaluate import (  # noqa: PLC0415  (imports PyTorch)
         evaluate_model,
         load_model,
@@ -202,7 +207,7 @@ def _evaluate(
             write_renders(model, folder, clock)
     if options.output is not None:
         _write_json(options.output, options, task, result)
-    return result
+    return result, model.doubt
 
 
 def _write_json(path: Path, options: Options, task: _Task, result: EvalResult) -> None:

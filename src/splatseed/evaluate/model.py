@@ -58,12 +58,14 @@ class TrainedModel:
         views: The scene's test views, in its world.
         render: Renders the Gaussians from a view in the world.
         scene: The scene.
+        doubt: Why the Gaussians may not be in its world after all; empty if they surely are.
     """
 
     gaussians: Gaussians
     views: Sequence[View]
     render: Render
     scene: Scene
+    doubt: str = ""
 
 
 def load_model(
@@ -114,11 +116,10 @@ def load_model(
         progress=progress,
     )
     world = None if transform is None else find_transform(transform, scene)
-    if transform != NO_TRANSFORM:
-        check_world(path, scene, gaussians, world)
+    doubt = "" if transform == NO_TRANSFORM else check_world(path, scene, gaussians, world)
     frame = training_frame([view_in(world, view) for view in poses_of(train)])
     render = gaussian_renderer(gaussians, frame, device)
-    return TrainedModel(gaussians, views, lambda view: render(view_in(world, view)), scene)
+    return TrainedModel(gaussians, views, lambda view: render(view_in(world, view)), scene, doubt)
 
 
 def evaluate_model(

@@ -77,7 +77,7 @@ def find_transform(word: str, scene: Scene) -> Similarity | None:
 
 def check_world(
     path: Path, scene: Scene, gaussians: Gaussians, given: Similarity | None = None
-) -> None:
+) -> str:
     """Refuse a model that is not in the assumed world.
 
     Args:
@@ -86,16 +86,22 @@ def check_world(
         gaussians: The model.
         given: The transform that the user named.
 
+    Returns:
+        Why it is doubtful that it is, in a sentence; empty if it is not.
+
     Raises:
         SceneFormatError: It is in another world.
     """
     apart = _measure(scene, gaussians)
     if apart is None or (ratio := apart(given)) <= DOUBTFUL:
-        return
+        return ""
     ratios = [(word, apart(world)) for word, world in _candidates(path, scene)]
     closest = min(each for _, each in ratios)
     if _fits(ratio, closest):
-        return
+        return (
+            f"Points of the scene are {ratio:.1f} times as far from the nearest Gaussian as "
+            "Gaussians from each other: look at the renders before you trust the scores."
+        )
     closer = (word for word, each in ratios if each < ratio / CLOSER and each <= DOUBTFUL)
     word = next(closer, None)
     fix = (
