@@ -136,3 +136,10 @@ def test_numbers_are_aligned_to_the_right(capsys):
     print_table("title", ("name", "value"), [("a", "1"), ("b", "1000")])
     lines = capsys.readouterr().out.splitlines()[2:]
     assert len({len(line.rstrip()) for line in lines}) == 1
+
+
+def test_a_table_in_a_file_cuts_no_name_short(capsys):
+    name = "a photograph with quite a long name, taken at 1305031102.175304.png"
+    header = ("image", *(f"column {i}" for i in range(8)))
+    print_table("title", header, [(name, *"12345678")])
+    assert name in capsys.readouterr().out

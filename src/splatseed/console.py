@@ -52,6 +52,8 @@ class LiteralConsole(Console):
 
 OUT = LiteralConsole()
 ERR = LiteralConsole(stderr=True)
+WIDEST = 1000
+"""Most characters of a table's line in a file."""
 COMPILE = "compiling kernels"
 TOLD_AFTER = 3.0
 """Compilations shorter than this many seconds are not logged."""
@@ -182,7 +184,8 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
     for row in rows:
         table.add_row(*map(visible, row))
     _print_title(title)
-    OUT.print(table)
+    # A file has no edge at which names would have to be cut short.
+    (OUT if OUT.is_terminal else LiteralConsole(file=OUT.file, width=WIDEST)).print(table)
 
 
 def print_commands(title: str, commands: Sequence[tuple[str, str]]) -> None:
