@@ -19,7 +19,7 @@ from typing import NoReturn
 from rich.table import Table
 
 from splatseed.console import ERR, OUT
-from splatseed.errors import SplatseedError
+from splatseed.errors import ParameterError, ReconstructionError, SplatseedError
 from splatseed.literal import did_you_mean, visible
 
 __all__ = ["main"]
@@ -86,6 +86,8 @@ def _run(verb: str, words: list[str]) -> None:
         with _termination_raised():
             import_module(f"splatseed.commands.{verb}").run(words)
             sys.stdout.flush()
+    except (ParameterError, ReconstructionError) as error:
+        _fail(_spelled(error, verb, words))
     except SplatseedError as error:
         _fail(str(error))
     except MemoryError as error:
@@ -110,6 +112,14 @@ def _run(verb: str, words: list[str]) -> None:
         from splatseed.process.interruption import exit_code  # noqa: PLC0415  (as late as possible)
 
         sys.exit(TERMINATED if isinstance(stop, _Termination) else exit_code())
+
+
+def _spelled(error: SplatseedError, verb: str, words: list[str]) -> str:
+    """The error with parameters named as the verb's options."""
+    from splatseed.commands.spelling import in_options  # noqa: PLC0415  (loads tyro)
+
+    reports = verb == "bench" and words[:1] in (["report"], ["compare"])
+    return str(error) if reports else in_options(str(error), verb)
 
 
 def _open_closed_streams() -> None:

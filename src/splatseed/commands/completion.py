@@ -6,9 +6,9 @@ Promise: the options are those of the verbs; if none matches what was typed, fil
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from importlib import import_module
 
 from splatseed.commands.options import known_options
+from splatseed.commands.spelling import options_of
 from splatseed.errors import ParameterError
 
 __all__ = ["completion_script"]
@@ -35,18 +35,10 @@ def completion_script(words: Sequence[str], verbs: Sequence[str]) -> str:
             found=" ".join(words) or "no shell",
             fix='For bash: eval "$(splatseed --completion bash)" in ~/.bashrc.',
         )
-    options = {verb: _options_of(verb) for verb in verbs}
+    options = {verb: options_of(verb) for verb in verbs}
     for name, kind in _reports().items():
         options[f"bench {name}"] = known_options(kind)
     return (ZSH if words[0] == "zsh" else "") + _bash(verbs, options)
-
-
-def _options_of(verb: str) -> list[str]:
-    if verb == "upsample":
-        from splatseed.commands.upsample.command import HELP_ALL, full_options  # noqa: PLC0415
-
-        return [*known_options(full_options()), HELP_ALL]
-    return known_options(import_module(f"splatseed.commands.{verb}").Options)
 
 
 def _reports() -> Mapping[str, type]:

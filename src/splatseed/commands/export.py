@@ -14,6 +14,7 @@ from splatseed.console import print_commands, print_note, print_pairs, stage_dis
 from splatseed.errors import OutputError
 from splatseed.export import (
     FORMATS,
+    check_opacity,
     format_of_name,
     keep_gaussians,
     parse_crop,
@@ -58,6 +59,7 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "export", arguments)
     name = format_of_name(options.output)
     crop = None if options.crop is None else parse_crop(options.crop)
+    check_opacity(options.min_opacity)
     path = model_file(options.model)
     _check_output(options, path)
     with stage_display() as clock:

@@ -13,7 +13,7 @@ from splatseed.commands.models import model_file
 from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_pairs, stage_display
 from splatseed.errors import OutputError, ParameterError
-from splatseed.export import keep_gaussians, parse_crop
+from splatseed.export import check_opacity, keep_gaussians, parse_crop
 from splatseed.io.output.staging import check_parents
 from splatseed.requirements import require
 from splatseed.train.settings import Backend
@@ -113,6 +113,7 @@ def run(arguments: list[str]) -> None:
 def _check(options: Options) -> None:
     """Check what can be checked before any work starts."""
     check_video_name(options.output)
+    check_opacity(options.min_opacity)
     check_parents(options.output)
     if options.output.exists() and not options.overwrite:
         fix = "Pass --overwrite to replace it, or choose another name."

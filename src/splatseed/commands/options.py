@@ -18,7 +18,7 @@ import tyro
 from splatseed.errors import ParameterError
 from splatseed.literal import did_you_mean
 
-__all__ = ["known_options", "parse_options"]
+__all__ = ["check_least", "known_options", "parse_options"]
 
 Options = TypeVar("Options")
 
@@ -71,6 +71,27 @@ def parse_options(
             raise
         raise _complaint(kind, verb, said.getvalue(), arguments) from None
     return options
+
+
+def check_least(options: object, least: float, *names: str) -> None:
+    """Refuse numbers that are too small; None, for an option that is not given, is none.
+
+    Args:
+        options: The parsed options.
+        least: The least value.
+        names: The fields to check.
+
+    Raises:
+        ParameterError: One is smaller, or no number.
+    """
+    for name in names:
+        value = getattr(options, name)
+        if value is not None and not value >= least:
+            raise ParameterError(
+                f"{name} of {least:g} or more",  # spelled as an option in the end
+                found=f"{value}",
+                fix="Leave it out for the default.",
+            )
 
 
 def _complaint(kind: type[Any], verb: str, said: str, arguments: Sequence[str]) -> ParameterError:

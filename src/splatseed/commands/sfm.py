@@ -33,6 +33,8 @@ from splatseed.sfm.video import pick_frames
 __all__ = ["run"]
 
 NAMES_SHOWN = 5
+OF_LENS = ("camera_model", "shared_camera")
+"""Options for a lens that is not known yet."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "sfm", arguments)
+    _check(options)
     with stage_display() as clock:
         clock("prepare", 0.0)
         if is_video(options.images):
@@ -85,6 +88,24 @@ def run(arguments: list[str]) -> None:
         else:
             report = _reconstruct(options, options.images, clock)
     _summarise(options, report)
+
+
+def _check(options: Options) -> None:
+    """Refuse options that would have no effect.
+
+    Raises:
+        ParameterError: There is one.
+    """
+    if options.frames < 1:
+        raise ParameterError("--frames of 1 or more", found=f"{options.frames}", fix="Try 150.")
+    if options.frames != Options.frames and not is_video(options.images):
+        found = f"the folder {visible(options.images)}"
+        raise ParameterError("a video with --frames", found=found, fix="Leave --frames out.")
+    own = [name for name in OF_LENS if getattr(options, name) != getattr(Options, name)]
+    if options.poses_from is not None and own:
+        raise ParameterError(
+            "no options for a lens that --poses-from tells", found=", ".join(own), fix="Leave out."
+        )
 
 
 def _of_video(options: Options, clock: StageClock) -> SfmReport:

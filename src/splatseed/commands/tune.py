@@ -39,7 +39,7 @@ from splatseed.bench.tuning.validation import make_validation_scene
 from splatseed.commands.bench.display import run_display, spoken_time
 from splatseed.commands.bench.machine import Machine, open_machine
 from splatseed.commands.bench.options import Options as BenchOptions
-from splatseed.commands.options import parse_options
+from splatseed.commands.options import check_least, parse_options
 from splatseed.console import OUT, print_commands, print_note, print_table, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SplatseedError
 from splatseed.io.output.staging import atomic_file
@@ -203,8 +203,9 @@ def _kept_if_begun(folder: Path) -> Iterator[None]:
 
 
 def _check(options: Options) -> None:
-    if not options.minutes > 0:
-        raise ParameterError("--minutes above 0", found=f"{options.minutes}", fix="Give some.")
+    check_least(options, 1, "max_steps", "long_side", "jobs", "threads")
+    if not 0 < options.minutes < math.inf:
+        raise ParameterError("--minutes above 0", found=f"{options.minutes}", fix="Try 30.")
     for name, needed in (("methods", SFM), ("strategies", "default")):
         if needed not in getattr(options, name):
             raise ParameterError(

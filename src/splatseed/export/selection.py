@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64
 from splatseed.errors import ParameterError
 from splatseed.splat.gaussians import Gaussians
 
-__all__ = ["Crop", "keep_gaussians", "parse_crop"]
+__all__ = ["Crop", "check_opacity", "keep_gaussians", "parse_crop"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +49,18 @@ def parse_crop(text: str) -> Crop:
     return Crop(numbers[:3], numbers[3:])
 
 
+def check_opacity(min_opacity: float) -> None:
+    """Refuse a lowest opacity that is not from 0 to 1.
+
+    Raises:
+        ParameterError: It is not.
+    """
+    if not 0 <= min_opacity < 1:
+        raise ParameterError(
+            "--min-opacity of 0 or more, less than 1", found=f"{min_opacity}", fix="Try 0.05."
+        )
+
+
 def keep_gaussians(
     gaussians: Gaussians, crop: Crop | None = None, min_opacity: float = 0.0
 ) -> Gaussians:
@@ -62,10 +74,7 @@ def keep_gaussians(
     Raises:
         ParameterError: The opacity is out of range, or no Gaussian is left.
     """
-    if not 0 <= min_opacity < 1:
-        raise ParameterError(
-            "--min-opacity of 0 or more, less than 1", found=f"{min_opacity}", fix="Try 0.05."
-        )
+    check_opacity(min_opacity)
     keep = _opaque(gaussians, min_opacity)
     if crop is not None:
         keep &= ((gaussians.means >= crop.low) & (gaussians.means <= crop.high)).all(axis=1)

@@ -18,6 +18,7 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.pointcloud import ATTRIBUTES, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
+from splatseed.stereo.settings import MOST_GRID
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
@@ -78,6 +79,9 @@ class PhotographMethod:
             if field.name in {"spacing", "cell"}:
                 value = getattr(self, field.name)
                 require(1 <= value <= 256, f"{self.name}.{field.name} from 1 to 256", value)
+            if field.name == "grid":
+                grid = getattr(self, field.name)
+                require(1 <= grid <= MOST_GRID, f"{self.name}.grid from 1 to {MOST_GRID}", grid)
 
     def __call__(
         self,

@@ -18,6 +18,7 @@ __all__ = [
     "AS_3DGS",
     "BUDGET",
     "BYTES_EACH",
+    "LEAST_GAUSSIANS",
     "Backend",
     "Placing",
     "Seeding",
@@ -32,6 +33,7 @@ Backend = Literal["auto", "cpu", "cuda"]
 Placing = Literal["stereo", "none"]
 Seeding = Literal["auto", "scene"]
 
+LEAST_GAUSSIANS = 2
 BUDGET = 1_000_000
 """Default cap of the strategies that have a budget."""
 AS_3DGS = "-3dgs"
@@ -111,7 +113,11 @@ class TrainSettings:
             self._require(name, getattr(self, name) in known, f"one of {', '.join(known)}")
         for name, least in (("max_steps", 1), ("data_factor", 1), ("seed", 0), ("test_every", 2)):
             self._require(name, getattr(self, name) >= least, f"{least} or more")
-        self._require("cap_max", self.cap_max is None or self.cap_max >= 2, "2 or more")
+        self._require(
+            "cap_max",
+            self.cap_max is None or self.cap_max >= LEAST_GAUSSIANS,
+            f"{LEAST_GAUSSIANS} or more",
+        )
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0 to 3")
 
     def _require(self, name: str, fits: bool, expected: str) -> None:
@@ -128,6 +134,15 @@ class TrainSettings:
         if self.strategy == "auto":
             return "mcmc" if self.max_steps >= LONG_RUN else "grow"
         return cast("Densification", self.strategy.removesuffix(AS_3DGS))
+
+    @property
+    def idle(self) -> tuple[str, ...]:
+        """Names of settings that differ from their defaults, but not for this strategy."""
+        given = (
+            ("opacity_reset", self.opacity_reset, "default"),
+            ("placing", self.placing != "stereo", "grow"),
+        )
+        return tuple(name for name, set_, of in given if set_ and self.densification != of)
 
     @property
     def schedule(self) -> Schedule:

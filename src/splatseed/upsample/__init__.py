@@ -221,12 +221,18 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
                 found=f"{ratio:g}" if isinstance(ratio, Real) else repr(ratio),
                 fix="Give --ratio 8 for eight times as many points.",
             )
-        num_points = round(min(ratio * num_original, 2.0 * MAX_POINTS))
+        if ratio * num_original > MAX_POINTS:
+            raise ParameterError(
+                f"a ratio that gives {MAX_POINTS:,} points at most",
+                found=f"{ratio:g} for {num_original:,} originals",
+                fix="Ask for fewer.",
+            )
+        num_points = round(ratio * num_original)
     if not isinstance(num_points, (int, np.integer)) or num_points > MAX_POINTS:
         raise ParameterError(
             f"a whole number of points, {MAX_POINTS:,} at most",
             found=f"{num_points:,}" if isinstance(num_points, (int, float)) else repr(num_points),
-            fix="Ask for fewer, or check the ratio.",
+            fix="Ask for fewer.",
         )
     if num_points < num_original:
         raise ParameterError(

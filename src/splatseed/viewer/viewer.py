@@ -36,15 +36,22 @@ STEP_BACK = 0.6
 """How far behind the first camera a browser begins, on the stage, so that it sees that camera."""
 
 
-def free_port(host: str, port: int) -> int:
+def free_port(host: str, port: int, option: str = "--port") -> int:
     """A port that can be listened on: the one asked for, or any free port for 0.
+
+    Args:
+        host: The address to listen on.
+        port: The port.
+        option: The option by which the user names it.
 
     Raises:
         ParameterError: The port is taken or out of range, or the host is not this machine's.
     """
     if not 0 <= port <= MOST_PORT:
         raise ParameterError(
-            f"--port from 0 to {MOST_PORT}", found=f"{port}", fix="Pass another (0: any free one)."
+            f"{option} from 0 to {MOST_PORT}",
+            found=f"{port}",
+            fix="Pass another (0: any free one).",
         )
     try:
         with socket.socket() as probe:
@@ -53,9 +60,9 @@ def free_port(host: str, port: int) -> int:
             return int(probe.getsockname()[1])
     except OSError as error:
         raise ParameterError(
-            f"to listen on --host {host} --port {port}",
+            f"to listen on address {host}, {option} {port}",
             found=error.strerror or str(error),
-            fix="Pass another --port (0: any free one); --host 127.0.0.1 is this machine alone.",
+            fix=f"Pass another {option} (0: any free one); 127.0.0.1 is this machine alone.",
         ) from None
 
 

@@ -221,9 +221,10 @@ def _load_view(
     height, width = photograph.shape[:2]
     if min(width, height) < min_side:
         raise SceneFormatError(
-            f"{path} to have at least {min_side} pixels a side at --data-factor {data_factor}",
+            f"{path} to have at least {min_side} pixels a side, reduced by a factor of "
+            f"{data_factor}",
             found=f"{width} x {height}",
-            fix="Choose a smaller --data-factor.",
+            fix="Choose a smaller --data-factor, or a larger --long-side.",
         )
     camera = image.camera
     scale = _file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor

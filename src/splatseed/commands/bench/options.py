@@ -18,7 +18,7 @@ import tyro
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
 from splatseed.bench.planning.plan_file import read_plan
 from splatseed.bench.planning.presets import PRESETS, PresetName, preset_plan
-from splatseed.commands.options import parse_options
+from splatseed.commands.options import check_least, parse_options
 from splatseed.errors import ParameterError
 from splatseed.train.settings import StrategyName, TrainSettings
 from splatseed.upsample import Profile
@@ -193,10 +193,7 @@ def _check(options: Options) -> None:
             found="--scenes",
             fix="Leave --scenes out, or take --plan: --dry-run prints the preset's.",
         )
-    for name in ("jobs", "threads"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            raise ParameterError(f"--{name} of 1 or more", found=f"{value}", fix="Leave it out.")
+    check_least(options, 1, "jobs", "threads", "repeats", "long_side")
     if options.address is not None and options.executor != "ray":
         raise ParameterError("--executor ray with --address", found="local", fix="Add it.")
 
@@ -219,7 +216,9 @@ def _changes(options: Options) -> dict[str, Any]:
     """The fields of the plan that are given as options."""
     names = {each.name for each in dataclasses.fields(Plan)} - {"scenes", "parameters", "training"}
     given = {name: getattr(options, name) for name in names}
-    changes = {name: value for name, value in given.items() if value not in (None, (), False)}
+    # By identity: 0 equals False.
+    idle = {name for name, value in given.items() if value in (None, ()) or value is False}
+    changes = {name: value for name, value in given.items() if name not in idle}
     changes["training"] = options.training.settings
     if options.budgets and not options.ratios:
         changes["ratios"] = ()

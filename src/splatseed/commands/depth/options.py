@@ -11,9 +11,11 @@ from typing import Annotated, Any
 
 import tyro
 
+from splatseed.commands.options import check_least
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError
 from splatseed.monocular import DeviceName
+from splatseed.stereo.settings import MOST_GRID
 
 __all__ = ["Options", "check_together"]
 
@@ -101,6 +103,11 @@ def check_together(options: Options) -> None:
             found="both" if options.stereo else "neither",
             fix="Name a network with --model, or match the photographs themselves with --stereo.",
         )
+    check_least(options, 0, "seed")
+    check_least(options, 1, "grid", "batch", "max_size", "input_size", "input_multiple")
+    if (options.grid or 1) > MOST_GRID:
+        found = f"{options.grid}"
+        raise ParameterError(f"--grid from 1 to {MOST_GRID}", found=found, fix="Try 4.")
     idle = _given(options, _OF_NETWORK if options.stereo else _OF_STEREO)
     if idle:
         raise ParameterError(

@@ -35,7 +35,14 @@ from splatseed.train.schedule import FULL_RUN
 from splatseed.train.seeds import most_seeds
 from splatseed.train.settings import BUDGET, TrainSettings
 
-__all__ = ["Planned", "advice_commands", "advice_for", "advice_rows", "run_advice"]
+__all__ = [
+    "ADVICE_OPTIONS",
+    "Planned",
+    "advice_commands",
+    "advice_for",
+    "advice_rows",
+    "run_advice",
+]
 
 Budget = Annotated[
     str | None,
@@ -170,6 +177,9 @@ class _Options:
     """Most Gaussians at the end of training: a number, or per pixel of a photograph."""
     max_steps: int = FULL_RUN
     """Steps that you plan to train."""
+
+
+ADVICE_OPTIONS = ("--budget", "--max-steps")
 
 
 def run_advice(arguments: list[str]) -> None:

@@ -42,7 +42,13 @@ from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
 from splatseed.seeding.amounts import parse_budget
 from splatseed.train.record.folder import RunFolder
-from splatseed.train.settings import BUDGET, Seeding, StrategyName, TrainSettings
+from splatseed.train.settings import (
+    BUDGET,
+    LEAST_GAUSSIANS,
+    Seeding,
+    StrategyName,
+    TrainSettings,
+)
 from splatseed.views.photographs import user_cache_dir
 from splatseed.views.view import poses_of
 
@@ -121,6 +127,8 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "train", arguments)
     settings = options.settings
     require("torch", "gsplat")
+    if options.view_port != Options.view_port and not options.view:
+        raise ParameterError("--view with --view-port", found="none", fix="Add it.")
     port = view_port(options.view_port) if options.view else None
     notes: list[str] = []
     if options.resume and not RunFolder(options.output).is_run:
@@ -187,7 +195,14 @@ def _within_budget(
     views = poses_of(scene.images, settings.data_factor)
     pixels = median_pixels(views) if views else 0
     if options.budget is not None:
-        return replace(settings, cap_max=parse_budget(options.budget, pixels))
+        cap = parse_budget(options.budget, pixels)
+        if cap < LEAST_GAUSSIANS:
+            raise ParameterError(
+                f"--budget of {LEAST_GAUSSIANS} Gaussians or more",
+                found=f"{options.budget}",
+                fix="Try 0.25rho.",
+            )
+        return replace(settings, cap_max=cap)
     cap = max(2, min(BUDGET, round(pixels)))
     note(f"At most {cap:,} Gaussians, one for each pixel of a photograph; --budget sets another.")
     return replace(settings, cap_max=cap)
@@ -198,6 +213,9 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
     for note in notes:
         print_note(note)
     settings, views = training.settings, training.trainer.train_views
+    for name in settings.idle:
+        option = f"--{name.replace('_', '-')}"
+        print_note(f"{option} has no effect with strategy {settings.densification}.")
     OUT.print(
         f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} "
         f"test views of {views[0].width} x {views[0].height}, "

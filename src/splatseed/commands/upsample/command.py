@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import numpy as np
 import tyro
 
-from splatseed.commands.info.advice import run_advice
-from splatseed.commands.options import parse_options
+from splatseed.commands.info.advice import ADVICE_OPTIONS, run_advice
+from splatseed.commands.options import known_options, parse_options
+from splatseed.commands.upsample.checks import check_options
 from splatseed.commands.upsample.cloud import CLOUD, Bringing, bring_clouds, settle_cloud
 from splatseed.commands.upsample.flags import (
     budget_flag,
@@ -236,9 +237,10 @@ def run(arguments: list[str]) -> None:
             fix="splatseed upsample SCENE says whether it needs seeds; with -o OUT it makes them.",
         )
     if asks_what_to_do(arguments):
-        run_advice(arguments)
+        _advise(arguments)
         return
     options, methods = parse(arguments)
+    check_options(options)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     given = (options.scene, options.depth_maps, options.cloud_transform, *options.cloud_files)
     inputs = [path for path in given if path is not None]
@@ -251,6 +253,11 @@ def run(arguments: list[str]) -> None:
     if source is not None:
         run_tiled(options, methods, source, _provenance)
         return
+    _run_in_memory(options, methods)
+
+
+def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
+    """Upsample a scene that fits into memory whole."""
     notes: list[str] = []
     with stage_display() as clock:
         clock("read", 0.0)
@@ -288,6 +295,22 @@ def run(arguments: list[str]) -> None:
     summarise(options.scene, scene, seeds, report, seconds, checks, options.output, files)
     for sentence in notes:
         print_note(sentence)
+
+
+def _advise(arguments: list[str]) -> None:
+    """Say what to do with a scene; options of upsampling need an output."""
+    try:
+        run_advice(arguments)
+    except ParameterError:
+        given = [word.partition("=")[0] for word in arguments]
+        known = {*known_options(full_options()), HELP_ALL} - set(ADVICE_OPTIONS)
+        if needing := [word for word in given if word in known]:
+            raise ParameterError(
+                f"-o OUT, the scene folder to write, with {', '.join(needing)}",
+                found="none",
+                fix="Name it; without it, splatseed upsample SCENE only says what to do.",
+            ) from None
+        raise
 
 
 def asks_what_to_do(arguments: Sequence[str]) -> bool:

@@ -33,7 +33,7 @@ def cover_flag() -> Any:
         name="cover",
         constructor=int,
         metavar="INT",
-        help_behavior_hint="(default: none; auto and cover do so anyway)",
+        help_behavior_hint="(default: none; auto and cover have --auto.cell and --cover.cell)",
     )
 
 
