@@ -7,13 +7,27 @@ a new line, nor change the command it is printed in.
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import unicodedata
 from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
 
-__all__ = ["did_you_mean", "quoted", "visible"]
+__all__ = ["beginning", "did_you_mean", "quoted", "told", "visible"]
+
+MOST_TOLD = 160
+OBJECT = re.compile(r"<[\w.]+[^<>]*(?: at 0x[0-9a-f]+|name=[^<>]*)>")
+"""How Python shows an object that has no text of its own."""
+SAID = {
+    "builtins.IndexError": "fewer values than expected",
+    "builtins.RecursionError": "values nested too deep",
+    "builtins.TypeError": "a value of another kind",
+    "builtins.UnicodeDecodeError": "bytes that are not UTF-8 text",
+    "PIL.UnidentifiedImageError": "no picture of a known format",
+    "struct.error": "fewer bytes than expected",
+}
+"""Exceptions whose own words are meant for programmers."""
 
 
 def visible(text: object, keep: str = "") -> str:
@@ -42,6 +56,37 @@ def quoted(path: Path | str) -> str:
     if all(map(_shows, text)):
         return shlex.quote(text)
     return "$'" + "".join(map(_ansi_c, text)) + "'"
+
+
+def told(error: Exception) -> str:
+    """What the exception of a library says about a file, in words for its user.
+
+    Example:
+        >>> told(KeyError("scale")), told(ValueError("File is not a zip file"))
+        ("no 'scale'", 'File is not a zip file')
+    """
+    kind = type(error).__name__
+    said = SAID.get(f"{type(error).__module__}.{kind}")
+    text = " ".join(OBJECT.sub("", str(error)).split())[:MOST_TOLD]
+    if isinstance(error, KeyError):
+        return f"no {text}"
+    return said or (text if " " in text else f"{kind} {text}".strip())
+
+
+def beginning(data: bytes, most: int = 16) -> str:
+    r"""The first bytes of a file: as text if they are text, else as hexadecimal numbers.
+
+    Example:
+        >>> print(beginning(b"solid\n"), "and", beginning(bytes([137, 80, 0])))
+        'solid' and the bytes 89 50 00
+    """
+    first = data[:most]
+    if not first:
+        return "an empty file"
+    text = first.decode("ascii", "replace").strip()
+    if text and text.isprintable() and "\ufffd" not in text:
+        return repr(text)
+    return f"the bytes {first.hex(' ')}"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
 import zipfile
@@ -121,3 +122,51 @@ def test_numbers_are_no_weights(tmp_path):
     np.save(tmp_path / "weights.npy", np.zeros(3))
     with pytest.raises(SceneFormatError, match="LPIPS"):
         load_lpips("alex", tmp_path / "weights.npy")
+
+
+PYTHON = re.compile(r"<\w+[.\w]* |0x[0-9a-f]{5}|\bb['\"]|\\x|\b\w+Error\b")
+"""What only Python's programmers understand."""
+JUNK = {"bytes": bytes([137, 3, 0, 255, 13]) * 40, "text": b"some words\n" * 9, "empty": b""}
+
+
+@pytest.mark.parametrize("junk", JUNK)
+@pytest.mark.parametrize(
+    "words",
+    [
+        "info junk.ply",
+        "info junk.npz",
+        "info junk.las",
+        "info room",
+        "upsample room -o out",
+        "train room -o out --max-steps 1",
+        "sfm room/images -o out",
+        "depth room --stereo -o out",
+        "info room --depth maps",
+        "info transforms",
+        "export junk.ply -o out.splat",
+        "export junk.spz -o out.splat",
+        "export junk.sog -o out.splat",
+        "upsample room -o out --cloud junk.ply",
+        "upsample room -o out --cloud junk.ply --transform junk.json",
+    ],
+)
+def test_junk_is_told_without_python(words, junk, own_room, tmp_path, monkeypatch, splatseed):
+    if words.startswith("sfm"):
+        pytest.importorskip("pycolmap", reason="sfm needs pycolmap")
+    if "las" in words:
+        pytest.importorskip("laspy", reason="reads .las")
+    monkeypatch.chdir(tmp_path)
+    own_room.rename("room")
+    (tmp_path / "maps").mkdir()
+    for image in sorted((tmp_path / "room" / "images").iterdir()):
+        (tmp_path / "maps" / f"{image.stem}.npy").write_bytes(JUNK[junk])
+        image.write_bytes(JUNK[junk])
+    (tmp_path / "transforms").mkdir()
+    for name in ("ply", "npz", "las", "spz", "sog", "json"):
+        (tmp_path / f"junk.{name}").write_bytes(JUNK[junk])
+    (tmp_path / "transforms" / "transforms.json").write_bytes(JUNK[junk])
+    run = splatseed(*words.split())
+    assert not PYTHON.search(run.out + run.err), run
+    if words != "info room":  # which lists photographs that cannot be read
+        _refused(run)
+        assert not (tmp_path / "out").exists()

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.literal import did_you_mean
+from splatseed.literal import beginning, did_you_mean
 
 __all__ = ["ELSEWHERE", "FORMATS", "SUFFIXES", "Format", "detect_format", "format_of_name"]
 
@@ -105,7 +105,7 @@ def _begins_gzipped(data: bytes, mark: bytes) -> bool:
 
 
 def _unknown(path: Path, data: bytes) -> SceneFormatError:
-    found = repr(data[:16]) if data else "an empty file"
+    found = beginning(data)
     fix = "Name a file of trained Gaussians."
     if data.startswith(b"glTF"):
         found, fix = "a binary glTF", "Export a .ply where it came from: splatseed reads no glTF."

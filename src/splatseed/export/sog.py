@@ -30,6 +30,7 @@ from splatseed.export.packing import (
 )
 from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.files import read_bytes
+from splatseed.literal import told
 from splatseed.progress import Progress, silent
 from splatseed.splat.gaussians import Gaussians
 
@@ -94,7 +95,7 @@ def decode(path: Path) -> Gaussians:
     try:
         return _decoded(path, _opened(path))
     except ARCHIVE_FAILURES as error:
-        raise _damaged(path, f"{type(error).__name__}: {error}") from None
+        raise _damaged(path, told(error)) from None
 
 
 def _decoded(path: Path, content: Callable[[str], bytes]) -> Gaussians:

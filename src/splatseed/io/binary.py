@@ -15,6 +15,7 @@ import numpy as np
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.files import read_bytes
+from splatseed.literal import beginning
 
 __all__ = ["ByteReader"]
 
@@ -81,7 +82,7 @@ class ByteReader:
         try:
             text = raw.decode("utf-8")
         except UnicodeDecodeError:
-            raise self.error("a name in UTF-8", repr(raw[:80])) from None
+            raise self.error("a name in UTF-8", beginning(raw, 80)) from None
         self.offset = end + 1
         return text
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splatseed.io.files import open_file
+from splatseed.literal import told
 from splatseed.scene import Image
 
 __all__ = ["image_warnings", "lens_warnings"]
@@ -62,7 +63,7 @@ def _size_warning(image: Image, image_dir: Path) -> str | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, UnidentifiedImageError, PilImage.DecompressionBombError) as error:
-        return f"{image.name} cannot be read: {error}."
+        return f"{image.name} cannot be read: {told(error)}."
     expected = (image.intrinsics.width, image.intrinsics.height)
     if size == expected:
         return None

@@ -16,6 +16,7 @@ import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_file
+from splatseed.literal import told
 from splatseed.scene import Scene
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
     try:
         return Image.open(BytesIO(encoded))
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError) as error:
-        raise _unusable(path, type(error).__name__) from None
+        raise _unusable(path, told(error)) from None
 
 
 def decode_photograph(path: Path, encoded: bytes) -> PilImage.Image:
@@ -160,7 +161,7 @@ def _over_black(photograph: PilImage.Image) -> PilImage.Image:
 
 
 def _damaged(path: Path, error: Exception) -> SceneFormatError:
-    return _unusable(path, f"an image cut short or damaged ({error})")
+    return _unusable(path, f"an image cut short or damaged ({told(error)})")
 
 
 def _unusable(path: Path, found: str) -> SceneFormatError:

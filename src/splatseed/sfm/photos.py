@@ -17,7 +17,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import VIDEO_SUFFIXES, open_file
 from splatseed.io.output.manifest import kind_of
-from splatseed.literal import quoted
+from splatseed.literal import quoted, told
 from splatseed.scene import Image, Scene
 
 __all__ = ["Photo", "find_photos", "match_poses", "name_some"]
@@ -149,7 +149,7 @@ def _read_photo(image_dir: Path, name: str) -> Photo | None:
     except (OSError, SyntaxError, ValueError, PilImage.DecompressionBombError) as error:
         raise SceneFormatError(
             f"{path} to be a readable image",
-            found=str(error),
+            found=told(error),
             fix="Export it again, or take it out of the folder.",
         ) from error
     return Photo(name, width, height)

@@ -223,7 +223,7 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
             )
         if ratio * num_original > MAX_POINTS:
             raise ParameterError(
-                f"a ratio that gives {MAX_POINTS:,} points at most",
+                f"a ratio for a number of points of {MAX_POINTS:,} at most",
                 found=f"{ratio:g} for {num_original:,} originals",
                 fix="Ask for fewer.",
             )

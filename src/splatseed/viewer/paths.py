@@ -20,6 +20,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_bytes
+from splatseed.literal import told
 from splatseed.similarity import Similarity
 from splatseed.splat.frame import stray_views
 from splatseed.splat.gaussians import Gaussians
@@ -152,7 +153,7 @@ def path_of_file(path: Path, size: tuple[int, int]) -> tuple[list[View], float |
     except SceneNotFoundError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise _no_path(path, f"{type(error).__name__}: {error}") from None
+        raise _no_path(path, told(error)) from None
     if not 0 < len(views) <= MOST_FRAMES:
         raise _no_path(path, f"{len(views)} cameras")
     return views, fps

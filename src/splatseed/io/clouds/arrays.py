@@ -22,6 +22,7 @@ from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.clouds.cloud_file import CHUNK, CloudChunk, CloudFile
 from splatseed.io.clouds.colors import ColorRange
 from splatseed.io.clouds.rows import COPY_AGAIN
+from splatseed.literal import told
 from splatseed.process.memory import check_memory
 
 __all__ = ["CONFIDENCES", "LEAST", "MASKS", "POSITIONS", "NpzCloud"]
@@ -199,5 +200,5 @@ def _of_size(members: dict[str, _Member], names: tuple[str, ...], count: int) ->
 
 
 def _damaged(path: Path, error: Exception) -> SceneFormatError:
-    found = " ".join(str(error).split())[:160]
-    return SceneFormatError(f"{path} to be an archive of NumPy arrays", found=found, fix=COPY_AGAIN)
+    expected = f"{path} to be an archive of NumPy arrays"
+    return SceneFormatError(expected, found=told(error), fix=COPY_AGAIN)

@@ -22,6 +22,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.clouds.cloud_file import CHUNK, CloudChunk, CloudFile
 from splatseed.io.clouds.rows import COPY_AGAIN, check_size
 from splatseed.io.files import open_file
+from splatseed.literal import told
 
 __all__ = ["GlbCloud"]
 
@@ -83,7 +84,7 @@ class GlbCloud(CloudFile):
             content, body = _read_json(path)
             parts = list(_parts(path, content, body))
         except (KeyError, IndexError, TypeError, ValueError, struct.error) as error:
-            raise _damaged(path, f"{type(error).__name__}: {error}") from None
+            raise _damaged(path, told(error)) from None
         drawn = [part for part in parts if part.mode == _POINTS]
         self._parts = tuple(drawn or parts)
         if not self._parts:

@@ -21,6 +21,7 @@ from splatseed.depthmap import DepthKind
 from splatseed.errors import SceneFormatError
 from splatseed.io.archives import ARCHIVE_FAILURES, ARRAY_FAILURES
 from splatseed.io.files import read_bytes
+from splatseed.literal import beginning, told
 
 __all__ = [
     "KINDS",
@@ -93,7 +94,7 @@ def read_npz(path: Path) -> StoredDepth:
                 _as_map(path, _parse_npy(path, _member(path, archive, wanted))), kind
             )
     except ARCHIVE_FAILURES as error:
-        refuse(path, "the archive of np.savez", f"{type(error).__name__}: {error}")
+        refuse(path, "the archive of np.savez", told(error))
 
 
 def read_pfm(path: Path) -> StoredDepth:
@@ -108,13 +109,13 @@ def read_pfm(path: Path) -> StoredDepth:
     data = read_bytes(path)
     header = _PFM_HEADER.match(data)
     if header is None or header[1] != b"Pf":
-        refuse(path, "a one-channel float map (Pf)", repr(data[:16]))
+        refuse(path, "a one-channel float map (Pf)", beginning(data))
     try:
         scale = float(header[4])
     except ValueError:
         scale = 0.0
     if not (math.isfinite(scale) and scale):
-        refuse(path, "a scale whose sign is the byte order", repr(header[4]))
+        refuse(path, "a scale whose sign is the byte order", beginning(header[4]))
     dtype = _FLOAT if scale < 0 else _FLOAT.newbyteorder(">")
     shape = (int(header[3]), int(header[2]))
     return StoredDepth(_body(path, data, header.end(), shape, dtype)[::-1])
@@ -130,7 +131,7 @@ def read_colmap_depth(path: Path) -> StoredDepth:
     data = read_bytes(path)
     header = _BIN_HEADER.match(data)
     if header is None or int(header[3]) != 1:
-        refuse(path, "a depth map of COLMAP's (W&H&1&)", repr(data[:16]))
+        refuse(path, "a depth map of COLMAP's (W&H&1&)", beginning(data))
     shape = (int(header[2]), int(header[1]))
     return StoredDepth(_body(path, data, header.end(), shape, _FLOAT))
 
@@ -168,12 +169,14 @@ def _body(
 
 def _parse_npy(path: Path, data: bytes) -> np.ndarray:
     """The array of a ``.npy`` file's bytes."""
+    if not data.startswith(npy_format.MAGIC_PREFIX):
+        refuse(path, "a NumPy array", beginning(data))
     stream = io.BytesIO(data)
     try:
         version = npy_format.read_magic(stream)
         shape, fortran, dtype = _NPY_HEADERS[version](stream)
     except ARRAY_FAILURES as error:
-        refuse(path, "the header of a NumPy array", f"{type(error).__name__}: {error}")
+        refuse(path, "the header of a NumPy array", told(error))
     if dtype.hasobject:
         refuse(path, "real numbers", "Python objects")
     count, start = math.prod(shape), stream.tell()

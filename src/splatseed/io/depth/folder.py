@@ -24,6 +24,7 @@ from splatseed.io.depth.arrays import KINDS, check_stored
 from splatseed.io.files import read_bytes
 from splatseed.io.output.layouts import write_json
 from splatseed.io.output.staging import MANIFEST, output_folder
+from splatseed.literal import told
 
 __all__ = [
     "CAMERA_FILE",
@@ -174,7 +175,7 @@ def _read_object(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(read_bytes(path).decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        wrong = f"{type(error).__name__}: {error}"
+        wrong = told(error)
     else:
         if isinstance(content, dict):
             return content

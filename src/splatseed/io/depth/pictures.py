@@ -18,6 +18,7 @@ import numpy as np
 
 from splatseed.io.depth.arrays import StoredDepth, check_stored, refuse
 from splatseed.io.files import read_bytes
+from splatseed.literal import told
 from splatseed.requirements import require
 
 __all__ = ["read_exr", "read_picture"]
@@ -47,7 +48,7 @@ def read_picture(path: Path) -> StoredDepth:
             mode, is_png = picture.mode, picture.format == "PNG"
             values = np.asarray(picture) if mode in _GREY else None
     except (*_PILLOW_FAILURES, PilImage.DecompressionBombError) as error:
-        refuse(path, "a readable PNG or TIFF", f"{type(error).__name__}: {error}")
+        refuse(path, "a readable PNG or TIFF", told(error))
     if values is None:
         refuse(path, "one channel of 8, 16 or 32 bits", f"a picture of mode {mode}")
     if is_png and values.dtype == np.int32:  # how some versions of Pillow open 16 bits
@@ -73,7 +74,7 @@ def read_exr(path: Path) -> StoredDepth:
         with openexr.File(str(path), separate_channels=True) as file:
             values = _channel(path, {key: each.pixels for key, each in file.channels().items()})
     except (*_EXR_FAILURES, MemoryError) as error:
-        refuse(path, "a readable OpenEXR picture", f"{type(error).__name__}: {error}")
+        refuse(path, "a readable OpenEXR picture", told(error))
     check_stored(path, values.shape, values.dtype)
     return StoredDepth(values)
 

@@ -26,6 +26,7 @@ from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError
 from splatseed.io.colmap.model import MAX_ID, make_intrinsics
 from splatseed.io.files import open_file, read_bytes
+from splatseed.literal import told
 from splatseed.scene import Image
 
 __all__ = ["OPENCV_FROM_OPENGL", "Transforms", "apply_transform", "read_transforms"]
@@ -202,7 +203,7 @@ def _size(where: str, values: Mapping[str, Any], file: Path) -> tuple[int, int]:
             return picture.size
     except (OSError, ValueError, PilImage.DecompressionBombError) as error:
         raise SceneFormatError(
-            f"w and h, or a readable image, in {where}", found=str(error), fix=_FIX
+            f"w and h, or a readable image, in {where}", found=told(error), fix=_FIX
         ) from None
 
 

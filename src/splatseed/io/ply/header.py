@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from splatseed.errors import SceneFormatError
+from splatseed.literal import beginning
 
 __all__ = ["EXPORT_PLY_AGAIN", "Element", "Header", "Property", "parse_header"]
 
@@ -88,7 +89,7 @@ def parse_header(path: Path, data: bytes) -> Header:
     if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
         raise SceneFormatError(
             f"{path} to be a PLY file: a line 'ply', a header, a line 'end_header'",
-            found=repr(data[:20]) if data else "an empty file",
+            found=beginning(data, 20),
             fix=EXPORT_PLY_AGAIN,
         )
     lines = _lines(path, data[: end.start()])

@@ -15,6 +15,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.depth.folder import CAMERA_FILE
 from splatseed.io.files import open_file, read_file
+from splatseed.literal import told
 
 __all__ = ["check_size", "find_camera_file", "read_intrinsics", "read_text"]
 
@@ -39,7 +40,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     except (KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
         raise SceneFormatError(
             f'{path} to hold {{"camera": {{w, h, fx, fy, cx, cy}}}} as numbers',
-            found=f"{type(error).__name__}: {error}",
+            found=told(error),
             fix="Write the camera's size, focal lengths and principal point in pixels.",
         ) from error
     values = (width, height, fx, fy)
@@ -66,7 +67,7 @@ def check_size(path: Path, intrinsics: Intrinsics) -> None:
             size = image.size
     except (OSError, ValueError, PilImage.DecompressionBombError) as error:
         raise SceneFormatError(
-            f"{path} to be a readable image", found=str(error), fix="Export the frame again."
+            f"{path} to be a readable image", found=told(error), fix="Export the frame again."
         ) from error
     if size != expected:
         raise SceneFormatError(
@@ -91,5 +92,5 @@ def read_text(path: Path) -> str:
         ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise SceneFormatError(
-            f"{path} to be a readable text file", found=str(error), fix="Check the file."
+            f"{path} to be a readable text file", found=told(error), fix="Check the file."
         ) from error
