@@ -165,6 +165,17 @@ def test_tune_names_the_scene_that_was_given(bent, tmp_path, splatseed):
     assert not (tmp_path / "tuned").exists()
 
 
+def test_maps_that_give_few_points_are_asked_for_few(room, tmp_path, monkeypatch, splatseed):
+    monkeypatch.chdir(tmp_path)
+    run = splatseed("depth", room, "--stereo", "--max-size", 60, "--grid", 3, "-o", "maps")
+    assert run.code == 0, run.err
+    assert "--ratio 16" not in run.out
+    assert follow(run.out, splatseed) == ["info", "upsample"]
+    shown = splatseed("info", room, "--depth", "maps")
+    shutil.rmtree("OUT")
+    assert follow(shown.out, splatseed) == ["upsample"]
+
+
 def test_maps_of_a_scene_without_points_are_used_without_alignment(
     room, tmp_path, monkeypatch, splatseed
 ):

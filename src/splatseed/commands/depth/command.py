@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 from splatseed.commands.depth.next_steps import after_network
@@ -93,4 +94,5 @@ def _summarise(options: Options, scene: Scene, network: DepthNetwork, report: De
             + shown
             + (f" and {more} more" if more > 0 else "")
         )
-    print_commands("next", after_network(options.scene, scene, report.path))
+    known = report.num_images * math.prod(report.sizes[0])
+    print_commands("next", after_network(options.scene, scene, report.path, known))

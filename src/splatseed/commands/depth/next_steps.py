@@ -9,11 +9,12 @@ from splatseed.lens import undistort_command
 from splatseed.literal import quoted
 from splatseed.scene import Scene
 
-__all__ = ["after_network", "after_stereo", "look"]
+__all__ = ["after_network", "after_stereo", "look", "number_for", "use"]
 
 
-PER_POINT = 8
-"""Confirmed pixels per point: lifting drops those that hide what another view sees."""
+RATIO = 16
+PER_POINT = 2
+"""Pixels of known depth per new point: lifting drops those that hide what another view sees."""
 
 
 def after_stereo(path: Path, scene: Scene, maps: Path, confirmed: int) -> list[tuple[str, str]]:
@@ -27,23 +28,22 @@ def after_stereo(path: Path, scene: Scene, maps: Path, confirmed: int) -> list[t
     """
     if is_distorted(scene):  # seeds are lifted along the rays of a pinhole camera
         return [look(path, maps)]
-    if len(scene.points):
-        return [look(path, maps), _use(path, maps, "--ratio 16")]
-    number = max(1, confirmed // PER_POINT)
-    return [look(path, maps), _use(path, maps, f"--no-align --num-points {number}")]
+    number = number_for(len(scene.points), confirmed)
+    aligned = "" if len(scene.points) else "--no-align "
+    return [look(path, maps), use(path, maps, aligned + number)]
 
 
-def after_network(path: Path, scene: Scene, maps: Path) -> list[tuple[str, str]]:
+def after_network(path: Path, scene: Scene, maps: Path, known: int) -> list[tuple[str, str]]:
     """What to do with a network's maps, which must be aligned to points; arguments as above."""
     if is_distorted(scene):
         return [look(path, maps), ("for seeds, begin with", undistort_command(path))]
     if len(scene.points):
-        return [look(path, maps), _use(path, maps, "--ratio 16")]
+        return [look(path, maps), use(path, maps, number_for(len(scene.points), known))]
     photographs = scene.source.image_dir if scene.source else None
     images = "IMAGES" if photographs is None else quoted(photographs)
     made = Path("SCENE")
     points = f"splatseed sfm {images} --poses-from {quoted(path)} -o {made}"
-    return [look(path, maps), ("points to align to", points), _use(made, maps, "--ratio 16")]
+    return [look(path, maps), ("points to align to", points), use(made, maps, f"--ratio {RATIO}")]
 
 
 def look(path: Path, maps: Path) -> tuple[str, str]:
@@ -52,6 +52,18 @@ def look(path: Path, maps: Path) -> tuple[str, str]:
     return "look", info
 
 
-def _use(path: Path, maps: Path, how: str) -> tuple[str, str]:
+def number_for(points: int, known: int) -> str:
+    """The option for as many points as maps can give, at most ``RATIO`` times those there are.
+
+    Args:
+        points: Points of the scene.
+        known: Number of pixels with a depth, of all maps.
+    """
+    most = points + max(1, known // PER_POINT)
+    return f"--ratio {RATIO}" if 0 < RATIO * points <= most else f"--num-points {most}"
+
+
+def use(path: Path, maps: Path, how: str) -> tuple[str, str]:
+    """The command that makes seeds of the maps."""
     seeds = f"splatseed upsample {quoted(path)} --method depth --depth {quoted(maps)}"
     return "use", f"{seeds} {how} -o OUT"

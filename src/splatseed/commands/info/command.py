@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import tyro
 
+from splatseed.commands.depth.next_steps import number_for, use
 from splatseed.commands.info.advice import Planned, advice_commands, advice_for, advice_rows
 from splatseed.commands.info.as_json import print_json
 from splatseed.commands.options import parse_options
@@ -25,6 +27,7 @@ from splatseed.diagnostics.scene import (
     find_problems,
     track_statistics,
 )
+from splatseed.diagnostics.trainable import is_distorted
 from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.output.earlier import was_upsampled
@@ -151,9 +154,9 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
 def _next_command(options: Options, scene: Scene) -> str:
     """The next command for the scene: points can be upsampled once there are some."""
     scene_dir = quoted(options.scene)
-    if options.depth is not None and len(scene.points):
-        maps = quoted(options.depth)
-        return f"splatseed upsample {scene_dir} --method depth --depth {maps} --ratio 16 -o OUT"
+    if options.depth is not None and len(scene.points) and not is_distorted(scene):
+        number = number_for(len(scene.points), _known_depths(scene))
+        return use(options.scene, options.depth, number)[1]
     if len(scene.points):
         planned = Planned.of(scene, options.budget, options.max_steps)
         advice, _ = advice_for(scene, planned, None)
@@ -161,6 +164,14 @@ def _next_command(options: Options, scene: Scene) -> str:
     images = scene.source.image_dir if scene.source else None
     photographs = "IMAGES" if images is None else quoted(images)
     return f"splatseed sfm {photographs} --poses-from {scene_dir} -o OUT"
+
+
+def _known_depths(scene: Scene) -> int:
+    """About how many pixels have a depth, by the first map."""
+    first = next(iter(scene.depths or ()), None)
+    if scene.depths is None or first is None:
+        return 0
+    return len(scene.depths) * int(np.count_nonzero(np.isfinite(scene.depths.read(first).values)))
 
 
 def _source_rows(scene: Scene) -> list[tuple[str, str]]:
