@@ -116,6 +116,8 @@ def test_an_option_of_upsampling_asks_for_the_output(word, room, splatseed):
     assert run.code == 2
     assert f"expected -o OUT, the scene folder to write, with {word.partition('=')[0]}" in run.err
     assert "unrecognized" in splatseed("upsample", room, "--nonsense").err
+    for slip, meant in (("--ouput", "--output"), ("--max-step", "--max-steps")):
+        assert f"Did you mean {meant}?" in splatseed("upsample", room, slip, "5").err
 
 
 @pytest.mark.parametrize(

@@ -301,15 +301,18 @@ def _advise(arguments: list[str]) -> None:
     """Say what to do with a scene; options of upsampling need an output."""
     try:
         run_advice(arguments)
-    except ParameterError:
+    except ParameterError as error:
         given = [word.partition("=")[0] for word in arguments]
-        known = {*known_options(full_options()), HELP_ALL} - set(ADVICE_OPTIONS)
-        if needing := [word for word in given if word in known]:
+        known = known_options(full_options())
+        if needing := [word for word in given if word in {*known} - {*ADVICE_OPTIONS}]:
             raise ParameterError(
                 f"-o OUT, the scene folder to write, with {', '.join(needing)}",
                 found="none",
                 fix="Name it; without it, splatseed upsample SCENE only says what to do.",
             ) from None
+        unknown = any(word.startswith("--") and word not in known for word in given)
+        if unknown and "Did you mean" not in error.fix:
+            parse(arguments)  # knows more options that may be meant
         raise
 
 
