@@ -286,6 +286,14 @@ def test_help_does_not_wait_for_pytorch():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+@pytest.mark.parametrize(("budget", "full"), [("50", True), ("100k", False)])
+def test_a_budget_that_the_points_fill_is_told(budget, full, plan_path, bench, tmp_path):
+    plan = plan_path(methods=("sfm", "mls"), ratios=(), budgets=(budget,))
+    run = bench("--plan", plan, "-o", tmp_path / "out", "--dry-run")
+    assert run.code == 0, run.err
+    assert ("add none" in run.out) == full
+
+
 @pytest.mark.parametrize("words", [["--dry-run"], []])
 def test_a_plan_without_a_run_is_refused(words, plan_path, bench, tmp_path):
     out = tmp_path / "out"

@@ -70,7 +70,7 @@ def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progres
     plan = dataclasses.replace(asked.plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
     runs = plan_runs(plan, scenes, backend, package_version("splatseed"))
-    notes += _notes(plan, scenes)
+    notes += [*_notes(plan, scenes), *_full(runs, scenes)]
     if not runs:
         raise ParameterError("a plan with runs", found="; ".join(notes) or "none", fix="Change it.")
     return Prepared(plan, scenes, runs, notes)
@@ -95,6 +95,18 @@ def _survey(scene: PlannedScene, plan: Plan, made: Path | None, progress: Progre
 def _scans(plan: Plan) -> bool:
     """Whether an arm needs the scenes' scans."""
     return any(map(needs_cloud, plan.methods))
+
+
+def _full(runs: Sequence[RunSpec], scenes: Sequence[SceneFacts]) -> Iterator[str]:
+    """A note for each budget that a scene's own points fill."""
+    there = {facts.name: facts.num_points for facts in scenes}
+    seeds = {(run.scene, run.arm.budget): run.most_seeds for run in runs if run.arm.method != SFM}
+    for (scene, budget), most in seeds.items():
+        if most is not None and most <= there[scene]:
+            yield (
+                f"{scene}: under {budget} a run begins with {most:,} seeds at most, and it has "
+                f"{there[scene]:,} points: auto and the methods that interpolate add none."
+            )
 
 
 def _notes(plan: Plan, scenes: Sequence[SceneFacts]) -> Iterator[str]:
