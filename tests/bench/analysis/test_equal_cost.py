@@ -87,6 +87,20 @@ def test_tables_and_sentences_can_be_read():
     assert unequal_numbers(study) is None
 
 
+@pytest.mark.parametrize(
+    ("gain", "says"),
+    [
+        (-0.5, "nothing beats sfm + default: mls 8x + default comes closest, 0.50 dB"),
+        (0.0, "nothing beats sfm + default: mls 8x + default comes closest, level with sfm"),
+        (0.5, "mls 8x + default comes out best: 0.50 dB"),
+    ],
+)
+def test_only_a_gain_is_called_best(gain, says):
+    gains = {("sfm", 1): 0.0, ("mls", 8): gain}
+    (study,) = studies(rows(gains=gains, noise=0.0, strategies=("default",)))
+    assert says in answer_at_equal_cost(study)[0]
+
+
 def test_lpips_reaches_the_tables_where_it_was_measured():
     study = _study()
     assert "LPIPS" not in arm_table(study).header

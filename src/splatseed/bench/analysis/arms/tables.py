@@ -18,6 +18,8 @@ from splatseed.bench.planning.records import RunResult
 __all__ = ["answer_at_equal_cost", "arm_table", "scene_arm_table", "seconds_table",
            "unequal_numbers"]  # fmt: skip
 
+SHOWN = 0.005
+"""The least gain in dB that does not read 0.00."""
 EQUAL = 0.01
 """Numbers of Gaussians that differ by no more than this share count as equal."""
 
@@ -196,7 +198,10 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
     best, scenes = others[0], len(others[0].scenes)
     lead = f"On {scenes} scene{'' if scenes == 1 else 's'}"
     at = " with as many Gaussians" if study.settings["budget"] else ""
-    said = [f"{lead}{at}, {best.arm.label} comes out best: {_against(best, base)}."]
+    first = f"{best.arm.label} comes out best: "
+    if best.gain.mean < SHOWN:
+        first = f"nothing beats {base.label}: {best.arm.label} comes closest, "
+    said = [f"{lead}{at}, {first}{_against(best, base)}."]
     as_it_is = [each for each in others if each.arm.variant == BASELINE]
     seeded = [each for each in others if each.arm.variant != BASELINE]
     if best.arm.variant == BASELINE and seeded:
@@ -212,7 +217,9 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
 def _against(each: Compared, base: Arm) -> str:
     """A gain in words."""
     gain = each.gain
-    more = "more" if gain.mean >= 0 else "less"
+    if abs(gain.mean) < SHOWN:
+        return f"level with {base.label}"
+    more = "more" if gain.mean > 0 else "less"
     over = "scenes" if len(each.scenes) > 1 else "repeats"
     spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {over})"
     doubt = _DOUBTS.get(gain.verdict, "")
