@@ -1,4 +1,4 @@
-"""Names of files as text that a terminal and a shell take literally.
+"""Names, bytes and errors of files as text that terminals, shells and people take as it is meant.
 
 Promise: whatever characters a name has, it can neither move the cursor, colour the terminal, begin
 a new line, nor change the command it is printed in.

@@ -93,7 +93,7 @@ def test_numbers_without_sense_are_refused_at_once(verb, room, model, tmp_path, 
         (("sfm", "{room}/images", "--camera-model", "FOO"), "expected --camera-model to be one of"),
         (
             ("sfm", "{room}/images", "--poses-from", "{room}", "--camera-model", "PINHOLE"),
-            "a lens that --poses-from tells; found --camera-model",
+            "the lens from --poses-from, without options of its own; found --camera-model",
         ),
     ],
 )

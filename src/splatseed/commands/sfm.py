@@ -104,7 +104,9 @@ def _check(options: Options) -> None:
     own = [name for name in OF_LENS if getattr(options, name) != getattr(Options, name)]
     if options.poses_from is not None and own:
         raise ParameterError(
-            "no options for a lens that --poses-from tells", found=", ".join(own), fix="Leave out."
+            "the lens from --poses-from, without options of its own",
+            found=", ".join(own),
+            fix="Leave them out.",
         )
 
 

@@ -94,8 +94,8 @@ class Options:
     budget: str = "0.25rho"
     """Gaussians at the end: a number, or per pixel of a photograph at the training size."""
     max_steps: int = 7000
-    """Steps that you plan to train; runs take no more, unless too few to tell: 100 in the first of
-    three rounds, more to grow to the budget, and twice as many in each next."""
+    """Steps that you plan to train. Runs take no more, unless that is too few to tell: the first of
+    three rounds takes 100, or what growing to the budget needs, and each next twice as many."""
     long_side: int = 400
     """Reduce photographs by a whole factor until their longer side has at most this many pixels."""
     methods: tuple[str, ...] = METHODS

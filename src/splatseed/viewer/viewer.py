@@ -36,13 +36,14 @@ STEP_BACK = 0.6
 """How far behind the first camera a browser begins, on the stage, so that it sees that camera."""
 
 
-def free_port(host: str, port: int, option: str = "--port") -> int:
+def free_port(host: str, port: int, option: str = "--port", of_host: str = "--host") -> int:
     """A port that can be listened on: the one asked for, or any free port for 0.
 
     Args:
         host: The address to listen on.
         port: The port.
-        option: The option by which the user names it.
+        option: The option by which the user names the port.
+        of_host: The option by which the user names the host, or a word for a host that is given.
 
     Raises:
         ParameterError: The port is taken or out of range, or the host is not this machine's.
@@ -60,9 +61,10 @@ def free_port(host: str, port: int, option: str = "--port") -> int:
             return int(probe.getsockname()[1])
     except OSError as error:
         raise ParameterError(
-            f"to listen on address {host}, {option} {port}",
+            f"to listen on {of_host} {host}, {option} {port}",
             found=error.strerror or str(error),
-            fix=f"Pass another {option} (0: any free one); 127.0.0.1 is this machine alone.",
+            fix=f"Pass another {option} (0: any free one); "
+            f"{of_host} 127.0.0.1 is this machine alone.",
         ) from None
 
 

@@ -19,6 +19,8 @@ from splatseed.train.settings import Backend
 
 __all__ = ["Prepared", "prepare"]
 
+NO_RUNS = "Name other methods, or what these need."
+
 
 @dataclass(frozen=True)
 class Prepared:
@@ -72,7 +74,7 @@ def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progres
     runs = plan_runs(plan, scenes, backend, package_version("splatseed"))
     notes += [*_notes(plan, scenes), *_full(runs, scenes)]
     if not runs:
-        raise ParameterError("a plan with runs", found="; ".join(notes) or "none", fix="Change it.")
+        raise ParameterError("a plan with runs", found="; ".join(notes) or "none", fix=NO_RUNS)
     return Prepared(plan, scenes, runs, notes)
 
 

@@ -31,9 +31,9 @@ def with_config(words: Sequence[str], known: Sequence[str]) -> list[str]:
         known: All options, such as ``--max-steps``; both forms of a switch.
 
     Raises:
-        ParameterError: A key is not an option, ``--config`` has no file, or no scene is named.
+        ParameterError: ``--config`` has no file.
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It cannot be read.
+        SceneFormatError: It cannot be read, or a key or a value is not an option's.
     """
     rest, path = _without_config(list(words))
     if path is None:
@@ -85,9 +85,9 @@ def _unreadable(path: Path, found: str) -> SceneFormatError:
     )
 
 
-def _unknown(path: Path, key: str, known: Sequence[str]) -> ParameterError:
+def _unknown(path: Path, key: str, known: Sequence[str]) -> SceneFormatError:
     options = {each.removeprefix("--").replace("-", "_") for each in known if len(each) > 2}
-    return ParameterError(
+    return SceneFormatError(
         f"options of splatseed train in {path}",
         found=repr(key),
         fix=f"{did_you_mean(key, options)}Run splatseed train --help to see them.",
@@ -99,8 +99,8 @@ def _words(path: Path, name: str, value: Any) -> list[str]:
         return [f"--{name}" if value else f"--no-{name}"]
     if isinstance(value, str | int | float):
         return [f"--{name}", str(value)]
-    raise ParameterError(
-        f"{name} in {path} to be a number, a text or true or false",
+    raise SceneFormatError(
+        f"{name.replace('-', '_')} in {path} to be a number, a text or true or false",
         found=type(value).__name__,
         fix="Write lines such as max_steps = 7000.",
     )

@@ -55,7 +55,7 @@ def view_port(port: int) -> int:
     require("viser")
     from splatseed.viewer.viewer import free_port  # noqa: PLC0415  (imports PyTorch)
 
-    return free_port(HOST, port, "--view-port")
+    return free_port(HOST, port, "--view-port", "address")
 
 
 @contextmanager

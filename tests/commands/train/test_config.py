@@ -40,8 +40,8 @@ def test_without_a_file_nothing_changes(known):
 @pytest.mark.parametrize(
     ("content", "error", "said"),
     [
-        ("max_stepz = 3", ParameterError, "Did you mean max_steps"),
-        ("max_steps = [1]", ParameterError, "a number"),
+        ("max_stepz = 3", SceneFormatError, "Did you mean max_steps"),
+        ("max_steps = [1]", SceneFormatError, "max_steps in .* to be a number"),
         ("max_steps 3", SceneFormatError, "max_steps = 7000"),
     ],
 )
