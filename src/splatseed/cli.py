@@ -39,6 +39,8 @@ VERBS = {
     "undistort": "Take lens distortion out of a scene (pycolmap).",
     "demo": "Make a small scene, upsample it by every method, measure, train.",
 }
+OF_ITSELF = ("--help", "--version", "--completion")
+"""Options without a verb."""
 TERMINATED = 143
 """A shell's code for a process ended by SIGTERM: 128 plus the signal's number."""
 
@@ -64,9 +66,10 @@ def main(arguments: list[str] | None = None) -> None:
         _print_completion(words[1:])
         return
     if words[0] not in VERBS:
+        meant = did_you_mean(words[0], [*VERBS, *OF_ITSELF])
         _fail(
             f"expected a verb ({', '.join(VERBS)}); found {words[0]!r}. "
-            f"{did_you_mean(words[0], VERBS)}Run splatseed --help to see what each does."
+            f"{meant}Run splatseed --help to see what each does."
         )
     _run(words[0], words[1:])
 

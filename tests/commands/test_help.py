@@ -28,6 +28,7 @@ OF_UNDISTORT = {"-h", "--help", "-o", "--output", "--threads", "--overwrite", "-
         (["train", "x", "-o", "y", "--backend", "gpu"], "Did you mean cuda?"),
         (["upsmaple"], "Did you mean upsample?"),
         (["Info"], "Did you mean info?"),
+        (["--verison"], "Did you mean --version?"),
     ],
 )
 def test_a_slip_gets_a_suggestion(words, says, splatseed):

@@ -37,6 +37,8 @@ UNION = re.compile(
     r"error parsing (\S+): no type matching (\S+) could.*?from \['(.*?)'\]", re.IGNORECASE
 )
 """A value that is none of several kinds: ``FLOAT|{gcv}``."""
+SHORT = re.compile(r"(\d+\.?\d*)([km])", re.IGNORECASE)
+"""A number such as 500k or 1.5M."""
 SYNONYMS = {"gpu": "cuda"}
 """Words for choices that look more like other choices."""
 VALUE = re.compile(r"missing value for argument '([^']*)'", re.IGNORECASE)
@@ -129,11 +131,17 @@ def _bad_value(box: str, see: str) -> ParameterError | None:
         what = " or ".join([*("a number" for each in kinds if each.isupper()), *names])
         fix = did_you_mean(word, names) or f"{see} it."
     elif number := NUMBER.search(box):
-        option, word, fix = number[1], number[3], f"{see} it."
+        option, word = number[1], number[3]
         what = "a whole number" if "int" in number[2] else "a number"
+        meant = SHORT.fullmatch(word)  # as budgets, which have no fixed unit, are written
+        fix = f"Did you mean {_in_full(*meant.groups())}?" if meant else f"{see} it."
     else:
         return None
     return ParameterError(f"{option} as {what}", found=repr(word), fix=fix.strip())
+
+
+def _in_full(digits: str, unit: str) -> str:
+    return f"{float(digits) * {'k': 1e3, 'm': 1e6}[unit.lower()]:.0f}"
 
 
 def _unfit(verb: str, found: str, see: str) -> ParameterError:
