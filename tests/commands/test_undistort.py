@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import shlex
 import shutil
 
@@ -15,6 +16,8 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap.binary import write_points3d
+from splatseed.io.output.earlier import saw_all_photographs, was_upsampled
+from splatseed.sfm import undistort
 from splatseed.views.view import check_lens, load_views
 
 
@@ -67,6 +70,36 @@ def test_a_distorted_scene_becomes_one_of_pinholes(layout, distorted, tmp_path, 
     again = splatseed("undistort", path, "-o", out)
     assert (again.code, "--overwrite" in again.err) == (2, True)
     assert [each.name for each in tmp_path.iterdir() if each.name.startswith(".")] == []
+
+
+@pytest.mark.parametrize("layout", ["colmap", "transforms"])
+def test_an_upsampled_scene_keeps_what_is_known_of_its_points(
+    layout, distorted, tmp_path, splatseed
+):
+    seeded, out, twice = (tmp_path / name for name in ("seeded", "straight", "twice"))
+    how = ("--method", "mls", "--ratio", 2, "--format", layout)
+    assert splatseed("upsample", distorted, *how, "-o", seeded).code == 0
+    run = splatseed("undistort", seeded, "-o", out)
+    assert f"splatseed train {out} -o RUN" in run.out, run
+    before, after = load_scene(seeded).points, load_scene(out).points
+    assert 0 < before.num_original < len(before)
+    np.testing.assert_array_equal(after.source, before.source)
+    np.testing.assert_array_equal(after.normals, before.normals)
+    assert "train it" in splatseed("info", out).out
+    assert splatseed("undistort", out, "-o", twice).code == 0  # and again
+    np.testing.assert_array_equal(load_scene(twice).points.source, before.source)
+    assert was_upsampled(load_scene(twice))
+
+
+def test_that_seeds_saw_all_photographs_is_remembered(distorted, tmp_path):
+    seeded = write_scene(load_scene(distorted), tmp_path / "seeded").path
+    facts = {"command": "upsample", "num_new": 5, "parameters": {"hold_out": 0}}
+    (seeded / "splatseed.json").write_text(json.dumps(facts))
+    undistort(load_scene(seeded), tmp_path / "straight")
+    assert saw_all_photographs(load_scene(tmp_path / "straight"))
+    undistort(load_scene(distorted), tmp_path / "never_seeded")
+    assert not saw_all_photographs(load_scene(tmp_path / "never_seeded"))
+    assert not was_upsampled(load_scene(tmp_path / "never_seeded"))
 
 
 def test_train_prints_the_command_that_mends_the_scene(distorted, tmp_path, splatseed, monkeypatch):

@@ -13,6 +13,7 @@ from splatseed.console import print_commands, print_note, print_pairs, stage_dis
 from splatseed.diagnostics.trainable import is_distorted
 from splatseed.io import load_scene
 from splatseed.io.image_checks import lens_warnings
+from splatseed.io.output.earlier import was_upsampled
 from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
 from splatseed.sfm import undistort
@@ -64,4 +65,5 @@ def run(arguments: list[str]) -> None:
             print_note(warning)
     if not is_distorted(scene):
         print_note("No camera had distortion: the photographs are copies.")
-    print_commands("next", [("", f"splatseed upsample {quoted(options.output)} -o OUT")])
+    verb, made = ("train", "RUN") if was_upsampled(scene) else ("upsample", "OUT")
+    print_commands("next", [("", f"splatseed {verb} {quoted(options.output)} -o {made}")])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import write_scene
+from splatseed.io.output.earlier import carry_seeds
 from splatseed.io.split import ROOT_LISTS
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -29,8 +30,8 @@ def undistort(
 ) -> Outcome:
     """Write a scene with undistorted photographs and PINHOLE cameras.
 
-    Poses, points and tracks stay; features move with the pixels. The size of photographs changes a
-    little.
+    Poses, points, their origins and tracks stay; features move with the pixels. The size of
+    photographs changes a little.
 
     Args:
         scene: A scene with all its photographs.
@@ -58,6 +59,7 @@ def undistort(
         job = UndistortJob(images, staging, settings, distorted / "sparse" / "0")
         log = staging / ".work" / "log.txt"
         outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
+        carry_seeds(scene, distorted, staging)
         for name in ROOT_LISTS:
             if (distorted / name).is_file():
                 shutil.copyfile(distorted / name, staging / name)

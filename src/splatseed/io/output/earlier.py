@@ -9,18 +9,31 @@ replaces the points made from them. If no point at all is an original, all count
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from splatseed.io.output.seeds_npz import read_seeds
+from splatseed.io.output.layouts import write_json
+from splatseed.io.output.seeds_npz import SEEDS, read_seeds
 from splatseed.io.output.staging import MANIFEST, kind_of
 from splatseed.pointcloud import GENERATED, ORIGINAL
 from splatseed.scene import Scene
 
-__all__ = ["number_of_originals", "recall_seeds", "saw_all_photographs", "was_upsampled"]
+__all__ = [
+    "carry_seeds",
+    "number_of_originals",
+    "recall_seeds",
+    "saw_all_photographs",
+    "upsampling",
+    "was_upsampled",
+]
+
+UPSAMPLED = "upsampled"
+"""Where the manifest of an undistorted scene holds that of the points."""
 
 
 def recall_seeds(scene: Scene) -> Scene:
@@ -60,27 +73,62 @@ def number_of_originals(root: Path, total: int) -> int:
 
 def was_upsampled(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made or thinned these points."""
-    written = scene.source is not None and kind_of(scene.source.root) == "upsample"
-    return written or scene.points.num_original < len(scene.points)
+    return upsampling(scene) is not None or scene.points.num_original < len(scene.points)
 
 
 def saw_all_photographs(scene: Scene) -> bool:
     """Whether ``splatseed upsample`` made new points from photographs and held none out."""
-    if scene.source is None or kind_of(scene.source.root) != "upsample":
-        return False
+    facts = upsampling(scene) or {}
     try:
-        facts = json.loads((scene.source.root / MANIFEST).read_text(encoding="utf-8"))
         return bool(facts["num_new"]) and facts["parameters"]["hold_out"] == 0
-    except (OSError, ValueError, TypeError, KeyError):
+    except (TypeError, KeyError):
         return False  # not made from photographs
+
+
+def upsampling(scene: Scene) -> dict[str, Any] | None:
+    """What ``splatseed upsample`` wrote about the scene's points; None if it did not make them.
+
+    A scene that was undistorted since holds it, too.
+    """
+    if scene.source is None:
+        return None
+    facts = _facts(scene.source.root / MANIFEST)
+    if kind_of(scene.source.root) == "undistort":
+        facts = facts.get(UPSAMPLED)
+    elif kind_of(scene.source.root) != "upsample":
+        facts = None
+    return facts if isinstance(facts, dict) else None
+
+
+def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
+    """Let an undistorted scene remember where its points come from, and what is known of them.
+
+    Args:
+        scene: The scene that is undistorted.
+        written: What ``write_scene`` made of it.
+        folder: The undistorted scene, with the same points in the same order.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    if (written / SEEDS).is_file():
+        shutil.copyfile(written / SEEDS, folder / SEEDS)
+    counts = {key: _facts(written / MANIFEST)[key] for key in ("num_points", "num_original")}
+    write_json(folder / MANIFEST, {**counts, UPSAMPLED: upsampling(scene)})
 
 
 def _num_original(manifest: Path, total: int) -> int:
     """How many of ``total`` points are originals; all unless a manifest for this cloud says so."""
-    try:
-        facts = json.loads(manifest.read_text(encoding="utf-8"))
-        num_points, num_original = facts["num_points"], facts["num_original"]
-    except (OSError, ValueError, TypeError, KeyError):
-        return total  # no manifest, or somebody else's file of that name
+    facts = _facts(manifest)
+    num_points, num_original = facts.get("num_points"), facts.get("num_original")
     fits = num_points == total and isinstance(num_original, int) and 0 < num_original < total
     return num_original if fits else total
+
+
+def _facts(manifest: Path) -> dict[str, Any]:
+    """What a manifest says; nothing if there is none, or somebody else's file of that name."""
+    try:
+        facts = json.loads(manifest.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
