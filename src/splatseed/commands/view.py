@@ -117,7 +117,7 @@ def _within(path: Path) -> list[Path]:
         if len(shown) > MOST_OPENED:
             print_note(
                 f"{visible(path)} holds {len(shown)}; shown are the first {MOST_OPENED} by name. "
-                "To see others, name them themselves."
+                "To see others, give their paths."
             )
         if shown:
             return shown[:MOST_OPENED]

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.progress import Progress, silent
-from splatseed.scene import Image, Scene
+from splatseed.scene import NO_POINT, Image, Scene
 
 __all__ = ["EMPTY_CELLS", "CloudStatistics", "EmptyRegions", "TrackStatistics",
            "cloud_statistics", "empty_regions",
@@ -122,7 +122,7 @@ def cloud_statistics(scene: Scene, progress: Progress = silent) -> CloudStatisti
 
 def track_statistics(scene: Scene) -> TrackStatistics | None:
     """Track lengths and reprojection errors; None for a scene without tracks."""
-    if scene.tracks is None or len(scene.tracks) == 0:
+    if scene.tracks is None or not _has_tracks(scene):
         return None
     lengths, errors = scene.tracks.lengths, scene.tracks.errors
     known = errors[errors >= 0]
@@ -166,7 +166,25 @@ def find_problems(
             f"{regions.mean:.0%} of the images' area has no point: upsampling fills between "
             "points, but only photographs or depth maps can fill a bare wall"
         )
+    if (astray := _features_astray(scene)) > 0:
+        problems.append(
+            f"{astray:,} features of the photographs name points, but no point has a track: the "
+            "points were put in later, and a trainer that reads features takes wrong ones for them;"
+            " what splatseed upsample writes of this scene is free of that"
+        )
     return tuple(problems)
+
+
+def _has_tracks(scene: Scene) -> bool:
+    return scene.tracks is not None and bool(np.any(scene.tracks.lengths))
+
+
+def _features_astray(scene: Scene) -> int:
+    """How many features name a point, in a scene whose points know of no feature."""
+    if _has_tracks(scene):
+        return 0
+    seen = (image.observations for image in scene.images)
+    return sum(int(np.count_nonzero(each.point_ids != NO_POINT)) for each in seen if each)
 
 
 def _without_points(scene: Scene) -> str:

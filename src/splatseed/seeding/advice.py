@@ -93,6 +93,16 @@ class Measured:
         return self.num_points / self.pixels if self.pixels else 0.0
 
 
+def _share(value: float) -> str:
+    """A number with two decimals, or with one significant digit if it is smaller.
+
+    Example:
+        >>> _share(0.148), _share(0.00287), _share(0)
+        ('0.15', '0.003', '0.00')
+    """
+    return f"{value:.2f}" if value >= 0.01 or not value else f"{value:.1g}"
+
+
 @dataclass(frozen=True)
 class Advice:
     """What to do, and why.
@@ -127,11 +137,13 @@ def advise(
         room: Least room at which new points are worth making; scoring fits it.
     """
     if not measured.num_points:
-        return Advice("auto", ("There are no points to begin with.",))
+        maps = "Its depth maps can give some, too: --method depth --no-align --num-points N."
+        none = "There are no points to begin with."
+        return Advice("auto", (none, maps) if measured.depth_maps else (none,))
     if not measured.photographs:
         return Advice("mls", ("There are no photographs to look at, so points are interpolated.",))
     has = most_seeds / measured.num_points
-    per_pixel = f"{measured.num_points:,} points, {measured.points_per_pixel:.2f} per pixel"
+    per_pixel = f"{measured.num_points:,} points, {_share(measured.points_per_pixel)} per pixel"
     if has < room or strategy == GROWS:
         full = (
             f"Training begins with {most_seeds:,} at most, so there is no room for more: adding "

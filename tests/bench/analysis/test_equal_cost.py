@@ -8,6 +8,7 @@ import pytest
 
 from splatseed.bench.analysis.arms.compared import baseline_of, compared_arms, psnr_at
 from splatseed.bench.analysis.arms.tables import (
+    _in_time,
     answer_at_equal_cost,
     arm_table,
     scene_arm_table,
@@ -63,6 +64,15 @@ def test_time_counts_seeding():
     assert slower.seeding == 4.0
     assert slower.gain_in_time.mean < slower.gain.mean
     assert slower.reached == slower.runs
+
+
+def test_a_loss_in_time_that_may_be_chance_is_called_so():
+    base = compared_arms(_study())[0].arm
+    best = compared_arms(_study())[-1]
+    for p, doubt in ((0.5, ", which may be chance"), (1e-6, "")):
+        unsure = dataclasses.replace(best.gain_in_time, mean=-0.8, adjusted=p)
+        said = _in_time(dataclasses.replace(best, gain_in_time=unsure), base)
+        assert said[0].endswith(f"is 0.80 dB behind{doubt}.")
 
 
 def test_scores_between_two_tests_of_a_curve():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.io import load_scene, write_scene
-from splatseed.io.colmap.binary import write_cameras
+from splatseed.io.colmap.binary import write_cameras, write_points3d
 from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
 
@@ -85,6 +86,9 @@ def test_an_rgbd_capture(tmp_path, splatseed):
     assert _rows(run.out)["format"] == "rgbd"
     assert f"splatseed sfm {tmp_path / 'results'}" in run.out
     assert "no points yet: splatseed upsample makes some from the photographs" in run.out
+    assert re.search(
+        rf"^  seeds +splatseed upsample {tmp_path} --budget \d+ ", run.out, re.MULTILINE
+    )
 
 
 @pytest.mark.parametrize(
@@ -110,6 +114,26 @@ def test_what_the_reader_found_odd_is_a_problem(own_room, splatseed):
     shutil.rmtree(own_room / "images")
     out = splatseed("info", own_room).out
     assert "images folder is missing" in out.partition("problems")[2]
+
+
+def test_points_that_were_put_into_another_model_are_a_problem(own_room, room, splatseed):
+    write_points3d(own_room / "sparse/0/points3D.bin", load_scene(room).points, None)
+    out = splatseed("info", own_room).out
+    assert _rows(out)["tracks"] == "none"
+    assert "features of the photographs name points, but no point has a track" in out
+    assert "nan" not in out
+    assert (
+        splatseed("upsample", own_room, "--method", "mls", "-o", own_room.with_name("up")).code == 0
+    )
+    assert "name points, but" not in splatseed("info", own_room.with_name("up")).out
+
+
+def test_unknown_reprojection_errors_are_called_so(own_room, splatseed):
+    path = own_room / "sparse/0/points3D.bin"
+    scene = load_scene(own_room)
+    unknown = dataclasses.replace(scene.tracks, errors=np.full(len(scene.tracks), -1.0))
+    write_points3d(path, scene.points, unknown)
+    assert _rows(splatseed("info", own_room).out)["reprojection error, px"] == "unknown"
 
 
 def test_many_kinds_of_cameras_are_counted_not_listed(own_room, splatseed):

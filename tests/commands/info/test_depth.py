@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image as PilImage
 
+from splatseed.commands.depth.next_steps import number_for
 from splatseed.depth import align
 from splatseed.io import find_depths, load_scene
 from splatseed.io.depth.folder import depth_folder
@@ -92,6 +93,8 @@ def test_why_an_image_is_left_out(tour, tmp_path, splatseed):
     assert pairs["maps"].startswith("8 of 15 images")
     assert pairs["left out"] == "1"
     assert f"- {names[2]}: the map has no depth at any pixel" in out
+    assert "- 1 of 8 depth maps cannot be aligned with the points" in out.partition("problems")[2]
+    assert "no problems" not in out
     assert _rows(out)[names[2]] == ("0", "-", "", "-")
     assert next(iter(_rows(out))) == names[2]
 
@@ -102,6 +105,15 @@ def test_depth_of_another_kind_is_found_out(room, tmp_path, splatseed):
     assert run.code == 0
     assert "values rise with depth" in run.out
     assert _pairs(run.out)["left out"] == "12"
+
+
+def test_as_many_points_are_asked_for_as_depth_prints(tour, tmp_path, splatseed):
+    few = lambda i, z: np.where(np.arange(z.size).reshape(z.shape) < 20 * (i + 1), z, np.nan)
+    maps = _rewrite(tour, tmp_path / "maps", few)
+    known = 20 * sum(range(1, 16))  # the first map says nothing about the others
+    number = number_for(len(load_scene(tour).points), known)
+    assert number.startswith("--num-points")
+    assert splatseed("info", tour, "--depth", maps).out.splitlines()[-1].count(f" {number} ") == 1
 
 
 def test_a_scale_of_the_users_is_taken(room, tmp_path, splatseed):

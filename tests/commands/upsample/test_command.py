@@ -15,6 +15,7 @@ from PIL import Image as PilImage
 
 from splatseed.io import load_scene, write_scene
 from splatseed.io.ply.points import read_ply, write_ply
+from splatseed.pointcloud import PointCloud
 from splatseed.upsample import METHODS, chooses_number, configure
 
 METHOD_NAMES = list(METHODS)
@@ -118,6 +119,18 @@ def test_the_closing_table_has_what_was_asked_for(room, tmp_path, splatseed):
     before, _, after = run.out.partition("\nsplatseed upsample\n")
     assert f"{2 * count:,} points" in before  # said before it is done
     assert "train it with" in after
+
+
+def test_the_origins_add_up_where_new_points_coincide(tmp_path, splatseed):
+    coarse = np.float32(2**20)  # floats here are 1/8 apart: points between these fall together
+    xyz = coarse + np.float32(np.random.default_rng(0).integers(0, 64, (300, 3))) / 8
+    xyz = np.unique(xyz, axis=0).astype(np.float32)
+    write_ply(tmp_path / "cloud.ply", PointCloud(xyz, np.zeros(xyz.shape, np.uint8)))
+    run = splatseed("upsample", tmp_path / "cloud.ply", "--method", "linear", "-o", tmp_path / "o")
+    assert re.search(r"left out .* [1-9]\d* duplicate", run.out), run
+    told = re.search(r"points out +([\d,]+) \(([\d,]+) original, ([\d,]+) linear\)", run.out)
+    total, *parts = (int(number.replace(",", "")) for number in told.groups())
+    assert total == sum(parts)
 
 
 def test_results_are_plain_text_and_the_rest_is_silent(room, tmp_path, splatseed):

@@ -13,8 +13,9 @@ __all__ = ["after_network", "after_stereo", "look", "number_for", "use"]
 
 
 RATIO = 16
-PER_POINT = 2
-"""Pixels of known depth per new point: lifting drops those that hide what another view sees."""
+PER_POINT = 8
+"""Pixels of known depth per new point. Beyond that, lifting runs out of pixels that are free and
+away from depth discontinuities: on stereo's maps of a kitchen with 14% known, one in 8.2 was."""
 
 
 def after_stereo(path: Path, scene: Scene, maps: Path, confirmed: int) -> list[tuple[str, str]]:

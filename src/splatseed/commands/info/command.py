@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -100,6 +101,8 @@ def run(arguments: list[str]) -> None:
         # An empty part is reason to upsample, which was done.
         problems = find_problems(scene, cloud, None if was_upsampled(scene) else regions)
         alignments = _alignments(options, scene, clock)
+        known = _known_depths(options, scene, clock)
+        problems = (*problems, *_unfit_maps(alignments or {}))
     if options.json:
         print_json(scene, cloud, tracks, regions, alignments, problems)
         return
@@ -116,7 +119,7 @@ def run(arguments: list[str]) -> None:
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
-        print_commands("next", [("", _next_command(options, scene))])
+        print_commands("next", _next_commands(options, scene, known))
 
 
 def _read(options: Options) -> Scene:
@@ -151,27 +154,39 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
     return alignments
 
 
-def _next_command(options: Options, scene: Scene) -> str:
-    """The next command for the scene: points can be upsampled once there are some."""
-    scene_dir = quoted(options.scene)
+def _unfit_maps(alignments: Mapping[str, Alignment]) -> list[str]:
+    unfit = sum(each.rejected is not None for each in alignments.values())
+    maps = f"{unfit:,} of {len(alignments):,} depth maps"
+    return [f"{maps} cannot be aligned with the points, and are left out"] if unfit else []
+
+
+def _next_commands(options: Options, scene: Scene, known: int) -> list[tuple[str, str]]:
+    """What to do next with the scene, or what there is to choose from."""
     if options.depth is not None and len(scene.points) and not is_distorted(scene):
-        number = number_for(len(scene.points), _known_depths(scene))
-        return use(options.scene, options.depth, number)[1]
-    if len(scene.points):
+        number = number_for(len(scene.points), known)
+        return [("", use(options.scene, options.depth, number)[1])]
+    advised = []
+    if len(scene.points) or scene.has_photographs:
         planned = Planned.of(scene, options.budget, options.max_steps)
         advice, _ = advice_for(scene, planned, None)
-        return advice_commands(options.scene, scene, advice, planned)[0][1]
+        advised = advice_commands(options.scene, scene, advice, planned)[:1]
+    if len(scene.points):
+        return [("", advised[0][1])]
     images = scene.source.image_dir if scene.source else None
     photographs = "IMAGES" if images is None else quoted(images)
-    return f"splatseed sfm {photographs} --poses-from {scene_dir} -o OUT"
+    points = f"splatseed sfm {photographs} --poses-from {quoted(options.scene)} -o OUT"
+    return [*advised, ("or points" if advised else "points", points)]
 
 
-def _known_depths(scene: Scene) -> int:
-    """About how many pixels have a depth, by the first map."""
-    first = next(iter(scene.depths or ()), None)
-    if scene.depths is None or first is None:
+def _known_depths(options: Options, scene: Scene, clock: StageClock) -> int:
+    """How many pixels have a depth, of all maps that the user named."""
+    if options.depth is None or scene.depths is None:
         return 0
-    return len(scene.depths) * int(np.count_nonzero(np.isfinite(scene.depths.read(first).values)))
+    known = 0
+    for i, name in enumerate(scene.depths):
+        known += int(np.count_nonzero(np.isfinite(scene.depths.read(name).values)))
+        clock("count depths", (i + 1) / len(scene.depths))
+    return known
 
 
 def _source_rows(scene: Scene) -> list[tuple[str, str]]:
@@ -210,9 +225,11 @@ def _cloud_rows(cloud: CloudStatistics) -> list[tuple[str, str]]:
 def _track_rows(tracks: TrackStatistics | None) -> list[tuple[str, str]]:
     if tracks is None:
         return [("tracks", "none")]
+    unknown = math.isnan(tracks.mean_error)
+    error = "unknown" if unknown else _spread(tracks.mean_error, tracks.error, ".3f")
     return [
         ("track length, images", _spread(tracks.mean_length, tracks.length, ".3g")),
-        ("reprojection error, px", _spread(tracks.mean_error, tracks.error, ".3f")),
+        ("reprojection error, px", error),
     ]
 
 

@@ -84,7 +84,8 @@ class Options:
     """Upsample the points of a scene, ready for any 3DGS trainer."""
 
     scene: Annotated[Path, tyro.conf.Positional]
-    """A COLMAP folder, one with transforms.json, or a cloud (.ply, .las, .laz, .e57, .xyz ...)."""
+    """A COLMAP folder, one with transforms.json, an RGB-D capture, or a cloud (.ply, .las, .laz,
+    .e57, .xyz ...)."""
     output: Annotated[Path, output_flag()]
     """The scene folder to write."""
     method: str = DEFAULT_METHOD

@@ -145,7 +145,7 @@ def summarise(
     Args:
         read_from: Where the scene was read.
         scene: The scene as it was read.
-        seeds: The points that were written.
+        seeds: The points that were to be written.
         report: The report of writing.
         seconds: Seconds by stage.
         checks: ``far``, the share of new points far from any original; ``before`` and ``after``,
@@ -153,9 +153,10 @@ def summarise(
         output: The scene folder.
         files: Names of further files in it, by label; those that are not there are left out.
     """
+    written = seeds if len(seeds) == report.num_points else seeds.select(seeds.distinct)
     rows = [
         ("points in", f"{len(scene.points):,}"),
-        ("points out", f"{report.num_points:,} ({_origins(seeds)})"),
+        ("points out", f"{report.num_points:,} ({_origins(written)})"),
         *_findings(checks),
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(output)),

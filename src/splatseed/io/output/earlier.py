@@ -19,7 +19,7 @@ from jaxtyping import UInt8
 
 from splatseed.io.output.layouts import write_json
 from splatseed.io.output.seeds_npz import SEEDS, read_seeds
-from splatseed.io.output.staging import MANIFEST, kind_of
+from splatseed.io.output.staging import MANIFEST
 from splatseed.pointcloud import GENERATED, ORIGINAL
 from splatseed.scene import Scene
 
@@ -93,11 +93,10 @@ def upsampling(scene: Scene) -> dict[str, Any] | None:
     if scene.source is None:
         return None
     facts = _facts(scene.source.root / MANIFEST)
-    if kind_of(scene.source.root) == "undistort":
-        facts = facts.get(UPSAMPLED)
-    elif kind_of(scene.source.root) != "upsample":
-        facts = None
-    return facts if isinstance(facts, dict) else None
+    if facts.get("command") == "upsample":
+        return facts
+    carried = facts.get(UPSAMPLED)
+    return carried if isinstance(carried, dict) else None
 
 
 def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
@@ -120,9 +119,10 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
 def _num_original(manifest: Path, total: int) -> int:
     """How many of ``total`` points are originals; all unless a manifest for this cloud says so."""
     facts = _facts(manifest)
-    num_points, num_original = facts.get("num_points"), facts.get("num_original")
-    fits = num_points == total and isinstance(num_original, int) and 0 < num_original < total
-    return num_original if fits else total
+    originals = facts.get("num_original")
+    if facts.get("num_points") == total and isinstance(originals, int) and 0 < originals < total:
+        return originals
+    return total
 
 
 def _facts(manifest: Path) -> dict[str, Any]:

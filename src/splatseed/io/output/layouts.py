@@ -163,6 +163,7 @@ def _model_notes(scene: Scene, model: Renumbered) -> list[str]:
     if not scene.images:
         notes.append(
             "The scene has no images, so it cannot be trained as it is: copy points3D.bin and"
-            " points3D.ply from sparse/0 into sparse/0 of the full scene."
+            " points3D.ply from sparse/0 into sparse/0 of a copy of the full scene, and seeds.npz,"
+            " if there is one, into that copy."
         )
     return notes

@@ -197,7 +197,7 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
         return ()
     best, scenes = others[0], len(others[0].scenes)
     lead = f"On {scenes} scene{'' if scenes == 1 else 's'}"
-    at = " with as many Gaussians" if study.settings["budget"] else ""
+    at = " with equal numbers of Gaussians" if study.settings["budget"] else ""
     first = f"{best.arm.label} comes out best: "
     if best.gain.mean < SHOWN:
         first = f"nothing beats {base.label}: {best.arm.label} comes closest, "
@@ -234,7 +234,7 @@ def _in_time(best: Compared, base: Arm) -> tuple[str, ...]:
         place = "ahead" if ahead >= 0 else "behind"
         told.append(
             f"When {base.label} has finished, seeding counted, {best.arm.label} is "
-            f"{abs(ahead):.2f} dB {place}."
+            f"{abs(ahead):.2f} dB {place}{_DOUBTS.get(best.gain_in_time.verdict, '')}."
         )
     if best.sooner is not None:
         share = math.exp(best.sooner.mean)
