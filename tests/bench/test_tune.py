@@ -63,6 +63,14 @@ def test_a_verdict_is_paired_by_view():
     assert verdict({SFM: _runs(*base)}, 400) is None
 
 
+def test_a_round_that_was_stopped_is_judged_by_the_repeats_that_all_have():
+    sfm = _runs(24.59) | _runs(25.16, repeat=1)
+    said = verdict({SFM: sfm, MLS: _runs(24.95)}, 400)
+    assert said.gain.mean == pytest.approx(0.36)
+    scores = dict(said.ranking)
+    assert scores[MLS] - scores[SFM] == pytest.approx(0.36)
+
+
 def test_rungs_fit_the_time_as_long_as_they_can():
     cost = lambda rungs: sum(r.steps * r.arms * r.repeats * 0.01 for r in rungs)
     rungs = plan_rungs(15, 600.0, 30_000, cost)
@@ -164,6 +172,10 @@ def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     with pytest.raises(SystemExit):
         main(words)
     assert "repeat the command to continue" in capsys.readouterr().out
+    here["most"] = 3  # one run of the second round
+    with pytest.raises(SystemExit):
+        main(words)
+    assert "Stopped before the last run" in capsys.readouterr().out
     here["most"] = 99
     main(words)
     out = capsys.readouterr().out
@@ -173,6 +185,7 @@ def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     assert here["done"] == 2 + 2 + 4
     assert "\n2 validation views" in out
     assert "splatseed train" in out
+    assert "Stopped" not in out
     assert "--cap-max 70 --max-steps 32" in out
     main(words)
     assert here["done"] == 8  # nothing is done twice

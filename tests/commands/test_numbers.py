@@ -81,6 +81,13 @@ def test_numbers_without_sense_are_refused_at_once(verb, room, model, tmp_path, 
         (("upsample", "{room}", "--cover", 0, "--method", "mls"), "--cover of 1 or more; found 0"),
         (("upsample", "{room}", "--auto.grid", 0), "--auto.grid from 1 to 32; found 0"),
         (("upsample", "{room}", "--num-points", "500k"), "Did you mean 500000?"),
+        (("upsample", "{room}", "--max-steps", 70), "--max-steps without -o and --method"),
+        (("upsample", "{room}", "--mls.k", "abc"), "splatseed upsample --method mls --help"),
+        (("upsample", "{room}", "--mls.kk", 3), "splatseed upsample --method mls --help"),
+        (("upsample", "{room}", "--budget", "1e-9rho"), "found 1e-9rho, which of 10,800 pixels is"),
+        (("train", "{room}", "--data-factor", 1000), "--data-factor, or a larger --long-side"),
+        (("train", "{room}", "--data-factor", 1000, "--seeds", "scene"), "view_000.png to have at"),
+        (("depth", "{room}", "--stereo", "--max-size", 5), "--max-size of 32 or more; found 5"),
         (("train", "{room}", "--cap-max", "1.5M"), "Did you mean 1500000?"),
         (("upsample", "{room}", "--cover", 8), "expected --auto.cell for method auto"),
         (("upsample", "{room}", "--method", "mls", "--ratio", "1e9"), "1e+09 for 464 originals"),
@@ -110,6 +117,14 @@ def test_the_error_names_what_was_typed(words, says, room, tmp_path, splatseed):
     assert says in run.err
     assert not run.out
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("value", "says"), [(0, "--max-steps of 1 or more; found 0"), ("abc", "as a whole number")]
+)
+def test_a_bad_value_in_a_question_for_advice_is_told(value, says, room, splatseed):
+    assert says in splatseed("upsample", room, "--max-steps", value).err
+    assert says in splatseed("info", room, "--max-steps", value).err
 
 
 @pytest.mark.parametrize("word", ["--preview", "--verify", "--seed=1", "--copy-images"])

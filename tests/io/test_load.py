@@ -214,6 +214,8 @@ def test_sparse_and_a_file_of_a_model_lead_to_the_scene(scene_dir):
     scene = load_scene(scene_dir / "sparse")
     assert scene.source.root == scene_dir
     assert scene.source.image_dir == scene_dir / "images"
+    with pytest.raises(SceneNotFoundError, match=f"Name the scene's folder: {scene_dir}$"):
+        load_scene(scene_dir / "images")
     for name in ("points3D.bin", "images.bin"):
         with pytest.raises(SceneFormatError, match=f"Name the scene's folder: {scene_dir}$"):
             load_scene(scene_dir / "sparse/0" / name)

@@ -222,10 +222,12 @@ def test_tensorboard_logs_what_the_curve_has(begin):
 
 def test_an_earlier_run_is_neither_replaced_nor_repeated_by_accident(begin, room, tmp_path):
     run = begin(max_steps=3)
-    with pytest.raises(OutputError, match="--resume"):
+    with pytest.raises(OutputError, match=r"unfinished run.*--resume"):
         begin(max_steps=3)
     run.train()
     run.finish(_score)
+    with pytest.raises(OutputError, match=r"found a finished run\. Pass --overwrite"):
+        begin(max_steps=3)
     with pytest.raises(OutputError, match="a finished one"):
         begin(options=RESUME, max_steps=3)
     assert begin(options=RunOptions(overwrite=True), max_steps=3).state.step == 0

@@ -50,7 +50,11 @@ TRIED = "Got errors:"
 
 
 def parse_options(
-    kind: type[Options], verb: str, arguments: Sequence[str], default: Options | None = None
+    kind: type[Options],
+    verb: str,
+    arguments: Sequence[str],
+    default: Options | None = None,
+    page: str | None = None,
 ) -> Options:
     """The options in ``arguments``.
 
@@ -59,6 +63,7 @@ def parse_options(
         verb: The verb they belong to.
         arguments: The words after the verb.
         default: Values of options that are not given; the dataclass's own defaults if left out.
+        page: The words with which ``--help`` shows the options, if not only the verb.
 
     Raises:
         ParameterError: An option is unknown, missing, or has an invalid value.
@@ -71,7 +76,7 @@ def parse_options(
     except SystemExit as stop:
         if not stop.code:
             raise
-        raise _complaint(kind, verb, said.getvalue(), arguments) from None
+        raise _complaint(kind, verb, said.getvalue(), arguments, page or verb) from None
     return options
 
 
@@ -96,10 +101,12 @@ def check_least(options: object, least: float, *names: str) -> None:
             )
 
 
-def _complaint(kind: type[Any], verb: str, said: str, arguments: Sequence[str]) -> ParameterError:
+def _complaint(
+    kind: type[Any], verb: str, said: str, arguments: Sequence[str], page: str
+) -> ParameterError:
     """Tyro's complaint as one of ours."""
     box = " ".join(COLOR.sub("", said).replace("│", " ").split())
-    see = f"Run splatseed {verb} --help to see"
+    see = f"Run splatseed {page} --help to see"
     if (bad := _bad_value(box, see)) is not None:
         return bad
     known = known_options(kind)

@@ -185,7 +185,7 @@ def run(arguments: list[str]) -> None:
             rungs = _rungs(study)
         _announce(study, rungs)
         ended = _climb(study, rungs)
-    _report(study, rungs)
+    _report(study, rungs, ended=ended)
     if not ended:
         sys.exit(exit_code())
 
@@ -322,12 +322,14 @@ def _do(study: _Study, specs: Sequence[RunSpec]) -> bool:
         return study.machine.run(study.ledger, study.folder, keys, JobOptions(), display)
 
 
-def _report(study: _Study, rungs: Sequence[Rung]) -> None:
+def _report(study: _Study, rungs: Sequence[Rung], *, ended: bool) -> None:
     """Print the verdict of the longest finished runs, and the command that follows from it."""
     said = _verdict(study, rungs)
     if said is None:
         print_note("Nothing can be said yet: repeat the command to continue.")
         return
+    if not ended:
+        print_note("Stopped before the last run: this is so far. Repeat the command to continue.")
     counts = _counts(study, said)
     rows = [
         (arm.label, arm.strategy, f"{counts[arm]:,}", f"{psnr:.2f}") for arm, psnr in said.ranking

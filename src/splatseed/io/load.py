@@ -142,9 +142,12 @@ def _no_scene(path: Path) -> SceneNotFoundError:
         inside, fix = f"scenes in it: {_some(scenes)}", f"Name one of them: {path / scenes[0]}"
     else:
         inside = f"only {_some(near)}" if near else "none of them"
+        above = next(filter(is_scene, path.absolute().parents[:_ABOVE]), None)
         fix = (
             "Name the scene's folder, or a .ply or .json file itself. For photographs alone, run:"
             " splatseed sfm IMAGES -o SCENE."
+            if above is None
+            else f"Name the scene's folder: {above}"
         )
     return SceneNotFoundError(
         f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt in {path}",

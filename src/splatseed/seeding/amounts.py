@@ -36,9 +36,11 @@ def parse_budget(budget: str | float, pixels: float) -> int:
         number = math.nan
     bare = not unit and 0 < number < 1
     if bare or not (math.isfinite(number) and round(number) >= 1):
+        none = unit == RHO and 0 < number < 1  # photographs are too small for this share
+        smaller = ", or reduce photographs by a smaller factor" if none else ""
         raise ParameterError(
             "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
-            found=repr(budget),
-            fix=f"Did you mean {text}rho?" if bare else "Give a number of at least 1.",
+            found=f"{text}, which of {pixels:,.6g} pixels is none" if none else repr(budget),
+            fix=f"Did you mean {text}rho?" if bare else f"Give a number of at least 1{smaller}.",
         )
     return round(number)

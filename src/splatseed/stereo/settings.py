@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from splatseed.errors import ParameterError
 
-__all__ = ["MOST_GRID", "StereoSettings"]
+__all__ = ["LEAST_SIZE", "MOST_GRID", "StereoSettings"]
 
+LEAST_SIZE = 32
 MOST_GRID = 32
 MOST_SOURCES = 8
 """Bits of the byte that records which views agree."""
@@ -35,7 +36,9 @@ class StereoSettings:
     """Pixels of higher cost (one minus correlation, 0 to 2) are left out."""
 
     def __post_init__(self) -> None:
-        _check(self.max_size >= 32, "stereo.max_size of at least 32", self.max_size)
+        _check(
+            self.max_size >= LEAST_SIZE, f"stereo.max_size of at least {LEAST_SIZE}", self.max_size
+        )
         _check(1 <= self.grid <= MOST_GRID, f"stereo.grid from 1 to {MOST_GRID}", self.grid)
         _check(self.sweeps >= 1, "stereo.sweeps of at least 1", self.sweeps)
         most = MOST_SOURCES

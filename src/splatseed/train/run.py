@@ -322,8 +322,8 @@ def _check_images(scene: Scene) -> None:
         raise SceneNotFoundError(
             "a scene with photographs to train on",
             found=f"points alone{where}",
-            fix="Name the scene's folder. To begin with the points of a scan, add them to it: "
-            "splatseed upsample SCENE --cloud FILE -o OUT.",
+            fix="Name a scene with cameras, images and photographs. To begin with the points of a "
+            "scan, add them to it: splatseed upsample SCENE --cloud FILE -o OUT.",
         )
 
 

@@ -125,7 +125,7 @@ class TrainSettings:
             raise ParameterError(
                 f"--{name.replace('_', '-')} of {expected}".replace("of one of", "among"),
                 found=f"{getattr(self, name)}",
-                fix="See splatseed train --help.",
+                fix="Leave it out for the default.",
             )
 
     @property

@@ -63,7 +63,14 @@ def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
     Args:
         images: The images.
         data_factor: The factor by which photographs are downsampled.
+
+    Raises:
+        SceneFormatError: A photograph would have no pixel left.
     """
+    for image in images:
+        sides = image.camera.width // data_factor, image.camera.height // data_factor
+        if not min(sides):
+            raise _too_small(image.name, 1, data_factor, sides)
     unseen = np.empty((0, 0, 3), np.uint8)
     shrink = np.diag([1 / data_factor, 1 / data_factor, 1.0])
     cameras = [(image.name, image.camera) for image in images]
@@ -220,12 +227,7 @@ def _load_view(
     photograph, file_size = load_photograph(path, data_factor, cache_dir)
     height, width = photograph.shape[:2]
     if min(width, height) < min_side:
-        raise SceneFormatError(
-            f"{path} to have at least {min_side} pixels a side, reduced by a factor of "
-            f"{data_factor}",
-            found=f"{width} x {height}",
-            fix="Choose a smaller --data-factor, or a larger --long-side.",
-        )
+        raise _too_small(path, min_side, data_factor, (width, height))
     camera = image.camera
     scale = _file_from_camera(path, file_size, (camera.width, camera.height)) / data_factor
     K = np.diag([*scale, 1.0]) @ camera.K
@@ -235,6 +237,17 @@ def _load_view(
 
     photograph, known = undistort(photograph, image.intrinsics, K)
     return View(image.name, photograph, K, width, height, camera.cam_from_world, known)
+
+
+def _too_small(
+    name: Path | str, min_side: int, data_factor: int, size: tuple[int, int]
+) -> SceneFormatError:
+    pixels = "pixel" if min_side == 1 else "pixels"
+    return SceneFormatError(
+        f"{name} to have at least {min_side} {pixels} a side, reduced by a factor of {data_factor}",
+        found=f"{size[0]} x {size[1]}",
+        fix="Choose a smaller --data-factor, or a larger --long-side.",
+    )
 
 
 def _file_from_camera(

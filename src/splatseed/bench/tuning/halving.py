@@ -166,7 +166,7 @@ def verdict(results: Results, steps: int) -> Verdict | None:
         results: Results of the rung.
         steps: Steps of its runs.
     """
-    ranking = _ranking(results)
+    ranking = _ranking(_of_common_repeats(results))
     base = next((arm for arm, _ in ranking if is_baseline(arm)), None)
     if base is None or len(ranking) < 2:
         return None
@@ -182,6 +182,15 @@ def verdict(results: Results, steps: int) -> Verdict | None:
         len(results[winner].keys() & results[base].keys()),
         tuple(ranking),
     )
+
+
+def _of_common_repeats(results: Results) -> Results:
+    """The results of repeats that all arms have: a round that was stopped has more of some arms."""
+    done = [set(runs) for runs in results.values() if runs]
+    common = set.intersection(*done) if done else set()
+    if not common:
+        return results
+    return {arm: {r: runs[r] for r in common & runs.keys()} for arm, runs in results.items()}
 
 
 def _by_view(base: Mapping[int, RunResult], own: Mapping[int, RunResult]) -> np.ndarray:

@@ -15,7 +15,7 @@ from splatseed.commands.options import check_least
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError
 from splatseed.monocular import DeviceName
-from splatseed.stereo.settings import MOST_GRID
+from splatseed.stereo.settings import LEAST_SIZE, MOST_GRID
 
 __all__ = ["Options", "check_together"]
 
@@ -104,7 +104,8 @@ def check_together(options: Options) -> None:
             fix="Name a network with --model, or match the photographs themselves with --stereo.",
         )
     check_least(options, 0, "seed")
-    check_least(options, 1, "grid", "batch", "max_size", "input_size", "input_multiple")
+    check_least(options, 1, "grid", "batch", "input_size", "input_multiple")
+    check_least(options, LEAST_SIZE if options.stereo else 1, "max_size")
     if (options.grid or 1) > MOST_GRID:
         found = f"{options.grid}"
         raise ParameterError(f"--grid from 1 to {MOST_GRID}", found=found, fix="Try 4.")

@@ -203,7 +203,10 @@ def _help(arguments: list[str]) -> None:
 
 def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
     """The options, with those of the methods given."""
-    return parse_options(_with_methods(methods, "--help" in arguments), "upsample", arguments)
+    kind = _with_methods(methods, "--help" in arguments)
+    own = [name for name in METHODS if any(word.startswith(f"--{name}.") for word in arguments)]
+    page = f"upsample --method {own[0]}" if own else "upsample"
+    return parse_options(kind, "upsample", arguments, page=page)
 
 
 def full_options() -> type[Any]:
@@ -240,6 +243,7 @@ def run(arguments: list[str]) -> None:
     if asks_what_to_do(arguments):
         _advise(arguments)
         return
+    _check_asks_for_points(arguments)
     options, methods = parse(arguments)
     check_options(options)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
@@ -255,6 +259,19 @@ def run(arguments: list[str]) -> None:
         run_tiled(options, methods, source, _provenance)
         return
     _run_in_memory(options, methods)
+
+
+def _check_asks_for_points(arguments: Sequence[str]) -> None:
+    """Refuse an option of the advice, whose words ``--help`` does not list."""
+    named = _named(arguments)
+    if {"-h", "--help", HELP_ALL} & set(named):
+        return
+    if "--max-steps" in {word.partition("=")[0] for word in arguments}:
+        raise ParameterError(
+            "--max-steps without -o and --method, where it asks for advice",
+            found=" and ".join(named),
+            fix="Leave it out: it is an option of splatseed train.",
+        )
 
 
 def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
@@ -311,7 +328,9 @@ def _advise(arguments: list[str]) -> None:
                 found="none",
                 fix="Name it; without it, splatseed upsample SCENE only says what to do.",
             ) from None
-        unknown = any(word.startswith("--") and word not in known for word in given)
+        unknown = any(
+            word.startswith("--") and word not in {*known, *ADVICE_OPTIONS} for word in given
+        )
         if unknown and "Did you mean" not in error.fix:
             parse(arguments)  # knows more options that may be meant
         raise
@@ -319,8 +338,13 @@ def _advise(arguments: list[str]) -> None:
 
 def asks_what_to_do(arguments: Sequence[str]) -> bool:
     """Whether neither an output nor a method is named, but a scene."""
-    named = ("-o", "--output", "--method", "-h", "--help", HELP_ALL)
-    return bool(arguments) and not any(word.partition("=")[0] in named for word in arguments)
+    return bool(arguments) and not _named(arguments)
+
+
+def _named(arguments: Sequence[str]) -> list[str]:
+    """The options with which points are added, or help is printed."""
+    names = ("-o", "--output", "--method", "-h", "--help", HELP_ALL)
+    return [name for word in arguments if (name := word.partition("=")[0]) in names]
 
 
 def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:

@@ -97,10 +97,12 @@ class RunFolder:
             return
         check_output(self.path, kind=KIND, overwrite=overwrite or self.is_run, protect=protect)
         if self.is_run and not overwrite:
+            ended = self.metrics.is_file()
+            go_on = "" if ended else "--resume, without options that differ, to continue it, "
             raise OutputError(
                 f"no folder, or an empty one, at {self.path}",
-                found="an earlier run",
-                fix="Pass --resume to continue it, --overwrite to replace it, or choose another.",
+                found="a finished run" if ended else "an unfinished run",
+                fix=f"Pass {go_on}--overwrite to replace it, or choose another.",
             )
 
     def begin(self, config: Mapping[str, object]) -> None:
