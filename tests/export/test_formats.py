@@ -227,6 +227,7 @@ def test_what_is_no_model_is_named(tmp_path):
         ("a.ksplat", bytes(40), "splat-transform IN.ksplat"),
         ("a.glb", b"glTF\x02\0\0\0", "no glTF"),
         ("a.json", b"{}", "a whole SOG|version"),
+        ("metrics.json", b'{"psnr": 20.0}', "describes no Gaussians"),
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(SceneFormatError, match=word):

@@ -100,6 +100,8 @@ def decode(path: Path) -> Gaussians:
 
 def _decoded(path: Path, content: Callable[[str], bytes]) -> Gaussians:
     meta = json.loads(content(META))
+    if "means" not in meta:  # of every version; a run's metrics.json has none
+        raise _damaged(path, "JSON that describes no Gaussians")
     if meta.get("version") != VERSION:
         raise SceneFormatError(
             f"{path} to be a SOG of version {VERSION}",
