@@ -87,6 +87,11 @@ def test_what_is_no_run_is_refused(name, room, splatseed, tmp_path):
     _says(splatseed("evaluate", tmp_path / name, "--scene", room), tmp_path / name, ".ply")
 
 
+def test_a_file_about_a_run_leads_to_the_run(run_folder, splatseed):
+    for name in ("config.json", "metrics.json", "curve.csv"):
+        _says(splatseed("evaluate", run_folder / name), f"Name the run: {run_folder}")
+
+
 def test_a_run_that_has_not_finished_is_refused(run_folder, splatseed, tmp_path):
     for name in ("config.json", "splatseed.json"):
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())

@@ -108,7 +108,20 @@ def test_model_of_points_alone_keeps_cameras_and_drops_tracks(scene_dir, model):
     assert scene.intrinsics == model.intrinsics
     assert scene.tracks is None
     np.testing.assert_array_equal(scene.points.xyz, model.points.xyz)
-    assert "tracks" in " ".join(scene.warnings)
+    said = " ".join(scene.warnings)
+    assert f"{scene_dir / 'sparse/0'} has no images.bin or images.txt: copy the whole model" in said
+
+
+def test_a_model_that_lists_no_images_says_which_file_does_not(scene_dir):
+    (scene_dir / "sparse/0/images.bin").write_bytes(bytes(8))
+    assert f"{scene_dir / 'sparse/0/images.bin'} lists none" in warnings_of(scene_dir)
+    shutil.rmtree(scene_dir / "images")
+    for name in ("images.bin", "cameras.bin", "points3D.bin"):
+        (scene_dir / "sparse/0" / name).unlink()
+    write_ply(
+        scene_dir / "sparse/0/points3D.ply", PointCloud(np.eye(3), np.zeros((3, 3), np.uint8))
+    )
+    assert warnings_of(scene_dir) == ""  # a cloud for a trainer, which is to have no poses
 
 
 def test_bare_ply(tmp_path, model):
@@ -127,6 +140,16 @@ def test_missing_photographs_are_counted_and_the_first_is_named(scene_dir, model
     assert model.images[1].name in text
     shutil.rmtree(scene_dir / "images")
     assert "images folder is missing" in warnings_of(scene_dir)
+
+
+@pytest.mark.parametrize("other", [str.upper, lambda name: f"{name}.jpeg"])
+def test_photographs_named_almost_as_their_images_are_told(other, scene_dir, model):
+    path = scene_dir / "images" / model.images[1].name
+    path.rename(path.with_name(other(path.stem) + path.suffix.upper()))
+    text = warnings_of(scene_dir)
+    assert f"the first is {model.images[1].name}" in text
+    near = other(path.stem) == path.stem.upper()
+    assert ("names must be equal to the letter" in text) == near
 
 
 def test_photographs_of_another_size_and_broken_ones_are_told(scene_dir, model):
@@ -225,6 +248,29 @@ def test_sparse_and_a_file_of_a_model_lead_to_the_scene(scene_dir):
         SceneFormatError, match=f"a .png file. Name the scene's folder: {scene_dir}$"
     ):
         load_scene(scene_dir / "images/right/view.png")
+
+
+def test_the_scene_above_is_spelled_as_it_was_named(scene_dir, monkeypatch):
+    for at, name, told in (
+        (scene_dir.parent, f"{scene_dir.name}/images", scene_dir.name),
+        (scene_dir, "images", "."),
+        (scene_dir / "images", ".", scene_dir),
+    ):
+        monkeypatch.chdir(at)
+        with pytest.raises(SceneNotFoundError, match=f"Name the scene's folder: {told}$"):
+            load_scene(name)
+
+
+def test_notes_of_an_output_lead_to_what_they_are_about(scene_dir):
+    manifest = scene_dir / "splatseed.json"
+    manifest.write_text('{"command": "upsample"}')
+    with pytest.raises(SceneFormatError, match=f"wrote. Name the scene's folder: {scene_dir}$"):
+        load_scene(manifest)
+    manifest.write_text('{"command": "train"}')
+    for name in ("config.json", "metrics.json"):
+        (scene_dir / name).write_text("{}")
+        with pytest.raises(SceneNotFoundError, match="a run of splatseed train"):
+            load_scene(scene_dir / name)
 
 
 def test_a_ply_without_points_has_no_poses_to_triangulate_from(tmp_path):

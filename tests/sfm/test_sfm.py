@@ -285,6 +285,10 @@ def test_pictures_of_an_output_are_no_photographs(photos: Path, tmp_path: Path) 
     (scene / "splatseed.json").write_text('{"command": "upsample"}')
     with pytest.raises(SceneNotFoundError, match=f"Name its photographs: {scene}/images"):
         reconstruct(scene, tmp_path / "out")
+    (scene / "images").rmdir()
+    (scene / "splatseed.json").write_text('{"command": "train"}')
+    with pytest.raises(SceneNotFoundError, match="found what splatseed train wrote"):
+        reconstruct(scene, tmp_path / "out")
 
 
 def test_photographs_are_told_before_any_work(photos: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 
 import numpy as np
@@ -14,6 +15,7 @@ from splatseed.io import load_scene
 from splatseed.similarity import Similarity
 from splatseed.splat.ply import read_gaussians
 from splatseed.viewer.renderer import ModelRenderer, model_frame
+from splatseed.viewer.video import write_video
 from splatseed.views.view import poses_of
 
 
@@ -120,6 +122,19 @@ def test_bad_input_is_one_line(words, said, run_folder, tmp_path, monkeypatch, s
     assert said in heard.err
     assert heard.err.count("\n") == 1
     assert not list(tmp_path.glob("*.mp4"))
+
+
+def test_a_stopped_video_leaves_nothing_and_ffmpeg_says_nothing(tmp_path, capfd):
+    def stopped():
+        yield np.zeros((32, 48, 3), np.uint8)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        write_video(tmp_path / "a.mp4", stopped(), (48, 32), 30.0)
+    del caught  # and with it the frames that keep ffmpeg's pipe open
+    gc.collect()
+    assert capfd.readouterr().err == ""
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_scene_is_no_model(room, tmp_path, splatseed):

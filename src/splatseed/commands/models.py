@@ -21,6 +21,7 @@ def model_file(path: Path) -> Path:
         SceneNotFoundError: There is none.
     """
     if path.is_file():
+        _refuse_note(path)
         return path
     folder = RunFolder(path)
     if path.is_dir() and folder.gaussians.is_file():
@@ -38,6 +39,16 @@ def model_file(path: Path) -> Path:
         found=found,
         fix=fix,
     )
+
+
+def _refuse_note(path: Path) -> None:
+    """Refuse the notes and the curve of a run, which are named by mistake for the run."""
+    if path.suffix in {".json", ".csv"} and RunFolder(path.parent).is_run:
+        raise SceneNotFoundError(
+            f"a run of splatseed train, or a file of Gaussians (.ply, .spz, ...), at {path}",
+            found="a file about a run",
+            fix=f"Name the run: {path.parent}",
+        )
 
 
 def config_of(path: Path) -> Mapping[str, Any]:

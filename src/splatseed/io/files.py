@@ -16,7 +16,14 @@ from typing import BinaryIO
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.process.memory import free_memory
 
-__all__ = ["VIDEO_SUFFIXES", "is_video", "open_file", "read_bytes", "read_file"]
+__all__ = [
+    "VIDEO_SUFFIXES",
+    "is_video",
+    "open_file",
+    "other_spelling",
+    "read_bytes",
+    "read_file",
+]
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 
@@ -32,6 +39,17 @@ _WAIT_NOT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr
 def is_video(path: Path) -> bool:
     """Whether a path is a video file, by its name."""
     return path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+
+
+def other_spelling(path: Path) -> str | None:
+    """The name of a file beside a missing one that differs in its suffix or in case only."""
+    try:
+        near = sorted(each.name for each in path.parent.iterdir())
+    except OSError:
+        return None
+    stem = path.stem.casefold()
+    alike = [name for name in near if Path(name).stem.casefold() == stem and name != path.name]
+    return min(alike, key=lambda name: name.casefold() != path.name.casefold(), default=None)
 
 
 def open_file(path: Path) -> BinaryIO:

@@ -9,7 +9,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatseed.io.files import open_file
+from splatseed.io.files import open_file, other_spelling
 from splatseed.literal import told
 from splatseed.scene import Image
 
@@ -35,7 +35,9 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
     warnings = []
     if missing:
         count, first = f"{len(missing)} of {len(images)} images are", next(iter(missing))
-        warnings.append(f"{count} missing in {image_dir}, the first is {first}.")
+        near = other_spelling(image_dir / first)
+        hint = f"; {near} is there, but names must be equal to the letter" if near else ""
+        warnings.append(f"{count} missing in {image_dir}, the first is {first}{hint}.")
     if outside:
         count, first = f"{len(outside)} of {len(images)} images lie", outside[0]
         warnings.append(f"{count} outside of {root}, the first is {first}.")

@@ -109,6 +109,7 @@ def _read_file(path: Path) -> Scene:
         ".json": read_transforms_scene,
     }
     refuse_foreign(path)
+    _refuse_of_output(path)
     if is_video(path):
         raise SceneFormatError(
             f"{path} to be a scene folder, a .ply or a .json file",
@@ -123,13 +124,41 @@ def _read_file(path: Path) -> Scene:
             fix=f"Name the scene's folder: {scene_root(path.parent)}",
         )
     if reader is None:
-        folder = next(filter(is_scene, path.absolute().parents[:_ABOVE]), "")
+        folder = _scene_above(path)
         raise SceneFormatError(
             f"{path} to be a scene folder, a .ply or a .json file",
             found=f"a {path.suffix or 'nameless'} file",
             fix=f"Name the scene's folder: {folder}" if folder else "Name the scene's folder.",
         )
     return reader(path)
+
+
+def _refuse_of_output(path: Path) -> None:
+    """Refuse a ``.json`` that splatseed wrote beside a run or a scene.
+
+    Raises:
+        SceneNotFoundError: It is a run's.
+        SceneFormatError: It is a scene's.
+    """
+    kind = kind_of(path.parent)
+    if kind is None or path.suffix != ".json" or path.name.startswith("transforms"):
+        return
+    if kind == "train":
+        raise _is_run(path.parent)
+    if is_scene(path.parent):
+        raise SceneFormatError(
+            f"{path} to be a scene folder, a .ply or a .json file with frames",
+            found=f"notes on what splatseed {kind} wrote",
+            fix=f"Name the scene's folder: {path.parent}",
+        )
+
+
+def _scene_above(path: Path) -> Path | None:
+    """The scene that a file or folder lies in, spelled as the path is."""
+    for level, folder in enumerate(path.absolute().parents[:_ABOVE]):
+        if is_scene(folder):
+            return path.parents[level] if level < len(path.parents) else folder
+    return None
 
 
 def _no_scene(path: Path) -> SceneNotFoundError:
@@ -142,7 +171,7 @@ def _no_scene(path: Path) -> SceneNotFoundError:
         inside, fix = f"scenes in it: {_some(scenes)}", f"Name one of them: {path / scenes[0]}"
     else:
         inside = f"only {_some(near)}" if near else "none of them"
-        above = next(filter(is_scene, path.absolute().parents[:_ABOVE]), None)
+        above = _scene_above(path)
         fix = (
             "Name the scene's folder, or a .ply or .json file itself. For photographs alone, run:"
             " splatseed sfm IMAGES -o SCENE."

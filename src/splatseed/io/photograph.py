@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import read_file
+from splatseed.io.files import other_spelling, read_file
 from splatseed.literal import told
 from splatseed.scene import Scene
 
@@ -65,10 +65,13 @@ def photograph_bytes(path: Path) -> bytes:
     try:
         return read_file(path)
     except FileNotFoundError:
+        near = other_spelling(path)
         raise SceneNotFoundError(
             f"the image {path}",
-            found="no such file",
-            fix="Put it there, or drop it from the model.",
+            found=f"{near} in its place" if near else "no such file",
+            fix="Name it as the model does, to the letter."
+            if near
+            else "Put it there, or drop it from the model.",
         ) from None
     except OSError as error:
         raise _unusable(path, error.strerror or type(error).__name__) from None

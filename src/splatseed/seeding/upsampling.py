@@ -230,5 +230,5 @@ def method_for(
     """The default method, or its replacement if there are no photographs."""
     if isinstance(scene, Scene) and scene.has_photographs:
         return method
-    note(f"The scene has no photographs: method {FALLBACK} is used instead of {DEFAULT_METHOD}.")
+    note(f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}.")
     return FALLBACK

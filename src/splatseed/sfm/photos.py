@@ -117,11 +117,13 @@ def _image_names(image_dir: Path) -> list[str]:
             fix="Name the folder that holds the photographs, or a video "
             f"({', '.join(sorted(VIDEO_SUFFIXES))}).",
         )
-    if (kind := kind_of(image_dir)) is not None and (image_dir / "images").is_dir():
+    if (kind := kind_of(image_dir)) is not None:
+        images = image_dir / "images"
+        fix = f"Name its photographs: {quoted(images)}."
         raise SceneNotFoundError(
             f"a folder of photographs at {image_dir}",
             found=f"what splatseed {kind} wrote, with pictures of its own",
-            fix=f"Name its photographs: {quoted(image_dir / 'images')}.",
+            fix=fix if images.is_dir() else "Name the folder that the photographs are in.",
         )
     relative = [path.relative_to(image_dir) for path in image_dir.rglob("*") if path.is_file()]
     files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -75,11 +76,11 @@ def write_video(
             ffmpeg_log_level="error",
             output_params=["-movflags", "+faststart"],
         )
-        writer.send(None)
         try:
-            for frame in frames:
-                writer.send(np.ascontiguousarray(frame))
-            writer.close()
+            with closing(writer):  # also when stopped: ffmpeg must end before its file is removed
+                writer.send(None)
+                for frame in frames:
+                    writer.send(np.ascontiguousarray(frame))
         except (OSError, RuntimeError) as error:  # ffmpeg ended early
             raise OutputError(
                 f"{path} to be written",

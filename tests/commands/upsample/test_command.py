@@ -99,7 +99,7 @@ def test_without_photographs_the_default_interpolates_and_says_so(own_room, tmp_
     run = splatseed("upsample", own_room, "-o", tmp_path / "out")
     assert run.code == 0
     assert "-> mls" in run.out
-    assert "no photographs" in run.out + run.err
+    assert "Without photographs" in run.out + run.err
 
 
 @pytest.mark.parametrize("words", [["--ratio", 4], ["--num-points", 5000]])

@@ -71,9 +71,9 @@ def read_colmap_scene(model_dir: Path) -> Scene:
         *image_warnings(images, image_dir, root),
         *lens_warnings(images),
     ]
-    if not images and tracks is not None:
-        tracks = None
-        warnings.append("The model has no images; the points' tracks, which name images, are gone.")
+    if not images and (tracks is not None or intrinsics or image_dir is not None):
+        tracks = None  # they name images
+        warnings.append(_no_poses(model_dir))
     return Scene(
         points,
         images,
@@ -129,6 +129,16 @@ def _find_image_dir(root: Path, images: Sequence[Image]) -> Path | None:
     first = images[0].name if images else ""
     holding = (folder for folder in (*folders, root) if first and (folder / first).is_file())
     return next(holding, folders[0] if folders else None)
+
+
+def _no_poses(model_dir: Path) -> str:
+    """Why a model has no images, and what to do."""
+    path = _model_file(model_dir, "images")
+    why = f"{path} lists none" if path else f"{model_dir} has no images.bin or images.txt"
+    return (
+        f"No photograph has a pose, for {why}: copy the whole model, or make one with splatseed "
+        "sfm IMAGES -o SCENE. Points can be made of the points alone; nothing can be trained."
+    )
 
 
 def _model_warnings(root: Path, model_dir: Path) -> list[str]:
