@@ -71,7 +71,7 @@ def test_upsamples_help_is_short_and_says_where_the_rest_is(splatseed):
     assert "--help-all" in short.out
     assert "None" not in short.out  # of choices: their defaults are in words
     words = " ".join(re.sub("[│|]", " ", short.out).split())
-    assert "The scene folder to write. (without it: a recommendation, nothing is written)" in words
+    assert "The scene folder to write. (without it: a recommendation for --budget and" in words
     assert ".laz, .e57" in words
     one = splatseed("upsample", "--method", "mls", "--help").out
     assert "--mls.k" in one

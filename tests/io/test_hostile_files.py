@@ -60,7 +60,7 @@ def _rename(scene_dir, model, name):
 def test_a_name_that_leads_out_of_the_scene_is_told(scene_dir, model, name):
     _rename(scene_dir, model, name)
     (told,) = [each for each in load_scene(scene_dir).warnings if "outside of" in each]
-    assert f"1 of {len(model.images)} images lie outside of {scene_dir}" in told
+    assert f"1 of {len(model.images)} images lies outside of {scene_dir}" in told
     assert name in told
 
 

@@ -22,6 +22,7 @@ from splatseed.io.output.staging import atomic_file, check_output, check_parents
 from splatseed.requirements import require
 from splatseed.train.settings import Backend, TrainSettings
 from splatseed.views.photographs import user_cache_dir
+from splatseed.wording import counted
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.evaluate import EvalResult, Lpips
@@ -236,7 +237,7 @@ def _summarise(options: Options, task: _Task, result: EvalResult) -> None:
         result.psnr, result.covisible_psnr, result.covisible_share, result.ssim, result.lpips
     )
     print_table(
-        f"{len(rows)} test views of {task.scene}",
+        f"{counted(len(rows), 'test view')} of {task.scene}",
         ("image", "PSNR, dB", "co-visible, dB", "of pixels", "SSIM", net, "render, ms"),
         [*rows, ("mean", *mean, f"{1e3 * result.render_seconds:.1f}")],
     )

@@ -17,6 +17,7 @@ import tyro
 
 from splatseed.errors import ParameterError
 from splatseed.literal import did_you_mean
+from splatseed.wording import agreeing
 
 __all__ = ["check_least", "known_options", "parse_options"]
 
@@ -121,7 +122,10 @@ def _complaint(
         found = {1: "none", 2: "neither"}.get(len(missing), "none of them")
         fix = f"{see} {'it' if len(missing) == 1 else 'them'}."
         return ParameterError(", and ".join(missing), found=found, fix=fix)
-    return _unfit(verb, _sentence(said), see)
+    if more := re.fullmatch(r"unrecognized options: (.+)", sentence := _sentence(said)):
+        what = agreeing(len(more[1].split()), "a word that belongs", "words that belong")
+        return _unfit(verb, f"{what} to none: {more[1]}", see)
+    return _unfit(verb, sentence, see)
 
 
 def _bad_value(box: str, see: str) -> ParameterError | None:

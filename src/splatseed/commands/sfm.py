@@ -29,6 +29,7 @@ from splatseed.literal import quoted, visible
 from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, triangulate
 from splatseed.sfm.photos import name_some
 from splatseed.sfm.video import pick_frames
+from splatseed.wording import counted
 
 __all__ = ["run"]
 
@@ -156,7 +157,7 @@ def _tell_photographs(images: Path, names: Sequence[str]) -> None:
     folders = Counter(str(PurePosixPath(name).parent) for name in names)
     shown = name_some([f"{count:,} in {folder}" for folder, count in folders.most_common()])
     where = "" if set(folders) == {"."} else f": {shown}"
-    ERR.print(visible(f"{len(names):,} photographs in {images}{where}"), soft_wrap=True)
+    ERR.print(visible(f"{counted(len(names), 'photograph')} in {images}{where}"), soft_wrap=True)
 
 
 def _summarise(options: Options, report: SfmReport) -> None:

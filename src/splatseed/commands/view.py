@@ -18,6 +18,7 @@ from splatseed.literal import visible
 from splatseed.requirements import require
 from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Backend
+from splatseed.wording import counted
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.viewer.shown import Shown
@@ -166,7 +167,8 @@ def _announce(options: Options, port: int, opened: list[Shown], beside: int | No
 def _contents(shown: Shown) -> str:
     parts = []
     if shown.gaussians is not None:
-        parts.append(f"{len(shown.gaussians):,} Gaussians")
+        parts.append(counted(len(shown.gaussians), "Gaussian"))
     if shown.scene is not None:
-        parts.append(f"{len(shown.scene.points):,} points, {len(shown.scene.images):,} images")
+        parts += [counted(len(shown.scene.points), "point")]
+        parts += [counted(len(shown.scene.images), "image")]
     return ", ".join(parts)

@@ -26,6 +26,7 @@ from splatseed.pointcloud import ORIGINAL
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 from splatseed.views.visibility import find_visibility
+from splatseed.wording import agreeing
 
 __all__ = ["Lifted", "lift"]
 
@@ -210,7 +211,9 @@ def _missing_notes(scene: Scene, num_used: int, hold_out: int) -> tuple[str, ...
     expected = len(scene.split(hold_out)[0] if hold_out else scene.images)
     if num_used >= expected:
         return ()
-    return (f"{expected - num_used} of {expected} images have no depth map and give no points.",)
+    lacking = expected - num_used
+    what = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
+    return (f"{lacking} of {expected} images {what} no points.",)
 
 
 def _exhausted(views: Sequence[View]) -> bool:

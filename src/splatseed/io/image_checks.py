@@ -12,6 +12,7 @@ from pathlib import Path
 from splatseed.io.files import open_file, other_spelling
 from splatseed.literal import told
 from splatseed.scene import Image
+from splatseed.wording import agreeing
 
 __all__ = ["image_warnings", "lens_warnings"]
 
@@ -34,13 +35,19 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
     missing = {im.name: None for im in images if not (image_dir / im.name).is_file()}
     warnings = []
     if missing:
-        count, first = f"{len(missing)} of {len(images)} images are", next(iter(missing))
+        first, are = next(iter(missing)), agreeing(len(missing), "is", "are")
         near = other_spelling(image_dir / first)
         hint = f"; {near} is there, but names must be equal to the letter" if near else ""
-        warnings.append(f"{count} missing in {image_dir}, the first is {first}{hint}.")
+        warnings.append(
+            f"{len(missing)} of {len(images)} images {are} missing in {image_dir}, the first is "
+            f"{first}{hint}."
+        )
     if outside:
-        count, first = f"{len(outside)} of {len(images)} images lie", outside[0]
-        warnings.append(f"{count} outside of {root}, the first is {first}.")
+        lie = agreeing(len(outside), "lies", "lie")
+        warnings.append(
+            f"{len(outside)} of {len(images)} images {lie} outside of {root}, the first is "
+            f"{outside[0]}."
+        )
     present = [im for im in images if im.name not in missing]
     sample = present[:: -(-len(present) // _MAX_OPENED) or 1]  # evenly spaced, the first among them
     wrong = [text for im in sample if (text := _size_warning(im, image_dir))]

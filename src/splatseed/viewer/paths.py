@@ -27,6 +27,7 @@ from splatseed.splat.gaussians import Gaussians
 from splatseed.viewer.renderer import CORE, resized
 from splatseed.views.view import View
 from splatseed.views.viewpoint import look_at
+from splatseed.wording import counted
 
 __all__ = ["check_path", "focus_of", "orbit", "path_of_file", "smooth_path", "views_from"]
 
@@ -65,7 +66,7 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
     if len(stops) < 2 or not reach > 0:
         raise ParameterError(
             "cameras in at least two places, for a path through them",
-            found=f"{len(views)} cameras",
+            found=counted(len(views), "camera"),
             fix="Pass --orbit, or --path FILE.",
         )
     # Turning by one radian counts as moving by the extent of the cameras.
@@ -155,7 +156,7 @@ def path_of_file(path: Path, size: tuple[int, int]) -> tuple[list[View], float |
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise _no_path(path, told(error)) from None
     if not 0 < len(views) <= MOST_FRAMES:
-        raise _no_path(path, f"{len(views)} cameras")
+        raise _no_path(path, counted(len(views), "camera"))
     return views, fps
 
 

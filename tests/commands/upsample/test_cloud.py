@@ -126,7 +126,7 @@ SPOILT = {
         ("not a number", "found 9 that are not finite"),
         ("degrees", "longitude and latitude: export the cloud in metres"),
         ("a national grid", r"none of 60,000, .* \(56\d{4}, 59\d{5}, .*--align.*--recenter would"),
-        ("another place", "lie at its depth. It is in another frame .* or of another place"),
+        ("another place", "at its depth. It is in another frame .* or of another place"),
         ("once, a million times", "found none of 1,000,000"),
     ],
 )

@@ -126,10 +126,10 @@ def test_images_without_pose_or_file_are_left_out_and_told(capture):
     assert [image.name for image in scene.images] == [f"{times[0]:.6f}.png", f"{times[2]:.6f}.png"]
     assert len(scene.warnings) == 2
     assert (
-        f"1 images have no pose near their time and are left out, the first is rgb/{times[3]:.6f}"
+        f"1 image without a pose close in time is left out, the first is rgb/{times[3]:.6f}"
         in (scene.warnings[0])
     )
-    assert "no file" in scene.warnings[1]
+    assert "1 image without a file is left out" in scene.warnings[1]
 
 
 def test_far_records_are_not_interpolated(capture):

@@ -16,6 +16,7 @@ from splatseed.bench.analysis.statistics import LEVEL, Difference, Verdict
 from splatseed.bench.analysis.study import BASELINE, Study, Variant
 from splatseed.bench.planning.records import RunResult
 from splatseed.train.settings import StrategyName
+from splatseed.wording import counted
 
 __all__ = ["decibels", "summary"]
 
@@ -43,7 +44,7 @@ def decibels(gain: Difference) -> str:
 
 def _answer(gained: Gains, best: Variant) -> str:
     """Whether any variant gains, and which gains most."""
-    scenes = _count(len(gained.scenes), "scene")
+    scenes = counted(len(gained.scenes), "scene")
     lead = f"Strategy {gained.strategy}, {scenes}:"
     top = gained.on_these[best]
     if top.verdict == "unknown":
@@ -52,14 +53,14 @@ def _answer(gained: Gains, best: Variant) -> str:
             f" The highest is that of {best.label}, {decibels(top)}."
         )
     better, worse = (_those(gained, verdict) for verdict in ("better", "worse"))
-    of = f"of {_count(len(gained.variants), 'variant')}"
+    of = f"of {counted(len(gained.variants), 'variant')}"
     if better:
         most = f"{best.label} most ({decibels(top)})"
         text = f"{lead} yes, {len(better)} {of} gain more than noise, {most}."
     else:
         text = (
             f"{lead} no gain beyond noise was found among "
-            f"{_count(len(gained.variants), 'variant')}; the"
+            f"{counted(len(gained.variants), 'variant')}; the"
             f" highest is that of {best.label}, {decibels(top)}."
         )
     loses = (
@@ -144,10 +145,6 @@ def _times(
     pairs = _pairs(study, strategy, variant)
     logs = [math.log(max(measure(own), 1e-9) / max(measure(base), 1e-9)) for base, own in pairs]
     return math.exp(fmean(logs))
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -10,6 +10,7 @@ from splatseed.bench.analysis.study import Study
 from splatseed.bench.analysis.tables import Table, words
 from splatseed.bench.planning.records import RunRow
 from splatseed.bench.report.html import Section, paragraphs, preformatted, table
+from splatseed.wording import counted
 
 __all__ = ["counts", "ledger_sections"]
 
@@ -23,7 +24,7 @@ def counts(rows: Sequence[RunRow]) -> str:
     Args:
         rows: The ledger's rows.
     """
-    told = [f"{len(rows):,} runs"]
+    told = [counted(len(rows), "run")]
     for status, said in (("done", "done"), ("failed", "failed"), ("running", "running"),
                          ("pending", "to do")):  # fmt: skip
         number = sum(row.status == status for row in rows)

@@ -22,10 +22,11 @@ from splatseed.commands.bench.options import PLAN, Asked, Options, parse_plan
 from splatseed.commands.bench.prepare import Prepared, prepare
 from splatseed.commands.bench.summary import print_summary
 from splatseed.console import OUT, print_note, stage_display
-from splatseed.errors import MissingDependencyError, SceneNotFoundError
+from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
 from splatseed.io.output.staging import atomic_file
-from splatseed.literal import visible
+from splatseed.literal import did_you_mean, visible
 from splatseed.process.interruption import exit_code
+from splatseed.wording import counted
 
 __all__ = ["run"]
 
@@ -39,6 +40,13 @@ def run(arguments: list[str]) -> None:
         reporting = import_module("splatseed.commands.bench.report")
         getattr(reporting, REPORTING[arguments[0]])(arguments[1:])
         return
+    if arguments and not arguments[0].startswith("-"):
+        meant = did_you_mean(arguments[0], REPORTING)
+        raise ParameterError(
+            f"{' or '.join(REPORTING)} after splatseed bench, or options",
+            found=repr(arguments[0]),
+            fix=f"{meant}Name scenes with --scenes; see splatseed bench --help.",
+        )
     options, asked = parse_plan(arguments)
     if options.dry_run or options.output is None:
         _dry_run(options, asked)
@@ -145,7 +153,7 @@ def _counts(rows: Sequence[RunRow]) -> str:
     """The number of runs, and how many of them are done."""
     done, failed = (sum(row.status == status for row in rows) for status in ("done", "failed"))
     ended = f" ({done} done, {failed} failed, {len(rows) - done - failed} to do)"
-    return f"{len(rows)} runs{ended if done or failed else ''}"
+    return f"{counted(len(rows), 'run')}{ended if done or failed else ''}"
 
 
 def _estimates(

@@ -32,6 +32,7 @@ from splatseed.console import (
 from splatseed.errors import SceneNotFoundError
 from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
+from splatseed.wording import counted
 
 __all__ = ["run_compare", "run_report"]
 
@@ -137,6 +138,6 @@ def _notes(comparison: Comparison, tables: Iterable[Table]) -> Iterable[str]:
     if not changes.rows:
         yield "They have no scene and method in common."
     if comparison.same_runs:
-        yield f"{comparison.same_runs} runs are in both, with the same key and score."
+        yield f"{counted(comparison.same_runs, 'run')} in both, with the same key and score."
     for scene in comparison.content:
         yield f"{scene} is not the same in both: its points, cameras or photographs differ."

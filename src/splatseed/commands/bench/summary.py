@@ -12,6 +12,7 @@ from splatseed.bench.running.kept import ERROR, kept_folder
 from splatseed.commands.bench.display import describe
 from splatseed.console import print_commands, print_note, print_pairs, print_table
 from splatseed.literal import quoted
+from splatseed.wording import counted
 
 __all__ = ["print_summary"]
 
@@ -91,10 +92,14 @@ def _print_next(bench: Path, rows: Collection[RunRow], failed: int) -> None:
     left = sum(row.status == "pending" for row in rows)
     elsewhere = sum(row.status == "running" for row in rows)
     if elsewhere:
-        print_note(f"Another process has {elsewhere} runs, or had when it was last seen.")
+        print_note(
+            f"Another process has {counted(elsewhere, 'run')}, or had when it was last seen."
+        )
     commands = []
     if left or elsewhere:
-        commands.append((f"the other {left + elsewhere} runs", f"splatseed bench -o {name}"))
+        commands.append(
+            (f"the other {counted(left + elsewhere, 'run')}", f"splatseed bench -o {name}")
+        )
     if failed:
         commands.append(("retry what failed", f"splatseed bench -o {name} --retry-failed"))
     print_commands("next", [*commands, ("tables and pictures", f"splatseed bench report {name}")])

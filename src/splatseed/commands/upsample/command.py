@@ -68,6 +68,7 @@ from splatseed.upsample import (
     planned_size,
     traits_of,
 )
+from splatseed.wording import counted
 
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.method import Cloud
@@ -425,9 +426,10 @@ def _announce(
     ):
         print_note(f"Profile paper changes nothing for method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
+    size = f"{counted(len(scene.images), 'image')}, {counted(len(scene.points), 'point')}"
     OUT.print(
-        f"{visible(options.scene)} ({kind}, {len(scene.images)} images, {len(scene.points):,} "
-        f"points)\n  -> {method_words(options.method, method, options.profile)}\n  "
+        f"{visible(options.scene)} ({kind}, {size})\n"
+        f"  -> {method_words(options.method, method, options.profile)}\n  "
         f"-> {visible(options.output)} ({number}, seed {options.seed}){takes}",
         soft_wrap=True,
     )

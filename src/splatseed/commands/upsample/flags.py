@@ -61,7 +61,9 @@ def default_flag(stands_in: str, metavar: str) -> Any:
 def output_flag() -> Any:
     """The flag --output; a scene alone is a question for advice."""
     return tyro.conf.arg(
-        aliases=["-o"], help_behavior_hint="(without it: a recommendation, nothing is written)"
+        aliases=["-o"],
+        help_behavior_hint="(without it: a recommendation for --budget and --max-steps, nothing is "
+        "written)",
     )
 
 

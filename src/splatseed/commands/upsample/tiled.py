@@ -34,6 +34,7 @@ from splatseed.scene import Scene
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for
 from splatseed.upsample import BYTES_EACH, Upsampler, planned_size
 from splatseed.upsample.registry import source_code
+from splatseed.wording import counted
 
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options
@@ -283,8 +284,8 @@ def _resuming(path: Path) -> str:
     weighed, made = (len(list((path / name).glob("*[0-9]"))) for name in ("weighed", "made"))
     place = f"Going on with the work in {visible(path)}"
     if made:
-        return f"{place}: {made:,} tiles are done."
-    return f"{place}: {weighed:,} tiles are prepared." if weighed else f"{place}."
+        return f"{place}: {counted(made, 'tile')} done."
+    return f"{place}: {counted(weighed, 'tile')} prepared." if weighed else f"{place}."
 
 
 def _write(

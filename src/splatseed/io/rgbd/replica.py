@@ -30,6 +30,7 @@ from splatseed.io.rgbd.capture import (
 )
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
+from splatseed.wording import agreeing, counted
 
 __all__ = ["load_rgbd"]
 
@@ -173,4 +174,6 @@ def _warnings(frames: list[Path], tracked: Bool[np.ndarray, " N"]) -> tuple[str,
     lost = [frames[i].name for i in np.flatnonzero(~tracked)]
     if not lost:
         return ()
-    return (f"{len(lost)} frames have no finite pose and are left out, the first is {lost[0]}.",)
+    are = agreeing(len(lost), "is", "are")
+    what = f"{counted(len(lost), 'frame')} without a finite pose"
+    return (f"{what} {are} left out, the first is {lost[0]}.",)

@@ -28,6 +28,7 @@ from splatseed.io.image_checks import lens_warnings
 from splatseed.io.rgbd.capture import check_size, find_camera_file, read_intrinsics
 from splatseed.io.rgbd.tum_lists import TOLERANCE, nearest_in_time, poses_at, read_list, read_track
 from splatseed.scene import Image, Scene, SceneSource
+from splatseed.wording import agreeing, counted
 
 __all__ = ["find_tum_depths", "is_tum", "load_tum"]
 
@@ -94,8 +95,8 @@ def load_tum(path: Path) -> Scene:
         source=SceneSource("rgbd", root, root / "groundtruth.txt", image_dir=root / folder),
         warnings=(
             *guessed,
-            *_left_out("no pose near their time", [names[i] for i in np.flatnonzero(~near)]),
-            *_left_out("no file", [names[i] for i in np.flatnonzero(near & ~present)]),
+            *_left_out("a pose close in time", [names[i] for i in np.flatnonzero(~near)]),
+            *_left_out("a file", [names[i] for i in np.flatnonzero(near & ~present)]),
             *lens_warnings(images),
         ),
     )
@@ -198,7 +199,9 @@ def _common_folder(names: Sequence[str]) -> PurePosixPath:
     return folders.pop() if len(folders) == 1 else PurePosixPath()
 
 
-def _left_out(why: str, names: Sequence[str]) -> tuple[str, ...]:
+def _left_out(lacking: str, names: Sequence[str]) -> tuple[str, ...]:
     if not names:
         return ()
-    return (f"{len(names)} images have {why} and are left out, the first is {names[0]}.",)
+    are = agreeing(len(names), "is", "are")
+    what = f"{counted(len(names), 'image')} without {lacking}"
+    return (f"{what} {are} left out, the first is {names[0]}.",)

@@ -277,16 +277,16 @@ def _check_fit(judged: Judged) -> tuple[str, ...]:
     """
     if judged.asked < ENOUGH:
         return ()
-    found = f"{judged.fit:.0%} of the scene's own points that are seen there lie at its depth"
+    share = f"{judged.fit:.0%} of the scene's own points seen there"
     if judged.fit < FITS:
         raise PointCloudError(
             "a cloud that fits the scene's own points",
-            found=found,
+            found=f"{share} at its depth",
             fix="It is in another frame (try --align, or give --transform FILE), or of another "
             "place.",
         )
     doubt = ": check its frame and its unit" if judged.fit < DOUBTFUL else ""
-    return (f"The cloud fits: {found}, within 3%{doubt}.",)
+    return (f"The cloud fits: {share} lie at its depth, within 3%{doubt}.",)
 
 
 def _fates(judged: Judged, num: int) -> tuple[str, ...]:
