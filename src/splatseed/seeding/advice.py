@@ -141,7 +141,7 @@ def advise(
         none = "There are no points to begin with."
         return Advice("auto", (none, maps) if measured.depth_maps else (none,))
     if not measured.photographs:
-        return Advice("mls", ("No photograph has a pose, so points are interpolated.",))
+        return Advice("mls", ("Without photographs and their poses, points are interpolated.",))
     has = most_seeds / measured.num_points
     per_pixel = f"{measured.num_points:,} points, {_share(measured.points_per_pixel)} per pixel"
     if has < room or strategy == GROWS:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 
 import numpy as np
@@ -132,8 +133,15 @@ def test_a_scenes_own_maps_are_counted(tmp_path, splatseed):
     assert _pairs(splatseed("info", folder).out)["depth maps"] == "3"
     run = splatseed("info", folder, "--depth", folder)
     assert run.code == 0
-    assert "0 SfM points see depth; 20 are needed" in run.out
-    assert "splatseed sfm" in run.out.splitlines()[-1]
+    assert "no points to align the depth maps with" in run.out
+    assert "left out" not in run.out
+    lifted, triangulated = run.out.splitlines()[-2:]
+    assert "splatseed sfm" in triangulated
+    words = shlex.split(lifted.split("splatseed ")[1])
+    made = splatseed(*[tmp_path / "out" if word == "OUT" else word for word in words])
+    assert made.code == 0, made.err
+    wanted = int(words[words.index("--num-points") + 1])
+    assert len(load_scene(tmp_path / "out").points) == wanted > 100
 
 
 def _as_rgbd(scene, depths, folder):

@@ -9,7 +9,7 @@ from splatseed.lens import undistort_command
 from splatseed.literal import quoted
 from splatseed.scene import Scene
 
-__all__ = ["after_network", "after_stereo", "look", "number_for", "use"]
+__all__ = ["PER_POINT", "after_network", "after_stereo", "look", "number_for", "use"]
 
 
 RATIO = 16

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from splatseed.commands.depth.next_steps import number_for, use
+from splatseed.commands.depth.next_steps import PER_POINT, number_for, use
 from splatseed.commands.info.advice import Planned, advice_commands, advice_for, advice_rows
 from splatseed.commands.info.as_json import print_json
 from splatseed.commands.options import parse_options
@@ -102,7 +102,7 @@ def run(arguments: list[str]) -> None:
         problems = find_problems(scene, cloud, None if was_upsampled(scene) else regions)
         alignments = _alignments(options, scene, clock)
         known = _known_depths(options, scene, clock)
-        problems = (*problems, *_unfit_maps(alignments or {}))
+        problems = (*problems, *_unfit_maps(scene, alignments or {}))
     if options.json:
         print_json(scene, cloud, tracks, regions, alignments, problems)
         return
@@ -154,7 +154,10 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
     return alignments
 
 
-def _unfit_maps(alignments: Mapping[str, Alignment]) -> list[str]:
+def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
+    if alignments and not len(scene.points):
+        unit = "only maps in the scene's unit can be used, with --no-align"
+        return [f"there are no points to align the depth maps with: {unit}"]
     unfit = sum(each.rejected is not None for each in alignments.values())
     maps = f"{unfit:,} of {len(alignments):,} depth maps"
     return [f"{maps} cannot be aligned with the points, and are left out"] if unfit else []
@@ -175,7 +178,17 @@ def _next_commands(options: Options, scene: Scene, known: int) -> list[tuple[str
     images = scene.source.image_dir if scene.source else None
     photographs = "IMAGES" if images is None else quoted(images)
     points = f"splatseed sfm {photographs} --poses-from {quoted(options.scene)} -o OUT"
-    return [*advised, ("or points" if advised else "points", points)]
+    maps = _from_maps(options, scene, known)
+    return [*advised, *maps, ("or points" if advised or maps else "points", points)]
+
+
+def _from_maps(options: Options, scene: Scene, known: int) -> list[tuple[str, str]]:
+    """The command for seeds from metric maps of a scene without points."""
+    if not known or options.depth is None or is_distorted(scene):
+        return []
+    most = Planned.of(scene, options.budget, options.max_steps).most_seeds
+    how = number_for(0, min(known, PER_POINT * most))
+    return [("or from the maps", use(options.scene, options.depth, f"--no-align {how}")[1])]
 
 
 def _known_depths(options: Options, scene: Scene, clock: StageClock) -> int:

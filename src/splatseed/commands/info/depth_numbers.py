@@ -35,6 +35,9 @@ def print_depth(
     """
     example = _example(scene)
     kind: DepthKind = example.kind if example else "z"
+    if not len(scene.points):  # nothing to compare with
+        print_pairs(title, [("maps", _maps(scene, example, alignments))])
+        return
     print_pairs(title, _summary(scene, example, alignments))
     ordered = sorted(alignments, key=lambda name: _badness(name, alignments[name]))
     listed = ordered if list_all else ordered[:ROWS]
@@ -53,15 +56,20 @@ def _example(scene: Scene) -> DepthMap | None:
     return None if first is None or depths is None else depths.read(first)
 
 
+def _maps(scene: Scene, example: DepthMap | None, alignments: Mapping[str, Alignment]) -> str:
+    """How many maps there are, and of which size and kind."""
+    maps = f"{len(alignments):,} of {len(scene.images):,} images"
+    if example is None:
+        return maps
+    return f"{maps}, the first {example.width} x {example.height}, kind {example.kind}"
+
+
 def _summary(
     scene: Scene, example: DepthMap | None, alignments: Mapping[str, Alignment]
 ) -> list[tuple[str, str]]:
     used = [a for a in alignments.values() if a.rejected is None]
-    maps = f"{len(alignments):,} of {len(scene.images):,} images"
-    if example is not None:
-        maps += f", the first {example.width} x {example.height}, kind {example.kind}"
     rows = [
-        ("maps", maps),
+        ("maps", _maps(scene, example, alignments)),
         ("left out", f"{len(alignments) - len(used):,}"),
         ("SfM points per image", _spread((a.num_points for a in alignments.values()), ".0f")),
     ]
