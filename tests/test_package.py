@@ -29,7 +29,6 @@ MODULES = ["splatseed"] + [m.name for m in pkgutil.walk_packages(splatseed.__pat
 ORDER = (
     "errors",
     "literal",
-    "wording",
     "requirements",
     "progress",
     "process",

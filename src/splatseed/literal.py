@@ -1,4 +1,4 @@
-"""Names, bytes and errors of files as text that terminals, shells and people take as it is meant.
+"""Names, numbers, bytes and errors as text that terminals, shells and people take as it is meant.
 
 Promise: whatever characters a name has, it can neither move the cursor, colour the terminal, begin
 a new line, nor change the command it is printed in.
@@ -14,7 +14,15 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
 
-__all__ = ["beginning", "did_you_mean", "quoted", "told", "visible"]
+__all__ = [
+    "agreeing",
+    "beginning",
+    "counted",
+    "did_you_mean",
+    "quoted",
+    "told",
+    "visible",
+]
 
 MOST_TOLD = 160
 OBJECT = re.compile(r"<[\w.]+[^<>]*(?: at 0x[0-9a-f]+|name=[^<>]*)>")
@@ -101,6 +109,30 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     bare = {each.lstrip("-"): each for each in known}
     close = get_close_matches(word.lower().lstrip("-"), list(bare), n=1, cutoff=0.6)
     return f"Did you mean {bare[close[0]]}? " if close else ""
+
+
+def counted(number: int, noun: str) -> str:
+    """A number and what it counts.
+
+    Args:
+        number: How many there are.
+        noun: One of them, in a word whose plural ends in s.
+
+    Example:
+        >>> print(counted(1, "test view"), counted(2300, "point"), sep=", ")
+        1 test view, 2,300 points
+    """
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def agreeing(number: int, one: str, more: str) -> str:
+    """The verb that agrees with a number of things.
+
+    Example:
+        >>> agreeing(1, "is", "are")
+        'is'
+    """
+    return one if number == 1 else more
 
 
 def _shows(character: str) -> bool:

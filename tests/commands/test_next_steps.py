@@ -113,7 +113,11 @@ def test_nothing_is_to_be_trained_without_its_photographs(kept, own_room, tmp_pa
         each.unlink()
     if kept == "no folder":
         shutil.rmtree(images)
-    missing = {"none": "missing 12 of 12", "some": "view_003.png", "no folder": "beside the model"}
+    missing = {
+        "none": "and 11 more into",
+        "some": "put view_003.png into",
+        "no folder": "beside the model",
+    }
     for words in (("upsample", own_room), ("upsample", own_room, "-o", tmp_path / "out")):
         run = splatseed(*words)
         assert run.code == 0, run.err

@@ -19,10 +19,10 @@ from splatseed.errors import (
     SceneNotFoundError,
 )
 from splatseed.io.output.staging import atomic_file, check_output, check_parents, output_folder
+from splatseed.literal import counted
 from splatseed.requirements import require
 from splatseed.train.settings import Backend, TrainSettings
 from splatseed.views.photographs import user_cache_dir
-from splatseed.wording import counted
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.evaluate import EvalResult, Lpips

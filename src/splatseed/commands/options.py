@@ -16,8 +16,7 @@ from typing import Any, TypeVar
 import tyro
 
 from splatseed.errors import ParameterError
-from splatseed.literal import did_you_mean
-from splatseed.wording import agreeing
+from splatseed.literal import agreeing, did_you_mean
 
 __all__ = ["check_least", "known_options", "parse_options"]
 

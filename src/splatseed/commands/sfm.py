@@ -25,11 +25,10 @@ from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.output.staging import check_output
-from splatseed.literal import quoted, visible
+from splatseed.literal import counted, quoted, visible
 from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, triangulate
 from splatseed.sfm.photos import name_some
 from splatseed.sfm.video import pick_frames
-from splatseed.wording import counted
 
 __all__ = ["run"]
 

@@ -14,11 +14,10 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneNotFoundError, SplatseedError
-from splatseed.literal import visible
+from splatseed.literal import counted, visible
 from splatseed.requirements import require
 from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Backend
-from splatseed.wording import counted
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.viewer.shown import Shown

@@ -22,11 +22,11 @@ from splatseed.depth.candidates import NEAR_EDGE, UNCONFIRMED, choose, gather
 from splatseed.depth.settings import Settings
 from splatseed.depth.views import Reader, View
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.literal import agreeing
 from splatseed.pointcloud import ORIGINAL
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 from splatseed.views.visibility import find_visibility
-from splatseed.wording import agreeing
 
 __all__ = ["Lifted", "lift"]
 

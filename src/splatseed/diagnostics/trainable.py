@@ -5,7 +5,7 @@ Promise: no photograph is opened.
 
 from __future__ import annotations
 
-from splatseed.literal import visible
+from splatseed.literal import agreeing, visible
 from splatseed.scene import Scene
 
 __all__ = ["is_distorted", "untrainable"]
@@ -24,9 +24,10 @@ def untrainable(scene: Scene) -> str:
     missing = [image.name for image in scene.images if not (folder / image.name).is_file()]
     if not missing:
         return ""
+    which = agreeing(len(missing), "", f"and {len(missing) - 1:,} more ")
     return (
-        f"Training needs all photographs: put the missing {len(missing):,} of "
-        f"{len(scene.images):,}, such as {visible(missing[0])}, into {visible(folder)}."
+        f"Training needs all {len(scene.images):,} photographs: put {visible(missing[0])} {which}"
+        f"into {visible(folder)}."
     )
 
 

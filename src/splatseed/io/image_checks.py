@@ -10,9 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from splatseed.io.files import open_file, other_spelling
-from splatseed.literal import told
+from splatseed.literal import agreeing, told
 from splatseed.scene import Image
-from splatseed.wording import agreeing
 
 __all__ = ["image_warnings", "lens_warnings"]
 

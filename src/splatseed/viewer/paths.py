@@ -20,14 +20,13 @@ from scipy.ndimage import gaussian_filter1d
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_bytes
-from splatseed.literal import told
+from splatseed.literal import counted, told
 from splatseed.similarity import Similarity
 from splatseed.splat.frame import stray_views
 from splatseed.splat.gaussians import Gaussians
 from splatseed.viewer.renderer import CORE, resized
 from splatseed.views.view import View
 from splatseed.views.viewpoint import look_at
-from splatseed.wording import counted
 
 __all__ = ["check_path", "focus_of", "orbit", "path_of_file", "smooth_path", "views_from"]
 

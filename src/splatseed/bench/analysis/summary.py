@@ -15,8 +15,8 @@ from splatseed.bench.analysis.gains import Gains, gains
 from splatseed.bench.analysis.statistics import LEVEL, Difference, Verdict
 from splatseed.bench.analysis.study import BASELINE, Study, Variant
 from splatseed.bench.planning.records import RunResult
+from splatseed.literal import counted
 from splatseed.train.settings import StrategyName
-from splatseed.wording import counted
 
 __all__ = ["decibels", "summary"]
 

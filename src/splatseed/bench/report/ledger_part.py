@@ -10,7 +10,7 @@ from splatseed.bench.analysis.study import Study
 from splatseed.bench.analysis.tables import Table, words
 from splatseed.bench.planning.records import RunRow
 from splatseed.bench.report.html import Section, paragraphs, preformatted, table
-from splatseed.wording import counted
+from splatseed.literal import counted
 
 __all__ = ["counts", "ledger_sections"]
 

@@ -31,8 +31,7 @@ from splatseed.console import (
 )
 from splatseed.errors import SceneNotFoundError
 from splatseed.io.output.staging import check_output
-from splatseed.literal import quoted
-from splatseed.wording import counted
+from splatseed.literal import counted, quoted
 
 __all__ = ["run_compare", "run_report"]
 

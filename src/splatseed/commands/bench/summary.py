@@ -11,8 +11,7 @@ from splatseed.bench.planning.records import SFM, Arm, RunRow
 from splatseed.bench.running.kept import ERROR, kept_folder
 from splatseed.commands.bench.display import describe
 from splatseed.console import print_commands, print_note, print_pairs, print_table
-from splatseed.literal import quoted
-from splatseed.wording import counted
+from splatseed.literal import counted, quoted
 
 __all__ = ["print_summary"]
 

@@ -51,7 +51,7 @@ from splatseed.errors import ParameterError
 from splatseed.io import WriteReport, find_depths, load_scene, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.output.staging import check_output
-from splatseed.literal import visible
+from splatseed.literal import counted, visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.process.memory import bytes_of
 from splatseed.scene import Scene
@@ -68,7 +68,6 @@ from splatseed.upsample import (
     planned_size,
     traits_of,
 )
-from splatseed.wording import counted
 
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.method import Cloud

@@ -26,7 +26,7 @@ from splatseed.io import WriteReport, load_scene, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap.scene import find_model
 from splatseed.io.output.point_stream import PointStream
-from splatseed.literal import visible
+from splatseed.literal import counted, visible
 from splatseed.pointcloud import PointCloud
 from splatseed.process.memory import free_memory, option_of, words_of
 from splatseed.progress import Progress
@@ -34,7 +34,6 @@ from splatseed.scene import Scene
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for
 from splatseed.upsample import BYTES_EACH, Upsampler, planned_size
 from splatseed.upsample.registry import source_code
-from splatseed.wording import counted
 
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options

@@ -28,9 +28,9 @@ from splatseed.io.rgbd.capture import (
     read_intrinsics,
     read_text,
 )
+from splatseed.literal import agreeing, counted
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
-from splatseed.wording import agreeing, counted
 
 __all__ = ["load_rgbd"]
 

@@ -27,8 +27,8 @@ from splatseed.io.depth.lens import Undistortion
 from splatseed.io.image_checks import lens_warnings
 from splatseed.io.rgbd.capture import check_size, find_camera_file, read_intrinsics
 from splatseed.io.rgbd.tum_lists import TOLERANCE, nearest_in_time, poses_at, read_list, read_track
+from splatseed.literal import agreeing, counted
 from splatseed.scene import Image, Scene, SceneSource
-from splatseed.wording import agreeing, counted
 
 __all__ = ["find_tum_depths", "is_tum", "load_tum"]
 
