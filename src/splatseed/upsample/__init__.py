@@ -219,7 +219,7 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
             raise ParameterError(
                 "a ratio of at least 1 (points in all, per original)",
                 found=f"{ratio:g}" if isinstance(ratio, Real) else repr(ratio),
-                fix="Give --ratio 8 for eight times as many points.",
+                fix="A ratio of 8 makes eight times as many points.",
             )
         if ratio * num_original > MAX_POINTS:
             raise ParameterError(
