@@ -79,7 +79,7 @@ WRONG_CALLS = [
     ({"ratio": 2, "num_points": 320}, "found both"),
     ({"seed": -1}, "a seed"),
     ({"seed": "one"}, "a seed"),
-    ({"ratio": "8"}, "a ratio of at least 1"),
+    ({"ratio": "8"}, "expected ratio of at least 1"),
     ({"num_points": "800"}, "a whole number of points"),
 ]
 

@@ -217,7 +217,7 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
         ratio = DEFAULT_RATIO if ratio is None else ratio
         if not isinstance(ratio, Real) or not 1 <= ratio < np.inf:
             raise ParameterError(
-                "a ratio of at least 1 (points in all, per original)",
+                "ratio of at least 1 (points in all, per original)",
                 found=f"{ratio:g}" if isinstance(ratio, Real) else repr(ratio),
                 fix="A ratio of 8 makes eight times as many points.",
             )
