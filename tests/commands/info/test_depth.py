@@ -112,9 +112,23 @@ def test_as_many_points_are_asked_for_as_depth_prints(tour, tmp_path, splatseed)
     few = lambda i, z: np.where(np.arange(z.size).reshape(z.shape) < 20 * (i + 1), z, np.nan)
     maps = _rewrite(tour, tmp_path / "maps", few)
     known = 20 * sum(range(1, 16))  # the first map says nothing about the others
-    number = number_for(len(load_scene(tour).points), known)
+    number = number_for(len(load_scene(tour).points), known, 10**6)
     assert number.startswith("--num-points")
     assert splatseed("info", tour, "--depth", maps).out.splitlines()[-1].count(f" {number} ") == 1
+
+
+@pytest.mark.parametrize(
+    ("points", "known", "most", "said"),
+    [
+        (100, 10**6, 10**6, "--ratio 16"),
+        (100, 10**6, 900, "--num-points 900"),  # training would thin out the others
+        (100, 80, 900, "--num-points 110"),
+        (100, 10**6, 50, "--num-points 101"),
+        (0, 800, 10**6, "--num-points 100"),
+    ],
+)
+def test_no_more_points_are_asked_for_than_there_is_room_for(points, known, most, said):
+    assert number_for(points, known, most) == said
 
 
 def test_a_scale_of_the_users_is_taken(room, tmp_path, splatseed):

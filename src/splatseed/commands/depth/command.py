@@ -9,6 +9,7 @@ from splatseed.commands.depth.next_steps import after_network
 from splatseed.commands.depth.options import Options, check_together
 from splatseed.commands.depth.stereo import provenance, run_stereo
 from splatseed.commands.options import parse_options
+from splatseed.commands.planned import Planned
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.output.staging import check_output
@@ -20,6 +21,7 @@ from splatseed.monocular import (
     load_network,
 )
 from splatseed.scene import Scene
+from splatseed.train.schedule import FULL_RUN
 
 __all__ = ["run"]
 
@@ -95,4 +97,5 @@ def _summarise(options: Options, scene: Scene, network: DepthNetwork, report: De
             + (f" and {more} more" if more > 0 else "")
         )
     known = report.num_images * math.prod(report.sizes[0])
-    print_commands("next", after_network(options.scene, scene, report.path, known))
+    most = Planned.of(scene, None, FULL_RUN).most_seeds
+    print_commands("next", after_network(options.scene, scene, report.path, known, most))

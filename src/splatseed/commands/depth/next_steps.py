@@ -9,7 +9,7 @@ from splatseed.lens import undistort_command
 from splatseed.literal import quoted
 from splatseed.scene import Scene
 
-__all__ = ["PER_POINT", "after_network", "after_stereo", "look", "number_for", "use"]
+__all__ = ["after_network", "after_stereo", "look", "number_for", "use"]
 
 
 RATIO = 16
@@ -18,7 +18,9 @@ PER_POINT = 8
 away from depth discontinuities: on stereo's maps of a kitchen with 14% known, one in 8.2 was."""
 
 
-def after_stereo(path: Path, scene: Scene, maps: Path, confirmed: int) -> list[tuple[str, str]]:
+def after_stereo(
+    path: Path, scene: Scene, maps: Path, confirmed: int, most: int
+) -> list[tuple[str, str]]:
     """What to do with stereo's maps, which need no alignment.
 
     Args:
@@ -26,20 +28,23 @@ def after_stereo(path: Path, scene: Scene, maps: Path, confirmed: int) -> list[t
         scene: The scene.
         maps: The folder of the maps.
         confirmed: Number of pixels with a depth, of all maps.
+        most: Most seeds with which training can begin.
     """
     if is_distorted(scene):  # seeds are lifted along the rays of a pinhole camera
         return [look(path, maps)]
-    number = number_for(len(scene.points), confirmed)
+    number = number_for(len(scene.points), confirmed, most)
     aligned = "" if len(scene.points) else "--no-align "
     return [look(path, maps), use(path, maps, aligned + number)]
 
 
-def after_network(path: Path, scene: Scene, maps: Path, known: int) -> list[tuple[str, str]]:
+def after_network(
+    path: Path, scene: Scene, maps: Path, known: int, most: int
+) -> list[tuple[str, str]]:
     """What to do with a network's maps, which must be aligned to points; arguments as above."""
     if is_distorted(scene):
         return [look(path, maps), ("for seeds, begin with", undistort_command(path))]
     if len(scene.points):
-        return [look(path, maps), use(path, maps, number_for(len(scene.points), known))]
+        return [look(path, maps), use(path, maps, number_for(len(scene.points), known, most))]
     photographs = scene.source.image_dir if scene.source else None
     images = "IMAGES" if photographs is None else quoted(photographs)
     made = Path("SCENE")
@@ -53,15 +58,18 @@ def look(path: Path, maps: Path) -> tuple[str, str]:
     return "look", info
 
 
-def number_for(points: int, known: int) -> str:
-    """The option for as many points as maps can give, at most ``RATIO`` times those there are.
+def number_for(points: int, known: int, most: int) -> str:
+    """The option for as many points as maps can give and training can begin with.
+
+    Of a scene with points, at most ``RATIO`` times as many.
 
     Args:
         points: Points of the scene.
         known: Number of pixels with a depth, of all maps.
+        most: Most seeds with which training can begin.
     """
-    most = points + max(1, known // PER_POINT)
-    return f"--ratio {RATIO}" if 0 < RATIO * points <= most else f"--num-points {most}"
+    number = max(points + 1, min(most, points + known // PER_POINT))
+    return f"--ratio {RATIO}" if 0 < RATIO * points <= number else f"--num-points {number}"
 
 
 def use(path: Path, maps: Path, how: str) -> tuple[str, str]:

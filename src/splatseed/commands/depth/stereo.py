@@ -15,6 +15,7 @@ import numpy as np
 
 from splatseed.commands.depth.next_steps import after_stereo, look
 from splatseed.commands.depth.options import Options
+from splatseed.commands.planned import Planned
 from splatseed.console import OUT, StageClock, print_commands, print_note, stage_display
 from splatseed.diagnostics.trainable import is_distorted
 from splatseed.io import load_scene
@@ -27,6 +28,7 @@ from splatseed.io.dense import (
 from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted, visible
 from splatseed.scene import Scene
+from splatseed.train.schedule import FULL_RUN
 
 if TYPE_CHECKING:
     from splatseed.stereo import StereoMap
@@ -142,7 +144,8 @@ def _sizes(maps: Sequence[StereoMap]) -> str:
 
 def _next(options: Options, scene: Scene, written: Path, confirmed: int) -> list[tuple[str, str]]:
     if not options.colmap:
-        return after_stereo(options.scene, scene, written, confirmed)
+        most = Planned.of(scene, None, FULL_RUN).most_seeds
+        return after_stereo(options.scene, scene, written, confirmed, most)
     fused = quoted(written / "fused.ply")
     fuse = (
         f"colmap stereo_fusion --workspace_path {quoted(written)} --output_path {fused}"

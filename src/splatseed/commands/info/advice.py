@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import tyro
 
 from splatseed.commands.options import parse_options
+from splatseed.commands.planned import Planned
 from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
 from splatseed.diagnostics.scene import empty_regions
 from splatseed.diagnostics.trainable import is_distorted, untrainable
@@ -32,12 +32,9 @@ from splatseed.seeding.advice import (
     stereo_agreement,
 )
 from splatseed.train.schedule import FULL_RUN
-from splatseed.train.seeds import most_seeds
-from splatseed.train.settings import BUDGET, TrainSettings
 
 __all__ = [
     "ADVICE_OPTIONS",
-    "Planned",
     "advice_commands",
     "advice_for",
     "advice_rows",
@@ -52,44 +49,6 @@ Budget = Annotated[
         help_behavior_hint="(default: 1rho, as splatseed train's)",
     ),
 ]
-
-
-@dataclass(frozen=True)
-class Planned:
-    """How a scene will be trained.
-
-    Args:
-        budget: Most Gaussians at the end.
-        max_steps: Training steps.
-        strategy: The strategy that ``splatseed train`` chooses for these steps.
-        most_seeds: Most seeds with which training begins.
-        flags: The options of ``splatseed train`` that differ from its defaults.
-    """
-
-    budget: int
-    max_steps: int
-    strategy: str
-    most_seeds: int
-    flags: str = ""
-
-    @classmethod
-    def of(cls, scene: Scene, budget: str | None, max_steps: int) -> Planned:
-        """A scene's plan, from the options.
-
-        Raises:
-            ParameterError: One of them is out of its range.
-        """
-        sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
-        pixels = round(float(np.median(sizes))) if sizes else BUDGET
-        number = max(2, min(BUDGET, pixels))
-        if budget is not None:
-            from splatseed.seeding.thinning import points_within  # noqa: PLC0415  (loads Numba)
-
-            number = max(2, points_within(scene, budget))
-        settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
-        flags = "" if budget is None else f"--cap-max {number} "
-        flags += "" if max_steps == FULL_RUN else f"--max-steps {max_steps} "
-        return cls(number, max_steps, settings.densification, most_seeds(settings, number), flags)
 
 
 def advice_for(

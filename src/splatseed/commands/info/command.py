@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from splatseed.commands.depth.next_steps import PER_POINT, number_for, use
-from splatseed.commands.info.advice import Planned, advice_commands, advice_for, advice_rows
+from splatseed.commands.depth.next_steps import number_for, use
+from splatseed.commands.info.advice import advice_commands, advice_for, advice_rows
 from splatseed.commands.info.as_json import print_json
 from splatseed.commands.options import parse_options
+from splatseed.commands.planned import Planned
 from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
 from splatseed.depthmap import DepthKind
 from splatseed.diagnostics.scene import (
@@ -166,7 +167,8 @@ def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
 def _next_commands(options: Options, scene: Scene, known: int) -> list[tuple[str, str]]:
     """What to do next with the scene, or what there is to choose from."""
     if options.depth is not None and len(scene.points) and not is_distorted(scene):
-        number = number_for(len(scene.points), known)
+        planned = Planned.of(scene, options.budget, options.max_steps)
+        number = number_for(len(scene.points), known, planned.most_seeds)
         return [("", use(options.scene, options.depth, number)[1])]
     advised = []
     if len(scene.points) or scene.has_photographs:
@@ -187,8 +189,8 @@ def _from_maps(options: Options, scene: Scene, known: int) -> list[tuple[str, st
     if not known or options.depth is None or is_distorted(scene):
         return []
     most = Planned.of(scene, options.budget, options.max_steps).most_seeds
-    how = number_for(0, min(known, PER_POINT * most))
-    return [("or from the maps", use(options.scene, options.depth, f"--no-align {how}")[1])]
+    how = f"--no-align {number_for(0, known, most)}"
+    return [("or from the maps", use(options.scene, options.depth, how)[1])]
 
 
 def _known_depths(options: Options, scene: Scene, clock: StageClock) -> int:
