@@ -260,7 +260,7 @@ def _notes(
     """How many points met which fate, one sentence each."""
     dropped = ~(agrees | bare | unknown)
     fates = (
-        (moved, "agree only after a move of more than a quarter of their spacing"),
+        (moved, "of them do so only after a move of more than a quarter of their spacing"),
         (dropped, "agree nowhere and were dropped"),
         (bare, "lie on flat surfaces without texture and were kept in place, at low confidence"),
         (unknown, "are seen by fewer than two photographs and were kept unchecked"),

@@ -73,6 +73,10 @@ def test_the_default_looks_at_the_photographs(room, tmp_path, splatseed):
         (("--method", "mls", "--budget", "1k"), "at most 1,000 points, seed 0"),
         (("--method", "mls", "--budget", "9k"), "-> mls ->"),
         (("--method", "mls", "--mls.k", "12", "--budget", "300"), "-> mls (k=12) ->"),
+        (
+            ("--method", "linear", "--ratio", "2", "--verify", "--cover", "8"),
+            "(928 points before --verify and --cover, seed 0)",
+        ),
         (("--method", "linear", "--profile", "paper"), "-> linear (profile paper) ->"),
     ],
 )

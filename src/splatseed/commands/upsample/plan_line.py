@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 from splatseed.scene import Scene
 from splatseed.upsample import Profile, Upsampler, configure
@@ -33,12 +34,13 @@ def method_words(name: str, method: Upsampler, profile: Profile) -> str:
     return f"{name} ({told})" if told else name
 
 
-def number_words(total: int | None, most: int | None) -> str:
+def number_words(total: int | None, most: int | None, changed_by: Sequence[str] = ()) -> str:
     """How many points there will be.
 
     Args:
         total: Points in all; None if the photographs determine the number.
         most: The budget, if there is one.
+        changed_by: Options that add points to the method's, or drop some of them.
 
     Example:
         >>> number_words(None, 50_000), number_words(800, 1000)
@@ -46,7 +48,10 @@ def number_words(total: int | None, most: int | None) -> str:
     """
     if most is not None and (total is None or total > most):
         return f"at most {most:,} points"
-    return "as many points as the photographs need" if total is None else f"{total:,} points"
+    if total is None:
+        return "as many points as the photographs need"
+    before = f" before {' and '.join(changed_by)}" if changed_by else ""
+    return f"{total:,} points{before}"
 
 
 def only_originals(scene: Scene) -> Scene:
