@@ -217,6 +217,9 @@ def test_what_is_no_scene_is_one_error(tmp_path, scene_dir):
         load_scene(tmp_path / "nowhere")
     with pytest.raises(SceneFormatError, match=r"a \.txt file"):
         load_scene(tmp_path / "notes.txt")
+    (tmp_path / "hall.laz").touch()
+    with pytest.raises(SceneFormatError, match=r"a scan. Make seeds of it: .* --cloud \S+hall.laz"):
+        load_scene(tmp_path / "hall.laz")
     with pytest.raises(SceneNotFoundError, match="none of them"):
         load_scene(tmp_path / "empty")
     with pytest.raises(SceneNotFoundError, match=r"transforms_train\.json"):

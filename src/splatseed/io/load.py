@@ -31,6 +31,7 @@ __all__ = ["is_scene", "load_scene"]
 _TRANSFORMS = "transforms.json"
 _ABOVE = 3
 """Folders above a file in which its scene is looked for: images may lie in folders of their own."""
+_SCANS = frozenset({".las", ".laz", ".e57", ".pcd", ".xyz", ".asc", ".pts", ".glb"})
 _TRIANGULATE = "Make points with: splatseed sfm IMAGES --poses-from SCENE -o OUT."
 
 
@@ -122,6 +123,12 @@ def _read_file(path: Path) -> Scene:
             f"{path} to be a scene folder, a .ply or a .json file",
             found="one file of a COLMAP model",
             fix=f"Name the scene's folder: {scene_root(path.parent)}",
+        )
+    if reader is None and path.suffix.lower() in _SCANS:
+        raise SceneFormatError(
+            f"{path} to be a scene folder, a .ply or a .json file",
+            found=f"a {path.suffix} file, a scan",
+            fix=f"Make seeds of it: splatseed upsample SCENE --cloud {quoted(path)} -o OUT.",
         )
     if reader is None:
         folder = _scene_above(path)

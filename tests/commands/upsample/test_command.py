@@ -77,6 +77,7 @@ def test_the_default_looks_at_the_photographs(room, tmp_path, splatseed):
             ("--method", "linear", "--ratio", "2", "--verify", "--cover", "8"),
             "(928 points before --verify and --cover, seed 0)",
         ),
+        (("--method", "linear", "--ratio", "2"), "(928 points, seed 0)"),
         (("--method", "linear", "--profile", "paper"), "-> linear (profile paper) ->"),
     ],
 )

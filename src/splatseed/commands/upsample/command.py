@@ -290,7 +290,8 @@ def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
         method = methods[options.method]
         total = _planned(options, method, len(scene.points))
         most = None if options.budget is None else points_within(scene, options.budget)
-    changed_by = [f"--{name}" for name in ("verify", "cover") if getattr(options, name)]
+    given = {"--verify": options.verify, "--cover": options.cover_cell is not None}
+    changed_by = [option for option, is_given in given.items() if is_given]
     number = number_words(total, most, changed_by)
     _announce(options, scene, method, number, _idle(options, methods), brought.takes)
     with stage_display(clock):
