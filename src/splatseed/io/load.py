@@ -111,33 +111,27 @@ def _read_file(path: Path) -> Scene:
     }
     refuse_foreign(path)
     _refuse_of_output(path)
-    if is_video(path):
-        raise SceneFormatError(
-            f"{path} to be a scene folder, a .ply or a .json file",
-            found="a video",
-            fix=f"Make a scene of it first: splatseed sfm {quoted(path)} -o SCENE.",
-        )
     reader = readers.get(path.suffix.lower())
-    if reader is None and find_model(path.parent) is not None:
-        raise SceneFormatError(
-            f"{path} to be a scene folder, a .ply or a .json file",
-            found="one file of a COLMAP model",
-            fix=f"Name the scene's folder: {scene_root(path.parent)}",
-        )
-    if reader is None and path.suffix.lower() in _SCANS:
-        raise SceneFormatError(
-            f"{path} to be a scene folder, a .ply or a .json file",
-            found=f"a {path.suffix} file, a scan",
-            fix=f"Make seeds of it: splatseed upsample SCENE --cloud {quoted(path)} -o OUT.",
-        )
     if reader is None:
-        folder = _scene_above(path)
-        raise SceneFormatError(
-            f"{path} to be a scene folder, a .ply or a .json file",
-            found=f"a {path.suffix or 'nameless'} file",
-            fix=f"Name the scene's folder: {folder}" if folder else "Name the scene's folder.",
-        )
+        found, fix = _no_reader(path)
+        expected = f"{path} to be a scene folder, a .ply or a .json file"
+        raise SceneFormatError(expected, found=found, fix=fix)
     return reader(path)
+
+
+def _no_reader(path: Path) -> tuple[str, str]:
+    """What a file is that no scene can be read from, and what to do with it."""
+    kind = path.suffix.lower()
+    if is_video(path):
+        return "a video", f"Make a scene of it first: splatseed sfm {quoted(path)} -o SCENE."
+    if find_model(path.parent) is not None:
+        return "one file of a COLMAP model", f"Name the scene's folder: {scene_root(path.parent)}"
+    if kind in _SCANS:
+        seeds = f"splatseed upsample SCENE --cloud {quoted(path)} -o OUT"
+        return f"a {kind} file, a scan", f"Make seeds of it: {seeds}."
+    folder = _scene_above(path)
+    fix = f"Name the scene's folder: {folder}" if folder else "Name the scene's folder."
+    return f"a {path.suffix or 'nameless'} file", fix
 
 
 def _refuse_of_output(path: Path) -> None:
