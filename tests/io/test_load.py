@@ -109,12 +109,15 @@ def test_model_of_points_alone_keeps_cameras_and_drops_tracks(scene_dir, model):
     assert scene.tracks is None
     np.testing.assert_array_equal(scene.points.xyz, model.points.xyz)
     said = " ".join(scene.warnings)
-    assert f"{scene_dir / 'sparse/0'} has no images.bin or images.txt: copy the whole model" in said
+    assert (
+        f"{scene_dir / 'sparse/0'} has no images.bin or images.txt, so no photograph has a pose"
+        in said
+    )
 
 
 def test_a_model_that_lists_no_images_says_which_file_does_not(scene_dir):
     (scene_dir / "sparse/0/images.bin").write_bytes(bytes(8))
-    assert f"{scene_dir / 'sparse/0/images.bin'} lists none" in warnings_of(scene_dir)
+    assert f"{scene_dir / 'sparse/0/images.bin'} lists no images" in warnings_of(scene_dir)
     shutil.rmtree(scene_dir / "images")
     for name in ("images.bin", "cameras.bin", "points3D.bin"):
         (scene_dir / "sparse/0" / name).unlink()

@@ -134,10 +134,10 @@ def _find_image_dir(root: Path, images: Sequence[Image]) -> Path | None:
 def _no_poses(model_dir: Path) -> str:
     """Why a model has no images, and what to do."""
     path = _model_file(model_dir, "images")
-    why = f"{path} lists none" if path else f"{model_dir} has no images.bin or images.txt"
+    why = f"{path} lists no images" if path else f"{model_dir} has no images.bin or images.txt"
     return (
-        f"No photograph has a pose, for {why}: copy the whole model, or make one with splatseed "
-        "sfm IMAGES -o SCENE. Points can be made of the points alone; nothing can be trained."
+        f"{why}, so no photograph has a pose: copy the whole model, or make one with splatseed sfm "
+        "IMAGES -o SCENE. Points can be interpolated, but nothing can be trained."
     )
 
 
