@@ -129,9 +129,9 @@ def test_no_regions_without_images_or_points(rng):
     assert empty_regions(_scene(np.zeros((0, 3)), images=(_image("a"),))) is None
 
 
-def _statistics(num_points, isolated):
+def _statistics(num_points, isolated, duplicates=0):
     three, five = (0.0,) * 3, (1.0,) * 5
-    return CloudStatistics(num_points, 0, 0, isolated, five, three, three, 0.0)
+    return CloudStatistics(num_points, 0, duplicates, isolated, five, three, three, 0.0)
 
 
 def test_problems_are_told_and_the_readers_come_first(rng):
@@ -143,4 +143,6 @@ def test_problems_are_told_and_the_readers_come_first(rng):
     assert [text.split()[0] for text in others] == ["100", "80%"]
     # Not only those with surfaces: linear and triangle reject isolated points too.
     assert "methods that interpolate start nothing from them" in others[0]
+    (repeats,) = find_problems(_scene(rng.random((5, 3))), _statistics(1000, 100, 200), None)
+    assert repeats.startswith("100 points (12.5%)")  # of those that are left
     assert "no points" in find_problems(_scene([]), _statistics(0, 0), None)[0]

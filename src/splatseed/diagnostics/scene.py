@@ -154,9 +154,10 @@ def find_problems(
 ) -> tuple[str, ...]:
     """What a user should know before training, one sentence each; the reader's warnings first."""
     problems = list(scene.warnings)
-    if cloud.isolated > MANY_ISOLATED * max(cloud.num_points, 1):
+    used = cloud.num_points - cloud.non_finite - cloud.duplicates
+    if cloud.isolated > MANY_ISOLATED * max(used, 1):
         problems.append(
-            f"{cloud.isolated:,} points ({cloud.isolated / cloud.num_points:.1%}) are isolated: "
+            f"{cloud.isolated:,} points ({cloud.isolated / used:.1%}) are isolated: "
             "outliers or a sparse background; methods that interpolate start nothing from them"
         )
     if cloud.num_points == 0:

@@ -46,7 +46,8 @@ def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
 @pytest.mark.parametrize(("seconds", "psnr"), [(2.4, None), (2.5, 20.0), (9.9, 22.0)])
 def test_psnr_after_some_seconds_counts_those_of_the_seeds(seconds, psnr):
     training = pytest.importorskip("splatseed.commands.demo.training", reason="needs PyTorch")
-    curve = (CurvePoint(10, 0.5, 20.0, 100), CurvePoint(30, 1.5, 22.0, 100))
+    tests = ((10, 0.5, 20.0), (20, 1.0, 22.0), (30, 1.5, 25.0))  # the last is of the mean
+    curve = tuple(CurvePoint(*test, 100) for test in tests)
     arm = training.Arm("auto", None, None, seconds=2.0)
     result = TrainingResult(None, curve, steps=30, train_seconds=1.5, num_seeds=100)
     each = training.TrainedArm(arm, result, None, None)

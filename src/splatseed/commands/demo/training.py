@@ -85,8 +85,12 @@ def total_seconds(each: TrainedArm) -> float:
 
 
 def psnr_after(seconds: float, each: TrainedArm) -> float | None:
-    """The last test PSNR, in dB, of an arm within ``seconds`` in all; None before its first."""
-    known = [test.psnr for test in each.result.curve if each.arm.seconds + test.seconds <= seconds]
+    """The last test PSNR, in dB, of an arm within ``seconds`` in all; None before its first.
+
+    The curve's end is of the mean that a run ends with, which an arm still in training has not yet.
+    """
+    during = each.result.curve[:-1]
+    known = [test.psnr for test in during if each.arm.seconds + test.seconds <= seconds]
     return known[-1] if known else None
 
 
