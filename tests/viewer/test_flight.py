@@ -49,6 +49,18 @@ def test_two_models_are_split_and_odd_sizes_become_even(run_folder, tmp_path, sp
     assert (frames[:, 10:60, 49:51].mean(axis=(0, 2, 3)) > 150).all()  # the line between them
 
 
+def test_without_cameras_the_video_circles_and_says_so(run_folder, tmp_path, splatseed):
+    ply = tmp_path / "model.ply"
+    ply.write_bytes((run_folder / "point_cloud.ply").read_bytes())
+    words = ("flight", ply, "--seconds", 0.1, "--fps", 20, "--size", "48x32", "-o")
+    said = splatseed(*words, tmp_path / "a.mp4")
+    assert said.code == 0, said.err
+    assert "so the video circles; --scene SCENE" in said.out
+    asked = splatseed(*words, tmp_path / "b.mp4", "--orbit")
+    assert "circles" not in asked.out
+    assert (_frames(tmp_path / "a.mp4")[0] == _frames(tmp_path / "b.mp4")[0]).all()
+
+
 def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, splatseed):
     frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 60}
     (tmp_path / "p.json").write_text(json.dumps({"camera_path": 4 * [frame], "fps": 8}))

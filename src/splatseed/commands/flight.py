@@ -11,7 +11,7 @@ import tyro
 
 from splatseed.commands.models import model_file
 from splatseed.commands.options import parse_options
-from splatseed.console import StageClock, print_pairs, stage_display
+from splatseed.console import StageClock, print_note, print_pairs, stage_display
 from splatseed.errors import OutputError, ParameterError
 from splatseed.export import check_opacity, keep_gaussians, parse_crop
 from splatseed.io.output.staging import check_parents
@@ -48,7 +48,8 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The video to write: .mp4, .mkv or .mov."""
     scene: PathOrNone = None
-    """The scene a file of Gaussians belongs to, for its cameras; a run knows its own."""
+    """The scene a file of Gaussians belongs to, for its cameras; a run knows its own. Without
+    cameras, the video circles around the Gaussians."""
     path: PathOrNone = None
     """A camera path in nerfstudio's JSON to follow instead, in the model's world or that of
     --transform."""
@@ -107,7 +108,8 @@ def run(arguments: list[str]) -> None:
         names = [each.name for each in models]
         frames = flight_frames(renderers, names, views, depth=options.depth, progress=clock)
         write_video(options.output, frames, size, fps)
-    _summarise(options, views, size, fps, clock)
+    circles_unasked = shown.scene is None and options.path is None and not options.orbit
+    _summarise(options, views, size, fps, clock, circles_unasked=circles_unasked)
 
 
 def _check(options: Options) -> None:
@@ -222,7 +224,13 @@ def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> 
 
 
 def _summarise(
-    options: Options, views: Sequence[View], size: tuple[int, int], fps: float, clock: StageClock
+    options: Options,
+    views: Sequence[View],
+    size: tuple[int, int],
+    fps: float,
+    clock: StageClock,
+    *,
+    circles_unasked: bool,
 ) -> None:
     seconds = clock.seconds().get("render", 0.0)
     rows = [
@@ -231,3 +239,5 @@ def _summarise(
         ("video", f"{options.output}, {options.output.stat().st_size / 1e6:.1f} MB"),
     ]
     print_pairs("splatseed flight", rows)
+    if circles_unasked:
+        print_note("No cameras are known, so the video circles; --scene SCENE names the scene's.")

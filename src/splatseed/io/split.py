@@ -49,7 +49,9 @@ def follow_lists(scene: Scene) -> Scene:
         split = _split(scene, lists)
         if split is not None:
             return scene.replace(listed=split, warnings=tuple(warnings))
-        warnings.append(f"{lists.origin} was ignored: it does not split the images.")
+        warnings.append(
+            f"{lists.origin} was ignored: it leaves no images to train on, or none to test."
+        )
     return scene.replace(warnings=tuple(warnings))
 
 

@@ -136,12 +136,6 @@ def upsample(
             found=f"{len(originals)} points, none of them finite and original",
             fix="Check that the scene holds the point cloud you meant.",
         )
-    if num_new == 0:  # no originals that a ratio could multiply
-        raise ParameterError(
-            "a number of points where there are no originals",
-            found="a ratio, or 0",
-            fix="Give --num-points.",
-        )
     new = NewPoints(*chosen(whole, num_new or 0, rng, progress))  # a plain tuple will do
     _check_finite(new)
     for sentence in new.notes:
@@ -165,6 +159,12 @@ def number_of_new(
     """
     if not chooses_number(method):
         total = planned_size(num_original, ratio, num_points)
+        if total == 0 and "points" not in traits_of(method).needs:
+            raise ParameterError(
+                "num_points of 1 or more, as there are no originals that a ratio could multiply",
+                found="none" if num_points is None else f"{num_points}",
+                fix="Say how many.",
+            )
         fix = "Ask for {most} in all, with --num-points or a smaller --ratio."
         check_memory(total, BYTES_EACH, "points", fix=fix)
         return total - num_original

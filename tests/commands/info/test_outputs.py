@@ -4,11 +4,24 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from splatseed.io import load_scene, write_scene
 from splatseed.train.record.folder import RunFolder
 from splatseed.upsample import upsample
+
+
+def test_points_of_a_seeded_scene_are_no_problem_for_being_isolated(room, tmp_path, splatseed):
+    scene = load_scene(room)
+    far = scene.points.xyz.copy()
+    far[:40] += 100 * np.arange(1, 41)[:, None]
+    scene = scene.replace(points=scene.points.replace(xyz=far), tracks=None)
+    write_scene(scene, tmp_path / "plain", provenance={})
+    assert "are isolated" in splatseed("info", tmp_path / "plain").out
+    seeds = upsample(scene, "linear", ratio=2)
+    write_scene(scene.replace(points=seeds), tmp_path / "out", provenance={"command": "upsample"})
+    assert "are isolated" not in splatseed("info", tmp_path / "out").out
 
 
 @pytest.fixture

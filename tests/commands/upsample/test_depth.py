@@ -67,7 +67,10 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(without_points, tmp_path
     surfaces = make_capture(0, num_views=12, width=120, height=90).surfaces
     # A PNG holds depth to a tenth of a millimetre.
     assert surfaces.distance(scene.points.xyz.astype(np.float64)).max() < 0.001
-    for words, says in ((["--no-align"], "--num-points"), (["--num-points", 9], "--poses-from")):
+    for words, says in (
+        (["--no-align"], "--num-points of 1 or more"),
+        (["--num-points", 9], "--poses-from"),
+    ):
         run = upsample(splatseed, without_points, tmp_path / "other", *words)
         assert (run.code, run.err.count("\n")) == (2, 1)
         assert says in run.err

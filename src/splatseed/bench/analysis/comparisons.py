@@ -119,8 +119,9 @@ def equal_count_table(study: Study) -> Table:
 def _equal_note(study: Study, any_rows: bool) -> str:
     rule = (
         "Listed are the variants of which every run ends within 1% of the number of Gaussians of "
-        "the sfm run that it is paired with. That happens where a cap binds both: with strategy "
-        "mcmc, or where --cap-max thins out the seeds of strategy none. ~: within noise."
+        "the sfm run that it is paired with. That happens where a cap binds both: under --budgets, "
+        "with strategy mcmc, or where --cap-max thins out the seeds of strategy none. ~: within "
+        "noise."
     )
     if any_rows:
         return rule

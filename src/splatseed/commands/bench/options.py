@@ -93,7 +93,7 @@ class Options:
     profiles: Annotated[tuple[Profile, ...], _hint(_listed(DEFAULT.profiles))] = ()
     """Parameter sets of the methods: improved ones, and those of the paper's text."""
     repeats: Annotated[int | None, _one(int, f"{DEFAULT.repeats}")] = None
-    """Number of repeats, with another seed each time; error bars need at least 3."""
+    """Number of repeats, with another seed each time; error bars need at least 2."""
     training: Annotated[PlanTraining, tyro.conf.arg(name="")] = PlanTraining()
     """How each run is trained: its fields are options of their own."""
     long_side: Annotated[int | None, _one(int, "none")] = None
