@@ -116,6 +116,11 @@ class PointCloud:
         return self.select(self.source == ORIGINAL)
 
     @property
+    def references(self) -> PointCloud:
+        """The points that show where the scene is: the originals, or all if none is one."""
+        return self.originals if self.num_original else self
+
+    @property
     def finite(self) -> Bool[np.ndarray, " N"]:
         """Which points have three finite coordinates, so that distances can be computed."""
         x, y, z = (np.abs(self.xyz[:, axis]) < FARTHEST for axis in range(3))  # NaN compares false

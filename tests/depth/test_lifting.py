@@ -233,7 +233,7 @@ def test_without_points_metric_depth_will_do(exact, capture):
     seeds = ss.upsample(empty, "depth", num_points=1500, align=False)
     assert len(seeds) == 1500
     assert capture.surfaces.distance(seeds.xyz.astype(np.float64)).max() < FLOAT32
-    with pytest.raises(ss.errors.ParameterError, match="--num-points"):
+    with pytest.raises(ss.errors.ParameterError, match="num_points of 1 or more"):
         ss.upsample(empty, "depth", ratio=4, align=False)
     with pytest.raises(ss.errors.PointCloudError, match="at least one original"):
         ss.upsample(empty, "depth", num_points=1500)

@@ -137,10 +137,11 @@ def choose(
     progress("choose points", 0.0)
     usable = int(np.count_nonzero(candidates.tier < DISTRUSTED))
     if usable < num:
+        larger = " or a larger --depth.region" if settings.region < 1 else ""
         raise PointCloudError(
             f"depth maps that can give {num:,} points",
             found=f"{usable:,} that no other view looks through" if usable else "none",
-            fix="Ask for fewer, or allow more with --depth.see-through or a larger --depth.region.",
+            fix=f"Ask for fewer, or allow more with --depth.see-through{larger}.",
         )
     taken = np.zeros(len(candidates.tier), bool)
     missing = num

@@ -155,7 +155,7 @@ def find_problems(
     """What a user should know before training, one sentence each; the reader's warnings first."""
     problems = list(scene.warnings)
     used = cloud.num_points - cloud.non_finite - cloud.duplicates
-    added = 0 < scene.points.num_original < len(scene.points)  # nothing will be interpolated
+    added = scene.points.num_original < len(scene.points)  # nothing will be interpolated
     if not added and cloud.isolated > MANY_ISOLATED * max(used, 1):
         problems.append(
             f"{cloud.isolated:,} points ({cloud.isolated / used:.1%}) are isolated: "

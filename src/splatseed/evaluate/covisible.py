@@ -52,7 +52,7 @@ def find_covisible(
     """The cells of each test view that at least two training views see, by the view's name.
 
     Args:
-        scene: Provides cameras, original points and depth maps.
+        scene: Provides cameras, points and depth maps.
         test_every: Every ``test_every``-th image, sorted by name, is a test view.
         progress: Called with the stage and the fraction done.
 
@@ -62,7 +62,7 @@ def find_covisible(
     Raises:
         SceneFormatError: A depth map is damaged.
     """
-    points = scene.points.originals
+    points = scene.points.references
     xyz = np.ascontiguousarray(points.xyz[points.finite], np.float32)
     maps = scene.depths if scene.source and scene.source.format == "rgbd" else None
     if not scene.images or (maps is None and not len(xyz)):

@@ -132,7 +132,7 @@ def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None]
     from scipy.spatial import KDTree  # noqa: PLC0415  (slow to import)
 
     rng = np.random.default_rng(0)
-    points = scene.points.originals
+    points = scene.points.references
     xyz = rng.permutation(points.xyz[points.finite].astype(np.float64))[:SAMPLES]
     means = gaussians.means[gaussians.opacities.reshape(-1) > VISIBLE].astype(np.float64)
     means = means[np.isfinite(means).all(axis=1)]

@@ -10,7 +10,7 @@ from splatseed.io.cloud import clean_scene
 from splatseed.io.depth.files import DepthFiles
 from splatseed.io.depth.folder import DepthWriter, depth_folder
 from splatseed.io.depth_search import find_depths
-from splatseed.io.load import load_scene
+from splatseed.io.load import load_originals, load_scene
 from splatseed.io.write import WriteReport, write_scene
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "clean_scene",
     "depth_folder",
     "find_depths",
+    "load_originals",
     "load_scene",
     "write_scene",
 ]

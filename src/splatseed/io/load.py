@@ -26,7 +26,7 @@ from splatseed.io.split import follow_lists
 from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneSource
 
-__all__ = ["is_scene", "load_scene"]
+__all__ = ["is_scene", "load_originals", "load_scene"]
 
 _TRANSFORMS = "transforms.json"
 _ABOVE = 3
@@ -71,6 +71,36 @@ def load_scene(path: str | Path, *, require_points: bool = True) -> Scene:
     # seeds.npz and the manifest count the points as the files have them, so this comes first.
     scene = clean_scene(follow_lists(recall_seeds(scene)))
     return scene.replace(warnings=(*scene.warnings, *cloud_warnings(scene.points)))
+
+
+def load_originals(path: str | Path, *, require_points: bool = True) -> Scene:
+    """Read a scene without the points that splatseed added to it before.
+
+    Args:
+        path: As for ``load_scene``.
+        require_points: Whether a scene without originals is an error; else its cloud is empty.
+
+    Returns:
+        The scene with its originals alone, and a warning if it had other points.
+
+    Raises:
+        SceneNotFoundError: There is no scene, or it has no originals.
+        SceneFormatError: A file is not what its format promises.
+    """
+    scene = load_scene(path, require_points=require_points)
+    points = scene.points.originals
+    added = len(scene.points) - len(points)
+    if not added:
+        return scene
+    if require_points and not len(points):
+        raise SceneNotFoundError(
+            f"points in {path} that splatseed did not add",
+            found=f"none: it made all {added:,}",
+            fix=_TRIANGULATE if scene.images else "Name a scene or a PLY that has other points.",
+        )
+    which = f"Only the {len(points):,} originals are used" if len(points) else "None is an original"
+    note = f"{which}: the {added:,} points that splatseed added before are replaced."
+    return scene.replace(points=points, warnings=(*scene.warnings, note))
 
 
 def _read(path: Path) -> Scene:

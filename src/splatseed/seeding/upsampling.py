@@ -117,7 +117,7 @@ def upsample(
         plain = ratio is None and num_points is None and cover is None
         if plain and most is not None and len(originals) >= most:  # nothing else would stay
             note(
-                f"The budget of {most:,} is no more than the {len(originals):,} points there are: "
+                f"There is room for {most:,} points, and there are {len(originals):,} already: "
                 "they are thinned, and none are added."
             )
             return thin_to(whole, originals, most, CELL, 0, seed, progress)

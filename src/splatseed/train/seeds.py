@@ -133,10 +133,11 @@ def _within_cap(
     points = points.select(np.argsort(points.source != ORIGINAL, kind="stable"))
     first, most = points.num_original, most_seeds(settings, cap)
     seeds = points.select(thin(points.xyz, views, most, first=first, priority=points.confidence))
+    kept = f", {seeds.num_original:,} of them originals" if first else ""
     room = "" if most == cap else f"; strategy {settings.densification} adds the rest"
     note(
-        f"{len(points):,} seeds were thinned to {most:,}, {seeds.num_original:,} of them originals:"
-        f" there may be {cap:,} Gaussians{room}."
+        f"{len(points):,} seeds were thinned to {most:,}{kept}: there may be {cap:,} Gaussians"
+        f"{room}."
     )
     return seeds
 

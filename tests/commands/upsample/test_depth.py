@@ -67,6 +67,7 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(without_points, tmp_path
     surfaces = make_capture(0, num_views=12, width=120, height=90).surfaces
     # A PNG holds depth to a tenth of a millimetre.
     assert surfaces.distance(scene.points.xyz.astype(np.float64)).max() < 0.001
+    assert "made 700 of its points and kept 0." in splatseed("info", out).out
     for words, says in (
         (["--no-align"], "--num-points of 1 or more"),
         (["--num-points", 9], "--poses-from"),
@@ -74,6 +75,26 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(without_points, tmp_path
         run = upsample(splatseed, without_points, tmp_path / "other", *words)
         assert (run.code, run.err.count("\n")) == (2, 1)
         assert says in run.err
+
+
+def test_seeds_without_originals_are_never_taken_for_originals(without_points, tmp_path, splatseed):
+    seeds = tmp_path / "seeds"
+    upsample(splatseed, without_points, seeds, "--no-align", "--num-points", 700)
+    run = upsample(splatseed, seeds, tmp_path / "again", "--depth", without_points / "results",
+                   "--depth-scale", 5000, "--no-align", "--num-points", 9)  # fmt: skip
+    assert run.code == 0, run.err
+    assert "None is an original: the 700 points that splatseed added" in run.out
+    assert len(load_scene(tmp_path / "again").points) == 9
+    for words in (
+        ["upsample", seeds, "--method", "mls", "-o", tmp_path / "mls"],
+        ["upsample", seeds, "--method", "mls", "--tile-points", 100, "-o", tmp_path / "mls"],
+        ["tune", seeds, "-o", tmp_path / "tune"],
+        ["bench", "--scenes", seeds, "-o", tmp_path / "bench"],
+    ):
+        run = splatseed(*words)
+        assert (run.code, run.err.count("\n")) == (2, 1), run.err
+        assert "found none: it made all 700" in run.err
+        assert not words[-1].exists()
 
 
 def test_no_align_is_the_methods_flag(room, tmp_path, splatseed):

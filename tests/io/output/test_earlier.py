@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from splatseed import load_scene, upsample, write_scene
-from splatseed.io.output.earlier import saw_all_photographs
+from splatseed.errors import SceneNotFoundError
+from splatseed.io import load_originals
+from splatseed.io.output.earlier import saw_all_photographs, was_upsampled
 from splatseed.io.output.seeds_npz import SEEDS
 from splatseed.pointcloud import GENERATED
 from splatseed.progress import silent
@@ -45,12 +47,26 @@ def test_an_output_of_an_earlier_version_knows_its_originals(scene, tmp_path):
     assert len(again.tracks) == n
 
 
-def test_where_no_point_is_an_original_all_are(scene, tmp_path):
+@pytest.mark.parametrize("known", [True, False])
+def test_a_scene_without_originals_keeps_what_its_points_are(scene, tmp_path, known):
     new = scene.points.replace(source=np.full(len(scene.points), 6, np.uint8))
-    write_scene(scene.replace(points=new, tracks=None), tmp_path / "out")
+    report = write_scene(scene.replace(points=new, tracks=None), tmp_path / "out")
+    if not known:
+        (tmp_path / "out" / SEEDS).unlink()
     again = load_scene(tmp_path / "out")
-    assert again.points.num_original == len(new)
-    assert not any("added by" in warning for warning in again.warnings)
+    assert set(again.points.source) == {6 if known else GENERATED}
+    assert was_upsampled(again)
+    assert len(again.points.references) == len(new)
+    if known:
+        write_scene(again, tmp_path / "again")
+        for name in set(report.files) - {"splatseed.json", "images"}:
+            there = (tmp_path / "again" / name).read_bytes()
+            assert there == (tmp_path / "out" / name).read_bytes()
+    bare = load_originals(tmp_path / "out", require_points=False)
+    assert not len(bare.points)
+    assert f"the {len(new):,} points that splatseed added before are replaced" in bare.warnings[-1]
+    with pytest.raises(SceneNotFoundError, match=f"found none: it made all {len(new):,}"):
+        load_originals(tmp_path / "out")
 
 
 @pytest.mark.parametrize(

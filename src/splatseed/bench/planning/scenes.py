@@ -13,7 +13,7 @@ from pathlib import Path
 
 from splatseed.bench.planning.digest import cloud_digest, depth_digest, scene_digest
 from splatseed.errors import SceneNotFoundError
-from splatseed.io import find_depths, load_scene
+from splatseed.io import find_depths, load_originals
 from splatseed.io.clouds import open_cloud
 from splatseed.io.depth_search import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
@@ -72,8 +72,7 @@ def open_scene(path: Path, *, images: str = "", depth: Path | None = None) -> Sc
         SceneNotFoundError: There is no scene, or no such folder.
         SceneFormatError: A file is not what its format promises.
     """
-    scene = load_scene(path)
-    scene = scene.replace(points=scene.points.originals)
+    scene = load_originals(path)
     if images:
         scene = _with_images(scene, images)
     return scene if depth is None else scene.replace(depths=find_depths(scene, depth))

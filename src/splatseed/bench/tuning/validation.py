@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatseed.errors import SceneNotFoundError
-from splatseed.io import load_scene, write_scene
+from splatseed.io import load_originals, write_scene
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
 from splatseed.views.view import check_lens
 
@@ -37,7 +37,7 @@ def make_validation_scene(scene_path: Path, target: Path, test_every: int = 8) -
     """
     if target.is_dir():
         return target
-    scene = load_scene(scene_path)
+    scene = load_originals(scene_path)
     for image in scene.images:
         check_lens(image, scene_path)
     train, _ = scene.split(test_every)
@@ -47,9 +47,8 @@ def make_validation_scene(scene_path: Path, target: Path, test_every: int = 8) -
             found=f"{len(train)}",
             fix="Tune a scene with more photographs.",
         )
-    points = scene.points.originals
     write_scene(
-        scene.replace(points=points, images=train, listed=None),
+        scene.replace(images=train, listed=None),
         target,
         format="colmap",
         provenance={"command": "tune"},

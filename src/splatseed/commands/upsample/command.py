@@ -34,7 +34,6 @@ from splatseed.commands.upsample.output import (
 from splatseed.commands.upsample.plan_line import (
     method_words,
     number_words,
-    only_originals,
     parameters_of,
 )
 from splatseed.commands.upsample.start import check_start, write_start
@@ -48,7 +47,7 @@ from splatseed.console import (
 from splatseed.depthmap import DepthKind
 from splatseed.diagnostics.geometry import far_share
 from splatseed.errors import ParameterError
-from splatseed.io import WriteReport, find_depths, load_scene, write_scene
+from splatseed.io import WriteReport, find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.output.staging import check_output
 from splatseed.literal import counted, visible
@@ -393,8 +392,7 @@ def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, floa
 
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
-    scene = load_scene(options.scene, require_points="points" in traits_of(method).needs)
-    scene = only_originals(scene)
+    scene = load_originals(options.scene, require_points="points" in traits_of(method).needs)
     if options.depth_maps is not None:
         maps = find_depths(
             scene, options.depth_maps, kind=options.depth_kind, scale=options.depth_scale

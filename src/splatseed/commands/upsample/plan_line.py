@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
-from splatseed.scene import Scene
 from splatseed.upsample import Profile, Upsampler, configure
 
-__all__ = ["method_words", "number_words", "only_originals", "parameters_of"]
+__all__ = ["method_words", "number_words", "parameters_of"]
 
 TOLD_ELSEWHERE = {"files", "transform", "memory"}
 """Parameters of a cloud that other lines tell."""
@@ -52,15 +51,3 @@ def number_words(total: int | None, most: int | None, changed_by: Sequence[str] 
         return "as many points as the photographs need"
     before = f" before {' and '.join(changed_by)}" if changed_by else ""
     return f"{total:,} points{before}"
-
-
-def only_originals(scene: Scene) -> Scene:
-    """The scene without the points that splatseed added before, and a warning if it had any."""
-    points = scene.points.originals
-    if len(points) == len(scene.points):
-        return scene
-    note = (
-        f"Only the {len(points):,} originals are used: the {len(scene.points) - len(points):,} "
-        "points that splatseed added before are replaced."
-    )
-    return scene.replace(points=points, warnings=(*scene.warnings, note))

@@ -22,7 +22,7 @@ from splatseed.console import (
     stage_display,
 )
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
-from splatseed.io import WriteReport, load_scene, write_scene
+from splatseed.io import WriteReport, load_originals, load_scene, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap.scene import find_model
 from splatseed.io.output.point_stream import PointStream
@@ -106,8 +106,7 @@ def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | 
     if not tiling.asked and tiling.memory is None:  # a file that holds no cloud alone
         return None
     _check_model(path, tiling.bound)
-    scene = load_scene(path)
-    scene = scene.replace(points=scene.points.originals)
+    scene = load_originals(path)
     large = tiling.asked or _is_large(options, method, len(scene.points))
     return SceneSource(scene) if large else None
 

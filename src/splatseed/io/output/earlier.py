@@ -3,7 +3,7 @@
 Point files have no field for a point's origin, but ``splatseed.json`` beside them says how many of
 the first points were in the input, and ``seeds.npz`` which method made each of the others. New
 points must never be taken for originals: upsampling an output again starts from its originals and
-replaces the points made from them. If no point at all is an original, all count as such.
+replaces the points made from them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def recall_seeds(scene: Scene) -> Scene:
         return scene
     known = read_seeds(scene.source.root, scene.points)
     source = known.points.source if known.has_source else _by_manifest(scene)
-    points = known.points.replace(source=source if (source == ORIGINAL).any() else None)
+    points = known.points.replace(source=source)
     notes = (known.warning,) if known.warning else ()
     # Tracks belong to the first points, and a new point has none.
     first_new = int(np.append(points.source != ORIGINAL, True).argmax())
@@ -120,7 +120,7 @@ def _num_original(manifest: Path, total: int) -> int:
     """How many of ``total`` points are originals; all unless a manifest for this cloud says so."""
     facts = _facts(manifest)
     originals = facts.get("num_original")
-    if facts.get("num_points") == total and isinstance(originals, int) and 0 < originals < total:
+    if facts.get("num_points") == total and isinstance(originals, int) and 0 <= originals < total:
         return originals
     return total
 
