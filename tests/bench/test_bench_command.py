@@ -176,6 +176,12 @@ def test_presets_leave_out_what_is_not_there(bench, own_room, tmp_path):
     )
     assert (plan.training.max_steps, plan.training.test_every) == (30_000, 8)
     assert plan.ratios == (4, 8, 16)
+    for name in ("garden", "bonsai"):
+        shutil.rmtree(data / name)
+    code, out, err = bench("--preset", "mipnerf360", "--data", data, "--dry-run")
+    assert (code, out) == (2, "")
+    assert f"treehill; in room, expected the folder images_2 in {data / 'room'}, found no" in err
+    assert err.endswith("folder. Name the folder that holds the preset's scenes with --data.\n")
 
 
 def test_captures_of_replica_are_left_out_with_what_they_lack(bench, own_room, tmp_path):

@@ -24,9 +24,10 @@ from splatseed.errors import (
     SceneFormatError,
     SceneNotFoundError,
 )
+from splatseed.io import load_scene
 from splatseed.io.rgbd.replica import load_rgbd
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Scene
+from splatseed.scene import Image, Scene, Split
 from splatseed.sfm import reconstruct, triangulate, worker
 from splatseed.sfm.orientation import clear_orientation
 
@@ -152,7 +153,12 @@ def test_triangulate_keeps_the_poses_and_finds_the_walls(
     posed: Scene, photos: Path, tmp_path: Path
 ) -> None:
     known = posed.replace(images=posed.images[1:])  # the first photograph has no pose
+    test = frozenset(["view2.png"])
+    split = Split(frozenset(image.name for image in known.images) - test, test, "two files")
+    known = known.replace(listed=split)
     report = triangulate(photos, known, tmp_path / "scene", matcher="sequential")
+    again = load_scene(report.path).listed
+    assert (again.train, again.test) == (split.train, split.test)
 
     assert (report.registered, report.total, report.unregistered) == (5, 6, ("view0.png",))
     model = pycolmap.Reconstruction(report.path / "sparse" / "0")
@@ -294,10 +300,12 @@ def test_pictures_of_an_output_are_no_photographs(photos: Path, tmp_path: Path) 
 def test_photographs_are_told_before_any_work(photos: Path, tmp_path: Path) -> None:
     shutil.copytree(photos, tmp_path / "photos" / "below")
 
-    def stop(names: list[str]) -> None:
-        raise KeyError(len(names), names[0])
+    PilImage.new("I;16", (WIDTH, HEIGHT)).save(tmp_path / "photos" / "depth.png")
 
-    with pytest.raises(KeyError, match=r"6, 'below/view0\.png'"):
+    def stop(names: list[str], left_out: list[str]) -> None:
+        raise KeyError(len(names), names[0], *left_out)
+
+    with pytest.raises(KeyError, match=r"6, 'below/view0\.png', 'depth\.png'"):
         reconstruct(tmp_path / "photos", tmp_path / "scene", on_photos=stop)
     assert not (tmp_path / "scene").exists()
 

@@ -151,12 +151,17 @@ def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport
     return triangulate(images, poses, options.output, **common)
 
 
-def _tell_photographs(images: Path, names: Sequence[str]) -> None:
+def _tell_photographs(images: Path, names: Sequence[str], left_out: Sequence[str]) -> None:
     """Say what is read, since a folder named by mistake may hold pictures of other things below."""
     folders = Counter(str(PurePosixPath(name).parent) for name in names)
     shown = name_some([f"{count:,} in {folder}" for folder, count in folders.most_common()])
     where = "" if set(folders) == {"."} else f": {shown}"
     ERR.print(visible(f"{counted(len(names), 'photograph')} in {images}{where}"), soft_wrap=True)
+    if left_out:
+        print_note(
+            f"Left out, as depth maps are such: {counted(len(left_out), 'image')} of 16-bit or "
+            f"floating-point grey, {name_some(left_out)}."
+        )
 
 
 def _summarise(options: Options, report: SfmReport) -> None:

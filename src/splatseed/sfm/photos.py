@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from PIL import Image as PilImage
 
@@ -20,7 +21,7 @@ from splatseed.io.output.manifest import kind_of
 from splatseed.literal import quoted, told
 from splatseed.scene import Image, Scene
 
-__all__ = ["Photo", "find_photos", "match_poses", "name_some"]
+__all__ = ["Photo", "Photographs", "find_photos", "match_poses", "name_some"]
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
@@ -42,8 +43,20 @@ class Photo:
     height: int
 
 
-def find_photos(image_dir: Path, *, at_least: int) -> tuple[Photo, ...]:
-    """The photographs below ``image_dir``, sorted by name.
+class Photographs(NamedTuple):
+    """What a folder holds.
+
+    Args:
+        photos: The photographs, sorted by name.
+        left_out: Names of images that are grey of 16 bits or more, as depth maps are.
+    """
+
+    photos: tuple[Photo, ...]
+    left_out: tuple[str, ...]
+
+
+def find_photos(image_dir: Path, *, at_least: int) -> Photographs:
+    """The photographs below ``image_dir``.
 
     Hidden files are left out, and so are 16-bit and floating-point grey images: those are the
     depth maps of an RGB-D capture.
@@ -55,14 +68,20 @@ def find_photos(image_dir: Path, *, at_least: int) -> tuple[Photo, ...]:
     names = _image_names(image_dir)
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
         read = pool.map(lambda name: _read_photo(image_dir, name), names)
-        photos = tuple(photo for photo in read if photo is not None)
+        by_name = dict(zip(names, read, strict=True))
+    photos = tuple(photo for photo in by_name.values() if photo is not None)
+    left_out = tuple(name for name, photo in by_name.items() if photo is None)
     if len(photos) < at_least:
+        found, fix = f"{len(photos)}", "Add photographs of the same scene from other places."
+        if left_out:
+            found += (
+                f", and {len(left_out)} of 16-bit or floating-point grey ({name_some(left_out)})"
+            )
+            fix = "Such images are taken for depth maps: save photographs with 8 bits."
         raise SceneNotFoundError(
-            f"at least {at_least} photographs in {image_dir}",
-            found=f"{len(photos)}",
-            fix="Add photographs of the same scene from other places.",
+            f"at least {at_least} photographs in {image_dir}", found=found, fix=fix
         )
-    return photos
+    return Photographs(photos, left_out)
 
 
 def match_poses(

@@ -13,6 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from shutil import rmtree
 
+from splatseed.io.output.layouts import write_split
 from splatseed.io.output.staging import MANIFEST, output_folder
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
@@ -45,7 +46,7 @@ def reconstruct(
     overwrite: bool = False,
     verbose: bool = False,
     on_progress: Progress = silent,
-    on_photos: Callable[[Sequence[str]], None] | None = None,
+    on_photos: Callable[[Sequence[str], Sequence[str]], None] | None = None,
 ) -> SfmReport:
     """Make a scene from photographs alone: features, matching, mapping, undistortion.
 
@@ -64,7 +65,8 @@ def reconstruct(
         overwrite: Replace ``output`` if it exists.
         verbose: Let pycolmap's log through to the terminal.
         on_progress: Called with the stage and the fraction done.
-        on_photos: Called with the photographs' names before work begins.
+        on_photos: Called before work begins with the photographs' names, and with those of images
+            that are left out, as they may be depth maps.
 
     Returns:
         What was found, and how long it took.
@@ -78,10 +80,10 @@ def reconstruct(
     check_camera_model(camera_model)
     check_installed()
     images = Path(image_dir).absolute()
-    photos = find_photos(images, at_least=2)
+    photos, left_out = find_photos(images, at_least=2)
     with staged(images, Path(output), overwrite=overwrite) as staging:
         if on_photos is not None:
-            on_photos([photo.name for photo in photos])
+            on_photos([photo.name for photo in photos], left_out)
         job = ReconstructJob(images, staging, settings, photos, camera_model, shared_camera)
         log = staging / ".work" / "log.txt"
         outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
@@ -103,12 +105,13 @@ def triangulate(
     overwrite: bool = False,
     verbose: bool = False,
     on_progress: Progress = silent,
-    on_photos: Callable[[Sequence[str]], None] | None = None,
+    on_photos: Callable[[Sequence[str], Sequence[str]], None] | None = None,
 ) -> SfmReport:
     """Make a scene from photographs whose poses are known: features, matching, triangulation.
 
     Poses and intrinsics stay exactly as given; only points are estimated. Photographs and poses
-    are paired by name. Images without a pose are left out, as are poses without an image.
+    are paired by name. Images without a pose are left out, as are poses without an image. A scene
+    that says which images test keeps its lists.
 
     Args:
         image_dir: The photographs, also in subfolders.
@@ -122,7 +125,8 @@ def triangulate(
         overwrite: Replace ``output`` if it exists.
         verbose: Let pycolmap's log through to the terminal.
         on_progress: Called with the stage and the fraction done.
-        on_photos: Called with the photographs' names before work begins.
+        on_photos: Called before work begins with the photographs' names, and with those of images
+            that are left out, as they may be depth maps.
 
     Returns:
         What was found, and how long it took.
@@ -136,14 +140,15 @@ def triangulate(
     settings = Settings(matcher, device, max_image_size, seed, threads)
     check_installed()
     images = Path(image_dir).absolute()
-    photos = find_photos(images, at_least=2)
+    photos, left_out = find_photos(images, at_least=2)
     pairs = match_poses(photos, poses_from, images)
     with staged(images, Path(output), overwrite=overwrite) as staging:
         if on_photos is not None:
-            on_photos([photo.name for photo in photos])
+            on_photos([photo.name for photo in photos], left_out)
         job = TriangulateJob(images, staging, settings, pairs)
         log = staging / ".work" / "log.txt"
         outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
+        write_split(poses_from, staging)
         report = _report(Path(output), photos, outcome)
         _write_manifest(staging, "triangulate", settings, report)
     return report

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import write_scene
 from splatseed.io.output.earlier import carry_seeds
-from splatseed.io.split import ROOT_LISTS
+from splatseed.io.output.layouts import write_split
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.sfm.jobs import Outcome, UndistortJob
@@ -60,9 +59,7 @@ def undistort(
         log = staging / ".work" / "log.txt"
         outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
         carry_seeds(scene, distorted, staging)
-        for name in ROOT_LISTS:
-            if (distorted / name).is_file():
-                shutil.copyfile(distorted / name, staging / name)
+        write_split(scene, staging)
     return outcome
 
 

@@ -293,6 +293,26 @@ def test_images_are_linked_or_copied(room, tmp_path, splatseed):
         assert file.read_bytes() == (room / "images" / file.name).read_bytes()
 
 
+def test_links_to_folders_beside_the_poses_are_told(room, tmp_path, splatseed):
+    blender = tmp_path / "blender"
+    write_scene(load_scene(room), tmp_path / "json", format="transforms")
+    content = json.loads((tmp_path / "json/transforms.json").read_text())
+    frames = content.pop("frames")
+    for part, some in (("train", frames[:9]), ("test", frames[9:])):
+        (blender / part).mkdir(parents=True)
+        for frame in some:
+            name = frame["file_path"].removeprefix("images/")
+            shutil.copy(room / "images" / name, blender / part / name)
+            frame["file_path"] = f"./{part}/{name}"
+        text = json.dumps({**content, "ply_file_path": "points.ply", "frames": some})
+        (blender / f"transforms_{part}.json").write_text(text)
+    shutil.copy(tmp_path / "json/sparse_pc.ply", blender / "points.ply")
+    run = splatseed("upsample", blender, "--method", "mls", "-o", tmp_path / "out")
+    assert run.code == 0, run.err
+    where = f"{(blender / 'test').resolve()}, {(blender / 'train').resolve()}"
+    assert f"linked, not copied: {where}; --copy-images" in run.out
+
+
 def test_an_earlier_output_is_replaced_when_asked(room, tmp_path, splatseed):
     out = tmp_path / "out"
     for ratio, words in ((2, []), (3, ["--overwrite"])):

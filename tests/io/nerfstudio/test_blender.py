@@ -68,6 +68,15 @@ def test_an_output_has_the_same_split_and_cameras(layout, lego, tmp_path):
     np.testing.assert_allclose(*pixels.values(), rtol=1e-3, atol=1e-2)
 
 
+def test_the_world_stays_that_of_the_files(lego, tmp_path):
+    scene = load_scene(lego)
+    again = load_scene(write_scene(scene, tmp_path / "out", format="transforms").path)
+    np.testing.assert_array_equal(again.points.xyz, scene.points.xyz)
+    by_name = {image.name: image.camera.world_from_cam for image in again.images}
+    for image in scene.images:
+        np.testing.assert_allclose(by_name[image.name], image.camera.world_from_cam, atol=1e-12)
+
+
 def test_one_of_the_files_alone_is_named_as_before(lego):
     (lego / "transforms_test.json").unlink()
     assert len(load_scene(lego / "transforms_train.json").images) == 5

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from scipy.spatial.transform import Rotation
 
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
@@ -86,6 +87,7 @@ def test_a_cloud_that_is_shifted_scaled_and_turned(made):
 def few_starts(monkeypatch):
     """What is refused is refused after fewer tries as well."""
     monkeypatch.setattr(coarse, "ROTATIONS", 150)
+    monkeypatch.setattr(coarse, "BEST", 2)
     monkeypatch.setattr(align_module, "ROUNDS", QUICK)
 
 
@@ -117,6 +119,22 @@ def test_too_few_points_are_refused(made):
     refused(made, made.dense[:500], "at least 1,000 points apart")
     few = SimpleNamespace(scene=Scene(made.scene.points.select(slice(50))), folder=made.folder)
     refused(few, made.dense, "at least 200 points of the scene's own")
+
+
+def degrees_between(first, second):
+    cosines = (np.einsum("nij,ij->n", first, second) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+
+
+def test_orientations_between_those_spread_are_tried(made):
+    spread = spread_rotations(coarse.ROTATIONS)
+    some = Rotation.random(1000, random_state=0).as_matrix()
+    farthest = max(some, key=lambda each: degrees_between(spread, each).min())
+    assert degrees_between(spread, farthest).min() > 13
+    marks = coarse.Unit.of(made.marks).similarity.points(made.marks)
+    turned = made.dense @ farthest.T
+    starts = coarse.find_starts(coarse.Unit.of(turned).similarity.points(turned), marks, 5)
+    assert degrees_between(starts.rotation, farthest).min() < 8
 
 
 @settings(max_examples=30, deadline=None)

@@ -60,6 +60,7 @@ def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progres
     """
     notes = [f"not there: {', '.join(asked.missing)}"] if asked.missing else []
     present: list[tuple[PlannedScene, SceneFacts]] = []
+    absent = [*notes]
     for scene in asked.plan.scenes:
         try:
             present.append((scene, _survey(scene, asked.plan, made, progress)))
@@ -67,8 +68,10 @@ def prepare(asked: Asked, backend: Backend, made: Path | None, progress: Progres
             if not asked.lenient:
                 raise
             notes.append(f"{scene.label} is left out: {error}")
+            absent.append(f"in {scene.label}, expected {error.expected}, found {error.found}")
     if not present:
-        raise SceneNotFoundError("scenes to run", found="; ".join(notes), fix="See above.")
+        fix = "Name the folder that holds the preset's scenes with --data."
+        raise SceneNotFoundError("scenes to run", found=f"none; {'; '.join(absent)}", fix=fix)
     plan = dataclasses.replace(asked.plan, scenes=tuple(scene for scene, _ in present))
     scenes = [facts for _, facts in present]
     runs = plan_runs(plan, scenes, backend, package_version("splatseed"))

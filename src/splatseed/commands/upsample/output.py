@@ -161,8 +161,8 @@ def summarise(
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(output)),
     ]
-    if (output / "images").is_symlink():
-        where = (output / "images").resolve()
+    if linked := _linked(output, report):
+        where = ", ".join(map(str, linked))
         rows.append(("images", f"linked, not copied: {where}; --copy-images to move OUT elsewhere"))
     if left_out := _left_out(scene, report):
         rows.insert(2, ("left out", left_out))
@@ -177,6 +177,14 @@ def summarise(
             "gsplat's examples, graphdeco's code and LichtFeld read COLMAP only: --format colmap."
         )
     tell_training(read_from, scene, output, report.layout)
+
+
+def _linked(output: Path, report: WriteReport) -> list[Path]:
+    """Where photographs lie that the output only links."""
+    links = [Path(name) for name in report.files if (output / name).is_symlink()]
+    photographs = [link for link in links if link.parts[0] == "images"] or links
+    there = [(output / link).resolve() for link in photographs]
+    return sorted({path if path.is_dir() else path.parent for path in there})
 
 
 def _left_out(scene: Scene, report: WriteReport) -> str:

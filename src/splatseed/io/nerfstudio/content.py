@@ -20,7 +20,13 @@ from splatseed.errors import OutputError
 from splatseed.io.nerfstudio.transforms import OPENCV_FROM_OPENGL, Transforms
 from splatseed.scene import Image, Scene
 
-__all__ = ["NERFSTUDIO_FROM_COLMAP", "frame_paths", "kept_json", "transforms_json"]
+__all__ = [
+    "NERFSTUDIO_FROM_COLMAP",
+    "applied_transform",
+    "frame_paths",
+    "kept_json",
+    "transforms_json",
+]
 
 NERFSTUDIO_FROM_COLMAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """The ``applied_transform`` that nerfstudio gives a COLMAP model: (x, y, z) -> (x, z, -y)."""
@@ -41,11 +47,17 @@ _NERFSTUDIO_MODELS = {
 }
 
 
-def transforms_json(scene: Scene) -> dict[str, Any]:
-    """A new ``transforms.json`` for a scene in COLMAP's world, as nerfstudio writes it.
+def applied_transform(scene: Scene) -> Float64[np.ndarray, "3 4"] | None:
+    """What a new ``transforms.json`` turns the world by; None where it was read from such files."""
+    kept = scene.source is not None and scene.source.format == "transforms"
+    return None if kept else NERFSTUDIO_FROM_COLMAP
 
-    Poses are in nerfstudio's space and OpenGL axes; images are ``images/NAME``; without
-    ``ply_file_path``.
+
+def transforms_json(scene: Scene) -> dict[str, Any]:
+    """A new ``transforms.json`` for a scene, as nerfstudio writes it.
+
+    Poses are turned by ``applied_transform``, in OpenGL axes; images are ``images/NAME``. There is
+    no ``ply_file_path``.
 
     Raises:
         OutputError: A camera model has no counterpart in nerfstudio.
@@ -55,18 +67,22 @@ def transforms_json(scene: Scene) -> dict[str, Any]:
     first = next(iter(cameras.values()), {})
     shared = first if len(used) == 1 else {"camera_model": first.get("camera_model", "OPENCV")}
     frames = []
+    A = applied_transform(scene)
     for image in scene.images:
         own = {} if len(used) == 1 else cameras[image.intrinsics.camera_id]
         frames.append(
             {
                 "file_path": f"images/{image.name}",
-                "transform_matrix": _opengl_pose(image).tolist(),
+                "transform_matrix": _opengl_pose(image, A).tolist(),
                 "colmap_im_id": image.image_id,
                 **own,
             }
         )
-    applied = NERFSTUDIO_FROM_COLMAP.tolist()
-    return {**shared, "frames": frames, "applied_transform": applied}
+    return {
+        **shared,
+        "frames": frames,
+        **({} if A is None else {"applied_transform": A.tolist()}),
+    }
 
 
 def kept_json(transforms: Transforms, names: Collection[str]) -> dict[str, Any]:
@@ -121,10 +137,11 @@ def _portable(frame: Mapping[str, Any], root: Path) -> dict[str, Any]:
     return {**frame, **moved}
 
 
-def _opengl_pose(image: Image) -> Float64[np.ndarray, "4 4"]:
-    """``world_from_cam`` in OpenGL axes and nerfstudio's space."""
+def _opengl_pose(image: Image, A: Float64[np.ndarray, "3 4"] | None) -> Float64[np.ndarray, "4 4"]:
+    """``world_from_cam`` in OpenGL axes, turned by A."""
     pose = image.camera.world_from_cam @ OPENCV_FROM_OPENGL
-    pose[:3] = NERFSTUDIO_FROM_COLMAP @ pose
+    if A is not None:
+        pose[:3] = A @ pose
     return np.asarray(pose)
 
 

@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from splatseed.camera import Intrinsics
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.io.colmap.ids import Renumbered, renumber
 from splatseed.io.colmap.scene import read_model_cameras
 from splatseed.io.nerfstudio.content import (
-    NERFSTUDIO_FROM_COLMAP,
+    applied_transform,
     frame_paths,
     kept_json,
     transforms_json,
@@ -33,10 +34,10 @@ from splatseed.io.split import MODEL_LISTS, ROOT_LISTS, split_fields
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 
-__all__ = ["write_colmap", "write_json", "write_transforms"]
+__all__ = ["write_colmap", "write_json", "write_split", "write_transforms"]
 
 _ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json")  # gsplat's examples read them if present
-_MODEL_EXTRAS = ("depth_params.json", *MODEL_LISTS)  # graphdeco's trainer reads them if present
+_MODEL_EXTRAS = ("depth_params.json",)  # graphdeco's trainer reads it if present
 _RIG_FILES = ("rigs", "frames")
 
 
@@ -51,7 +52,7 @@ def write_colmap(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path]
     write_ply(model_dir / "points3D.ply", scene.points)
     write_seeds(folder, scene.points)
     notes = [*_copy_extras(scene, folder, model_dir), *_model_notes(scene, model)]
-    _write_lists(scene, folder)
+    write_split(scene, folder)
     return notes, image_folders(scene)
 
 
@@ -68,7 +69,7 @@ def write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, P
     else:
         content = {**transforms_json(scene), **split_fields(scene)}
         folders = image_folders(scene)
-        points = _in_nerfstudio_space(points)
+        points = _turned(points, applied_transform(scene))
     write_json(folder / "transforms.json", {**content, "ply_file_path": "sparse_pc.ply"})
     write_ply(folder / "sparse_pc.ply", points)
     shutil.copyfile(folder / "sparse_pc.ply", folder / "pointcloud.ply")  # LichtFeld's name for it
@@ -78,12 +79,14 @@ def write_transforms(scene: Scene, folder: Path) -> tuple[list[str], dict[str, P
     return [], folders
 
 
-def _in_nerfstudio_space(points: PointCloud) -> PointCloud:
-    """The points and their normals, rotated as nerfstudio rotates those of a COLMAP model."""
-    xyz = apply_transform(NERFSTUDIO_FROM_COLMAP, points.xyz).astype(np.float32)
+def _turned(points: PointCloud, A: Float64[np.ndarray, "3 4"] | None) -> PointCloud:
+    """The points and their normals in the world of a new ``transforms.json``."""
+    if A is None:
+        return points
+    xyz = apply_transform(A, points.xyz).astype(np.float32)
     if points.normals is None:
         return points.replace(xyz=xyz)
-    return points.replace(xyz=xyz, normals=points.normals @ NERFSTUDIO_FROM_COLMAP[:, :3].T)
+    return points.replace(xyz=xyz, normals=points.normals @ A[:, :3].T)
 
 
 def write_json(path: Path, content: Mapping[str, object]) -> None:
@@ -120,10 +123,20 @@ def _copy(source: Path, names: Sequence[str], target: Path) -> None:
             shutil.copyfile(source / name, target / name)
 
 
-def _write_lists(scene: Scene, folder: Path) -> None:
-    """Write the split's lists: the scene's own, or those of transforms.json as nerfstudio's."""
+def write_split(scene: Scene, folder: Path) -> None:
+    """Write the lists of a scene's split beside a COLMAP model: its own, else nerfstudio's.
+
+    Args:
+        scene: The scene.
+        folder: The folder that holds ``sparse/0``.
+
+    Raises:
+        OSError: A list cannot be written.
+    """
     if scene.source is not None:
         _copy(scene.source.root, ROOT_LISTS, folder)
+        if scene.source.model_dir is not None:
+            _copy(scene.source.model_dir, MODEL_LISTS, folder / "sparse" / "0")
     if scene.listed is None or any((folder / name).exists() for name in ROOT_LISTS):
         return
     for part, images in zip(ROOT_LISTS, scene.split(), strict=False):  # train and test

@@ -295,7 +295,7 @@ def _check(best: _Candidate, rival: _Candidate | None, error: float) -> None:
     if best.share < SHARE:
         raise _unsure(
             f"at best {best.share:.0%} of the scene's points on the cloud: it is of another place, "
-            "or shows too little of this one"
+            "or shows too little of this one, or its points lie too far apart"
         )
     if rival is not None and rival.share > RIVAL * best.share:
         raise _unsure(

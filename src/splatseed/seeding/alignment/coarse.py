@@ -6,6 +6,8 @@ over the marks of max(``FAR`` - d / s, 0), with d the distance to the cloud: in 
 as otherwise shrinking all marks to one point of the cloud would be best. For each rotation and
 scale the rewards of all shifts are one correlation of the marks' histogram with the grid of
 max(``FAR`` - d / s, 0), computed by Fourier transforms.
+Then the orientations around the best ones are tried: halfway between two of the first is too far
+from either for ICP in a sparse cloud.
 Promise: the same points give the same starts; nothing is random.
 
 Orientations are Alexa's super-Fibonacci spirals on unit quaternions ("Super-Fibonacci Spirals:
@@ -15,6 +17,7 @@ Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +30,8 @@ __all__ = ["Unit", "even", "find_starts", "spread_rotations"]
 
 ROTATIONS = 1200
 """About 18 degrees from any orientation to the nearest."""
+BEST, AROUND = 12, (-9.0, 0.0, 9.0)
+"""Of how many orientations those around are tried, and by how many degrees about each axis."""
 SCALES = (0.7, 0.84, 1.0, 1.19, 1.42)
 EVEN = 0.1
 """Side of the cells of which each counts once, however many marks it holds."""
@@ -72,6 +77,11 @@ class Starts(NamedTuple):
     shift: Float64[np.ndarray, "n 3"]
     reward: Float64[np.ndarray, " n"]
 
+    def best(self, num: int) -> Starts:
+        """The ``num`` best, best first."""
+        order: Int64[np.ndarray, " n"] = np.argsort(-self.reward, kind="stable")[:num]
+        return Starts(*(values[order] for values in self))
+
 
 def find_starts(
     cloud: Float64[np.ndarray, "N 3"],
@@ -87,16 +97,32 @@ def find_starts(
         num: How many starts.
         progress: Told how far it is.
     """
+    from scipy.fft import rfftn  # noqa: PLC0415  (slow to import)
+
+    distances, some = _distances(cloud), even(marks, EVEN)
+    fields = [rfftn(np.maximum(FAR - distances / scale, 0).astype(np.float32)) for scale in SCALES]
+    spread = spread_rotations(ROTATIONS)
+    first = _correlate(fields, some, spread, "try orientations", progress)
+    around = _around(first.best(BEST).rotation)
+    second = _correlate(fields, some, around, "try those around the best", progress)
+    return Starts(*(np.concatenate(pair) for pair in zip(first, second, strict=True))).best(num)
+
+
+def _correlate(
+    fields: list[np.ndarray],
+    marks: Float64[np.ndarray, "M 3"],
+    rotations: Float64[np.ndarray, "n 3 3"],
+    stage: str,
+    progress: Progress,
+) -> Starts:
+    """Each rotation with its best scale and shift."""
     from scipy.fft import irfftn, rfftn  # noqa: PLC0415  (slow to import)
 
     shape, side = (CELLS,) * 3, 2 * HALF / CELLS
-    distances = _distances(cloud)
-    rotations, some = spread_rotations(ROTATIONS), even(marks, EVEN)
-    fields = [rfftn(np.maximum(FAR - distances / scale, 0).astype(np.float32)) for scale in SCALES]
     reward = np.full(len(rotations), -np.inf)
     scale, shift = np.empty(len(rotations)), np.empty((len(rotations), 3))
     for r, rotation in enumerate(rotations):
-        turned = some @ rotation.T
+        turned = marks @ rotation.T
         for s, field in zip(SCALES, fields, strict=True):
             cells = np.floor(s * turned / side).astype(np.int64) % CELLS
             flat = np.ravel_multi_index(tuple(cells.T), shape)
@@ -107,10 +133,18 @@ def find_starts(
                 reward[r], scale[r] = rewards.max(), s
                 shift[r] = (best + 0.5) * side - HALF
         if r % 50 == 0:
-            progress("try orientations", r / len(rotations))
-    progress("try orientations", 1.0)
-    order: Int64[np.ndarray, " n"] = np.argsort(-reward, kind="stable")[:num]
-    return Starts(rotations[order], scale[order], shift[order], reward[order] / len(some))
+            progress(stage, r / len(rotations))
+    progress(stage, 1.0)
+    return Starts(rotations, scale, shift, reward / len(marks))
+
+
+def _around(rotations: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "m 3 3"]:
+    """Rotations a little off each of these, about all axes."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
+
+    turns = [turn for turn in product(AROUND, repeat=3) if any(turn)]
+    small = Rotation.from_rotvec(np.radians(turns)).as_matrix()
+    return np.asarray(rotations[:, None] @ small).reshape(-1, 3, 3)
 
 
 def even(xyz: Float64[np.ndarray, "N 3"], side: float) -> Float64[np.ndarray, "M 3"]:
