@@ -89,6 +89,20 @@ def test_a_plain_scene_is_seeded_first_unless_it_is_to_stay(room_path, tmp_path,
     assert counts["auto"] > counts["scene"]
 
 
+def test_seeds_that_cannot_be_made_are_told(room_path, tmp_path, capsys):
+    seeded = tmp_path / "seeded"
+    assert exit_code("upsample", room_path, "--method", "mls", "-o", seeded) == 0
+    for scene, strategy, told in (
+        (room_path, "none-3dgs", "strategy none-3dgs begins with the scene's points as they are."),
+        (seeded, "none", "splatseed upsample made the points, and training begins with them"),
+    ):
+        words = (scene, "--max-steps", "2", "--data-factor", "2", "--strategy", strategy)
+        for i, seeds in enumerate(((), ("--seeds", "auto"))):
+            assert _run(*words, *seeds, "-o", tmp_path / f"{strategy}{i}") == 0
+            said = capsys.readouterr().out
+            assert (f"--seeds auto has no effect: {told}" in said) == bool(seeds)
+
+
 def test_interrupted_it_saves_and_says_how_to_go_on(room_path, tmp_path):
     """A process of its own, interrupted by a signal once it trains."""
     run = tmp_path / "run"

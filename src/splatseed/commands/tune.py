@@ -143,7 +143,7 @@ class _Study:
     def _asked_for(self) -> int:
         """The number of Gaussians that the user's budget comes to."""
         factor = max(1, -(-self.facts.long_side // self.options.long_side))
-        return parse_budget(self.options.budget, self.facts.pixels / factor**2)
+        return parse_budget(self.options.budget, self.facts.pixels_at(factor))
 
     def specs(self, rung: Rung, arms: Collection[Arm] | None = None) -> list[RunSpec]:
         """The runs of a rung, for these arms or for all."""

@@ -25,7 +25,14 @@ from splatseed.views.view import View
 if TYPE_CHECKING:
     from splatseed.stereo.result import Stereo
 
-__all__ = ["SEEDS_SHARE", "most_seeds", "seeded", "seeds_digest", "usable_seeds"]
+__all__ = [
+    "SEEDS_SHARE",
+    "most_seeds",
+    "seeded",
+    "seeds_digest",
+    "usable_seeds",
+    "why_not_seeded",
+]
 
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
 """Most seeds as a fraction of the cap, for strategies that add Gaussians; others may use it all."""
@@ -53,13 +60,12 @@ def seeded(
         SceneNotFoundError: Photographs are missing.
         SceneFormatError: One is damaged.
     """
-    as_it_is = settings.seeding == "scene" or settings.strategy.endswith(AS_3DGS)
     if saw_all_photographs(scene):
         note(
             "The seeds were made from all photographs, test views included, which may flatter the "
             "score: train the scene itself, or hold views out of them, as by --auto.hold-out 8."
         )
-    if as_it_is or was_upsampled(scene):
+    if settings.seeding == "scene" or why_not_seeded(scene, settings):
         return scene, None
     from splatseed.seeding.photographs import Auto  # noqa: PLC0415  (loads with its use)
     from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
@@ -82,6 +88,20 @@ def seeded(
     )
     note(_made(scene, cloud, time.perf_counter() - start))
     return scene.replace(points=cloud), results[-1] if results else None
+
+
+def why_not_seeded(scene: Scene, settings: TrainSettings) -> str:
+    """Why a run begins with the scene's points even if ``auto`` is asked for; empty if not.
+
+    Args:
+        scene: The scene.
+        settings: The run's.
+    """
+    if settings.strategy.endswith(AS_3DGS):
+        return f"strategy {settings.strategy} begins with the scene's points as they are"
+    if was_upsampled(scene):
+        return "splatseed upsample made the points, and training begins with them as they are"
+    return ""
 
 
 def _made(scene: Scene, cloud: PointCloud, seconds: float) -> str:

@@ -22,14 +22,16 @@ from splatseed.bench.planning.records import RunRow
 from ..planted import result, rows
 
 
-def _study(noise=0.02, **changes):
-    """Two strategies of one number of Gaussians: ``grow`` has 0.3 dB more, its seeds take 4 s."""
+def _study(noise=0.02, plain=5000, **changes):
+    """Two strategies under one budget, of which ``sfm`` makes ``plain``: ``grow`` has 0.3 dB more,
+    its seeds take 4 s."""
     finished = []
     for row in rows(strategies=("default", "grow"), noise=noise, seed=3, **changes):
         arm = dataclasses.replace(row.spec.arm, budget="5000", ratio=row.spec.arm.ratio)
         run = dataclasses.replace(row.spec, arm=arm)
         more = 0.3 if arm.strategy == "grow" else 0.0
-        made = result(row.result.psnr + more, upsample_seconds=0.0 if arm.method == "sfm" else 4.0)
+        seconds, count = (0.0, plain) if arm.method == "sfm" else (4.0, 5000)
+        made = result(row.result.psnr + more, upsample_seconds=seconds, num_gaussians=count)
         finished.append(RunRow(run, "done", made, started=0.0, finished=25.0))
     (study,) = studies(finished)
     return study
@@ -95,6 +97,16 @@ def test_tables_and_sentences_can_be_read():
     assert "seeding counted" in said
     assert "at most 5,000 Gaussians" in study.description
     assert unequal_numbers(study) is None
+    assert "with equal numbers of Gaussians" in said
+
+
+def test_arms_that_do_not_fill_the_budget_are_told():
+    study = _study(plain=3000)
+    assert "3,000 to 5,000 Gaussians" in unequal_numbers(study)
+    assert "--budgets" not in unequal_numbers(study)
+    said = " ".join(answer_at_equal_cost(study))
+    assert "under one budget of Gaussians" in said
+    assert "equal numbers" not in said
 
 
 @pytest.mark.parametrize(

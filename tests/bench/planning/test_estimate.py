@@ -13,7 +13,8 @@ from splatseed.bench.planning.scenes import SceneFacts
 from splatseed.scores import EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
-FACTS = SceneFacts("room", "", "ab12", num_points=10_000, num_images=80, pixels=800 * 600)
+FACTS = SceneFacts("room", "", "ab12", num_points=10_000, num_images=80, pixels=800 * 600,
+                    long_side=800)  # fmt: skip
 TRAINING = TrainSettings(max_steps=1000, backend="cpu")
 SPEC = RunSpec("room", "ab12", Arm("mls", "default", 8, "none"), repeat=0, training=TRAINING)
 SCORES = EvalResult((ViewScore("a.png", 21.5, 0.8, None, 0.01),), num_gaussians=80_000)

@@ -267,6 +267,16 @@ def with_capture(bench, capture, **changes):
     return write_ledger(bench, finished)
 
 
+@pytest.mark.parametrize(
+    ("gain", "told"), [(0.0, "level with sfm (+0.00 dB"), (-0.1, "though it loses (-0.10 dB")]
+)
+def test_only_seeds_that_gain_are_called_the_best(gain, told, tmp_path, capture):
+    gains = {(SFM, 1): 0.0, ("mls", 3): gain}
+    bench = with_capture(tmp_path / "b", capture, gains=gains, noise=0.0)
+    write_report(bench)
+    assert f"mls 3x, the best of the others on this scene, {told}" in text_of(bench)
+
+
 def test_seeds_and_views_are_shown(tmp_path, capture):
     bench = with_capture(tmp_path / "b", capture)
     report = write_report(bench)
@@ -274,7 +284,7 @@ def test_seeds_and_views_are_shown(tmp_path, capture):
     assert len(list((bench / "figures").glob("clouds_room_*.png"))) == 1
     said = text_of(bench)
     assert "room: what training begins with." in said
-    assert "test view view0: mls 3x, the best on this scene" in said
+    assert "test view view0: mls 3x, the best on this scene (+" in said
     assert "texture" in said
     kept = json.loads((bench / "descriptors.json").read_text("utf-8"))
     assert list(kept["scenes"]) == [capture[1]]

@@ -47,6 +47,20 @@ def _pairs(out):
     return {line[0]: line[1].strip() for line in lines if len(line) == 2}
 
 
+def test_the_next_step_reads_the_maps_alike(room, tmp_path, splatseed):
+    rays = _rewrite(room, tmp_path / "rays", lambda _, z: 2 * z)
+    words = ("--depth-kind", "ray", "--depth-scale", 2)
+    run = splatseed("info", room, "--depth", rays, *words)
+    assert f"--depth {rays} --depth-kind ray --depth-scale 2 --ratio 16 -o OUT" in run.out
+
+
+def test_nothing_follows_from_maps_that_do_not_fit(room, splatseed):
+    run = splatseed("info", room, "--depth", room / "depths", "--depth-kind", "inverse")
+    assert "12 of 12 depth maps cannot be aligned" in run.out
+    assert "--method depth" not in run.out
+    assert "by method depth" not in run.out
+
+
 def test_true_depth_fits(room, splatseed):
     run = splatseed("info", room, "--depth", room / "depths")
     assert (run.code, run.err) == (0, "")
@@ -109,9 +123,9 @@ def test_depth_of_another_kind_is_found_out(room, tmp_path, splatseed):
 
 
 def test_as_many_points_are_asked_for_as_depth_prints(tour, tmp_path, splatseed):
-    few = lambda i, z: np.where(np.arange(z.size).reshape(z.shape) < 20 * (i + 1), z, np.nan)
+    few = lambda i, z: np.where(np.arange(z.size).reshape(z.shape) < 200 * (i + 1), z, np.nan)
     maps = _rewrite(tour, tmp_path / "maps", few)
-    known = 20 * sum(range(1, 16))  # the first map says nothing about the others
+    known = 200 * sum(range(1, 16))  # the first map says nothing about the others
     number = number_for(len(load_scene(tour).points), known, 10**6)
     assert number.startswith("--num-points")
     assert splatseed("info", tour, "--depth", maps).out.splitlines()[-1].count(f" {number} ") == 1

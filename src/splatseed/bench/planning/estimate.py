@@ -279,7 +279,7 @@ class Estimator:
         return seeds, min(seeds * (alike or GROWTH[_densification(spec)]), most)
 
     def _pixels(self, spec: RunSpec) -> float:
-        return self._scenes[spec.scene_digest].pixels / spec.training.data_factor**2
+        return self._scenes[spec.scene_digest].pixels_at(spec.training.data_factor)
 
     def _speed(self, spec: RunSpec) -> _Speed:
         return SPEEDS["cuda" if spec.training.backend == "cuda" else "cpu"]

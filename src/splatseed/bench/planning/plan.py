@@ -88,9 +88,9 @@ class Plan:
     ratios: tuple[float, ...] = (8.0,)
     """Points in all, per original; empty if budgets determine the number."""
     budgets: tuple[str, ...] = ()
-    """Gaussians at the end, the same for every arm: numbers, or such as "0.25rho", per pixel of a
-    photograph at training size. Seeds are thinned to them, or for strategies that add Gaussians to
-    the fraction they begin with."""
+    """Most Gaussians at the end, the same for every arm: numbers, or such as "0.25rho", per pixel
+    of a photograph at training size. Seeds are thinned to them, or for strategies that add
+    Gaussians to the fraction they begin with."""
     strategies: tuple[StrategyName, ...] = ("default",)
     """Densification strategies."""
     profiles: tuple[Profile, ...] = ("default",)
@@ -232,7 +232,7 @@ def _training(plan: Plan, scene: SceneFacts, arm: Arm, backend: Backend) -> Trai
     settings = replace(plan.training, backend=backend, data_factor=factor)
     if not arm.budget:
         return settings
-    return replace(settings, cap_max=max(2, parse_budget(arm.budget, scene.pixels / factor**2)))
+    return replace(settings, cap_max=max(2, parse_budget(arm.budget, scene.pixels_at(factor))))
 
 
 def _budget(given: object) -> str:

@@ -59,6 +59,11 @@ class SceneFacts:
     cloud_path: str = ""
     cloud_digest: str = ""
 
+    def pixels_at(self, factor: int) -> int:
+        """Pixels of the first photograph, downsampled by a whole factor."""
+        short_side = self.pixels // self.long_side
+        return (self.long_side // factor) * (short_side // factor)
+
 
 def open_scene(path: Path, *, images: str = "", depth: Path | None = None) -> Scene:
     """A scene with its original points, as a run begins with it.

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseed.bench.analysis.arms.tables import answer_at_equal_cost
+from splatseed.bench.analysis.arms.tables import SHOWN, answer_at_equal_cost
 from splatseed.bench.analysis.study import Study, studies
 from splatseed.bench.analysis.summary import summary
 from splatseed.bench.analysis.tables import Table, write_table
@@ -190,9 +190,12 @@ def _views(part: _Part, bench: Path) -> Iterable[str]:
 
 
 def _view_title(view: ComparedView) -> str:
-    chosen = "the best" if view.gain > 0 else "the best, though it loses"
+    chosen = "the best on this scene"
+    if view.gain < SHOWN:
+        lost = "level with sfm" if view.gain > -SHOWN else "though it loses"
+        chosen = f"the best of the others on this scene, {lost}"
     return (
-        f"{view.scene}, test view {view.name}: {view.best.label}, {chosen} on this scene "
+        f"{view.scene}, test view {view.name}: {view.best.label}, {chosen} "
         f"({view.gain:+.2f} dB over all its test views). Error maps: black is none, the brightest "
         "0.25 or more."
     )

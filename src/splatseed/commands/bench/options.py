@@ -86,7 +86,7 @@ class Options:
     ratios: Annotated[tuple[float, ...], _hint(_listed(DEFAULT.ratios))] = ()
     """Points in all, per original."""
     budgets: Annotated[tuple[str, ...], _hint("none")] = ()
-    """Gaussians at the end, the same for every arm: such as 50k, or 0.25rho, per pixel of a
+    """Most Gaussians at the end, the same for every arm: such as 50k, or 0.25rho, per pixel of a
     photograph at training size. Methods then fill the budget, unless --ratios are given too."""
     strategies: Annotated[tuple[StrategyName, ...], _hint(_listed(DEFAULT.strategies))] = ()
     """Densification strategies; -3dgs: in 3DGS's own conventions of rates and schedules."""

@@ -104,6 +104,8 @@ def run(arguments: list[str]) -> None:
         alignments = _alignments(options, scene, clock)
         known = _known_depths(options, scene, clock)
         problems = (*problems, *_unfit_maps(scene, alignments or {}))
+        if alignments and len(scene.points) and all(each.rejected for each in alignments.values()):
+            scene = scene.replace(depths=None)  # nothing follows from maps that cannot be used
     if options.json:
         print_json(scene, cloud, tracks, regions, alignments, problems)
         return
@@ -166,10 +168,11 @@ def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
 
 def _next_commands(options: Options, scene: Scene, known: int) -> list[tuple[str, str]]:
     """What to do next with the scene, or what there is to choose from."""
-    if options.depth is not None and len(scene.points) and not is_distorted(scene):
+    if scene.depths is not None and options.depth and len(scene.points) and not is_distorted(scene):
         planned = Planned.of(scene, options.budget, options.max_steps)
         number = number_for(len(scene.points), known, planned.most_seeds)
-        return [("", use(options.scene, options.depth, number)[1])]
+        how = f"{_reading(options)}{number}"
+        return [("", use(options.scene, options.depth, how)[1])]
     advised = []
     if len(scene.points) or scene.has_photographs:
         planned = Planned.of(scene, options.budget, options.max_steps)
@@ -189,8 +192,14 @@ def _from_maps(options: Options, scene: Scene, known: int) -> list[tuple[str, st
     if not known or options.depth is None or is_distorted(scene):
         return []
     most = Planned.of(scene, options.budget, options.max_steps).most_seeds
-    how = f"--no-align {number_for(0, known, most)}"
+    how = f"{_reading(options)}--no-align {number_for(0, known, most)}"
     return [("or from the maps", use(options.scene, options.depth, how)[1])]
+
+
+def _reading(options: Options) -> str:
+    """The options that say how the maps are to be read."""
+    kind = "" if options.depth_kind is None else f"--depth-kind {options.depth_kind} "
+    return kind if options.depth_scale is None else f"{kind}--depth-scale {options.depth_scale:g} "
 
 
 def _known_depths(options: Options, scene: Scene, clock: StageClock) -> int:

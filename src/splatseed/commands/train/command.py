@@ -42,6 +42,7 @@ from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
 from splatseed.seeding.amounts import parse_budget
 from splatseed.train.record.folder import RunFolder
+from splatseed.train.seeds import why_not_seeded
 from splatseed.train.settings import (
     BUDGET,
     LEAST_GAUSSIANS,
@@ -158,6 +159,8 @@ def _prepare(
     if scene.listed is not None:
         note(scene.listed.sentence)
     settings = _within_budget(options, _sized(options, settings, scene), scene, note)
+    if options.seeds == "auto" and (why := why_not_seeded(scene, settings)):
+        note(f"--seeds auto has no effect: {why}.")
     how = RunOptions(
         resume=options.resume,
         overwrite=options.overwrite,

@@ -76,7 +76,7 @@ def arm_table(study: Study) -> Table:
     share = _share(study)
     notes = [GAIN_NOTE.format(base=base.label if base else "")]
     notes += [SCORES_NOTE.format(share=share)] if share is not None else []
-    title = "All arms, at one number of Gaussians" if study.settings["budget"] else "All arms"
+    title = "All arms, under one budget of Gaussians" if study.settings["budget"] else "All arms"
     return Table("arms", title, header, tuple(rows), (*notes, f"{study.description}."))
 
 
@@ -179,9 +179,10 @@ def unequal_numbers(study: Study) -> str | None:
     numbers = [each.num_gaussians for each in compared_arms(study)]
     if not numbers or max(numbers) <= min(numbers) * (1 + EQUAL):
         return None
+    hint = "" if study.settings["budget"] else ": --budgets bounds every arm alike"
     return (
         f"The arms end with {min(numbers):,.0f} to {max(numbers):,.0f} Gaussians, and more of them "
-        "alone can bring a gain: --budgets gives every arm the same number."
+        f"alone can bring a gain{hint}."
     )
 
 
@@ -197,7 +198,8 @@ def answer_at_equal_cost(study: Study) -> tuple[str, ...]:
         return ()
     best, scenes = others[0], len(others[0].scenes)
     lead = f"On {scenes} scene{'' if scenes == 1 else 's'}"
-    at = " with equal numbers of Gaussians" if study.settings["budget"] else ""
+    at = " under one budget of Gaussians" if study.settings["budget"] else ""
+    at = at if unequal_numbers(study) else " with equal numbers of Gaussians"
     first = f"{best.arm.label} comes out best: "
     if best.gain.mean < SHOWN:
         first = f"nothing beats {base.label}: {best.arm.label} comes closest, "
