@@ -264,13 +264,17 @@ def test_what_is_said_of_the_room_before_it_is_made_is_so():
         (("-o", "B", "--plan", "x.toml"), "x.toml"),
         (("-o", "B", "--data", "FULL"), "--preset with --data"),
         (("-o", "SONGS", "--scenes", "ROOM"), "another program"),
-        (("-o", "B", "--scenes", "ROOM", "--lpips"), "weights for LPIPS"),
+        (("-o", "B", "--scenes", "ROOM", "--lpips"), r"put it into [^ ]*checkpoints\.$"),
+        (("--dry-run", "--scenes", "ROOM", "--lpips"), "weights for LPIPS"),
+        (("-o", "TUNED", "--scenes", "ROOM"), "found what splatseed tune wrote"),
     ],
 )
 def test_bad_words_end_in_one_line(bench, room_path, tmp_path, monkeypatch, words, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "FULL").mkdir()
     (tmp_path / "FULL" / "thesis.txt").write_text("keep")
+    (tmp_path / "TUNED").mkdir()
+    (tmp_path / "TUNED" / "tune.json").write_text("{}")
     (tmp_path / "SONGS").mkdir()
     with sqlite3.connect(tmp_path / "SONGS" / "ledger.sqlite") as db:
         db.execute("CREATE TABLE songs (title TEXT)")
@@ -280,7 +284,7 @@ def test_bad_words_end_in_one_line(bench, room_path, tmp_path, monkeypatch, word
     assert (code, out) == (2, "")
     assert re.search(said, err), err
     assert err.count("error:") == 1
-    assert {path.name for path in tmp_path.iterdir()} == {"FULL", "SONGS"}
+    assert {path.name for path in tmp_path.iterdir()} == {"FULL", "SONGS", "TUNED"}
     assert [path.name for path in (tmp_path / "SONGS").iterdir()] == ["ledger.sqlite"]
 
 

@@ -24,6 +24,7 @@ from splatseed.bench.tuning.validation import make_validation_scene
 from splatseed.cli import main
 from splatseed.commands import tune
 from splatseed.commands.bench.machine import Machine
+from splatseed.commands.tune import _sentence
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.scores import EvalResult, ViewScore
@@ -61,6 +62,18 @@ def test_a_verdict_is_paired_by_view():
     assert (said.views, said.repeats, said.steps) == (3, 1, 400)
     assert verdict({AUTO: _runs(*own)}, 400) is None
     assert verdict({SFM: _runs(*base)}, 400) is None
+
+
+def test_repeats_that_disagree_are_no_verdict():
+    """What a stranger saw: two repeats, -0.26 and +2.04 dB, alike on both views."""
+    base = _runs(28.18, 28.1) | _runs(26.48, 26.4, repeat=1)
+    own = _runs(27.92, 27.9) | _runs(28.52, 28.4, repeat=1)
+    said = verdict({SFM: base, GROW: own}, 400)
+    assert said.gain.mean == pytest.approx(0.89, abs=0.03)
+    assert said.gain.se > 1.0
+    assert said.gain.p > 0.3
+    assert "± 1." in _sentence(said)
+    assert "within noise" in _sentence(said)
 
 
 def test_a_round_that_was_stopped_is_judged_by_the_repeats_that_all_have():

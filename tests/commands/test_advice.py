@@ -36,6 +36,22 @@ def test_a_sparse_cloud_is_to_be_added_to(room, capsys):
     assert f"splatseed upsample {room} --budget" in out
 
 
+def test_a_trial_is_of_the_plan_that_was_given(room, capsys):
+    main(["upsample", str(room), "--budget", "500", "--max-steps", "20000"])
+    rho = f"{500 / (64 * 48):.3g}rho"
+    assert f"--minutes 30 --budget {rho} --max-steps 20000\n" in capsys.readouterr().out
+    main(["upsample", str(room)])
+    assert "--minutes 30\n" in capsys.readouterr().out
+
+
+def test_only_unknown_options_are_called_unknown(room, capsys):
+    for words in (["--max-steps", "9"], ["--max-steps=9"]):
+        with pytest.raises(SystemExit):
+            main(["upsample", str(room), *words, "--strategy", "default"])
+        said = " ".join(capsys.readouterr().err.split())
+        assert "found unrecognized option --strategy." in said
+
+
 def test_upsample_tries_stereo_before_it_says_what_to_do(room, capsys):
     main(["upsample", str(room)])
     out = capsys.readouterr().out

@@ -45,10 +45,10 @@ def test_words_reach_the_reconstruction(called, tmp_path, splatseed):
 def test_the_photographs_are_counted_by_folder_first(called, tmp_path, splatseed, capsys):
     splatseed("sfm", tmp_path, "-o", tmp_path / "out")
     tell = called["reconstruct"][1]["on_photos"]
-    tell(["a.png", "b.png"], [])
-    tell(["scene/images/a.png", "run/render.png", "scene/images/b.png"], ["run/d.png"])
+    tell(["a.png", "b.png"], {})
+    tell(["scene/images/a.png", "run/render.png", "scene/images/b.png"], {"of grey": ["run/d.png"]})
     told = capsys.readouterr()
-    assert "1 image of 16-bit or floating-point grey, run/d.png." in told.out
+    assert told.out == "note: Left out: 1 image of grey, run/d.png.\n"
     assert told.err.splitlines() == [
         f"2 photographs in {tmp_path}",
         f"3 photographs in {tmp_path}: 2 in scene/images, 1 in run",

@@ -115,6 +115,14 @@ def test_train_prints_the_command_that_mends_the_scene(distorted, tmp_path, spla
     assert path.exists()
 
 
+def test_missing_poses_are_no_missing_photographs(distorted, tmp_path, splatseed):
+    path = write_scene(load_scene(distorted), tmp_path / "own", copy_images=True).path
+    (path / "sparse/0/images.bin").unlink()
+    run = splatseed("undistort", path, "-o", tmp_path / "out")
+    assert run.code == 2
+    assert "the poses of its photographs; found none. Copy the whole model, images.bin" in run.err
+
+
 def test_a_missing_photograph_is_named(distorted, tmp_path, splatseed):
     path = write_scene(load_scene(distorted), tmp_path / "own", copy_images=True).path
     (path / "images/view_003.png").unlink()

@@ -275,7 +275,9 @@ def test_bad_image_folders(photos: Path, tmp_path: Path) -> None:
     with pytest.raises(SceneNotFoundError, match="at least 2 photographs"):
         reconstruct(folder, out)
     PilImage.new("I;16", (WIDTH, HEIGHT)).save(folder / "depth.png")
-    with pytest.raises(SceneNotFoundError, match="found 1"):
+    with pytest.raises(
+        SceneNotFoundError, match=r"found 1 and 1 of 16-bit .* \(depth\.png\) and 1"
+    ):
         reconstruct(folder, out)
     (folder / "b.png").write_bytes(b"not an image")
     with pytest.raises(SceneFormatError, match=r"b\.png to be a readable image"):
@@ -302,10 +304,14 @@ def test_photographs_are_told_before_any_work(photos: Path, tmp_path: Path) -> N
 
     PilImage.new("I;16", (WIDTH, HEIGHT)).save(tmp_path / "photos" / "depth.png")
 
-    def stop(names: list[str], left_out: list[str]) -> None:
-        raise KeyError(len(names), names[0], *left_out)
+    (tmp_path / "photos" / "phone.heic").touch()
 
-    with pytest.raises(KeyError, match=r"6, 'below/view0\.png', 'depth\.png'"):
+    def stop(names: list[str], left_out: dict[str, list[str]]) -> None:
+        raise KeyError(len(names), names[0], *left_out.values())
+
+    with pytest.raises(
+        KeyError, match=r"6, 'below/view0\.png', \['depth\.png'\], \['phone\.heic'\]"
+    ):
         reconstruct(tmp_path / "photos", tmp_path / "scene", on_photos=stop)
     assert not (tmp_path / "scene").exists()
 

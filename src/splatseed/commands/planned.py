@@ -24,6 +24,7 @@ class Planned:
         strategy: The strategy that ``splatseed train`` chooses for these steps.
         most_seeds: Most seeds with which training begins.
         flags: The options of ``splatseed train`` that differ from its defaults.
+        tuning: Those of ``splatseed tune`` that plan the same.
     """
 
     budget: int
@@ -31,6 +32,7 @@ class Planned:
     strategy: str
     most_seeds: int
     flags: str = ""
+    tuning: str = ""
 
     @classmethod
     def of(cls, scene: Scene, budget: str | None, max_steps: int) -> Planned:
@@ -49,4 +51,8 @@ class Planned:
         settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
         flags = "" if budget is None else f"--cap-max {number} "
         flags += "" if max_steps == FULL_RUN else f"--max-steps {max_steps} "
-        return cls(number, max_steps, settings.densification, most_seeds(settings, number), flags)
+        # A trial's photographs are smaller, and so is its number of Gaussians.
+        tuning = "" if budget is None else f" --budget {number / pixels:.3g}rho"
+        tuning += "" if max_steps == FULL_RUN else f" --max-steps {max_steps}"
+        most = most_seeds(settings, number)
+        return cls(number, max_steps, settings.densification, most, flags, tuning)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -151,17 +151,16 @@ def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport
     return triangulate(images, poses, options.output, **common)
 
 
-def _tell_photographs(images: Path, names: Sequence[str], left_out: Sequence[str]) -> None:
+def _tell_photographs(
+    images: Path, names: Sequence[str], left_out: Mapping[str, Sequence[str]]
+) -> None:
     """Say what is read, since a folder named by mistake may hold pictures of other things below."""
     folders = Counter(str(PurePosixPath(name).parent) for name in names)
     shown = name_some([f"{count:,} in {folder}" for folder, count in folders.most_common()])
     where = "" if set(folders) == {"."} else f": {shown}"
     ERR.print(visible(f"{counted(len(names), 'photograph')} in {images}{where}"), soft_wrap=True)
-    if left_out:
-        print_note(
-            f"Left out, as depth maps are such: {counted(len(left_out), 'image')} of 16-bit or "
-            f"floating-point grey, {name_some(left_out)}."
-        )
+    for what, them in left_out.items():
+        print_note(f"Left out: {counted(len(them), 'image')} {what}, {name_some(them)}.")
 
 
 def _summarise(options: Options, report: SfmReport) -> None:

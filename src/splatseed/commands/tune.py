@@ -17,12 +17,13 @@ from typing import Annotated, Any
 
 import tyro
 
+from splatseed.bench.analysis.statistics import LEVEL
 from splatseed.bench.planning.estimate import Estimator
 from splatseed.bench.planning.plan import Plan, PlannedScene, plan_runs
 from splatseed.bench.planning.records import SFM, Arm, RunResult, RunSpec
 from splatseed.bench.planning.scenes import SceneFacts, survey
 from splatseed.bench.running.environment import describe_environment, package_version
-from splatseed.bench.running.folder import check_bench_folder, make_bench_folder
+from splatseed.bench.running.folder import TUNING, check_bench_folder, make_bench_folder
 from splatseed.bench.running.job import JobOptions
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.bench.tuning.halving import (
@@ -50,7 +51,6 @@ from splatseed.train.settings import Backend, StrategyName, TrainSettings
 
 __all__ = ["Options", "run"]
 
-TUNING = "tune.json"
 SCENE = "scene"
 MINUTE = 60.0
 EQUAL = 0.99
@@ -177,7 +177,7 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "tune", arguments)
     _check(options)
     folder = options.output or Path(f"tune_{options.scene.resolve().name}")
-    check_bench_folder(folder, [options.scene])
+    check_bench_folder(folder, [options.scene], tunes=True)
     asked = BenchOptions(jobs=options.jobs, threads=options.threads)
     with open_machine(asked, options.backend) as machine:
         with _kept_if_begun(folder):
@@ -367,8 +367,9 @@ def _sentence(said: Verdict) -> str:
     name = f"{arm.label} + {arm.strategy}"
     if (arm.method, arm.strategy) == (SFM, "default"):
         return "The scene's own points with strategy default are best: leave them as they are."
-    spread = f" ± {gain.se:.2f} (standard error over the views)" if not math.isnan(gain.se) else ""
-    sure = not math.isnan(gain.se) and abs(gain.mean) > 2 * gain.se
+    over = "views and repeats" if said.repeats > 1 else "views"
+    spread = f" ± {gain.se:.2f} (standard error over {over})" if not math.isnan(gain.se) else ""
+    sure = gain.p <= LEVEL
     doubt = "" if sure else " That is within noise: sfm + default may do as well."
     return f"Best is {name}: {gain.mean:+.2f} dB{spread} over sfm + default.{doubt}"
 

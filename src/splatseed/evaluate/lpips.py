@@ -28,7 +28,16 @@ from torch.nn.functional import conv2d, max_pool2d
 from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
 from splatseed.requirements import require
 
-__all__ = ["LPIPS_NETS", "Backbone", "Conv", "Lpips", "LpipsNet", "load_lpips", "lpips_is_here"]
+__all__ = [
+    "GIVE_PATH",
+    "LPIPS_NETS",
+    "Backbone",
+    "Conv",
+    "Lpips",
+    "LpipsNet",
+    "load_lpips",
+    "lpips_is_here",
+]
 
 LpipsNet = Literal["vgg", "alex"]
 

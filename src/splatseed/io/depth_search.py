@@ -15,7 +15,7 @@ from splatseed.io.depth.matching import match_by_name
 from splatseed.io.rgbd.tum import find_tum_depths, is_tum
 from splatseed.scene import Scene
 
-__all__ = ["find_depths", "search_depths"]
+__all__ = ["find_depths", "search_depths", "with_own_depths"]
 
 
 def find_depths(
@@ -56,6 +56,17 @@ def find_depths(
             fix="Name maps as their images are, with subfolders and another suffix.",
         )
     return replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
+
+
+def with_own_depths(scene: Scene) -> Scene:
+    """The scene with the depth maps that lie in its own folder, if it has none and there are some.
+
+    Raises:
+        SceneFormatError: Two images share a map, or the folder's description is damaged.
+    """
+    if scene.depths is not None or scene.source is None:
+        return scene
+    return scene.replace(depths=search_depths(scene, scene.source.root))
 
 
 def search_depths(scene: Scene, root: Path) -> DepthFiles | None:

@@ -6,7 +6,7 @@ JPEG as a picture with a grey lower half, and skips files that it cannot read.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,12 @@ from splatseed.scene import Image, Scene
 __all__ = ["Photo", "Photographs", "find_photos", "match_poses", "name_some"]
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
+_FOREIGN_SUFFIXES = frozenset(
+    {".heic", ".heif", ".avif", ".webp", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf",
+     ".orf", ".rw2"}
+)  # fmt: skip
+_GREY = "of 16-bit or floating-point grey, as depth maps are"
+_FOREIGN = "of a format that is not read"
 _DEPTH_MODES = ("I", "F")  # Pillow's names for 16- and 32-bit grey
 _SHOWN = 8
 
@@ -48,38 +54,38 @@ class Photographs(NamedTuple):
 
     Args:
         photos: The photographs, sorted by name.
-        left_out: Names of images that are grey of 16 bits or more, as depth maps are.
+        left_out: Names of other images, by what they are.
     """
 
     photos: tuple[Photo, ...]
-    left_out: tuple[str, ...]
+    left_out: Mapping[str, Sequence[str]]
 
 
 def find_photos(image_dir: Path, *, at_least: int) -> Photographs:
     """The photographs below ``image_dir``.
 
     Hidden files are left out, and so are 16-bit and floating-point grey images: those are the
-    depth maps of an RGB-D capture.
+    depth maps of an RGB-D capture. Formats such as HEIC and cameras' raw ones are not read.
 
     Raises:
         SceneNotFoundError: The folder is missing or holds fewer photographs than ``at_least``.
         SceneFormatError: An image cannot be decoded.
     """
-    names = _image_names(image_dir)
+    names, foreign = _image_names(image_dir)
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
         read = pool.map(lambda name: _read_photo(image_dir, name), names)
         by_name = dict(zip(names, read, strict=True))
     photos = tuple(photo for photo in by_name.values() if photo is not None)
-    left_out = tuple(name for name, photo in by_name.items() if photo is None)
+    grey = [name for name, photo in by_name.items() if photo is None]
+    left_out = {what: them for what, them in ((_GREY, grey), (_FOREIGN, foreign)) if them}
     if len(photos) < at_least:
-        found, fix = f"{len(photos)}", "Add photographs of the same scene from other places."
-        if left_out:
-            found += (
-                f", and {len(left_out)} of 16-bit or floating-point grey ({name_some(left_out)})"
-            )
-            fix = "Such images are taken for depth maps: save photographs with 8 bits."
+        told = [f"{len(them)} {what} ({name_some(them)})" for what, them in left_out.items()]
         raise SceneNotFoundError(
-            f"at least {at_least} photographs in {image_dir}", found=found, fix=fix
+            f"at least {at_least} photographs in {image_dir}",
+            found=" and ".join([f"{len(photos)}", *told]),
+            fix="Save photographs as JPEG, or as PNG of 8 bits."
+            if left_out
+            else "Add photographs of the same scene from other places.",
         )
     return Photographs(photos, left_out)
 
@@ -128,7 +134,8 @@ def name_some(names: Sequence[str]) -> str:
     return f"{shown} and {more} more" if more > 0 else shown
 
 
-def _image_names(image_dir: Path) -> list[str]:
+def _image_names(image_dir: Path) -> tuple[list[str], list[str]]:
+    """Names of the images, and of those in formats that are not read."""
     if not image_dir.is_dir():
         raise SceneNotFoundError(
             f"a folder of photographs or a video at {image_dir}",
@@ -146,7 +153,10 @@ def _image_names(image_dir: Path) -> list[str]:
         )
     relative = [path.relative_to(image_dir) for path in image_dir.rglob("*") if path.is_file()]
     files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]
-    names = sorted(path.as_posix() for path in files if path.suffix.lower() in _SUFFIXES)
+    names, foreign = (
+        sorted(path.as_posix() for path in files if path.suffix.lower() in suffixes)
+        for suffixes in (_SUFFIXES, _FOREIGN_SUFFIXES)
+    )
     if not names:
         kinds = sorted({path.suffix.lower() or "(no suffix)" for path in files})
         raise SceneNotFoundError(
@@ -154,7 +164,7 @@ def _image_names(image_dir: Path) -> list[str]:
             found=f"{len(files)} files of other kinds: {name_some(kinds)}" if files else "no files",
             fix="Give the folder that holds the photographs, as JPEG or PNG.",
         )
-    return names
+    return names, foreign
 
 
 def _read_photo(image_dir: Path, name: str) -> Photo | None:

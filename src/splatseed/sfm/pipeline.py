@@ -6,12 +6,13 @@ Here the input is checked and the output staged; the work is done by ``worker`` 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from shutil import rmtree
+from typing import TypeAlias
 
 from splatseed.io.output.layouts import write_split
 from splatseed.io.output.staging import MANIFEST, output_folder
@@ -29,7 +30,9 @@ from splatseed.sfm.settings import (
 )
 from splatseed.sfm.worker import run_job
 
-__all__ = ["reconstruct", "staged", "triangulate"]
+__all__ = ["OnPhotos", "reconstruct", "staged", "triangulate"]
+
+OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]]], None]
 
 
 def reconstruct(
@@ -46,7 +49,7 @@ def reconstruct(
     overwrite: bool = False,
     verbose: bool = False,
     on_progress: Progress = silent,
-    on_photos: Callable[[Sequence[str], Sequence[str]], None] | None = None,
+    on_photos: OnPhotos | None = None,
 ) -> SfmReport:
     """Make a scene from photographs alone: features, matching, mapping, undistortion.
 
@@ -65,8 +68,8 @@ def reconstruct(
         overwrite: Replace ``output`` if it exists.
         verbose: Let pycolmap's log through to the terminal.
         on_progress: Called with the stage and the fraction done.
-        on_photos: Called before work begins with the photographs' names, and with those of images
-            that are left out, as they may be depth maps.
+        on_photos: Called before work begins with the photographs' names, and with those of other
+            images, by what they are.
 
     Returns:
         What was found, and how long it took.
@@ -105,7 +108,7 @@ def triangulate(
     overwrite: bool = False,
     verbose: bool = False,
     on_progress: Progress = silent,
-    on_photos: Callable[[Sequence[str], Sequence[str]], None] | None = None,
+    on_photos: OnPhotos | None = None,
 ) -> SfmReport:
     """Make a scene from photographs whose poses are known: features, matching, triangulation.
 
@@ -125,8 +128,8 @@ def triangulate(
         overwrite: Replace ``output`` if it exists.
         verbose: Let pycolmap's log through to the terminal.
         on_progress: Called with the stage and the fraction done.
-        on_photos: Called before work begins with the photographs' names, and with those of images
-            that are left out, as they may be depth maps.
+        on_photos: Called before work begins with the photographs' names, and with those of other
+            images, by what they are.
 
     Returns:
         What was found, and how long it took.

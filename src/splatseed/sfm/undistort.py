@@ -64,17 +64,21 @@ def undistort(
 
 
 def _photographs(scene: Scene) -> Path:
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None or not scene.images:
-        there = "no images" if folder else "no folder of images"
-        missing = ""
-    else:
-        missing = next((im.name for im in scene.images if not (folder / im.name).is_file()), "")
-        there = f"{missing} missing in {folder}"
-    if folder is None or not scene.images or missing:
+    if not scene.images:
         raise SceneNotFoundError(
-            "a scene with all of its photographs",
-            found=there,
-            fix="Put them beside the model in a folder named images.",
+            "a scene with the poses of its photographs",
+            found="none",
+            fix="Copy the whole model, images.bin too, or make one: splatseed sfm IMAGES -o SCENE.",
         )
-    return folder.absolute()
+    folder = scene.source.image_dir if scene.source else None
+    there = "no folder of images"
+    if folder is not None:
+        missing = next((im.name for im in scene.images if not (folder / im.name).is_file()), "")
+        if not missing:
+            return folder.absolute()
+        there = f"{missing} missing in {folder}"
+    raise SceneNotFoundError(
+        "a scene with all of its photographs",
+        found=there,
+        fix="Put them beside the model in a folder named images.",
+    )

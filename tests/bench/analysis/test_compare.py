@@ -124,6 +124,12 @@ def test_the_command(tmp_path, capsys):
     assert "All settings are the same." in said
     assert "What only one of them has" in said
     assert (tmp_path / "out" / "changes.csv").is_file()
+    with pytest.raises(SystemExit) as stop:
+        main(["bench", "compare", a, b, "-o", str(tmp_path / "out")])
+    assert stop.value.code == 2
+    assert "found an earlier output. Pass --overwrite" in " ".join(capsys.readouterr().err.split())
+    main(["bench", "compare", a, b, "-o", str(tmp_path / "out"), "--overwrite"])
+    capsys.readouterr()
     empty = bench(tmp_path / "c", [])
     with pytest.raises(SystemExit) as stop:
         main(["bench", "compare", a, empty])

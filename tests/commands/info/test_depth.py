@@ -231,6 +231,7 @@ def test_near_is_yellow_and_a_hole_is_grey(room, tmp_path, splatseed):
     ("words", "said"),
     [
         (("--picture", "a.png"), "--depth DIR"),
+        (("--picture", "a.txt"), "a file that ends in .png, for --picture; found a.txt. Try a.png"),
         (("--depth-kind", "ray"), "--depth DIR"),
         (("--depth-scale", "5"), "--depth DIR"),
         (("--depth", "gone"), "a folder of depth maps at gone"),

@@ -13,6 +13,7 @@ from splatseed.camera import rotation_from_quat
 from splatseed.commands.upsample.cloud import Brought
 from splatseed.io import load_scene, write_scene
 from splatseed.io.output.manifest import unlisted_files
+from splatseed.io.ply.points import write_ply
 from splatseed.io.recentring import recentred
 from splatseed.similarity import Similarity
 from splatseed.synthetic import make_capture
@@ -173,9 +174,16 @@ def test_duplicates_by_the_million_change_nothing(splatseed, room, xyz, tmp_path
 
 
 def test_a_cloud_beside_cover(splatseed, room, scan, tmp_path):
+    few = load_scene(room).points
+    write_ply(tmp_path / "part.ply", few.select(few.xyz[:, 0] < np.median(few.xyz[:, 0])))
     words = ("--cloud", scan, "--method", "cover", "-o", tmp_path / "out", "--preview")
     run = splatseed("upsample", room, *words)
     assert run.code == 0, run.err
+    for i, method in enumerate(("cloud", "cover")):
+        words = ("--cloud", tmp_path / "part.ply", "--method", method, "-o", tmp_path / f"part{i}")
+        run = splatseed("upsample", room, *words)
+        assert "The cloud covers" in run.out
+        assert ("seeds the rest" in run.out) == (method == "cloud")
     assert {0, CLOUD, SOURCE_CODES["cover"]} <= set(load_scene(tmp_path / "out").points.source)
 
 

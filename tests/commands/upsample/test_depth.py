@@ -77,6 +77,20 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(without_points, tmp_path
         assert says in run.err
 
 
+def test_the_scenes_own_maps_are_found(room, tmp_path, splatseed):
+    clouds = []
+    for name, words in (("own", ()), ("named", ("--depth", room / "depths"))):
+        run = upsample(splatseed, room, tmp_path / name, "--ratio", 2, *words)
+        assert (run.code, run.err) == (0, "")
+        clouds.append(load_scene(tmp_path / name).points.xyz)
+    np.testing.assert_array_equal(*clouds)
+    bare = write_scene(load_scene(room), tmp_path / "bare").path
+    (bare / "depths").unlink()
+    run = upsample(splatseed, bare, tmp_path / "none")
+    assert (run.code, run.err.count("\n")) == (2, 1)
+    assert "maps of none of them. Name the folder with the maps: --depth DIR." in run.err
+
+
 def test_seeds_without_originals_are_never_taken_for_originals(without_points, tmp_path, splatseed):
     seeds = tmp_path / "seeds"
     upsample(splatseed, without_points, seeds, "--no-align", "--num-points", 700)
@@ -107,7 +121,6 @@ def test_no_align_is_the_methods_flag(room, tmp_path, splatseed):
 
 
 WRONG = [
-    ([], "--depth DIR"),
     (["--depth", "nowhere"], "a folder of depth maps at nowhere"),
     (["--depth-kind", "ray"], "--depth DIR, which"),
     (["--depth-scale", "2"], "--depth DIR, which"),

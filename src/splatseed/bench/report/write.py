@@ -36,6 +36,7 @@ from splatseed.bench.report.ledger_part import counts, ledger_sections
 from splatseed.bench.report.pictures import CLOUDS, FIGURES, Pictures, scene_pictures
 from splatseed.bench.report.study_part import StudyReport, study_report
 from splatseed.bench.report.views import ComparedView, compared_views, jpeg
+from splatseed.bench.running.folder import PLAN
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.io.output.staging import atomic_file, output_folder
 from splatseed.progress import Progress, silent
@@ -46,7 +47,6 @@ REPORT = "report.html"
 TABLES = "tables"
 KIND = "bench report"
 """The kind recorded in the manifests of the folders of tables and figures."""
-PLAN = "plan.toml"
 CLOUD_SIDE = 1800
 
 

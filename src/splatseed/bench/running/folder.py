@@ -16,7 +16,14 @@ from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.errors import OutputError
 from splatseed.io.output.staging import MANIFEST, atomic_file, check_output
 
-__all__ = ["DEMO_FACTS", "check_bench_folder", "make_bench_folder", "make_demo_scene"]
+__all__ = [
+    "DEMO_FACTS",
+    "PLAN",
+    "TUNING",
+    "check_bench_folder",
+    "make_bench_folder",
+    "make_demo_scene",
+]
 
 DEMO_FACTS = SceneFacts(
     "demo",
@@ -31,12 +38,17 @@ DEMO_FACTS = SceneFacts(
 """Facts about the synthetic room before it is made; the number of points is approximate."""
 
 
-def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
+PLAN, TUNING = "plan.toml", "tune.json"
+"""What ``splatseed bench`` and ``splatseed tune`` put beside their ledgers."""
+
+
+def check_bench_folder(folder: Path, protect: Sequence[Path] = (), *, tunes: bool = False) -> None:
     """Refuse a folder that is not a benchmark's, before any work is done.
 
     Args:
         folder: The folder, which need not be there.
         protect: Scenes, which the folder must lie apart from.
+        tunes: Whether it is to be that of ``splatseed tune``.
 
     Raises:
         OutputError: It is another's, or lies in a scene or around one.
@@ -45,6 +57,13 @@ def check_bench_folder(folder: Path, protect: Sequence[Path] = ()) -> None:
     ledger = folder / LEDGER
     if ledger.is_file() and ledger.stat().st_size:  # else another process is about to write it
         Ledger.open(ledger, read_only=True)
+    verb, other, mark = ("tune", "bench", PLAN) if tunes else ("bench", "tune", TUNING)
+    if (folder / mark).is_file():
+        raise OutputError(
+            f"the folder of splatseed {verb}, or a new one, at {folder}",
+            found=f"what splatseed {other} wrote",
+            fix="Choose another folder.",
+        )
     marked = (folder / MANIFEST).is_file() and not (folder / LEDGER).exists()
     if marked and _command(folder) != "bench":
         raise OutputError(

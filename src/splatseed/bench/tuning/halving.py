@@ -16,7 +16,7 @@ from statistics import fmean
 
 import numpy as np
 
-from splatseed.bench.analysis.statistics import Difference, over_scenes
+from splatseed.bench.analysis.statistics import Difference, over_views_and_repeats
 from splatseed.bench.planning.records import SFM, Arm, RunResult
 from splatseed.errors import ParameterError
 
@@ -66,7 +66,8 @@ class Verdict:
 
     Args:
         winner: The arm with the highest mean PSNR.
-        gain: Its PSNR minus the baseline's, dB: mean and standard error over validation views.
+        gain: Its PSNR minus the baseline's, dB: mean and standard error over validation views and
+            repeats.
         steps: Steps of its runs.
         views: Number of validation views.
         repeats: Runs of each arm.
@@ -172,13 +173,13 @@ def verdict(results: Results, steps: int) -> Verdict | None:
         return None
     winner = ranking[0][0]
     gains = _by_view(results[base], results[winner])
-    if not len(gains):
+    if not gains.size:
         return None
     return Verdict(
         winner,
-        over_scenes(gains),
+        over_views_and_repeats(gains),
         steps,
-        len(gains),
+        gains.shape[1],
         len(results[winner].keys() & results[base].keys()),
         tuple(ranking),
     )
@@ -194,11 +195,12 @@ def _of_common_repeats(results: Results) -> Results:
 
 
 def _by_view(base: Mapping[int, RunResult], own: Mapping[int, RunResult]) -> np.ndarray:
-    """PSNR differences by view, averaged over common repeats, [V]."""
+    """PSNR differences by common repeat and view, finite in all of them, [R, V]."""
     shared = sorted(base.keys() & own.keys())
-    gains = [_of_views(own[r]) - _of_views(base[r]) for r in shared]
-    mean = np.mean(gains, axis=0) if gains else np.zeros(0)
-    return np.asarray(mean[np.isfinite(mean)])
+    if not shared:
+        return np.zeros((0, 0))
+    gains = np.stack([_of_views(own[r]) - _of_views(base[r]) for r in shared])
+    return np.asarray(gains[:, np.isfinite(gains).all(axis=0)])
 
 
 def _of_views(result: RunResult) -> np.ndarray:

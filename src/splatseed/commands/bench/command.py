@@ -13,12 +13,12 @@ from splatseed.bench.planning.plan import Plan
 from splatseed.bench.planning.plan_file import plan_text
 from splatseed.bench.planning.records import RunRow, RunSpec
 from splatseed.bench.running.environment import describe_environment
-from splatseed.bench.running.folder import check_bench_folder, make_bench_folder
+from splatseed.bench.running.folder import PLAN, check_bench_folder, make_bench_folder
 from splatseed.bench.running.job import JobOptions
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.commands.bench.display import run_display, spoken_time
 from splatseed.commands.bench.machine import Machine, check_machine, open_machine
-from splatseed.commands.bench.options import PLAN, Asked, Options, parse_plan
+from splatseed.commands.bench.options import Asked, Options, parse_plan
 from splatseed.commands.bench.prepare import Prepared, prepare
 from splatseed.commands.bench.summary import print_summary
 from splatseed.console import OUT, print_note, stage_display
@@ -101,11 +101,17 @@ def _job_options(plan: Plan) -> JobOptions:
 
     If LPIPS is requested, missing weights are reported now rather than in every run.
     """
-    from splatseed.evaluate import load_lpips  # noqa: PLC0415  (PyTorch)
+    from splatseed.evaluate.lpips import GIVE_PATH, load_lpips  # noqa: PLC0415  (PyTorch)
 
     try:
         load_lpips()
-    except (MissingDependencyError, SceneNotFoundError):
+    except SceneNotFoundError as error:
+        if plan.lpips:
+            # splatseed bench has no option for their path: its runs are processes of their own.
+            fix = error.fix.replace(f", or {GIVE_PATH}", "")
+            raise SceneNotFoundError(error.expected, found=error.found, fix=fix) from None
+        return JobOptions(keep_models=plan.keep_models)
+    except MissingDependencyError:
         if plan.lpips:
             raise
         return JobOptions(keep_models=plan.keep_models)
@@ -184,6 +190,8 @@ def _dry_run(options: Options, asked: Asked) -> None:
         open_machine(options, asked.plan.training.backend) as machine,
         stage_display() as clock,
     ):
+        if asked.plan.lpips:
+            _job_options(asked.plan)  # refuses now what a run would
         kept = options.output / "scenes" if options.output else None
         scenes = kept if kept and (kept / "demo").is_dir() else None
         prepared = prepare(asked, machine.backend, scenes, clock)

@@ -18,14 +18,14 @@ import tyro
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
 from splatseed.bench.planning.plan_file import read_plan
 from splatseed.bench.planning.presets import PRESETS, PresetName, preset_plan
+from splatseed.bench.running.folder import PLAN
 from splatseed.commands.options import check_least, parse_options
 from splatseed.errors import ParameterError
 from splatseed.train.settings import StrategyName, TrainSettings
 from splatseed.upsample import Profile
 
-__all__ = ["PLAN", "Asked", "Options", "parse_plan"]
+__all__ = ["Asked", "Options", "parse_plan"]
 
-PLAN = "plan.toml"
 """The name of the plan in the folder of a benchmark."""
 DEFAULT = Plan()
 

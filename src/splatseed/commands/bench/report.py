@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -30,7 +30,7 @@ from splatseed.console import (
     stage_display,
 )
 from splatseed.errors import SceneNotFoundError
-from splatseed.io.output.staging import check_output
+from splatseed.io.output.staging import check_output, output_folder
 from splatseed.literal import counted, quoted
 
 __all__ = ["run_compare", "run_report"]
@@ -59,6 +59,8 @@ class CompareOptions:
         tyro.conf.arg(aliases=["-o"], constructor=Path, metavar="DIR", help_behavior_hint=""),
     ] = None
     """A folder to write the tables to, as CSV, Markdown and LaTeX."""
+    overwrite: bool = False
+    """Replace what an earlier comparison wrote there."""
 
 
 def run_report(arguments: list[str]) -> None:
@@ -97,8 +99,9 @@ def run_compare(arguments: list[str]) -> None:
         arguments: The words after ``splatseed bench compare``.
     """
     options = parse_options(CompareOptions, "bench compare", arguments)
+    written: Any = {"kind": "bench compare", "protect": (options.a, options.b)}
     if options.output is not None:
-        check_output(options.output, kind="bench compare", protect=(options.a, options.b))
+        check_output(options.output, overwrite=options.overwrite, **written)
     comparison = compare(_rows(options.a), _rows(options.b))
     if comparison is None:
         raise SceneNotFoundError(
@@ -113,8 +116,9 @@ def run_compare(arguments: list[str]) -> None:
     for note in _notes(comparison, tables):
         print_note(note)
     if options.output is not None:
-        for table in tables:
-            write_table(table, options.output)
+        with output_folder(options.output, overwrite=options.overwrite, **written) as partial:
+            for table in tables:
+                write_table(table, partial)
         print_pairs("written", [("tables", str(options.output))])
 
 

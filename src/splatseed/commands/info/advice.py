@@ -118,7 +118,7 @@ def advice_commands(
         train = f"splatseed train OUT {training}"
     if not trains:
         return first or [("look", f"splatseed view {source}")]
-    tune = ("or ask by experiment", f"splatseed tune {source} --minutes 30")
+    tune = ("or ask by experiment", f"splatseed tune {source} --minutes 30{planned.tuning}")
     tunes = advice.method in (AS_IT_IS, "auto") and len(scene.points)
     return [*first, ("train", train), *([tune] if tunes else [])]
 

@@ -34,7 +34,7 @@ from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.output.earlier import was_upsampled
 from splatseed.io.output.staging import check_parents
-from splatseed.literal import quoted
+from splatseed.literal import quoted, visible
 from splatseed.scene import Scene
 from splatseed.train.schedule import FULL_RUN
 
@@ -128,6 +128,12 @@ def run(arguments: list[str]) -> None:
 def _read(options: Options) -> Scene:
     """The scene, with the depth maps that the user names, else with its own."""
     if options.picture is not None:
+        if options.picture.suffix.lower() != ".png":
+            raise ParameterError(
+                "a file that ends in .png, for --picture",
+                found=visible(options.picture.name),
+                fix=f"Try {quoted(options.picture.with_suffix('.png'))}.",
+            )
         check_parents(options.picture)
     scene = load_scene(options.scene, require_points=False)
     if options.depth is not None:

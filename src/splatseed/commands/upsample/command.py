@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +49,7 @@ from splatseed.diagnostics.geometry import far_share
 from splatseed.errors import ParameterError
 from splatseed.io import WriteReport, find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
+from splatseed.io.depth_search import with_own_depths
 from splatseed.io.output.staging import check_output
 from splatseed.literal import counted, visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
@@ -69,7 +70,7 @@ from splatseed.upsample import (
 )
 
 if TYPE_CHECKING:
-    from splatseed.seeding.clouds.method import Cloud
+    from splatseed.seeding.clouds.method import Cloud, GivenClouds
 
 __all__ = ["HELP_ALL", "Options", "asks_what_to_do", "full_options", "parse", "run"]
 
@@ -294,7 +295,9 @@ def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
     number = number_words(total, most, changed_by)
     _announce(options, scene, method, number, _idle(options, methods), brought.takes)
     with stage_display(clock):
-        beside = methods[CLOUD] if options.cloud_files and options.method != CLOUD else None
+        beside = None
+        if options.cloud_files and options.method != CLOUD:
+            beside = dataclasses.replace(cast("GivenClouds", methods[CLOUD]), alone=False)
         seeds = _make(options, scene, method, beside, total, clock, notes)
         clock("check", 0.0)
         checks = _check(scene, seeds, method)
@@ -333,8 +336,18 @@ def _advise(arguments: list[str]) -> None:
             word.startswith("--") and word not in {*known, *ADVICE_OPTIONS} for word in given
         )
         if unknown and "Did you mean" not in error.fix:
-            parse(arguments)  # knows more options that may be meant
+            parse(_without(ADVICE_OPTIONS, arguments))  # knows more options that may be meant
         raise
+
+
+def _without(options: Collection[str], arguments: Sequence[str]) -> list[str]:
+    """The words without these options and their values."""
+    values = {i + 1 for i, word in enumerate(arguments) if word in options}
+    return [
+        word
+        for i, word in enumerate(arguments)
+        if i not in values and word.partition("=")[0] not in options
+    ]
 
 
 def asks_what_to_do(arguments: Sequence[str]) -> bool:
@@ -393,6 +406,8 @@ def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, floa
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
     scene = load_originals(options.scene, require_points="points" in traits_of(method).needs)
+    if options.method == "depth" and options.depth_maps is None:
+        scene = with_own_depths(scene)
     if options.depth_maps is not None:
         maps = find_depths(
             scene, options.depth_maps, kind=options.depth_kind, scale=options.depth_scale

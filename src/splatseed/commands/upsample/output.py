@@ -174,7 +174,8 @@ def summarise(
         print_note(note)
     if report.layout == "transforms":
         print_note(
-            "gsplat's examples, graphdeco's code and LichtFeld read COLMAP only: --format colmap."
+            "The commands of gsplat's examples, graphdeco's code and LichtFeld are for COLMAP's "
+            "layout: --format colmap."
         )
     tell_training(read_from, scene, output, report.layout)
 

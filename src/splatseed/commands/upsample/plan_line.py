@@ -9,7 +9,7 @@ from splatseed.upsample import Profile, Upsampler, configure
 
 __all__ = ["method_words", "number_words", "parameters_of"]
 
-TOLD_ELSEWHERE = {"files", "transform", "memory"}
+TOLD_ELSEWHERE = {"files", "transform", "memory", "alone"}
 """Parameters of a cloud that other lines tell."""
 
 

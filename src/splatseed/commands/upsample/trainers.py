@@ -53,8 +53,8 @@ def training_commands(
 
     Args:
         path: The scene folder that was written.
-        written_format: "colmap" or "transforms": gsplat's examples, graphdeco's code and LichtFeld
-            Studio read only the former.
+        written_format: "colmap" or "transforms": gsplat's examples and graphdeco's code read only
+            the former, and LichtFeld Studio is made for it.
         distorted: Whether cameras have lens distortion, with which only some trainers deal.
 
     Example:

@@ -117,6 +117,8 @@ class GivenClouds(Cloud):
     """From their frame to the scene's; the same frame when None."""
     memory: int | None = None
     """Most bytes of memory; 4 GB when None, and never more than is free."""
+    alone: bool = True
+    """Whether no other method adds what the clouds lack: notes then name one."""
 
     def plan(self, scene: Scene) -> MemoryPlan:
         """What it will take for a scene.
@@ -178,7 +180,7 @@ class GivenClouds(Cloud):
             lacks = "no colours" if own is None else "intensity only"
             notes = (*notes, f"The cloud has {lacks}: colours are those of the photographs.")
         return NewPoints(
-            xyz, rgb, (*notes, *_note_on_cover(scene, xyz)),
+            xyz, rgb, (*notes, *_note_on_cover(scene, xyz, alone=self.alone)),
             confidence=np.nan_to_num(evidence.agreement, nan=UNKNOWN),
             source=np.full(len(xyz), source_code("cloud"), np.uint8),
         )  # fmt: skip
@@ -312,11 +314,11 @@ def _read_notes(streamed: Streamed) -> tuple[str, ...]:
     return tuple(told)
 
 
-def _note_on_cover(scene: Scene, xyz: np.ndarray) -> tuple[str, ...]:
+def _note_on_cover(scene: Scene, xyz: np.ndarray, *, alone: bool) -> tuple[str, ...]:
     from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (loads Numba)
 
     share = covered_share(frames_of(scene), xyz, CELL, silent)
     if share >= CORNER:
         return ()
-    told = f"The cloud covers {share:.0%} of the photographs"
-    return (f"{told}: --method auto beside --cloud seeds the rest.",)
+    hint = ": --method auto beside --cloud seeds the rest" if alone else ""
+    return (f"The cloud covers {share:.0%} of the photographs{hint}.",)
