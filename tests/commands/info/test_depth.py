@@ -59,6 +59,7 @@ def test_nothing_follows_from_maps_that_do_not_fit(room, splatseed):
     assert "12 of 12 depth maps cannot be aligned" in run.out
     assert "--method depth" not in run.out
     assert "by method depth" not in run.out
+    assert _pairs(run.out)["depth maps"] == "12"
 
 
 def test_true_depth_fits(room, splatseed):

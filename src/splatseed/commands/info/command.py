@@ -104,13 +104,14 @@ def run(arguments: list[str]) -> None:
         alignments = _alignments(options, scene, clock)
         known = _known_depths(options, scene, clock)
         problems = (*problems, *_unfit_maps(scene, alignments or {}))
-        if alignments and len(scene.points) and all(each.rejected for each in alignments.values()):
-            scene = scene.replace(depths=None)  # nothing follows from maps that cannot be used
     if options.json:
         print_json(scene, cloud, tracks, regions, alignments, problems)
         return
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
-    rows += _advice_rows(options, scene, regions)
+    usable = scene
+    if alignments and len(scene.points) and all(each.rejected for each in alignments.values()):
+        usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
+    rows += _advice_rows(options, usable, regions)
     print_pairs(str(options.scene), rows)
     if alignments is not None:
         from splatseed.commands.info.depth_numbers import print_depth  # noqa: PLC0415  (loads Numba)
@@ -122,7 +123,7 @@ def run(arguments: list[str]) -> None:
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
-        print_commands("next", _next_commands(options, scene, known))
+        print_commands("next", _next_commands(options, usable, known))
 
 
 def _read(options: Options) -> Scene:
