@@ -213,6 +213,7 @@ def test_fewer_than_half_registered_is_an_error_that_names_them(
         reconstruct(mixed, tmp_path / "scene", camera_model="SIMPLE_RADIAL")
     assert "found 6 in the largest" in str(caught.value)
     assert "other0.png" in caught.value.found
+    assert "exhaustive" not in caught.value.fix  # it was
     assert "view0.png" not in caught.value.found
     assert {path.name for path in tmp_path.iterdir()} == {"mixed"}
 

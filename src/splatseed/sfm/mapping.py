@@ -19,10 +19,14 @@ from splatseed.sfm.photos import name_some
 
 __all__ = ["map_images", "triangulate_points"]
 
-_ADVICE = (
-    "Take more overlapping photographs, take out those of other places, try the exhaustive "
-    "matcher, a simpler camera_model such as SIMPLE_RADIAL, or a larger max_image_size."
-)
+
+def _advice(run: Run) -> str:
+    """What can make more photographs fit together."""
+    matcher = "" if run.settings.matcher == "exhaustive" else "the exhaustive matcher, "
+    return (
+        f"Take more overlapping photographs, take out those of other places, try {matcher}a "
+        "simpler camera_model such as SIMPLE_RADIAL, or a larger max_image_size."
+    )
 
 
 def map_images(run: Run, names: Sequence[str]) -> Path:
@@ -38,7 +42,7 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
         raise ReconstructionError(
             f"a model of the {len(names)} images in {run.image_dir}",
             found="no two images that match well enough to begin one",
-            fix=_ADVICE,
+            fix=_advice(run),
         )
     best = max(models, key=lambda i: (models[i].num_reg_images(), models[i].num_points3D()))
     _check_registered(run, models[best], len(models), names)
@@ -81,7 +85,7 @@ def _check_registered(run: Run, model: Any, num_models: int, names: Sequence[str
         f"at least half of the {len(names)} images in {run.image_dir} to register",
         found=f"{len(registered)} in the largest of {num_models} models; "
         f"without a pose: {name_some(missing)}",
-        fix=_ADVICE,
+        fix=_advice(run),
     )
 
 

@@ -170,7 +170,8 @@ def _estimates(
         return []
     seconds = sum(estimator.of_all(left).values()) / min(machine.jobs, len(left))
     measured = estimator.num_measured
-    by = f"by {measured} finished runs" if measured else "by a rough model, until runs are finished"
+    finished = counted(measured, "finished run")
+    by = f"by {finished}" if measured else "by a rough model, until runs are finished"
     return [f"about {spoken_time(seconds)} ({by}), {_disk(plan, left, machine.jobs, estimator)}"]
 
 
