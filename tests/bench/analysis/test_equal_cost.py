@@ -123,6 +123,12 @@ def test_only_a_gain_is_called_best(gain, says):
     assert says in answer_at_equal_cost(study)[0]
 
 
+def test_a_few_repeats_of_one_scene_are_not_called_chance():
+    """Beside it stands the test by the noise of all variants, which two repeats may pass."""
+    (study,) = studies(rows(scenes=("fox",), strategies=("default",), repeats=2, noise=0.3))
+    assert "these two arms' 2 repeats alone do not confirm" in answer_at_equal_cost(study)[0]
+
+
 def test_lpips_reaches_the_tables_where_it_was_measured():
     study = _study()
     assert "LPIPS" not in arm_table(study).header

@@ -225,6 +225,9 @@ def _against(each: Compared, base: Arm) -> str:
     over = "scenes" if len(each.scenes) > 1 else "repeats"
     spread = "" if math.isnan(gain.se) else f" (± {gain.se:.2f} over {over})"
     doubt = _DOUBTS.get(gain.verdict, "")
+    if gain.verdict == "within noise" and len(each.scenes) == 1:
+        # The noise of all variants together, which other sentences go by, may tell more.
+        doubt = f", which these two arms' {each.runs} repeats alone do not confirm"
     return f"{abs(gain.mean):.2f} dB{spread} {more} than {base.label}{doubt}"
 
 
