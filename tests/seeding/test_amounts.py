@@ -25,6 +25,11 @@ def test_a_budget_is_a_number_or_a_density(budget, number):
     assert parse_budget(budget, 2000) == number
 
 
+def test_a_slip_of_many_digits_is_told():
+    with pytest.raises(ParameterError, match="a budget that a trainer can hold; found '1e30'"):
+        parse_budget("1e30", 2000)
+
+
 @pytest.mark.parametrize("budget", ["", "many", "rho", "-3", "0", "0.1", "nan", "inf", "1e-9rho"])
 def test_no_other_budget_is_taken(budget):
     with pytest.raises(ParameterError, match="expected a budget such as 50000"):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
 
-from splatseed.io import load_scene
+from splatseed.io import load_scene, write_scene
 from splatseed.similarity import Similarity
 from splatseed.splat.ply import read_gaussians
 from splatseed.viewer.renderer import ModelRenderer, model_frame
@@ -147,6 +149,22 @@ def test_a_stopped_video_leaves_nothing_and_ffmpeg_says_nothing(tmp_path, capfd)
     gc.collect()
     assert capfd.readouterr().err == ""
     assert not list(tmp_path.iterdir())
+
+
+def test_models_of_two_places_are_not_compared(run_folder, room, tmp_path, splatseed):
+    scene = load_scene(room)
+    moved = [dataclasses.replace(im, translation=im.translation + 1) for im in scene.images]
+    write_scene(scene.replace(images=tuple(moved)), tmp_path / "elsewhere")
+    other = shutil.copytree(run_folder, tmp_path / "other")
+    config = json.loads((other / "config.json").read_text())
+    config["scene"] = str(tmp_path / "elsewhere")
+    (other / "config.json").write_text(json.dumps(config))
+    words = ("flight", run_folder, "--compare", other, "--seconds", 0.1, "--fps", 20)
+    heard = splatseed(*words, "-o", tmp_path / "a.mp4")
+    assert (heard.code, heard.err.count("\n")) == (2, 1)
+    assert "a model of the same scene as" in heard.err
+    heard = splatseed(*words, "-o", tmp_path / "a.mp4", "--scene", room)
+    assert heard.code == 0, heard.err
 
 
 def test_a_scene_is_no_model(room, tmp_path, splatseed):

@@ -101,7 +101,7 @@ def run(arguments: list[str]) -> None:
         shown = _open(options, options.model)
         models = [shown]
         if options.compare is not None:
-            models.append(_open(options, options.compare))
+            models.append(_compared(options, options.compare, shown))
         size = _size(options, shown)
         views, fps = _views(options, shown, size)
         renderers = _renderers(options, models, clock)
@@ -145,6 +145,20 @@ def _open(options: Options, path: Path) -> Shown:
             f"{path} to be a trained model",
             found="a scene or points",
             fix="Train it first (splatseed train), or look at it with splatseed view.",
+        )
+    return shown
+
+
+def _compared(options: Options, path: Path, first: Shown) -> Shown:
+    """The model beside the first, which the same cameras see."""
+    from splatseed.viewer.shown import share_a_world  # noqa: PLC0415  (loads with its use)
+
+    shown = _open(options, path)
+    if not share_a_world(first, shown):
+        raise ParameterError(
+            f"a model of the same scene as {options.model}, for --compare",
+            found=f"{path}, whose scene has no photograph with a pose of that scene",
+            fix="Compare runs of one scene; if these are, name it with --scene.",
         )
     return shown
 

@@ -10,6 +10,8 @@ __all__ = ["RHO", "parse_budget"]
 
 RHO = "rho"
 """The unit of Gaussians per pixel of a photograph."""
+MOST = 10**12
+"""More than any trainer holds, so that a slip is told at once."""
 
 
 def parse_budget(budget: str | float, pixels: float) -> int:
@@ -21,7 +23,7 @@ def parse_budget(budget: str | float, pixels: float) -> int:
         pixels: Pixels of one image.
 
     Raises:
-        ParameterError: It is neither, or allows none.
+        ParameterError: It is neither, or allows none, or more than anything can hold.
 
     Example:
         >>> parse_budget("50k", 0), parse_budget("0.25rho", 800 * 600)
@@ -42,5 +44,9 @@ def parse_budget(budget: str | float, pixels: float) -> int:
             "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
             found=f"{text}, which of {pixels:,.6g} pixels is none" if none else repr(budget),
             fix=f"Did you mean {text}rho?" if bare else f"Give a number of at least 1{smaller}.",
+        )
+    if number > MOST:
+        raise ParameterError(
+            "a budget that a trainer can hold", found=repr(budget), fix="Give one such as 500k."
         )
     return round(number)

@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.export import detect_format, read_model
 from splatseed.io import load_scene
@@ -19,7 +21,7 @@ from splatseed.scene import Scene
 from splatseed.splat.gaussians import Gaussians
 from splatseed.train.record.folder import RunFolder
 
-__all__ = ["Shown", "open_shown"]
+__all__ = ["Shown", "open_shown", "share_a_world"]
 
 MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
 _HEADER = 1 << 16
@@ -52,6 +54,21 @@ class Shown:
     def test_every(self) -> int:
         """Every ``test_every``-th image, sorted by name, is a test view."""
         return int(self.config.get("test_every", 8))
+
+
+def share_a_world(first: Shown, second: Shown) -> bool:
+    """Whether the cameras of one also see the other: a photograph has the same pose in both.
+
+    Also where the scene of one is unknown, as nothing speaks against it.
+    """
+    if not (first.scene and first.scene.images and second.scene):
+        return True
+    poses = {image.name: image.camera.world_from_cam for image in first.scene.images}
+    return any(
+        np.allclose(poses[image.name], image.camera.world_from_cam, rtol=1e-4, atol=1e-4)
+        for image in second.scene.images
+        if image.name in poses
+    )
 
 
 def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
