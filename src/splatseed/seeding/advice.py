@@ -55,8 +55,9 @@ INWARD = 0.7
 GROWS = "grow"
 """The strategy that needs no seeds."""
 PLACES_ITSELF = (
-    "Strategy grow puts new Gaussians at the depth that stereo finds; points added before it "
-    "gained 0.1 dB at most on some of the captures measured, and cost as much on others."
+    "Strategy grow puts new Gaussians at the depth that stereo finds; points that method auto "
+    "added before it gained 0.1 dB at most on some of the captures measured, and cost as much on "
+    "others."
 )
 VIEWS_LOOKED_AT = 2
 SIDE_LOOKED_AT = 400
