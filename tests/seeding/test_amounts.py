@@ -25,6 +25,12 @@ def test_a_budget_is_a_number_or_a_density(budget, number):
     assert parse_budget(budget, 2000) == number
 
 
+@pytest.mark.parametrize(("typed", "meant"), [("0,25rho", r"0\.25rho"), ("0.25", r"0\.25rho")])
+def test_what_was_meant_is_told(typed, meant):
+    with pytest.raises(ParameterError, match=rf"Did you mean {meant}\?"):
+        parse_budget(typed, 2000)
+
+
 def test_a_slip_of_many_digits_is_told():
     with pytest.raises(ParameterError, match="a budget that a trainer can hold; found '1e30'"):
         parse_budget("1e30", 2000)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from splatseed.errors import ParameterError
 
@@ -10,6 +11,8 @@ __all__ = ["RHO", "parse_budget"]
 
 RHO = "rho"
 """The unit of Gaussians per pixel of a photograph."""
+DECIMAL = re.compile(r"\d+,\d+(rho|k|m)")
+"""A number with a decimal comma and a unit."""
 MOST = 10**12
 """More than any trainer holds, so that a slip is told at once."""
 
@@ -39,11 +42,12 @@ def parse_budget(budget: str | float, pixels: float) -> int:
     bare = not unit and 0 < number < 1
     if bare or not (math.isfinite(number) and round(number) >= 1):
         none = unit == RHO and 0 < number < 1  # photographs are too small for this share
+        meant = f"{text}rho" if bare else text.replace(",", ".") if DECIMAL.fullmatch(text) else ""
         smaller = ", or reduce photographs by a smaller factor" if none else ""
         raise ParameterError(
             "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
             found=f"{text}, which of {pixels:,.6g} pixels is none" if none else repr(budget),
-            fix=f"Did you mean {text}rho?" if bare else f"Give a number of at least 1{smaller}.",
+            fix=f"Did you mean {meant}?" if meant else f"Give a number of at least 1{smaller}.",
         )
     if number > MOST:
         raise ParameterError(

@@ -76,7 +76,11 @@ class Options:
     training: Annotated[TrainSettings, tyro.conf.arg(name="")] = BEST_SETTINGS
     """The settings; its fields are options of their own."""
     budget: Annotated[
-        str | None, tyro.conf.arg(metavar="N|Xrho", help_behavior_hint="(default: --cap-max's)")
+        str | None,
+        tyro.conf.arg(
+            metavar="N|Xrho",
+            help_behavior_hint="(default: 1rho, 1000000 at most, for auto; else --cap-max's)",
+        ),
     ] = None
     """Most Gaussians: a number, or 0.25rho for a quarter of the pixels of a photograph at training
     size."""
