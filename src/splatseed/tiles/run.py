@@ -145,8 +145,8 @@ def check_tileable(name: str, method: object) -> None:
     raise ParameterError(
         "a method that works tile by tile (linear, triangle, spline, mls, voronoi, random)",
         found=reason,
-        fix=f"Choose one of these{way_out}, or work in memory: without --memory, --jobs, --executor"
-        " and --tile-points.",
+        fix=f"Choose one of these{way_out}, or work in memory: a scene or a .ply without --memory, "
+        "--jobs, --executor and --tile-points, a scan by upsample SCENE --cloud SCAN.",
     )
 
 

@@ -206,8 +206,8 @@ def _check_options(options: Options, source: Source) -> None:
             "no option that looks at all points at once while a cloud is worked on in tiles",
             found=names,
             fix=f"Leave {'it' if len(given) == 1 else 'them'} out (fewer points: --ratio or "
-            "--num-points), or work in memory: without --memory, --jobs, --executor and "
-            "--tile-points.",
+            "--num-points), or work in memory: a scene or a .ply without --memory, --jobs, "
+            "--executor and --tile-points, a scan by upsample SCENE --cloud SCAN.",
         )
     scene = source.scene if isinstance(source, SceneSource) else None
     read = scene.source.format if scene is not None and scene.source is not None else "ply"
