@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
+import os
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,9 +14,10 @@ import splatseed
 from splatseed.bench.running import child
 from splatseed.bench.running.job import JobOptions
 from splatseed.errors import ReconstructionError
+from splatseed.process import tasks
 from splatseed.sfm import worker
 
-NAMES = ("numpy", "random", "json", "pickle", "splatseed")
+NAMES = ("numpy", "random", "json", "pickle", "splatseed", "wave")
 
 
 @pytest.fixture
@@ -60,3 +64,10 @@ def test_no_other_module_starts_an_interpreter():
     starts = {path.name for path in named if "-m pip" not in path.read_text()}
     assert starts == {"interpreter.py"}
     assert not any("subprocess" in path.read_text() for path in named if path.name not in starts)
+
+
+def test_the_processes_of_tiles(trap):
+    tasks.ProcessTasks(1, 1).run(importlib.import_module, [("wave",)], "stage", lambda *_: None)
+    assert not (trap / "mark").exists()
+    assert "PYTHONSAFEPATH" not in os.environ
+    assert "" in sys.path

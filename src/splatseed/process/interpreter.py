@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 
-__all__ = ["child_command", "child_environment"]
+__all__ = ["child_command", "child_environment", "safe_children"]
+
+SAFE = "PYTHONSAFEPATH"
+"""The variable that keeps the working directory out of an interpreter's ``sys.path``."""
 
 
 def child_command(program: str, *words: str) -> list[str]:
@@ -32,4 +36,24 @@ def child_environment(more: Mapping[str, str] | None = None) -> dict[str, str]:
     """
     # An empty entry would stand for the working directory.
     places = os.pathsep.join(filter(None, sys.path))
-    return {**os.environ, "PYTHONPATH": places, "PYTHONSAFEPATH": "1", **(more or {})}
+    return {**os.environ, "PYTHONPATH": places, SAFE: "1", **(more or {})}
+
+
+@contextmanager
+def safe_children() -> Iterator[None]:
+    """Keep this module's promise for the interpreters that ``multiprocessing`` starts in the block.
+
+    It runs ``python -c`` with our environment, and then hands on our ``sys.path``.
+    """
+    variable, path = os.environ.get(SAFE), sys.path
+    os.environ[SAFE] = "1"
+    sys.path = list(filter(None, path))
+    try:
+        yield
+    finally:
+        sys.path = path
+        if variable is None:
+            del os.environ[SAFE]
+        else:
+            os.environ[SAFE] = variable
+

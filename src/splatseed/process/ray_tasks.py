@@ -10,8 +10,9 @@ from __future__ import annotations
 import logging
 import os
 import socket
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import chdir, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -29,6 +30,8 @@ ANSWER_SECONDS = 5.0
 """Seconds in which the machine at a cluster's address must answer."""
 ATTEMPTS = 2
 """Ray's attempts, 40 s each, to find a cluster where something answers; its own default is 20."""
+UNIMPORTED = "remote function failed to import"
+"""What Ray says of a task whose function a worker could not import."""
 MOST_THREADS = 8
 """Default threads of a task: with more, they wait for each other."""
 
@@ -115,12 +118,14 @@ def ray_cluster(address: str | None) -> Iterator[Cluster]:
 
     options: dict[str, Any] = {} if address else {"include_dashboard": False}
     try:
-        ray.init(
-            address=address or "local",
-            log_to_driver=False,
-            logging_level=logging.ERROR,
-            **options,
-        )
+        # Workers import from the directory that Ray is started in, before all else.
+        with chdir(sys.prefix):
+            ray.init(
+                address=address or "local",
+                log_to_driver=False,
+                logging_level=logging.ERROR,
+                **options,
+            )
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise _no_cluster(address, " ".join(str(error).split())) from None
     try:
@@ -219,6 +224,19 @@ def _landing(reference: Any) -> Landing:
     try:
         return Landing(ray.get(reference))
     except ray.exceptions.RayTaskError as error:
+        told = str(error.cause)
+        if isinstance(error.cause, ray.exceptions.RaySystemError) or UNIMPORTED in told:
+            return Landing(error=_not_installed(told))
         return Landing(error=error.cause)
     except ray.exceptions.RayError as error:
         return Landing(lost=" ".join(str(error).split()))
+
+
+def _not_installed(told: str) -> ParameterError:
+    """What a worker's traceback means, if the worker could not import what it is to call."""
+    reason = next(filter(None, map(str.strip, reversed(told.splitlines()))), "no reason")
+    return ParameterError(
+        "splatseed on every node of the cluster, in the Python that ray start ran in",
+        found=reason,
+        fix="Install the same version of splatseed there, and run the same command again.",
+    )

@@ -20,6 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from splatseed.errors import TaskLostError
+from splatseed.process.interpreter import safe_children
 from splatseed.process.ray_tasks import LOSSES, Cluster, Flights, Share
 from splatseed.process.threads import few_threads
 from splatseed.progress import Progress
@@ -111,7 +112,7 @@ class ProcessTasks(Tasks):
     ) -> None:
         """Run what is left; what is done is removed from it."""
         context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(self._jobs, context, _begin) as pool:
+        with safe_children(), ProcessPoolExecutor(self._jobs, context, _begin) as pool:
             flying: dict[Any, Call] = {}
             waiting = deque(left)
             try:

@@ -191,8 +191,15 @@ class Auto(Stereo):
         return _join(seeds, gaps)
 
 
-def photographed(scene: Scene, hold_out: int = 0) -> tuple[Image, ...]:
+def photographed(
+    scene: Scene, hold_out: int = 0, *, without: str = "choose --method mls"
+) -> tuple[Image, ...]:
     """The images whose photographs are used, by name.
+
+    Args:
+        scene: The scene.
+        hold_out: Leave out every n-th image by name, as in ``PhotographMethod``.
+        without: What to do if there are none, for the error.
 
     Raises:
         SceneNotFoundError: There are none.
@@ -206,7 +213,7 @@ def photographed(scene: Scene, hold_out: int = 0) -> tuple[Image, ...]:
         raise SceneNotFoundError(
             "photographs of the scene",
             found=f"none of {len(ordered)} images" if folder else "no folder with images",
-            fix="Put them beside the model in a folder named images, or choose --method mls.",
+            fix=f"Put them beside the model in a folder named images, or {without}.",
         )
     return tuple(used)
 

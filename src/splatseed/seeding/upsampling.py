@@ -172,7 +172,8 @@ def add_cover(
         SceneNotFoundError: There are no photographs.
     """
     points = scene.points if cloud is None else cloud
-    views = read_views(scene, photographed(scene), MAX_SIZE, progress)
+    images = photographed(scene, without="do without cover")
+    views = read_views(scene, images, MAX_SIZE, progress)
     return with_cover(views, points, cell, seed, progress)
 
 
@@ -198,7 +199,7 @@ def add_verified(
     if not guessed.any():
         note("There are no interpolated points to verify.")
         return cloud
-    images = photographed(scene)
+    images = photographed(scene, without="do without verify")
     views = read_views(scene, images, MAX_SIZE, progress)
     points = cloud.select(guessed)
     new = NewPoints(points.xyz, points.rgb, (), source=points.source)

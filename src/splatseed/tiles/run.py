@@ -126,8 +126,13 @@ class Tiled:
         return chain(self.originals(progress), self.new(progress))
 
 
-def check_tileable(name: str, method: object) -> None:
+def check_tileable(name: str, method: object, in_memory: str = "work in memory") -> None:
     """Refuse a method that needs more than a point's surroundings.
+
+    Args:
+        name: Its name.
+        method: The method.
+        in_memory: What the user may do instead, for the error.
 
     Raises:
         ParameterError: It does.
@@ -145,8 +150,7 @@ def check_tileable(name: str, method: object) -> None:
     raise ParameterError(
         "a method that works tile by tile (linear, triangle, spline, mls, voronoi, random)",
         found=reason,
-        fix=f"Choose one of these{way_out}, or work in memory: a scene or a .ply without --memory, "
-        "--jobs, --executor and --tile-points, a scan by upsample SCENE --cloud SCAN.",
+        fix=f"Choose one of these{way_out}, or {in_memory}.",
     )
 
 

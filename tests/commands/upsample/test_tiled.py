@@ -126,7 +126,18 @@ def test_a_survey_far_from_zero_is_moved_and_says_so(tmp_path, splatseed):
             ("--tile-points", "99", "--budget", "50"),
             r"looks at all .* found --budget\. Leave it .*--num-points",
         ),
-        (("--tile-points", "99", "--method", "stereo"), r"a method that works tile by tile"),
+        (
+            ("--tile-points", "99", "--method", "stereo"),
+            r"a method that works tile by tile .* or bring .* upsample SCENE --cloud SCAN\.",
+        ),
+        (
+            ("--jobs", "2", "--memory", "1G", "--verify"),
+            r"found --verify\. Leave it out .*, or leave out --jobs, --memory to work in memory\.",
+        ),
+        (
+            ("--tile-points", "99", "--method", "voronoi", "--profile", "paper"),
+            r"or voronoi with --profile default, or leave out --tile-points to work in memory\.",
+        ),
     ],
 )
 def test_what_cannot_be_is_one_line(words, told, cloud, tmp_path, splatseed):
@@ -135,6 +146,33 @@ def test_what_cannot_be_is_one_line(words, told, cloud, tmp_path, splatseed):
     assert run.code == 2
     assert re.search(told, run.err.replace("\n", " "))
     assert not list(tmp_path.glob("out*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--method", "stereo"), "found stereo, which needs the whole scene at once."),
+        (("--preview",), "found --preview. Leave it out"),
+        (("--budget", "50"), "found --budget. Leave it out"),
+    ],
+)
+def test_a_lone_scan_is_led_to_its_photographs(words, told, cloud, tmp_path, splatseed):
+    method = () if "--method" in words else ("--method", "mls")
+    run = splatseed("upsample", npz(cloud), "-o", tmp_path / "out", *method, *words)
+    assert run.code == 2
+    message = " ".join(run.err.split())
+    assert told in message
+    assert message.endswith("with splatseed upsample SCENE --cloud SCAN.")
+
+
+def test_what_the_machine_alone_cuts_into_tiles_is_told_what_it_takes(
+    cloud, tmp_path, splatseed, monkeypatch
+):
+    monkeypatch.setattr("splatseed.commands.upsample.tiled.free_memory", lambda: 200 << 20)
+    run = splatseed("upsample", cloud, "-o", tmp_path / "out", "--method", "mls", "--preview")
+    assert run.code == 2
+    message = " ".join(run.err.split())
+    assert re.search(r"or use a machine with 3\d\d MB of free memory", message), message
 
 
 @pytest.mark.parametrize("content", ["nan nan nan\n" * 9, "1 2 3\n" * 99 + "1 2\n"])

@@ -281,7 +281,7 @@ def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
         clock("read", 0.0)
         scene = _read(options, methods[options.method])
         if options.gaussians is not None:
-            photographed(scene)  # raises without photographs: views bound the Gaussians' sizes
+            photographed(scene, without="leave out --gaussians")  # views bound their sizes
         options = _settle(options, scene, notes)
         plain = cast("Cloud", methods[CLOUD])
         brought = bring_clouds(options.bringing, scene, plain, clock)

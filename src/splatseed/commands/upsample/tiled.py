@@ -32,7 +32,7 @@ from splatseed.process.memory import free_memory, option_of, words_of
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for
-from splatseed.upsample import BYTES_EACH, Upsampler, planned_size
+from splatseed.upsample import BYTES_EACH, Upsampler, planned_size, traits_of
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
@@ -73,9 +73,14 @@ class Tiling:
     tile_points: int | None
 
     @property
-    def asked(self) -> bool:
-        """Whether the options ask for tiles, whatever the memory."""
-        return self.executor == "ray" or (self.jobs or 1) > 1 or self.tile_points is not None
+    def asked(self) -> tuple[str, ...]:
+        """The options that ask for tiles, whatever the memory."""
+        asks = {
+            "--executor": self.executor == "ray",
+            "--jobs": (self.jobs or 1) > 1,
+            "--tile-points": self.tile_points is not None,
+        }
+        return tuple(name for name, asked in asks.items() if asked)
 
     @property
     def bound(self) -> int | None:
@@ -107,8 +112,9 @@ def find_source(options: Options, methods: Mapping[str, Upsampler]) -> Source | 
         return None
     _check_model(path, tiling.bound)
     scene = load_originals(path)
-    large = tiling.asked or _is_large(options, method, len(scene.points))
-    return SceneSource(scene) if large else None
+    if tiling.asked or _is_large(options, method, len(scene.points)):
+        return SceneSource(scene)
+    return None
 
 
 def _check_model(path: Path, bound: int | None) -> None:
@@ -134,13 +140,17 @@ def _check_model(path: Path, bound: int | None) -> None:
 
 def _is_large(options: Options, method: Upsampler, count: int) -> bool:
     """Whether the whole cloud takes more memory than it may."""
+    bound = options.tiling.bound
+    return bound is not None and _needed(options, method, count) > bound
+
+
+def _needed(options: Options, method: Upsampler, count: int) -> int:
+    """Bytes that the whole cloud takes in memory."""
     from splatseed.upsample.nearest import NearestMethod  # noqa: PLC0415  (SciPy, Numba)
 
     total = planned_size(count, options.ratio, options.num_points)
     neighbors = method.num_queried if isinstance(method, NearestMethod) else 16
-    needed = PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
-    bound = options.tiling.bound
-    return bound is not None and needed > bound
+    return PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
 
 
 def run_tiled(
@@ -175,8 +185,9 @@ def run_tiled(
         scene = source.scene if isinstance(source, SceneSource) else PointCloud.empty()
         options = replace(options, method=str(method_for(scene, note=print_note)))
     method = methods[options.method]
-    _check_options(options, source)
-    check_tileable(options.method, method)
+    in_memory = _in_memory(options, method, source)
+    _check_options(options, source, in_memory)
+    check_tileable(options.method, method, in_memory)
     request = Request(options.method, method, options.ratio, options.num_points, options.seed)
     path, clock = work_path(options.output), StageClock()
     with _tasks(options, method, source) as tasks:
@@ -195,7 +206,24 @@ def run_tiled(
     _summarise(options, tiled, report, clock.seconds())
 
 
-def _check_options(options: Options, source: Source) -> None:
+def _in_memory(options: Options, method: Upsampler, source: Source) -> str:
+    """What to do for the cloud to be worked on in memory, with all options and methods."""
+    tiling, path = options.tiling, options.scene
+    if path.is_file() and (path.suffix.lower() in CLOUDS or _looks(method)):
+        return "bring the scan to its photographs with splatseed upsample SCENE --cloud SCAN"
+    asked = tiling.asked + (("--memory",) if tiling.memory is not None else ())
+    if asked:
+        return f"leave out {', '.join(asked)} to work in memory"
+    needed = words_of(_needed(options, method, source.count or 0), up=True)
+    return f"use a machine with {needed} of free memory, which all points at once take"
+
+
+def _looks(method: Upsampler) -> bool:
+    """Whether a method needs more than points."""
+    return bool(traits_of(method).needs - {"points"})
+
+
+def _check_options(options: Options, source: Source, in_memory: str) -> None:
     from splatseed.tiles import SceneSource  # noqa: PLC0415  (Numba)
 
     given = [name for name in WHOLE if getattr(options, name)]
@@ -206,8 +234,7 @@ def _check_options(options: Options, source: Source) -> None:
             "no option that looks at all points at once while a cloud is worked on in tiles",
             found=names,
             fix=f"Leave {'it' if len(given) == 1 else 'them'} out (fewer points: --ratio or "
-            "--num-points), or work in memory: a scene or a .ply without --memory, --jobs, "
-            "--executor and --tile-points, a scan by upsample SCENE --cloud SCAN.",
+            f"--num-points), or {in_memory}.",
         )
     scene = source.scene if isinstance(source, SceneSource) else None
     read = scene.source.format if scene is not None and scene.source is not None else "ply"
