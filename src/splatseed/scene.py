@@ -159,6 +159,18 @@ class SceneSource:
     image_dir: Path | None = None
     transforms_path: Path | None = None
 
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """What was read, which outputs must stay apart from.
+
+        Not so a folder of images above the root: they lie apart, and an output may lie there too.
+        """
+        if self.format == "ply":
+            return (self.points_path,)
+        above = self.root.resolve().parents
+        places = (self.root, self.model_dir, self.image_dir)
+        return tuple(each for each in places if each and each.resolve() not in above)
+
 
 @dataclass(frozen=True)
 class Split:

@@ -15,7 +15,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene, write_scene
-from splatseed.io.colmap.binary import write_points3d
+from splatseed.io.colmap.binary import write_images, write_points3d
 from splatseed.io.output.earlier import saw_all_photographs, was_upsampled
 from splatseed.sfm import undistort
 from splatseed.views.view import check_lens, load_views
@@ -45,6 +45,23 @@ def test_points_that_go_are_told_of(distorted, tmp_path, splatseed):
     run = splatseed("undistort", path, "-o", tmp_path / "straight")
     assert run.code == 0, run.err
     assert "1 point repeats the position of another and was left out." in run.out
+
+
+@pytest.mark.parametrize("how", ["absolute", "above", "within"])
+def test_a_name_that_leads_out_is_refused(how, distorted, tmp_path, splatseed):
+    """pycolmap would write the undistorted photograph over the one that the user has there."""
+    path = shutil.copytree(distorted, tmp_path / "scene", symlinks=False)
+    scene = load_scene(path)
+    mine = shutil.copy(path / "images" / scene.images[0].name, tmp_path / "mine.png")
+    names = {"absolute": str(mine), "above": "../../mine.png", "within": "../images/../mine.png"}
+    images = (dataclasses.replace(scene.images[0], name=names[how]), *scene.images[1:])
+    write_images(path / "sparse" / "0" / "images.bin", images)
+    before = {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()}
+    run = splatseed("undistort", path, "-o", tmp_path / "a" / "straight")
+    assert (run.code, run.err.count("\n")) == (2, 1)
+    assert "names stay inside their folder" in run.err
+    assert names[how] in run.err
+    assert {each: each.read_bytes() for each in tmp_path.rglob("*") if each.is_file()} == before
 
 
 @pytest.mark.parametrize("layout", ["colmap", "transforms"])

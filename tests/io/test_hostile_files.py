@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import json
 import os
 import socket
 import zipfile
@@ -13,7 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatseed.errors import OutputError, SceneFormatError
+from splatseed.diagnostics.trainable import untrainable
+from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import files, load_scene, write_scene
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.io.depth.arrays import read_npz
@@ -41,6 +43,44 @@ def test_only_regular_files_are_opened(odd, name, says):
         open_file(odd / name)
     with pytest.raises(SceneFormatError, match=f"{name} to be an image; found {says}"):
         photograph_bytes(odd / name)
+
+
+@pytest.mark.parametrize(("name", "is_"), [("pipe", "a pipe"), ("link", "a device")])
+def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model):
+    with pytest.raises(SceneNotFoundError, match=f"a scene at .*; found {is_}, not a file"):
+        load_scene(odd / name)
+    _rename(scene_dir, model, str(odd / name))
+    scene = load_scene(scene_dir)
+    assert f"{odd / name}, which is {is_}, not a file." in " ".join(scene.warnings)
+    assert untrainable(scene) == (
+        f"Training needs all {len(model.images)} photographs: {odd / name} is {is_}, not a file."
+    )
+    path = write_scene(scene_of_files(scene_dir), odd / "json", format="transforms").path
+    content = json.loads((path / "transforms.json").read_text())
+    (path / "transforms.json").write_text(json.dumps(content | {"ply_file_path": f"../{name}"}))
+    assert f"ply_file_path ../{name} is {is_}, not a file." in load_scene(path).warnings
+
+
+def scene_of_files(scene_dir):
+    """The scene as transforms.json can hold it: all its images lie in one folder."""
+    scene = load_scene(scene_dir)
+    return scene.replace(images=scene.images[1:])
+
+
+@pytest.mark.parametrize("frame", ["../apart.jpg", "/dev/zero"])
+def test_an_image_outside_leaves_room_for_outputs_and_is_told(frame, scene_dir, tmp_path):
+    path = write_scene(load_scene(scene_dir), tmp_path / "json", format="transforms").path
+    (tmp_path / "apart.jpg").write_bytes((scene_dir / "images/left/image000.jpg").read_bytes())
+    content = json.loads((path / "transforms.json").read_text())
+    content["frames"][0]["file_path"] = frame
+    (path / "transforms.json").write_text(json.dumps(content))
+    scene = load_scene(path)
+    (told,) = [each for each in scene.warnings if "outside of" in each]
+    assert frame.rpartition("/")[2] in told
+    write_scene(scene, tmp_path / "out")
+    for taken in (path, path / "out"):
+        with pytest.raises(OutputError, match="an output folder apart from the input"):
+            write_scene(scene, taken)
 
 
 def test_a_file_larger_than_the_memory_is_not_read(tmp_path, monkeypatch):

@@ -66,6 +66,23 @@ def test_two_lists_can_leave_images_out(scene_dir, names):
     assert not any("list.txt" in each for each in scene.warnings)
 
 
+@pytest.mark.parametrize(
+    ("slips", "told"),
+    [
+        ((), None),
+        (("left/imgae002.jpg",), "1 name fits no image (left/imgae002.jpg)"),
+        (tuple("abcd"), "4 names fit no image (a, b, c, ...)"),
+    ],
+)
+def test_names_of_no_image_are_told(slips, told, scene_dir):
+    (scene_dir / "test_list.txt").write_text("\n".join([*TEST, *slips]))
+    (scene_dir / "validation_list.txt").write_text("only nerfstudio reads it\n")
+    scene = load_scene(scene_dir)
+    assert _names(scene.split(8)[1]) == TEST
+    warnings = [each for each in scene.warnings if "test_list.txt" in each]
+    assert warnings == ([] if told is None else [f"test_list.txt and validation_list.txt: {told}."])
+
+
 def test_the_lists_of_transforms_json_are_followed_and_carried_over(scene_dir, names, tmp_path):
     write_scene(load_scene(scene_dir), tmp_path / "plain", format="transforms")
     path = tmp_path / "plain/transforms.json"

@@ -7,10 +7,10 @@ import signal
 
 import pytest
 
-from splatseed.cli import main
-from splatseed.commands.bench import command as bench
+from splatseed.cli import VERBS, main
+from splatseed.commands.bench import machine
 from splatseed.commands.train import command as train
-from splatseed.process.interruption import exit_code, interruption
+from splatseed.process.interruption import Interruption, exit_code, interruption
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -44,5 +44,38 @@ def test_train_exits_with_it(number, code, tmp_path, monkeypatch, capsys):
     assert "--resume" in capsys.readouterr().err
 
 
-def test_bench_exits_with_it_too():
-    assert bench.exit_code is exit_code
+STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+
+
+@pytest.mark.parametrize(("number", "code"), STOPS)
+@pytest.mark.parametrize("words", [("bench", "--scenes", "demo"), ("tune", "demo")])
+def test_what_trains_in_processes_exits_with_it(
+    words, number, code, room_path, tmp_path, monkeypatch, splatseed
+):
+    class Stopped:
+        """Runs that are told to stop while they are under way."""
+
+        def __init__(self, *_):
+            pass
+
+        def run(self, _keys):
+            with interruption():
+                os.kill(os.getpid(), number)
+            return False
+
+    monkeypatch.setattr(machine, "LocalExecutor", Stopped)
+    named = [room_path if word == "demo" else word for word in words]
+    run = splatseed(*named, "-o", tmp_path / "out")
+    assert (run.code, "Traceback" in run.err) == (code, False)
+
+
+@pytest.mark.parametrize(("number", "code"), STOPS)
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_exits_with_it(verb, number, code, monkeypatch, splatseed):
+    def stopped(_words):
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(f"splatseed.commands.{verb}.run", stopped)
+    monkeypatch.setattr(Interruption, "last", signal.SIGINT)
+    run = splatseed(verb)
+    assert (run.code, run.err.split()[0]) == (code, "interrupted;")

@@ -17,6 +17,7 @@ from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, PointCloudError, SceneFormatError
 from splatseed.evaluate import evaluate_views
+from splatseed.scene import Split
 from splatseed.splat.ply import read_gaussians
 from splatseed.train import device, run as run_module, trainer
 from splatseed.train.averaging import add_to_mean
@@ -60,6 +61,19 @@ def test_training_makes_unseen_views_better(begin, strategy, gain):
     before = run.trainer.test_scores()[0]
     assert run.train()
     assert run.trainer.test_scores()[0] > before + gain
+
+
+def test_the_scenes_own_lists_are_followed(room, tmp_path):
+    names = [image.name for image in sorted(room.images, key=lambda image: image.name)]
+    split = Split(frozenset(names[3:]), frozenset(names[1:3]), "test_list.txt")
+    run = prepare_run(
+        room.replace(listed=split), tmp_path / "run", TrainSettings(max_steps=1), RunOptions()
+    )
+    assert [view.name for view in run.trainer.train_views] == names[3:]
+    assert run.train()
+    run.finish(_score)
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
+    assert [each["name"] for each in metrics["per_image"]] == names[1:3]
 
 
 @pytest.mark.parametrize("strategy", ["default", "grow", "mcmc", "none"])

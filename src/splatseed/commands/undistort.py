@@ -12,7 +12,7 @@ from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.diagnostics.trainable import is_distorted
 from splatseed.io import load_scene
-from splatseed.io.image_checks import lens_warnings
+from splatseed.io.image_checks import warnings_but_lens
 from splatseed.io.output.earlier import was_upsampled
 from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
@@ -60,9 +60,8 @@ def run(arguments: list[str]) -> None:
         ("output", str(options.output)),
     ]
     print_pairs("splatseed undistort", rows)
-    for warning in scene.warnings:
-        if warning not in lens_warnings(scene.images):  # it is mended now
-            print_note(warning)
+    for warning in warnings_but_lens(scene):
+        print_note(warning)
     if not is_distorted(scene):
         print_note("No camera had distortion: the photographs are copies.")
     verb, made = ("train", "RUN") if was_upsampled(scene) else ("upsample", "OUT")

@@ -5,6 +5,7 @@ Promise: no photograph is opened.
 
 from __future__ import annotations
 
+from splatseed.io.files import odd_kind
 from splatseed.literal import agreeing, visible
 from splatseed.scene import Scene
 
@@ -24,11 +25,11 @@ def untrainable(scene: Scene) -> str:
     missing = [image.name for image in scene.images if not (folder / image.name).is_file()]
     if not missing:
         return ""
+    needs = f"Training needs all {len(scene.images):,} photographs"
+    if kind := odd_kind(folder / missing[0]):
+        return f"{needs}: {visible(missing[0])} is {kind}."
     which = agreeing(len(missing), "", f"and {len(missing) - 1:,} more ")
-    return (
-        f"Training needs all {len(scene.images):,} photographs: put {visible(missing[0])} {which}"
-        f"into {visible(folder)}."
-    )
+    return f"{needs}: put {visible(missing[0])} {which}into {visible(folder)}."
 
 
 def is_distorted(scene: Scene) -> bool:

@@ -19,6 +19,7 @@ from splatseed.process.memory import free_memory
 __all__ = [
     "VIDEO_SUFFIXES",
     "is_video",
+    "odd_kind",
     "open_file",
     "other_spelling",
     "read_bytes",
@@ -50,6 +51,16 @@ def other_spelling(path: Path) -> str | None:
     stem = path.stem.casefold()
     alike = [name for name in near if Path(name).stem.casefold() == stem and name != path.name]
     return min(alike, key=lambda name: name.casefold() != path.name.casefold(), default=None)
+
+
+def odd_kind(path: Path) -> str:
+    """What a path is that is neither a regular file nor a folder; empty if it is, or is nothing."""
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return ""
+    known = stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)
+    return "" if known else _kind(status)[1]
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -86,8 +97,12 @@ def read_file(path: Path) -> bytes:
 def _check(path: Path, status: os.stat_result) -> None:
     if stat.S_ISREG(status.st_mode):
         return
-    number, kind = next((number, kind) for is_, number, kind in _KINDS if is_(status.st_mode))
-    raise OSError(number, kind, str(path))
+    raise OSError(*_kind(status), str(path))
+
+
+def _kind(status: os.stat_result) -> tuple[int, str]:
+    """The error and the name of what is no regular file."""
+    return next((number, kind) for is_, number, kind in _KINDS if is_(status.st_mode))
 
 
 def read_bytes(path: Path) -> bytes:

@@ -9,11 +9,11 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from splatseed.io.files import open_file, other_spelling
+from splatseed.io.files import odd_kind, open_file, other_spelling
 from splatseed.literal import agreeing, told
-from splatseed.scene import Image
+from splatseed.scene import Image, Scene
 
-__all__ = ["image_warnings", "lens_warnings"]
+__all__ = ["image_warnings", "lens_warnings", "warnings_but_lens"]
 
 _MAX_OPENED = 32  # files whose size is compared
 
@@ -37,6 +37,8 @@ def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) 
         first, are = next(iter(missing)), agreeing(len(missing), "is", "are")
         near = other_spelling(image_dir / first)
         hint = f"; {near} is there, but names must be equal to the letter" if near else ""
+        if kind := odd_kind(image_dir / first):
+            hint = f", which is {kind}"
         warnings.append(
             f"{len(missing)} of {len(images)} images {are} missing in {image_dir}, the first is "
             f"{first}{hint}."
@@ -79,6 +81,12 @@ def _size_warning(image: Image, image_dir: Path) -> str | None:
         f"{image.name} has {size[0]} x {size[1]} pixels, its camera {image.intrinsics.camera_id}"
         f" {expected[0]} x {expected[1]}; some trainers rescale, others fail."
     )
+
+
+def warnings_but_lens(scene: Scene) -> list[str]:
+    """What is wrong with a scene for a command that takes lens distortion out."""
+    lens = lens_warnings(scene.images)
+    return [warning for warning in scene.warnings if warning not in lens]
 
 
 def lens_warnings(images: Sequence[Image]) -> list[str]:

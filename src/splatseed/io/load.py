@@ -14,7 +14,7 @@ from pathlib import Path
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.cloud import clean_scene, cloud_warnings
 from splatseed.io.colmap.scene import find_model, read_colmap_scene, scene_root
-from splatseed.io.files import is_video
+from splatseed.io.files import is_video, odd_kind
 from splatseed.io.nerfstudio.blender import is_blender, read_blender
 from splatseed.io.nerfstudio.scene import read_transforms_scene
 from splatseed.io.output.earlier import recall_seeds
@@ -108,7 +108,9 @@ def _read(path: Path) -> Scene:
         return _read_file(path)
     if not path.is_dir():
         raise SceneNotFoundError(
-            f"a scene at {path}", found="no such file or folder", fix="Check the path."
+            f"a scene at {path}",
+            found=odd_kind(path) or "no such file or folder",
+            fix="Check the path.",
         )
     first = find_model(path / "sparse" / "0", path / "sparse", path, path / "0")
     if first is not None:

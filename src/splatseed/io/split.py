@@ -5,7 +5,7 @@ fits is used, and reported: ``train_filenames`` and ``test_filenames`` (else ``v
 transforms.json, as nerfstudio writes them; ``train_list.txt``, ``test_list.txt`` (else
 ``validation_list.txt``) in the scene's folder, as nerfstudio's COLMAP reader has them; ``test.txt``
 in the model's folder (graphdeco); ``train.txt`` and ``test.txt`` in the scene's. A list whose names
-match no image is ignored, and reported too.
+match no image is ignored, and reported too, as are single names that match none.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from splatseed.io.files import read_bytes
+from splatseed.literal import counted
 from splatseed.scene import Scene, Split
 
 __all__ = ["MODEL_LISTS", "ROOT_LISTS", "follow_lists", "split_fields"]
@@ -25,6 +26,8 @@ ROOT_LISTS = ("train_list.txt", "test_list.txt", "validation_list.txt", "train.t
 MODEL_LISTS = ("test.txt",)
 """Lists beside a COLMAP model."""
 _PARTS = ("train", "test", "val")
+SHOWN = 3
+"""Names that a warning shows."""
 
 
 class _Lists(NamedTuple):
@@ -46,13 +49,22 @@ def follow_lists(scene: Scene) -> Scene:
         return scene
     warnings = list(scene.warnings)
     for lists in _lists(scene):
-        split = _split(scene, lists)
+        split, unknown = _split(scene, lists)
         if split is not None:
+            if unknown:
+                warnings.append(_unknown_names(lists, unknown))
             return scene.replace(listed=split, warnings=tuple(warnings))
         warnings.append(
             f"{lists.origin} was ignored: it leaves no images to train on, or none to test."
         )
     return scene.replace(warnings=tuple(warnings))
+
+
+def _unknown_names(lists: _Lists, unknown: Sequence[str]) -> str:
+    """The warning of names that a list has and the scene has not: a slip, or lost by SfM."""
+    shown = ", ".join(unknown[:SHOWN]) + (", ..." if len(unknown) > SHOWN else "")
+    fit = "fits" if len(unknown) == 1 else "fit"
+    return f"{lists.origin}: {counted(len(unknown), 'name')} {fit} no image ({shown})."
 
 
 def split_fields(scene: Scene) -> dict[str, list[str]]:
@@ -99,35 +111,36 @@ def _read(path: Path) -> list[str]:
     return [line.strip() for line in lines if line.strip()]
 
 
-def _split(scene: Scene, lists: _Lists) -> Split | None:
-    """The split of the images; None if one part would be empty."""
+def _split(scene: Scene, lists: _Lists) -> tuple[Split | None, list[str]]:
+    """The split of the images, None if one part would be empty; and the names of no image."""
     names = [image.name for image in scene.images]
     folder = scene.source.image_dir if scene.source else None
     prefixes = ("", "images/", f"{folder.name}/" if folder else "")
-    train, test, validation = (_known(names, each, prefixes) for each in lists[1:])
+    known = [_known(names, each, prefixes) for each in lists[1:]]
+    train, test, validation = (frozenset(each.values()) for each in known)
+    used = (0, 1) if test or not validation else (0, 2)
+    unknown = [name for i in used for name in lists[1 + i] if name not in known[i]]
     test = test or validation
     if lists.train and not lists.test and not lists.validation:
         test = frozenset(names) - train
     if not lists.train:
         train = frozenset(names) - test
     train -= test
-    return Split(train, test, lists.origin) if train and test else None
+    return (Split(train, test, lists.origin) if train and test else None), unknown
 
 
-def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str]) -> frozenset[str]:
-    """The names that are listed: as they are, within their folder, or by file name or stem."""
-    whole = {_plain(each) for each in listed}
-    exact = frozenset(n for n in names if any(f"{prefix}{n}" in whole for prefix in prefixes))
-    if exact:
-        return exact
-    for field in ("name", "stem"):
-        parts = [getattr(PurePosixPath(name), field) for name in names]
-        if len(set(parts)) == len(parts):  # else a name would be ambiguous
-            wanted = {getattr(PurePosixPath(each), field) for each in whole}
-            matching = frozenset(n for n, own in zip(names, parts, strict=True) if own in wanted)
-            if matching:
-                return matching
-    return frozenset()
+def _known(names: Sequence[str], listed: Sequence[str], prefixes: Sequence[str]) -> dict[str, str]:
+    """The images that are listed: by name as it is or within their folder, or by file or stem."""
+    exact = {f"{prefix}{name}": name for prefix in reversed(prefixes) for name in names}
+    known = {each: exact[plain] for each in listed if (plain := _plain(each)) in exact}
+    for field in () if known else ("name", "stem"):
+        parts = {getattr(PurePosixPath(name), field): name for name in names}
+        if len(parts) == len(names):  # else a name would be ambiguous
+            wanted = {each: getattr(PurePosixPath(_plain(each)), field) for each in listed}
+            known = {each: parts[part] for each, part in wanted.items() if part in parts}
+        if known:
+            break
+    return known
 
 
 def _plain(name: str) -> str:

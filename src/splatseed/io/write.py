@@ -104,7 +104,7 @@ def write_scene(
     path = Path(path)
     kind = str((provenance or {}).get("command", _KIND))
     more = stream or PointStream(0, 0, ORIGINAL, lambda: iter(()))
-    inputs = (*_inputs(scene), *more.files)
+    inputs = (*(scene.source.inputs if scene.source else ()), *more.files)
     with output_folder(path, kind=kind, overwrite=overwrite, protect=inputs) as folder:
         write_layout = write_colmap if layout == "colmap" else write_transforms
         notes, image_sources = write_layout(clean, folder)
@@ -142,16 +142,6 @@ def _choose_layout(scene: Scene, wanted: str) -> Layout:
     raise OutputError(
         "a format of auto, colmap or transforms", found=repr(wanted), fix="Choose one of them."
     )
-
-
-def _inputs(scene: Scene) -> tuple[Path, ...]:
-    """The files that were read, which the output must stay apart from."""
-    source = scene.source
-    if source is None:
-        return ()
-    if source.format == "ply":
-        return (source.points_path,)
-    return tuple(each for each in (source.root, source.model_dir, source.image_dir) if each)
 
 
 def _listing(folder: Path, linked: Sequence[str]) -> tuple[str, ...]:

@@ -94,7 +94,7 @@ def estimate_depths(
         if number < 1:
             raise ParameterError(f"--{name} of 1 or more", found=f"{number}", fix="Raise it.")
     folder = photograph_folder(scene)
-    protect = (folder,) if scene.source is None else (folder, scene.source.root)
+    protect = (folder,) if scene.source is None else scene.source.inputs
     check_output(output, kind="depth", overwrite=overwrite, protect=protect)
     sizes = _check_images(scene.images, folder, max_size, progress)
     _check_memory(sizes, batch)

@@ -56,4 +56,3 @@ def safe_children() -> Iterator[None]:
             del os.environ[SAFE]
         else:
             os.environ[SAFE] = variable
-

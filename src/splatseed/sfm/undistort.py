@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from splatseed.errors import SceneNotFoundError
+from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import write_scene
 from splatseed.io.output.earlier import carry_seeds
 from splatseed.io.output.layouts import write_split
@@ -45,6 +45,7 @@ def undistort(
 
     Raises:
         SceneNotFoundError: The scene has no photographs, or one is missing.
+        SceneFormatError: The name of one leads out of their folder.
         OutputError: ``output`` is taken or cannot be written.
         ReconstructionError: pycolmap failed.
         MissingDependencyError: pycolmap is absent.
@@ -70,6 +71,7 @@ def _photographs(scene: Scene) -> Path:
             found="none",
             fix="Copy the whole model, images.bin too, or make one: splatseed sfm IMAGES -o SCENE.",
         )
+    _check_names(scene)
     folder = scene.source.image_dir if scene.source else None
     there = "no folder of images"
     if folder is not None:
@@ -82,3 +84,15 @@ def _photographs(scene: Scene) -> Path:
         found=there,
         fix="Put them beside the model in a folder named images.",
     )
+
+
+def _check_names(scene: Scene) -> None:
+    """Refuse names that lead out: pycolmap writes to the output's folder joined with each."""
+    paths = ((image.name, PurePosixPath(image.name.replace("\\", "/"))) for image in scene.images)
+    outside = next((name for name, path in paths if path.is_absolute() or ".." in path.parts), None)
+    if outside is not None:
+        raise SceneFormatError(
+            "photographs whose names stay inside their folder, as copies get the same names",
+            found=repr(outside),
+            fix="Move it into the folder and rename it in the model.",
+        )

@@ -332,7 +332,7 @@ def _checked_folder(output: Path, scene: Scene, options: RunOptions) -> RunFolde
     if options.tensorboard:
         require("tensorboard")
     folder = RunFolder(Path(output))
-    protect = (scene.source.root,) if scene.source else ()
+    protect = scene.source.inputs if scene.source else ()
     folder.check(overwrite=options.overwrite, resume=options.resume, protect=protect)
     return folder
 

@@ -107,6 +107,15 @@ def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, do, tmp_pat
     assert not (tmp_path / "work" / "a").exists()
 
 
+def test_the_scenes_own_test_images_are_scored(small_plan, own_room, do):
+    names = sorted(image.name for image in load_scene(own_room).images)
+    (own_room / "test_list.txt").write_text("\n".join(names[1:3]))
+    plan = dataclasses.replace(small_plan, repeats=1, training=with_steps(small_plan, 1))
+    (spec, *_) = plan_runs(plan, [survey(own_room, "room")], "cpu", "1")
+    outcome = do(spec)
+    assert [each.name for each in outcome.result.scores.per_image] == names[1:3]
+
+
 def test_models_are_kept_on_request(specs, do, tmp_path):
     assert do(specs["sfm"], options=JobOptions(keep_models=True)).status == "done"
     assert (tmp_path / "runs" / "a" / "point_cloud.ply").stat().st_size > 1000

@@ -88,6 +88,8 @@ def _summarise(options: Options, scene: Scene, network: DepthNetwork, report: De
         ("output", str(report.path)),
     ]
     print_pairs("splatseed depth", rows)
+    for warning in scene.warnings:
+        print_note(warning)
     if report.flat:
         shown = ", ".join(report.flat[:NAMES_SHOWN])
         more = len(report.flat) - NAMES_SHOWN

@@ -25,6 +25,7 @@ from splatseed.io.dense import (
     write_dense_maps,
     write_dense_workspace,
 )
+from splatseed.io.image_checks import warnings_but_lens
 from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted, visible
 from splatseed.scene import Scene
@@ -122,6 +123,8 @@ def _summarise(
     )
     if options.preview:
         OUT.print(f"pictures: {visible(options.output / PICTURE)}", soft_wrap=True)
+    for warning in warnings_but_lens(scene):
+        print_note(warning)
     if report.empty:
         more = len(report.empty) - NAMES_SHOWN
         shown = ", ".join(report.empty[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")

@@ -52,8 +52,7 @@ def write_dense_maps(
     """
     images = {image.name: image for image in scene.images}
     count, total = DenseCount(), length_hint(maps, len(images)) or 1
-    source = scene.source
-    protect = tuple(each for each in (source.root, source.image_dir) if each) if source else ()
+    protect = scene.source.inputs if scene.source else ()
     with depth_folder(
         Path(path), "z", overwrite=overwrite, protect=protect, provenance=provenance
     ) as writer:

@@ -78,9 +78,8 @@ def write_dense_workspace(
     model = photograph_model(scene, check_dense_scene(scene, undistorts=undistort is not None))
     count, overlap = DenseCount(), OverlapPoints()
     total = length_hint(maps, len(scene.images)) or 1
-    with output_folder(
-        Path(path), kind="depth", overwrite=overwrite, protect=_inputs(scene)
-    ) as folder:
+    inputs = scene.source.inputs if scene.source else ()
+    with output_folder(Path(path), kind="depth", overwrite=overwrite, protect=inputs) as folder:
         bring_photographs(scene, folder, undistort, progress, copy=copy_images)
         stereo = _Stereo(folder / "stereo", model)
         progress("write maps", 0.0)
@@ -115,14 +114,6 @@ def check_dense_scene(scene: Scene, *, undistorts: bool = False) -> dict[str, Si
     """
     folder = photograph_folder(scene)
     return {image.name: check_image(image, folder, undistorts=undistorts) for image in scene.images}
-
-
-def _inputs(scene: Scene) -> tuple[Path, ...]:
-    """The files that were read, which the output must stay apart from."""
-    source = scene.source
-    if source is None:
-        return ()
-    return tuple(each for each in (source.root, source.model_dir, source.image_dir) if each)
 
 
 class _Stereo:

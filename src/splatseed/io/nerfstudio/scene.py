@@ -20,6 +20,7 @@ from splatseed.io.colmap.scene import (
     read_model_cameras,
     read_model_points,
 )
+from splatseed.io.files import odd_kind
 from splatseed.io.image_checks import image_warnings, lens_warnings
 from splatseed.io.nerfstudio.transforms import Transforms, apply_transform, read_transforms
 from splatseed.io.ply.points import read_ply
@@ -69,7 +70,7 @@ def find_points(transforms: Transforms) -> tuple[PointCloud, Path, list[str]]:
     named = transforms.json.get("ply_file_path")
     names = [name for name in (named, *_POINT_FILES) if isinstance(name, str)]
     if isinstance(named, str) and not (root / named).is_file():
-        notes.append(f"ply_file_path {named} is not there.")
+        notes.append(f"ply_file_path {named} is {odd_kind(root / named) or 'not there'}.")
     ply = next((root / name for name in names if (root / name).is_file()), None)
     if ply is not None:
         return read_ply(ply), ply, notes
