@@ -29,7 +29,11 @@ from splatseed.io.rgbd.replica import load_rgbd
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, Split
 from splatseed.sfm import reconstruct, triangulate, worker
+from splatseed.sfm.features import Run
+from splatseed.sfm.mapping import _advice
 from splatseed.sfm.orientation import clear_orientation
+from splatseed.sfm.photos import Photo
+from splatseed.sfm.settings import MatcherName, Settings
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -218,12 +222,33 @@ def test_fewer_than_half_registered_is_an_error_that_names_them(
     assert {path.name for path in tmp_path.iterdir()} == {"mixed"}
 
 
-def test_no_model_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
+def test_no_model_is_an_error_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("photos", "temporary"):
+        (tmp_path / name).mkdir()
     add_noise_images(tmp_path / "photos", 3)
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
     with pytest.raises(ReconstructionError, match="a model of the 3 images"):
         reconstruct(tmp_path / "photos", tmp_path / "scene")
-    assert {path.name for path in tmp_path.iterdir()} == {"photos"}
+    assert {path.name for path in tmp_path.iterdir()} == {"photos", "temporary"}
+    assert list((tmp_path / "temporary").iterdir()) == []  # COLMAP's log is ours alone
+
+
+@pytest.mark.parametrize(
+    ("matcher", "model", "size", "told"),
+    [
+        ("exhaustive", "PINHOLE", 640, "or take out those of other places."),
+        ("exhaustive", "OPENCV", 640, "places or try a simpler camera_model such as"),
+        ("exhaustive", "PINHOLE", 639, "places or find features at a larger max_image_size."),
+        ("sequential", "SIMPLE_RADIAL", 9999, "places or try the exhaustive matcher."),
+    ],
+)
+def test_only_what_was_not_done_is_advised(
+    matcher: MatcherName, model: str, size: int, told: str
+) -> None:
+    run = Run(None, Settings(matcher, "cpu", size, 0, -1), Path(), Path())
+    assert told in _advice(run, [Photo("a.png", 640, 480), Photo("b.png", 480, 320)], model)
 
 
 def test_wrong_poses_are_an_error(posed: Scene, photos: Path, tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ class ReconstructJob:
         names = [photo.name for photo in self.photos]
         find_features(run, names)
         match_features(run)
-        export_scene(run, map_images(run, names), self.staging)
+        export_scene(run, map_images(run, self.photos, self.camera_model), self.staging)
         return _outcome(run, self.staging)
 
 

@@ -15,26 +15,39 @@ import numpy as np
 from splatseed.errors import ReconstructionError
 from splatseed.scene import Image
 from splatseed.sfm.features import Run
-from splatseed.sfm.photos import name_some
+from splatseed.sfm.photos import Photo, name_some
 
 __all__ = ["map_images", "triangulate_points"]
 
 
-def _advice(run: Run) -> str:
-    """What can make more photographs fit together."""
-    matcher = "" if run.settings.matcher == "exhaustive" else "the exhaustive matcher, "
-    return (
-        f"Take more overlapping photographs, take out those of other places, try {matcher}a "
-        "simpler camera_model such as SIMPLE_RADIAL, or a larger max_image_size."
-    )
+SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
+"""Camera models than which none is worth trying instead."""
 
 
-def map_images(run: Run, names: Sequence[str]) -> Path:
+def _advice(run: Run, photos: Sequence[Photo], camera_model: str) -> str:
+    """What can make more photographs fit together, of what has not been done already."""
+    ways = ["Take more overlapping photographs", "take out those of other places"]
+    if run.settings.matcher != "exhaustive":
+        ways.append("try the exhaustive matcher")
+    if camera_model not in SIMPLE:
+        ways.append("try a simpler camera_model such as SIMPLE_RADIAL")
+    if run.settings.max_image_size < max(max(photo.width, photo.height) for photo in photos):
+        ways.append("find features at a larger max_image_size")
+    return f"{', '.join(ways[:-1])} or {ways[-1]}."
+
+
+def map_images(run: Run, photos: Sequence[Photo], camera_model: str) -> Path:
     """Solve for poses, lenses and points, and keep the model with the most images.
 
+    Args:
+        run: The run.
+        photos: The photographs.
+        camera_model: The model of their lenses.
+
     Raises:
-        ReconstructionError: No model was found, or it has fewer than half of the images ``names``.
+        ReconstructionError: No model was found, or it has fewer than half of the photographs.
     """
+    names, advice = [photo.name for photo in photos], _advice(run, photos, camera_model)
     models_dir = run.work / "models"
     models_dir.mkdir()
     models = _incremental_mapping(run, models_dir, len(names))
@@ -42,10 +55,10 @@ def map_images(run: Run, names: Sequence[str]) -> Path:
         raise ReconstructionError(
             f"a model of the {len(names)} images in {run.image_dir}",
             found="no two images that match well enough to begin one",
-            fix=_advice(run),
+            fix=advice,
         )
     best = max(models, key=lambda i: (models[i].num_reg_images(), models[i].num_points3D()))
-    _check_registered(run, models[best], len(models), names)
+    _check_registered(run, models[best], len(models), names, advice)
     return models_dir / str(best)
 
 
@@ -76,7 +89,9 @@ def _incremental_mapping(run: Run, models_dir: Path, num_images: int) -> dict[in
     )
 
 
-def _check_registered(run: Run, model: Any, num_models: int, names: Sequence[str]) -> None:
+def _check_registered(
+    run: Run, model: Any, num_models: int, names: Sequence[str], advice: str
+) -> None:
     registered = {image.name for image in model.images.values() if image.has_pose}
     if 2 * len(registered) >= len(names):
         return
@@ -85,7 +100,7 @@ def _check_registered(run: Run, model: Any, num_models: int, names: Sequence[str
         f"at least half of the {len(names)} images in {run.image_dir} to register",
         found=f"{len(registered)} in the largest of {num_models} models; "
         f"without a pose: {name_some(missing)}",
-        fix=_advice(run),
+        fix=advice,
     )
 
 

@@ -103,6 +103,7 @@ def _serve(commands: BinaryIO, replies: BinaryIO, *, verbose: bool) -> None:
         job = pickle.load(commands)  # noqa: S301  (our own parent)
         Thread(target=_end_with, args=(commands.fileno(),), daemon=True).start()
         check_cuda(pycolmap, job.settings.device)
+        pycolmap.logging.logtostderr = True  # alone: it would leave files in the temporary folder
         pycolmap.logging.minloglevel = int(
             pycolmap.logging.Level.INFO if verbose else pycolmap.logging.Level.ERROR
         )
