@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import splatseed as ss
+from splatseed.console import stage_display
 from splatseed.evaluate import EvalResult, evaluate_views
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.run import TrainingRun
@@ -90,8 +91,9 @@ def _train(options: Options, strategy: str, steps: int, folder: Path) -> Trained
         strategy=cast("StrategyName", strategy), max_steps=steps, backend="cpu",
         data_factor=options.data_factor, cap_max=round(options.rho * pixels),
     )  # fmt: skip
-    run = prepare_run(scene, folder, settings)
-    run.train()
+    with stage_display() as clock:
+        run = prepare_run(scene, folder, settings, progress=clock)
+        run.train(lambda step: clock(f"train {strategy}", step / steps))
     if run.state.step < steps:
         raise SystemExit(130)  # interrupted: half a run is not compared
     scores = evaluate_views(run.trainer.render, run.trainer.test_views)

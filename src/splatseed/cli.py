@@ -21,6 +21,7 @@ from rich.table import Table
 from splatseed.console import ERR, OUT
 from splatseed.errors import ParameterError, ReconstructionError, SplatseedError
 from splatseed.literal import did_you_mean, visible
+from splatseed.process.interruption import Termination, exit_code
 
 __all__ = ["main"]
 
@@ -41,12 +42,6 @@ VERBS = {
 }
 OF_ITSELF = ("--help", "--version", "--completion")
 """Options without a verb."""
-TERMINATED = 143
-"""A shell's code for a process ended by SIGTERM: 128 plus the signal's number."""
-
-
-class _Termination(KeyboardInterrupt):
-    """SIGTERM, as schedulers send it: cleanup runs as after Ctrl-C."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -112,9 +107,7 @@ def _run(verb: str, words: list[str]) -> None:
         kept = " ".join(getattr(stop, "__notes__", ()))
         told = f". {kept}" if kept else "; nothing was left half-written"
         ERR.print(f"\ninterrupted{told}", soft_wrap=True)
-        from splatseed.process.interruption import exit_code  # noqa: PLC0415  (as late as possible)
-
-        sys.exit(TERMINATED if isinstance(stop, _Termination) else exit_code())
+        sys.exit(exit_code(stop))
 
 
 def _spelled(error: SplatseedError, verb: str, words: list[str]) -> str:
@@ -150,7 +143,7 @@ def _termination_raised() -> Iterator[None]:
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  (signal's)
-    raise _Termination
+    raise Termination
 
 
 def _print_any_name() -> None:

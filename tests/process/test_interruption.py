@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 
 import pytest
 
 from splatseed.cli import VERBS, main
+from splatseed.commands import view
 from splatseed.commands.bench import machine
 from splatseed.commands.train import command as train
 from splatseed.process.interruption import Interruption, exit_code, interruption
@@ -42,6 +44,22 @@ def test_train_exits_with_it(number, code, tmp_path, monkeypatch, capsys):
         main(["train", str(tmp_path), "-o", str(tmp_path / "run")])
     assert stop.value.code == code
     assert "--resume" in capsys.readouterr().err
+
+
+def test_a_viewer_is_ended_by_ctrl_c_and_told_of_sigterm(room_path, monkeypatch, splatseed):
+    for number, code in ((signal.SIGINT, 0), (signal.SIGTERM, 143)):
+        monkeypatch.setattr(view.time, "sleep", lambda _, it=number: os.kill(os.getpid(), it))
+        run = splatseed("view", room_path, "--port", 0)
+        assert (run.code, run.err) == (code, "")
+        assert run.out.endswith("stopped\n")
+
+
+def test_a_slip_in_a_path_is_told_before_a_taken_port(tmp_path, splatseed):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        run = splatseed("view", tmp_path / "nope", "--port", taken.getsockname()[1])
+    assert (run.code, "a scene at" in run.err) == (2, True)
 
 
 STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]

@@ -18,6 +18,7 @@ from splatseed.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.device import BYTES_EACH as BYTES_TRAINED
 from splatseed.upsample import BYTES_EACH, number_of_new, upsample
+from splatseed.upsample.neighbors import NEIGHBOR_BYTES
 from splatseed.views.view import load_views
 
 
@@ -43,6 +44,14 @@ def test_upsample_says_how_many_points_fit(free, rng):
         match=r"at most 5,000 points.*free memory.*found 1,000,000,000.*Ask for 5000",
     ):
         upsample(cloud, "mls", num_points=10**9)
+
+
+def test_neighbors_that_do_not_fit_name_the_most(free, rng):
+    cloud = PointCloud(rng.random((1000, 3)), np.zeros((1000, 3), np.uint8))
+    free(200 * 1000 * NEIGHBOR_BYTES)
+    assert len(upsample(cloud, "mls", ratio=2, k=200)) == 2000
+    with pytest.raises(ParameterError, match=r"at most 200 neighbours of each of 1,000 .* 999"):
+        upsample(cloud, "mls", ratio=2, k=100_000)
 
 
 def test_photographs_of_a_scene(free, scene):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import sys
 import time
 import webbrowser
 from dataclasses import dataclass
@@ -14,7 +15,9 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
 from splatseed.errors import ParameterError, SceneNotFoundError, SplatseedError
+from splatseed.io.load import check_there
 from splatseed.literal import counted, visible
+from splatseed.process.interruption import Termination, exit_code
 from splatseed.requirements import require
 from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Backend
@@ -66,6 +69,8 @@ def run(arguments: list[str]) -> None:
         raise ParameterError(
             "--max-points of 1 or more", found=f"{options.max_points}", fix="Try 1000000."
         )
+    for path in filter(None, (options.what, options.compare)):
+        check_there(path)  # a slip in a path is told before a port that is taken
     port = free_port(options.host, options.port)
     with stage_display() as clock:
         clock("read", 0.0)
@@ -80,8 +85,10 @@ def run(arguments: list[str]) -> None:
     try:
         while True:
             time.sleep(3600)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         OUT.print("stopped")
+        if isinstance(stop, Termination):  # Ctrl-C is how a viewer ends
+            sys.exit(exit_code(stop))
     finally:
         viewer.stop()
 

@@ -26,7 +26,7 @@ from splatseed.io.split import follow_lists
 from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneSource
 
-__all__ = ["is_scene", "load_originals", "load_scene"]
+__all__ = ["check_there", "is_scene", "load_originals", "load_scene"]
 
 _TRANSFORMS = "transforms.json"
 _ABOVE = 3
@@ -103,15 +103,24 @@ def load_originals(path: str | Path, *, require_points: bool = True) -> Scene:
     return scene.replace(points=points, warnings=(*scene.warnings, note))
 
 
-def _read(path: Path) -> Scene:
-    if path.is_file():
-        return _read_file(path)
-    if not path.is_dir():
+def check_there(path: Path) -> None:
+    """Refuse the path of a scene at which there is neither a file nor a folder.
+
+    Raises:
+        SceneNotFoundError: There is none.
+    """
+    if not path.is_file() and not path.is_dir():
         raise SceneNotFoundError(
             f"a scene at {path}",
             found=odd_kind(path) or "no such file or folder",
             fix="Check the path.",
         )
+
+
+def _read(path: Path) -> Scene:
+    if path.is_file():
+        return _read_file(path)
+    check_there(path)
     first = find_model(path / "sparse" / "0", path / "sparse", path, path / "0")
     if first is not None:
         return read_colmap_scene(first)

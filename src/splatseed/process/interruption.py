@@ -12,9 +12,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["Interruption", "exit_code", "interruption"]
+__all__ = ["Interruption", "Termination", "exit_code", "interruption"]
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Termination(KeyboardInterrupt):
+    """SIGTERM, as schedulers send it: cleanup runs as after Ctrl-C."""
 
 
 class Interruption:
@@ -37,9 +41,13 @@ class Interruption:
         self.requested = True
 
 
-def exit_code() -> int:
-    """The exit code, by shell convention, of a process that stopped because it was asked to."""
-    return 128 + Interruption.last
+def exit_code(stop: KeyboardInterrupt | None = None) -> int:
+    """The exit code, by shell convention, of a process that stopped because it was asked to.
+
+    Args:
+        stop: What was raised, if the signal was not only noted.
+    """
+    return 128 + (signal.SIGTERM if isinstance(stop, Termination) else Interruption.last)
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ORIGINAL, PointCloud
+from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
 from splatseed.upsample.nearest_points import distances_of, nearest_others
@@ -45,6 +46,8 @@ OUTLIER_NEIGHBORS = 16
 """Neighbours that a point's spacing is compared with."""
 OUTLIER_FACTOR = 3.0
 """Times their lower quartile, at which a point is isolated: catches 62% of planted outliers."""
+NEIGHBOR_BYTES = 12
+"""What is held of each neighbour of each point: its row, int32, and its distance, float64."""
 QUERY_BLOCK = 1 << 13
 """Rows per task of a thread."""
 SHORT_TRACK = 3
@@ -125,6 +128,7 @@ class PreparedCloud:
 
         Raises:
             PointCloudError: There is only one point, which has no neighbour.
+            ParameterError: They do not fit into memory.
         """
         k = min(k, len(self) - 1)
         if k < 1:
@@ -133,6 +137,10 @@ class PreparedCloud:
                 found=f"{len(self)}",
                 fix="Check that the scene holds the point cloud you meant.",
             )
+        check_memory(
+            k, NEIGHBOR_BYTES * len(self), f"neighbours of each of {len(self):,} points",
+            fix="Pass a smaller k, {most} at most, or close other programs.",
+        )  # fmt: skip
         assert self.tree is not None  # noqa: S101  (a tile's neighbours are found elsewhere)
         tree, idx = self.tree, np.empty((len(self), k), np.int32)
         row_of_rank = np.empty(len(self), np.int32)

@@ -168,7 +168,9 @@ def test_infinite_and_curveless_runs(tmp_path):
 def test_sets_of_runs_have_their_own_files_and_links(tmp_path):
     more = rows(max_steps=2000, scenes=("fox",), **GONE)
     bench = write_ledger(tmp_path / "b", [*rows(**GONE), *more])
-    write_report(bench)
+    said = write_report(bench).summary
+    first, second = (each for each in said if each.startswith("Set "))
+    assert (said[0], second.startswith("Set 2: 2,000 steps")) == (first, True)
     assert "set2_gains" in outline(bench).ids
     assert (bench / "tables" / "set2_gains_none.csv").is_file()
     assert "Set 2: 2,000 steps" in text_of(bench)

@@ -69,7 +69,7 @@ def test_all_runs_end_up_done_once_although_a_node_is_lost(cluster, small_plan, 
         [*COMMAND, *map(str, words)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     until = time.monotonic() + 120
-    while len(list((tmp_path / "nodes").glob("splatseed-*/*/config.json"))) < 2:
+    while len(list((tmp_path / "nodes").glob("splatseed-*/work/*/config.json"))) < 2:
         assert time.monotonic() < until, "no run on each of the nodes"
         assert process.poll() is None, process.communicate()
         time.sleep(0.1)
@@ -95,6 +95,13 @@ def test_a_node_says_what_it_lacks(specs, room_path):
     assert "the same path" in outcome.error
     older = dataclasses.replace(specs[0], version="0.0.1", scene_path=str(room_path))
     assert "splatseed 0.0.1 on the node" in run_on_node(older.to_json(), {}, 1).outcome.error
+
+
+def test_a_run_on_a_node_leaves_nothing_there(specs, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    outcome = run_on_node(specs[0].to_json(), {}, 1).outcome
+    assert (outcome.status, outcome.error) == ("done", "")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_process_that_dies_on_a_node_is_told_of(specs, monkeypatch):

@@ -135,8 +135,12 @@ def _page(rows: Sequence[RunRow], sections: Iterable[Section]) -> str:
 
 
 def _said(parts: Sequence[_Part]) -> tuple[str, ...]:
-    """The answers of all studies."""
-    told = [sentence for part in parts for sentence in _answers(part.study)]
+    """The answers of all studies, each behind what its runs have in common if there are more."""
+    told: list[str] = []
+    for number, part in enumerate(parts, start=1):
+        if len(parts) > 1:
+            told.append(f"Set {number}: {part.study.description}.")
+        told += _answers(part.study)
     return tuple(told) or ("No run is done yet.",)
 
 

@@ -21,7 +21,7 @@ from splatseed.bench.running.child import Child, Killed
 from splatseed.bench.running.environment import package_version
 from splatseed.bench.running.executor import Executor
 from splatseed.bench.running.job import JobOptions, Outcome
-from splatseed.bench.running.kept import kept_folder, read_result, write_kept
+from splatseed.bench.running.kept import kept_folder, read_result, work_folder, write_kept
 from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.watcher import Watcher
 from splatseed.errors import OutputError, ParameterError, SceneNotFoundError, SplatseedError
@@ -152,7 +152,8 @@ def run_on_node(spec_json: str, options: Mapping[str, Any], threads: int) -> _Re
     except SplatseedError as error:
         return _Returned(Outcome("failed", error=str(error)))
     with tempfile.TemporaryDirectory(prefix="splatseed-", ignore_cleanup_errors=True) as temporary:
-        work, target = (Path(temporary) / name for name in ("work", "kept"))
+        bench = Path(temporary)  # laid out as one: runs keep there what others can use
+        work, target = work_folder(bench, spec.key), kept_folder(bench, spec.key)
         child = Child(spec, work, target, JobOptions(**options), slot_environment(threads))
         try:
             outcome = child.wait(silent)
