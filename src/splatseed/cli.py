@@ -51,6 +51,14 @@ def main(arguments: list[str] | None = None) -> None:
     _show_log()
     _print_any_name()
     _let_threads_sleep()
+    try:
+        _act(words)
+        sys.stdout.flush()
+    except OSError as error:
+        _fail_of_system(error, asks_help=True)
+
+
+def _act(words: list[str]) -> None:
     if not words or words[0] in {"-h", "--help"}:
         _print_help()
         return
@@ -95,19 +103,24 @@ def _run(verb: str, words: list[str]) -> None:
         )
     except OSError as error:
         asks_help = any(word.startswith(("-h", "--help")) for word in words)
-        if isinstance(error, BrokenPipeError) and asks_help:
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python reports it once more at exit
-            sys.exit(1)  # as Rich does: whoever reads the help has read enough
-        where = f" at {error.filename}" if error.filename else ""
-        _fail(
-            "expected to read the input and write the output; found"
-            f" {error.strerror or type(error).__name__}{where}. Check the disk and the path."
-        )
+        _fail_of_system(error, asks_help=asks_help)
     except KeyboardInterrupt as stop:
         kept = " ".join(getattr(stop, "__notes__", ()))
         told = f". {kept}" if kept else "; nothing was left half-written"
         ERR.print(f"\ninterrupted{told}", soft_wrap=True)
         sys.exit(exit_code(stop))
+
+
+def _fail_of_system(error: OSError, *, asks_help: bool) -> NoReturn:
+    """Exit for an error of the system; quietly if a reader of the help has read enough."""
+    if isinstance(error, BrokenPipeError) and asks_help:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # or Python reports it once more at exit
+        sys.exit(1)  # as Rich does
+    where = f" at {error.filename}" if error.filename else ""
+    _fail(
+        "expected to read the input and write the output; found"
+        f" {error.strerror or type(error).__name__}{where}. Check the disk and the path."
+    )
 
 
 def _spelled(error: SplatseedError, verb: str, words: list[str]) -> str:

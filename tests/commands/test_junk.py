@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 import warnings
 import zipfile
@@ -112,6 +113,18 @@ def test_a_full_output(room, splatseed, monkeypatch):
         run = splatseed("info", room)
         full.close = lambda: None  # what is left in its buffer cannot be written
     _refused(run, "No space left on device")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("words", [["--help"], ["-V"], ["--completion", "bash"], ["info", "-h"]])
+def test_help_into_a_full_output(words):
+    program = [sys.executable, "-c", "from splatseed.cli import main; main()", *words]
+    with Path("/dev/full").open("w") as full:
+        run = subprocess.run(
+            program, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=120
+        )
+    assert (run.returncode, run.stderr.count("\n")) == (2, 1)
+    assert "No space left on device" in run.stderr
 
 
 def test_numbers_are_no_weights(tmp_path):

@@ -27,6 +27,7 @@ from splatseed.export import (
 )
 from splatseed.export.codebook import codebook, codes, palette
 from splatseed.export.packing import from_smallest_three, smallest_three
+from splatseed.export.sog import MOST_META
 from splatseed.splat.gaussians import Gaussians
 
 SUFFIXES = [each.suffix for each in FORMATS.values()]
@@ -216,6 +217,14 @@ def test_a_count_is_not_believed(files, tmp_path):
     (tmp_path / "m.spz").write_bytes(gzip.compress(bytes(content)))
     with pytest.raises(SplatseedError, match="expected"):
         read_model(tmp_path / "m.spz")
+
+
+def test_notes_that_would_burst_are_refused_unread(tmp_path, monkeypatch):
+    with zipfile.ZipFile(tmp_path / "m.sog", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("meta.json", b" " * (MOST_META + 1))
+    monkeypatch.setattr(zipfile.ZipFile, "read", None)  # must not be called
+    with pytest.raises(SceneFormatError, match=r"meta\.json of 16,777,217 bytes"):
+        read_model(tmp_path / "m.sog")
 
 
 def test_what_is_no_model_is_named(tmp_path):

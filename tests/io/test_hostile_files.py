@@ -7,6 +7,7 @@ import dataclasses
 import io
 import json
 import os
+import re
 import socket
 import zipfile
 from pathlib import Path
@@ -14,12 +15,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import splatseed
+from splatseed.bench.planning.plan_file import read_plan
+from splatseed.commands.train.config import with_config
 from splatseed.diagnostics.trainable import untrainable
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
-from splatseed.io import files, load_scene, write_scene
+from splatseed.io import files, load_originals, load_scene, write_scene
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.io.depth.arrays import read_npz
 from splatseed.io.files import open_file, read_file
+from splatseed.io.output.manifest import kind_of
 from splatseed.io.photograph import photograph_bytes
 
 
@@ -59,6 +64,36 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
     content = json.loads((path / "transforms.json").read_text())
     (path / "transforms.json").write_text(json.dumps(content | {"ply_file_path": f"../{name}"}))
     assert f"ply_file_path ../{name} is {is_}, not a file." in load_scene(path).warnings
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link"])
+def test_notes_beside_a_scene_are_not_read_without_end(kind, odd, scene_dir):
+    (scene_dir / "splatseed.json").symlink_to(odd / kind)
+    assert load_originals(scene_dir).points.num_original == len(load_scene(scene_dir).points)
+    assert kind_of(scene_dir) is None
+    for read in (read_plan, lambda path: with_config(["--config", str(path)], [])):
+        with pytest.raises(SceneFormatError, match=r"a pipe|a device"):
+            read(odd / kind)
+
+
+READ_WHOLE = {
+    "process/memory.py", "process/peak.py", "bench/running/worker.py",
+    "bench/running/environment.py",  # the system's own files
+    "bench/report/html.py", "bench/analysis/paper.py", "kernels/sources.py",  # the package's own
+    "sfm/worker.py", "sfm/orientation.py", "bench/running/child.py", "bench/report/clouds.py",
+    "bench/running/ray_cluster.py", "commands/demo/command.py",  # written by this very command
+    "io/rgbd/tum.py",  # after is_file
+}  # fmt: skip
+
+
+def test_all_else_is_read_by_what_refuses_pipes_and_devices():
+    folder = Path(splatseed.__file__).parent
+    reads = {
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*.py")
+        if re.search(r"\.read_(text|bytes)\(", path.read_text())
+    }
+    assert reads == READ_WHOLE
 
 
 def scene_of_files(scene_dir):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseed.errors import SceneNotFoundError
+from splatseed.io.files import odd_kind
 from splatseed.io.load import is_scene
 from splatseed.literal import quoted
 from splatseed.train.record.folder import RunFolder
@@ -26,7 +27,7 @@ def model_file(path: Path) -> Path:
     folder = RunFolder(path)
     if path.is_dir() and folder.gaussians.is_file():
         return folder.gaussians
-    found, fix = "nothing there", "Check the path."
+    found, fix = odd_kind(path) or "nothing there", "Check the path."
     if folder.is_run:
         found = "a run that has not finished"
         fix = f"Finish it: splatseed train SCENE -o {quoted(path)} --resume."

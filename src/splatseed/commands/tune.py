@@ -43,6 +43,7 @@ from splatseed.commands.bench.options import Options as BenchOptions
 from splatseed.commands.options import check_least, parse_options
 from splatseed.console import OUT, print_commands, print_note, print_table, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SplatseedError
+from splatseed.io.files import read_text
 from splatseed.io.output.staging import atomic_file
 from splatseed.literal import quoted, visible
 from splatseed.process.interruption import exit_code
@@ -231,7 +232,7 @@ def _rungs(study: _Study) -> tuple[Rung, ...]:
     path, asked = study.folder / TUNING, _asked(study.options)
     if path.is_file():
         try:
-            kept = json.loads(path.read_text("utf-8"))
+            kept = json.loads(read_text(path))
             rungs = tuple(Rung(**each) for each in kept["rungs"])
         except (OSError, ValueError, KeyError, TypeError):
             raise SceneFormatError(

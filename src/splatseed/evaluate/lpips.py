@@ -26,6 +26,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
 from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotFoundError
+from splatseed.io.files import odd_kind
 from splatseed.requirements import require
 
 __all__ = [
@@ -197,7 +198,7 @@ def _weights_path(backbone: Backbone, given: Path | None) -> Path:
     if not path.is_file():
         raise SceneNotFoundError(
             f"the weights for LPIPS, {backbone.file}",
-            found="none" if given is None else f"no such file at {given}",
+            found="none" if given is None else f"{odd_kind(given) or 'no such file'} at {given}",
             fix=f"Download {backbone.url} and put it into {folder if given is None else 'a folder'}"
             f"{', or ' if given is None else '; '}{GIVE_PATH}.",
         )

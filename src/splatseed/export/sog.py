@@ -45,7 +45,8 @@ PER_ROW = 64
 MOST_LEVELS, LEAST_LEVELS = 16, 10
 """The palette grows with the number of Gaussians, from 2^10 to 2^16 entries at most."""
 MOST_BYTES = 2**31
-"""Larger parts of an archive are refused unread."""
+MOST_META = 1 << 24
+"""Larger parts of an archive are refused unread; meta.json takes some kilobytes."""
 QUAT_MARK = 252
 """Alpha of a rotation whose largest component is the first; SOG's marker."""
 FIX = "Copy the file again, or export it again."
@@ -228,7 +229,7 @@ def _opened(path: Path) -> Callable[[str], bytes]:
     archive = zipfile.ZipFile(io.BytesIO(read_bytes(path)))
 
     def content(name: str) -> bytes:
-        if archive.getinfo(name).file_size > MOST_BYTES:
+        if archive.getinfo(name).file_size > (MOST_META if name == META else MOST_BYTES):
             raise _damaged(path, f"{name} of {archive.getinfo(name).file_size:,} bytes")
         return archive.read(name)
 

@@ -24,6 +24,7 @@ __all__ = [
     "other_spelling",
     "read_bytes",
     "read_file",
+    "read_text",
 ]
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
@@ -57,8 +58,8 @@ def odd_kind(path: Path) -> str:
     """What a path is that is neither a regular file nor a folder; empty if it is, or is nothing."""
     try:
         status = path.stat()
-    except (OSError, ValueError):
-        return ""
+    except OSError as error:
+        return "a link that leads back to itself" if error.errno == errno.ELOOP else ""
     known = stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)
     return "" if known else _kind(status)[1]
 
@@ -92,6 +93,16 @@ def read_file(path: Path) -> bytes:
             told = f"{size / 1e9:,.1f} GB, more than the {free / 1e9:,.1f} GB of free memory"
             raise OSError(errno.EFBIG, told, str(path))
         return file.read()
+
+
+def read_text(path: Path) -> str:
+    """The whole content of a regular file of UTF-8, such as JSON or TOML.
+
+    Raises:
+        OSError: See ``read_file``.
+        UnicodeDecodeError: It is something else.
+    """
+    return read_file(path).decode("utf-8")
 
 
 def _check(path: Path, status: os.stat_result) -> None:

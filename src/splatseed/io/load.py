@@ -14,7 +14,7 @@ from pathlib import Path
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.cloud import clean_scene, cloud_warnings
 from splatseed.io.colmap.scene import find_model, read_colmap_scene, scene_root
-from splatseed.io.files import is_video, odd_kind
+from splatseed.io.files import is_video, odd_kind, read_text
 from splatseed.io.nerfstudio.blender import is_blender, read_blender
 from splatseed.io.nerfstudio.scene import read_transforms_scene
 from splatseed.io.output.earlier import recall_seeds
@@ -229,7 +229,7 @@ def _no_scene(path: Path) -> SceneNotFoundError:
 
 def _is_run(path: Path) -> SceneNotFoundError:
     try:
-        scene = json.loads((path / "config.json").read_text("utf-8"))["scene"]
+        scene = json.loads(read_text(path / "config.json"))["scene"]
     except (OSError, ValueError, TypeError, KeyError):
         scene = None
     named = isinstance(scene, str)

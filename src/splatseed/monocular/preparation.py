@@ -19,6 +19,7 @@ from jaxtyping import Float32, UInt8
 from PIL import Image as PilImage
 
 from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io.files import read_text
 
 __all__ = ["InputForm", "Preparation", "complete", "json_beside"]
 
@@ -129,7 +130,7 @@ def json_beside(path: Path, name: str) -> dict[str, Any]:
     """
     for folder in (path.parent, path.resolve().parent.parent):
         try:
-            content = json.loads((folder / name).read_bytes())
+            content = json.loads(read_text(folder / name))
         except OSError:
             continue
         except (ValueError, RecursionError) as error:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from splatseed.errors import OutputError
+from splatseed.io.files import read_text
 from splatseed.io.output.leftovers import remove_tree
 from splatseed.literal import visible
 
@@ -167,7 +168,7 @@ def _brief(value: object) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text("utf-8"))
+        content = json.loads(read_text(path))
     except (OSError, ValueError):
         content = None
     if not isinstance(content, dict):

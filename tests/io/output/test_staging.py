@@ -6,6 +6,7 @@ import errno
 import os
 import re
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -49,12 +50,24 @@ def test_a_mistyped_path_makes_no_folders(tmp_path):
     assert listing(tmp_path) == []
 
 
+def _refused(**_):
+    raise PermissionError
+
+
+@pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="needs /proc")
+def test_a_system_without_folders_of_ours_is_refused_beforehand():
+    with pytest.raises(OutputError, match="found /proc, which is write-protected"):
+        check_output(Path("/proc/out"), kind="test")
+
+
 def test_a_place_in_which_nothing_can_be_made_is_refused_beforehand(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match="file, which is not a folder"):
         check_output(tmp_path / "file" / "out", kind="test")
-    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
-    with pytest.raises(OutputError, match="which is write-protected"):
+    check_output(tmp_path / "out", kind="test")
+    assert listing(tmp_path) == ["file"]
+    monkeypatch.setattr(tempfile, "mkdtemp", _refused)  # root may write nearly everywhere
+    with pytest.raises(OutputError, match="write-protected"):
         check_output(tmp_path / "out", kind="test")
     (tmp_path / "there").mkdir()
     check_output(tmp_path / "there", kind="test")

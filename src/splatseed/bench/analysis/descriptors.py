@@ -19,6 +19,7 @@ from jaxtyping import Float32, Float64
 
 from splatseed.diagnostics.scene import empty_regions
 from splatseed.errors import PointCloudError, SplatseedError
+from splatseed.io.files import read_text
 from splatseed.io.output.staging import atomic_file
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.progress import Progress, in_threads, silent
@@ -188,7 +189,7 @@ def read_descriptors(path: Path) -> dict[str, Descriptors]:
     """
     names = {field.name for field in fields(Descriptors)}
     with suppress(OSError, ValueError, TypeError, KeyError, AttributeError):
-        content = json.loads(path.read_text("utf-8"))
+        content = json.loads(read_text(path))
         if content["schema"] == SCHEMA:
             return {
                 digest: Descriptors(

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 from splatseed.bench.planning.plan import DEMO, Plan, PlannedScene
 from splatseed.bench.planning.records import SHARED
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.files import read_text
 from splatseed.literal import quoted
 from splatseed.train.settings import TrainSettings
 
@@ -131,7 +132,7 @@ def plan_text(plan: Plan) -> str:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text("utf-8"))
+        return tomllib.loads(read_text(path))
     except FileNotFoundError:
         raise SceneNotFoundError(
             f"a plan at {path}",

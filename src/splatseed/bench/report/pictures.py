@@ -25,6 +25,7 @@ from splatseed.bench.analysis.study import Study, Variant
 from splatseed.bench.planning.records import RunSpec
 from splatseed.bench.report.clouds import cloud_picture, open_unchanged, seed_specs
 from splatseed.errors import SplatseedError
+from splatseed.io.files import read_file, read_text
 from splatseed.progress import Progress, silent
 
 __all__ = ["CLOUDS", "FIGURES", "KEPT_DESCRIPTORS", "Pictures", "safe_name", "scene_pictures"]
@@ -125,9 +126,9 @@ def _drawn(bench: Path) -> dict[str, bytes]:
     """Pictures of an earlier report by what they are of."""
     pictures = {}
     with suppress(OSError, ValueError, AttributeError):
-        names = json.loads((bench / FIGURES / CLOUDS).read_text("utf-8"))
+        names = json.loads(read_text(bench / FIGURES / CLOUDS))
         for name, key in names.items():
-            pictures[key] = (bench / FIGURES / f"{Path(name).name}.png").read_bytes()
+            pictures[key] = read_file(bench / FIGURES / f"{Path(name).name}.png")
     return pictures
 
 

@@ -38,6 +38,7 @@ from splatseed.bench.report.study_part import StudyReport, study_report
 from splatseed.bench.report.views import ComparedView, compared_views, jpeg
 from splatseed.bench.running.folder import PLAN
 from splatseed.bench.running.ledger import LEDGER, Ledger
+from splatseed.io.files import read_text
 from splatseed.io.output.staging import atomic_file, output_folder
 from splatseed.progress import Progress, silent
 
@@ -211,7 +212,7 @@ def _notes(pictures: Pictures) -> list[str]:
 
 def _plan(bench: Path) -> str:
     with suppress(OSError, UnicodeDecodeError):
-        return (bench / PLAN).read_text("utf-8")
+        return read_text(bench / PLAN)
     return ""
 
 

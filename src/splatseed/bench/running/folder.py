@@ -14,6 +14,7 @@ from pathlib import Path
 from splatseed.bench.planning.scenes import SceneFacts
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.errors import OutputError
+from splatseed.io.files import read_text
 from splatseed.io.output.staging import MANIFEST, atomic_file, check_output
 
 __all__ = [
@@ -119,7 +120,7 @@ def make_demo_scene(folder: Path) -> Path:
 def _command(folder: Path) -> str:
     """What wrote a folder, by its manifest."""
     try:
-        content = json.loads((folder / MANIFEST).read_text("utf-8"))
+        content = json.loads(read_text(folder / MANIFEST))
     except (OSError, ValueError):
         return "something else"
     return str(content.get("command")) if isinstance(content, dict) else "something else"

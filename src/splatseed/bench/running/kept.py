@@ -14,6 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from splatseed.bench.planning.records import RunResult, RunSpec
+from splatseed.io.files import read_text
 from splatseed.io.output.staging import output_folder
 from splatseed.train.record.folder import RunFolder
 
@@ -90,7 +91,7 @@ def result_bytes(spec: RunSpec, result: RunResult) -> bytes:
 def read_result(target: Path, key: str) -> RunResult | None:
     """The result that is kept of a run; None where there is none."""
     with suppress(OSError, ValueError, KeyError, TypeError):
-        content = json.loads((target / RESULT).read_text("utf-8"))
+        content = json.loads(read_text(target / RESULT))
         if content["key"] == key:
             return RunResult.from_json(json.dumps(content["result"]))
     return None

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from splatseed.bench.planning.records import RunResult, RunSpec
 from splatseed.bench.running.kept import RESULT, read_result
+from splatseed.io.files import read_file, read_text
 from splatseed.io.output.staging import MANIFEST, atomic_file
 from splatseed.pointcloud import PointCloud
 from splatseed.train.seeds import seeds_digest, usable_seeds
@@ -55,13 +56,13 @@ def find_twin(
         lpips: Whether LPIPS must have been measured.
     """
     with suppress(OSError):
-        key = (_folder(target) / mark).read_text("utf-8").strip() if mark else ""
+        key = read_text(_folder(target) / mark).strip() if mark else ""
         kept = target.parent / key
         result = read_result(kept, key) if key and key != target.name else None
         if result is None or (lpips and result.lpips is None):
             return None
         files = {
-            path.relative_to(kept).as_posix(): path.read_bytes()
+            path.relative_to(kept).as_posix(): read_file(path)
             for path in kept.rglob("*")
             if path.is_file() and path.name not in {RESULT, MANIFEST}
         }

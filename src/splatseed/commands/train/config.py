@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.files import read_text
 from splatseed.literal import did_you_mean
 
 __all__ = ["with_config"]
@@ -66,7 +67,7 @@ def _without_config(words: list[str]) -> tuple[list[str], Path | None]:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text("utf-8")
+        text = read_text(path)
         content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
     except FileNotFoundError:
         raise SceneNotFoundError(f"a file {path}", found="none", fix="Check the path.") from None

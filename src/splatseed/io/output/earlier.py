@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from splatseed.io.files import read_text
 from splatseed.io.output.layouts import write_json
 from splatseed.io.output.seeds_npz import SEEDS, read_seeds
 from splatseed.io.output.staging import MANIFEST
@@ -128,7 +129,7 @@ def _num_original(manifest: Path, total: int) -> int:
 def _facts(manifest: Path) -> dict[str, Any]:
     """What a manifest says; nothing if there is none, or somebody else's file of that name."""
     try:
-        facts = json.loads(manifest.read_text(encoding="utf-8"))
+        facts = json.loads(read_text(manifest))
     except (OSError, ValueError, RecursionError):
         return {}
     return facts if isinstance(facts, dict) else {}

@@ -15,6 +15,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+from splatseed.io.files import read_text
+
 __all__ = ["MANIFEST", "add_files", "kind_of", "seal", "unlisted_files", "why_kept"]
 
 MANIFEST = "splatseed.json"
@@ -117,7 +119,7 @@ def _is_smaller(folder: Path, name: str) -> bool:
 
 def _read(folder: Path) -> dict[str, Any]:
     try:
-        content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        content = json.loads(read_text(folder / MANIFEST))
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}

@@ -11,8 +11,8 @@ cannot be removed is named.
 from __future__ import annotations
 
 import errno
-import os
 import secrets
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -186,7 +186,7 @@ def check_parents(path: Path) -> None:
         missing = [each for each in target.parents if not each.exists()]
         above = target.parents[len(missing)]
         known = above.is_dir()
-    if not known or not os.access(above, os.W_OK | os.X_OK):
+    if not known or not _takes_folders(above):
         raise OutputError(
             f"a folder above {target.name} that can be written to",
             found=f"{above}, which {'is write-protected' if known else 'is not a folder'}",
@@ -198,6 +198,15 @@ def check_parents(path: Path) -> None:
             found=f"no {missing[-1]}",
             fix="Check the path, or make the folder first.",
         )
+
+
+def _takes_folders(above: Path) -> bool:
+    """Whether a folder can be made in another: permissions do not tell, least of all to root."""
+    try:
+        Path(tempfile.mkdtemp(prefix=".splatseed-", dir=above)).rmdir()
+    except OSError:
+        return False
+    return True
 
 
 def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:

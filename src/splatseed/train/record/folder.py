@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from splatseed.errors import OutputError, SceneFormatError
+from splatseed.io.files import read_text
 from splatseed.io.output.staging import MANIFEST, add_files, atomic_file, check_apart, check_output
 
 __all__ = ["RunFolder", "write_json"]
@@ -173,7 +174,7 @@ class RunFolder:
             SceneFormatError: It is no JSON object.
         """
         try:
-            config = json.loads(self.config.read_text("utf-8"))
+            config = json.loads(read_text(self.config))
         except (OSError, ValueError) as error:
             raise _unreadable(self.config, type(error).__name__) from None
         if not isinstance(config, dict):
