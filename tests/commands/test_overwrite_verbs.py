@@ -19,7 +19,8 @@ def _run_folder(path):
 def _bench(path):
     path.mkdir()
     make_bench_folder(path)
-    (path / "ledger.sqlite").touch()
+    for name in ("ledger.sqlite", "plan.toml"):
+        (path / name).touch()
 
 
 def _notes(path):
@@ -28,16 +29,28 @@ def _notes(path):
     (path / "thesis.tex").write_text("years")
 
 
+WORDS = {
+    "upsample": ["upsample", "SCENE"],
+    "depth": ["depth", "SCENE", "--stereo"],
+    "sfm": ["sfm", "SCENE/images"],
+    "undistort": ["undistort", "SCENE"],
+    "demo": ["demo"],
+    "train": ["train", "SCENE"],
+}
+NEVER_REPLACE = {"bench": ["bench", "--scenes", "SCENE"], "tune": ["tune", "SCENE"]}
+"""Without --overwrite, as they go on with what is theirs."""
+
+
 @pytest.mark.parametrize("make", [_run_folder, _bench, _notes])
-@pytest.mark.parametrize("verb", ["upsample", "depth", "sfm", "demo", "train"])
+@pytest.mark.parametrize("verb", [*WORDS, *NEVER_REPLACE])
 def test_another_kinds_folder_is_refused(make, verb, room, tmp_path, splatseed):
-    if (make, verb) == (_run_folder, "train"):
+    if (make, verb) in {(_run_folder, "train"), (_bench, "bench")}:
         pytest.skip("its own kind")
     out = tmp_path / "out"
     make(out)
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-    source = {"sfm": [room / "images"], "demo": [], "depth": [room, "--stereo"]}.get(verb, [room])
-    run = splatseed(verb, *source, "-o", out, "--overwrite")
+    words = [*WORDS[verb], "--overwrite"] if verb in WORDS else NEVER_REPLACE[verb]
+    run = splatseed(*(word.replace("SCENE", str(room)) for word in words), "-o", out)
     assert (run.code, run.err.count("\n")) == (2, 1)
     assert str(out) in run.err
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
