@@ -152,6 +152,7 @@ def test_the_commands_to_train_with_name_what_is_there(room, tmp_path, splatseed
     assert next(iter(commands)) == "splatseed"
     for words in commands.values():
         assert str(out) in words  # one word, although it has a space
+    assert commands["Brush"][0] == "brush"
     words = commands["gsplat"]
     assert words[words.index("--data_factor") + 1] == "1"  # there is no images_2 beside images
     words = commands["nerfstudio"]
