@@ -63,6 +63,17 @@ def test_training_makes_unseen_views_better(begin, strategy, gain):
     assert run.trainer.test_scores()[0] > before + gain
 
 
+def test_a_second_signal_says_what_is_kept(begin):
+    def twice(done):
+        if done == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt) as stop:
+        begin().train(twice)
+    assert stop.value.__notes__ == ["The run as of step 0 is kept: continue it with --resume."]
+
+
 def test_the_scenes_own_lists_are_followed(room, tmp_path):
     names = [image.name for image in sorted(room.images, key=lambda image: image.name)]
     split = Split(frozenset(names[3:]), frozenset(names[1:3]), "test_list.txt")

@@ -100,9 +100,9 @@ class Options:
     long_side: int = 400
     """Reduce photographs by a whole factor until their longer side has at most this many pixels."""
     methods: tuple[str, ...] = METHODS
-    """Seeds to try."""
+    """Seeds to try, sfm among them."""
     strategies: tuple[StrategyName, ...] = STRATEGIES
-    """Strategies to try."""
+    """Strategies to try, default among them."""
     jobs: Annotated[int | None, _number(int, "one per GPU, else 1")] = None
     """Runs at a time."""
     threads: Annotated[int | None, _number(int, "an equal share of the cores")] = None

@@ -76,7 +76,7 @@ def preview_errors(
     path: Path | str,
     *,
     limit: float = 1.0,
-    unit: str = "h",
+    unit: str = "spacings",
 ) -> Path:
     """Write a grid of clouds whose points are coloured by their distance to the true surface.
 
@@ -86,7 +86,7 @@ def preview_errors(
         camera: The camera to look from.
         path: The PNG to write.
         limit: Distances from this on have the last colour of the colour bar.
-        unit: Unit of the colour bar.
+        unit: Unit of the colour bar; by default the originals' spacing h.
 
     Raises:
         OutputError: The file cannot be written.

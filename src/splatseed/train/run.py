@@ -291,13 +291,16 @@ class TrainingRun:
 
     @contextmanager
     def _told_of_checkpoint(self) -> Iterator[None]:
-        """Say in an error on writing which step is saved, and how to resume."""
+        """Say which step is saved, and how to resume, if writing fails or a signal cuts it off."""
         try:
             yield
-        except OutputError as error:
+        except (OutputError, KeyboardInterrupt) as error:
             if self._saved_step is None:
                 raise
             kept = f"The run as of step {self._saved_step:,} is kept: continue it with --resume."
+            if isinstance(error, KeyboardInterrupt):
+                error.add_note(kept)
+                raise
             raise OutputError(
                 error.expected, found=error.found, fix=f"{error.fix} {kept}"
             ) from error
