@@ -64,6 +64,8 @@ def test_no_other_module_starts_an_interpreter():
     starts = {path.name for path in named if "-m pip" not in path.read_text()}
     assert starts == {"interpreter.py"}
     assert not any("subprocess" in path.read_text() for path in named if path.name not in starts)
+    spawns = {path.name for path in folder.rglob("*.py") if "multiprocessing" in path.read_text()}
+    assert spawns == {"interpreter.py", "tasks.py"}  # the former in words alone
 
 
 def test_the_processes_of_tiles(trap):
