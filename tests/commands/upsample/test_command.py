@@ -138,6 +138,14 @@ def test_the_origins_add_up_where_new_points_coincide(tmp_path, splatseed):
     assert total == sum(parts)
 
 
+@pytest.mark.parametrize("name", ["more.ply", "MORE.LAZ"])
+def test_the_name_of_a_file_is_not_made_a_folder(name, room, tmp_path, splatseed):
+    run = splatseed("upsample", room, "-o", tmp_path / name)
+    assert (run.code, run.out) == (2, "")
+    assert f"Pass -o {tmp_path / name[:4]}: the points" in " ".join(run.err.split())
+    assert not list(tmp_path.iterdir())
+
+
 def test_results_are_plain_text_and_the_rest_is_silent(room, tmp_path, splatseed):
     run = splatseed("upsample", room, "-o", tmp_path / "out", "--preview")
     assert run.err == ""

@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING
 
 from splatseed.commands.options import check_least
 from splatseed.errors import ParameterError
+from splatseed.literal import quoted
 
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options
 
 __all__ = ["check_options"]
 
+FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
+"""Suffixes by which somebody means a file of points."""
 COVERING = ("auto", "cover")
 """Methods that leave no gaps for --cover."""
 
@@ -24,6 +27,13 @@ def check_options(options: Options) -> None:
     """
     check_least(options, 1, "num_points", "jobs", "tile_points")
     check_least(options, 0, "seed")
+    if options.output.suffix.lower() in FILES and not options.output.is_dir():
+        raise ParameterError(
+            "a folder after -o, as a whole scene is written",
+            found=f"{options.output}, the name of a file",
+            fix=f"Pass -o {quoted(options.output.with_suffix(''))}: the points lie there as a .ply "
+            "too.",
+        )
     if options.address is not None and options.executor != "ray":
         raise ParameterError("--executor ray with --address", found="local", fix="Add it.")
     if options.cover_cell is None:
