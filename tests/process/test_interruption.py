@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,6 +14,14 @@ from splatseed.commands import view
 from splatseed.commands.bench import machine
 from splatseed.commands.train import command as train
 from splatseed.process.interruption import Interruption, exit_code, interruption
+
+
+@pytest.fixture(autouse=True)
+def _ctrl_c():
+    """Ctrl-C as in a terminal: a suite in the background of a shell has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -46,9 +55,14 @@ def test_train_exits_with_it(number, code, tmp_path, monkeypatch, capsys):
     assert "--resume" in capsys.readouterr().err
 
 
+def _stop(number):
+    os.kill(os.getpid(), number)
+    pytest.fail("the signal had no effect")
+
+
 def test_a_viewer_is_ended_by_ctrl_c_and_told_of_sigterm(room_path, monkeypatch, splatseed):
     for number, code in ((signal.SIGINT, 0), (signal.SIGTERM, 143)):
-        monkeypatch.setattr(view.time, "sleep", lambda _, it=number: os.kill(os.getpid(), it))
+        monkeypatch.setattr(view, "time", SimpleNamespace(sleep=lambda _, it=number: _stop(it)))
         run = splatseed("view", room_path, "--port", 0)
         assert (run.code, run.err) == (code, "")
         assert run.out.endswith("stopped\n")
