@@ -70,8 +70,8 @@ def test_two_lists_can_leave_images_out(scene_dir, names):
     ("slips", "told"),
     [
         ((), None),
-        (("left/imgae002.jpg",), "1 name fits no image (left/imgae002.jpg)"),
-        (tuple("abcd"), "4 names fit no image (a, b, c, ...)"),
+        (("left/imgae002.jpg",), "1 name matches no image (left/imgae002.jpg)"),
+        (tuple("abcd"), "4 names match no image (a, b, c, ...)"),
     ],
 )
 def test_names_of_no_image_are_told(slips, told, scene_dir):

@@ -63,8 +63,8 @@ def follow_lists(scene: Scene) -> Scene:
 def _unknown_names(lists: _Lists, unknown: Sequence[str]) -> str:
     """The warning of names that a list has and the scene has not: a slip, or lost by SfM."""
     shown = ", ".join(unknown[:SHOWN]) + (", ..." if len(unknown) > SHOWN else "")
-    fit = "fits" if len(unknown) == 1 else "fit"
-    return f"{lists.origin}: {counted(len(unknown), 'name')} {fit} no image ({shown})."
+    match = "matches" if len(unknown) == 1 else "match"
+    return f"{lists.origin}: {counted(len(unknown), 'name')} {match} no image ({shown})."
 
 
 def split_fields(scene: Scene) -> dict[str, list[str]]:

@@ -215,7 +215,7 @@ def _in_memory(options: Options, method: Upsampler, source: Source) -> str:
     if asked:
         return f"leave out {', '.join(asked)} to work in memory"
     needed = words_of(_needed(options, method, source.count or 0), up=True)
-    return f"use a machine with {needed} of free memory, which all points at once take"
+    return f"use a machine with {needed} of free memory, to hold all points at once"
 
 
 def _looks(method: Upsampler) -> bool:
