@@ -143,8 +143,8 @@ def _stages(trainer: Trainer) -> dict[str, Sequence[Place]]:
     optimizers, strategy = trainer.state.optimizers.values(), trainer.state.strategy
     return {
         **RENDER_STAGES,
-        "loss": [(losses._CpuLoss, "forward")],  # noqa: SLF001  (there is no public way)
-        "loss backward": [(losses._CpuLoss, "backward")],  # noqa: SLF001  (there is no public way)
+        "loss": [(losses._Loss, "forward")],  # noqa: SLF001  (there is no public way)
+        "loss backward": [(losses._Loss, "backward")],  # noqa: SLF001  (there is no public way)
         "photograph": [(loop, "photograph_of")],
         "Adam": [(each, name) for each in optimizers for name in ("step", "zero_grad")],
         "strategy": [(strategy, "before"), (strategy, "after")],

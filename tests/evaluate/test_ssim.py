@@ -11,7 +11,7 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from splatseed.evaluate.images import psnr, ssim
+from splatseed.evaluate.images import l1_and_ssim_by_convolution, psnr
 from splatseed.evaluate.ssim import l1_and_ssim
 from splatseed.train.losses import photometric_loss
 
@@ -25,20 +25,34 @@ def _pair(rng, height, width):
 @pytest.mark.parametrize(("height", "width"), [(11, 11), (12, 40), (37, 23), (64, 50)])
 def test_ssim_is_torchmetrics_where_the_window_fits(rng, height, width):
     x, y = _pair(rng, height, width)
-    images = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (x, y))
-    _, full = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
-    expected = float(full[..., 5:-5, 5:-5].mean())
+    pair = torch.from_numpy(x), torch.from_numpy(y)
+    expected = float(_torchmetrics_ssim(*pair))
     assert l1_and_ssim(x, y, 0.8, 0.2)[1] == pytest.approx(expected, abs=2e-6)
-    assert float(ssim(torch.from_numpy(x), torch.from_numpy(y))) == pytest.approx(
-        expected, abs=2e-6
-    )
+    l1, ours, _ = l1_and_ssim_by_convolution(*pair, 0.8, 0.2)
+    assert float(ours) == pytest.approx(expected, abs=2e-6)
+    assert float(l1) == pytest.approx(np.abs(x - y).mean(), rel=1e-6)
 
 
-def test_gradient_is_autograds(rng):
+def _torchmetrics_ssim(x, y):
+    """Mean SSIM where the window fits entirely, differentiable."""
+    images = (image.permute(2, 0, 1)[None] for image in (x, y))
+    _, full = structural_similarity_index_measure(*images, data_range=1.0, return_full_image=True)
+    return full[..., 5:-5, 5:-5].mean()
+
+
+def _by_convolution(render, photograph):
+    """The loss as on a GPU, its gradient from ``l1_and_ssim_by_convolution``."""
+    l1, ssim, gradient = l1_and_ssim_by_convolution(render, photograph, 0.8, 0.2)
+    value = 0.8 * l1 + 0.2 * (1 - ssim)
+    return value + ((render - render.detach()) * gradient).sum()
+
+
+@pytest.mark.parametrize("compute", [photometric_loss, _by_convolution])
+def test_gradient_is_autograds(rng, compute):
     x, y = (torch.from_numpy(image) for image in _pair(rng, 40, 29))
     ours, theirs = x.clone().requires_grad_(), x.double().requires_grad_()
-    loss = photometric_loss(ours, y)
-    expected = 0.8 * (theirs - y).abs().mean() + 0.2 * (1 - ssim(theirs, y.double()))
+    loss = compute(ours, y)
+    expected = 0.8 * (theirs - y).abs().mean() + 0.2 * (1 - _torchmetrics_ssim(theirs, y.double()))
     (3 * loss).backward()
     (3 * expected).backward()
     assert loss.item() == pytest.approx(expected.item(), rel=1e-5)

@@ -2,13 +2,14 @@
 
 Notation: gsplat's parameter dict as tensors: ``means``, ``scales`` (logarithms), ``quats``,
 ``opacities`` (logits), ``sh0``, ``shN``. Promise: one rasteriser call serves training and scoring
-on CPU and CUDA alike.
+on CPU and CUDA alike; a view's camera is copied to a GPU once, and a photograph without waiting.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -18,7 +19,31 @@ from torch import Tensor
 from splatseed.render import rasterization
 from splatseed.views.view import View
 
-__all__ = ["photograph_of", "render_features", "render_view"]
+__all__ = ["CameraTensors", "camera_of", "photograph_of", "render_features", "render_view"]
+
+
+class CameraTensors(NamedTuple):
+    """A view's camera on a device."""
+
+    viewmats: Float[Tensor, "1 4 4"]
+    """cam_from_world, as the rasteriser takes it, float32."""
+    Ks: Float[Tensor, "1 3 3"]
+    """Pinhole matrix, likewise."""
+    cam_from_world: Float[Tensor, "4 4"]
+    """In full, float64."""
+
+
+_CAMERAS: WeakKeyDictionary[View, dict[torch.device, CameraTensors]] = WeakKeyDictionary()
+
+
+def camera_of(view: View, device: torch.device) -> CameraTensors:
+    """The view's camera on a device, copied there once as long as the view lives."""
+    kept = _CAMERAS.setdefault(view, {})
+    if device not in kept:
+        pose, K = (torch.from_numpy(np.array(each)) for each in (view.cam_from_world, view.K))
+        single = (each.to(torch.float32)[None].to(device) for each in (pose, K))
+        kept[device] = CameraTensors(*single, pose.to(device))
+    return kept[device]
 
 
 def render_view(
@@ -51,14 +76,15 @@ def _rasterize(
     sh_degree: int | None,
 ) -> tuple[Float[Tensor, "H W D"], dict[str, Any]]:
     means = params["means"]
+    camera = camera_of(view, means.device)
     images, _, info = rasterization(
         means=means,
         quats=params["quats"],
         scales=torch.exp(params["scales"]),
         opacities=torch.sigmoid(params["opacities"]),
         colors=colors,
-        viewmats=_on_device(view.cam_from_world, means)[None],
-        Ks=_on_device(view.K, means)[None],
+        viewmats=camera.viewmats,
+        Ks=camera.Ks,
         width=view.width,
         height=view.height,
         sh_degree=sh_degree,
@@ -69,8 +95,10 @@ def _rasterize(
 
 def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
     """The view's photograph as float32 from 0 to 1."""
-    # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be.
-    return torch.tensor(view.photograph, device=device).to(torch.float32).div_(255.0)
+    # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be. From pinned
+    # memory the GPU fetches it while it works on earlier steps.
+    pixels = torch.tensor(view.photograph, pin_memory=device.type == "cuda")
+    return pixels.to(device, non_blocking=True).to(torch.float32).div_(255.0)
 
 
 def _harmonics(
@@ -79,6 +107,3 @@ def _harmonics(
     """The coefficients in use; unused ones would cost copies and optimiser steps for nothing."""
     return params["sh0"] if sh_degree == 0 else (params["sh0"], params["shN"])
 
-
-def _on_device(matrix: np.ndarray, like: Tensor) -> Tensor:
-    return torch.from_numpy(np.asarray(matrix, np.float32)).to(like.device)

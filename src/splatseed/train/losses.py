@@ -1,19 +1,22 @@
 """The loss of 3DGS, (1 - s) L1 + s (1 - SSIM) with s = 0.2.
 
-Notation: images are [H, W, 3], values about 0..1. Promise: on the CPU the loss and its gradient
-come from one Numba pass and do not depend on the number of threads; on CUDA from PyTorch's
-convolutions, which compute the same (that code runs on the CPU too, and the tests compare them).
+Notation: images are [H, W, 3], values about 0..1. Promise: the gradient is computed along with the
+loss, which ends the graph: on the CPU in one Numba pass, whose bytes do not depend on the number of
+threads; on a GPU by a few convolutions without TF32, or by the fused kernel of the package
+``fused-ssim`` where it is installed.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseed.evaluate.images import ssim
+from splatseed.evaluate.images import l1_and_ssim_by_convolution
 from splatseed.evaluate.ssim import l1_and_ssim
 
 __all__ = ["SSIM_WEIGHT", "photometric_loss"]
@@ -30,29 +33,44 @@ def photometric_loss(
         render: The rendered view, float32; at least 11 pixels a side.
         photograph: The view as captured, likewise.
     """
-    if render.device.type == "cpu":
-        loss: Tensor = _CpuLoss.apply(render, photograph)
+    fused = _fused_ssim() if render.is_cuda else None
+    if fused is None:
+        loss: Tensor = _Loss.apply(render, photograph)
         return loss
     l1 = (render - photograph).abs().mean()
-    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - ssim(render, photograph))
+    x, y = (image.permute(2, 0, 1)[None].contiguous() for image in (render, photograph))
+    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - fused(x, y, padding="valid"))
 
 
-class _CpuLoss(torch.autograd.Function):
-    """The loss, whose gradient is computed along with it, as it ends the graph."""
+@lru_cache
+def _fused_ssim() -> Callable[..., Tensor] | None:
+    """The function of the package fused-ssim, None without it."""
+    try:
+        from fused_ssim import fused_ssim  # noqa: PLC0415  (optional)
+    except ImportError:
+        return None
+    return fused_ssim  # type: ignore[no-any-return]  # it has no types
+
+
+class _Loss(torch.autograd.Function):
+    """The loss, with the analytic gradient of both of its parts."""
 
     @staticmethod
     def forward(ctx: Any, render: Tensor, photograph: Tensor) -> Tensor:
-        l1, similarity, gradient = l1_and_ssim(
-            render.detach().contiguous().numpy(),
-            photograph.contiguous().numpy(),
-            1 - SSIM_WEIGHT,
-            SSIM_WEIGHT,
-        )
-        ctx.save_for_backward(torch.from_numpy(gradient))
-        return torch.tensor((1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - similarity))
+        weights = 1 - SSIM_WEIGHT, SSIM_WEIGHT
+        if render.device.type == "cpu":
+            arrays = render.detach().contiguous().numpy(), photograph.contiguous().numpy()
+            l1, similarity, slopes = l1_and_ssim(*arrays, *weights)
+            ctx.save_for_backward(torch.from_numpy(slopes))
+            return torch.tensor(weights[0] * l1 + weights[1] * (1 - similarity))
+        of_l1, of_ssim, gradient = l1_and_ssim_by_convolution(render, photograph, *weights)
+        ctx.save_for_backward(gradient)
+        return weights[0] * of_l1 + weights[1] * (1 - of_ssim)
 
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
         (gradient,) = ctx.saved_tensors
-        # backward mostly starts at the loss, and multiplying by one takes a whole pass.
-        return gradient if float(upstream[0]) == 1.0 else gradient * upstream[0], None
+        # backward mostly starts at the loss, and multiplying by one takes a whole pass; on a GPU
+        # looking at the number would wait.
+        at_loss = gradient.device.type == "cpu" and float(upstream[0]) == 1.0
+        return gradient if at_loss else gradient * upstream[0], None
