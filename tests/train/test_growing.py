@@ -15,7 +15,7 @@ from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies import make_strategy
 from splatseed.train.strategies.contributions import contributions
 from splatseed.train.strategies.growing import PLACED
-from splatseed.train.strategies.placing import draw_candidates
+from splatseed.train.strategies.placing import draw_candidates, join_candidates
 from splatseed.views.view import View
 
 SIDE = 32
@@ -193,7 +193,7 @@ def test_candidates_lie_on_wrong_pixels_of_known_depth(height, width, count, see
     depth = torch.as_tensor(rng.choice([0.0, 1.0, 2.5], (height, width)).astype(np.float32))
     photograph = torch.as_tensor(rng.random((height, width, 3)).astype(np.float32))
     torch.manual_seed(seed)
-    drawn = draw_candidates(view, depth, error, photograph, count)
+    drawn = join_candidates([draw_candidates(view, depth, error, photograph, count)])
     assert len(drawn["depths"]) <= count
     assert (len(drawn["depths"]) > 0) == bool(((error > 0) & (depth > 0)).any())
     x, y, z = pose[:3, :3] @ drawn["means"].double().numpy().T + pose[:3, 3:]

@@ -91,7 +91,7 @@ def test_photographs_are_compared_once_for_seeds_and_growth(scene, tmp_path, mon
 
 def test_seeding_hands_on_what_stereo_found(scene):
     asked = TrainSettings(strategy="grow", max_steps=60, seeding="auto")
-    stereo = seeded(scene, asked, lambda _: None, silent)[1]
+    stereo = seeded(scene, asked, "cpu", lambda _: None, silent)[1]
     assert stereo is not None
     assert [view.name for view in stereo.views] == [image.name for image in scene.split(8)[0]]
 
@@ -101,21 +101,24 @@ def test_seeding_hands_on_what_stereo_found(scene):
     count=st.integers(1, 400),
     width=st.integers(64, 4000),
     factor=st.integers(1, 8),
+    device=st.sampled_from(["cpu", "cuda"]),
 )
 def test_comparing_takes_a_part_of_training_unless_it_is_at_the_trained_size(
-    steps, count, width, factor
+    steps, count, width, factor, device
 ):
     lens = Intrinsics(1, "PINHOLE", width, width * 3 // 4, (width, width, width / 2, width / 3))
     images = [Image(f"{i}.png", i + 1, lens, np.array([1.0, 0, 0, 0]), np.zeros(3)) for i in
               range(count)]  # fmt: skip
     asked = TrainSettings(strategy="grow", max_steps=steps, data_factor=factor)
-    size = stereo_size(images, asked)
+    size = stereo_size(images, asked, device)
     assert 64 <= size <= 800
-    assert stereo_size(images, dataclasses.replace(asked, max_steps=steps + 1)) >= size
+    longer = dataclasses.replace(asked, max_steps=steps + 1)
+    assert stereo_size(images, longer, device) >= size
     side = min(size, width)
     compared = count * side * side * 3 / 4
     rendered = steps * (width / factor) ** 2 * 3 / 4
-    assert compared <= 1.05 * PER_RENDERED * rendered or size <= max(64, width // factor)
+    least = max(64, width // factor) if device == "cpu" else 200
+    assert compared <= 1.05 * PER_RENDERED[device] * rendered or size <= least
 
 
 def test_a_short_run_of_many_photographs_compares_them_at_the_trained_size(scene):
@@ -125,4 +128,4 @@ def test_a_short_run_of_many_photographs_compares_them_at_the_trained_size(scene
     for name, depth in half.items():
         assert depth.shape == tuple(n // 2 for n in full[name].shape)
     assert half
-    assert stereo_size([], short) == 800
+    assert stereo_size([], short, "cpu") == 800

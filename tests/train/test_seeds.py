@@ -107,21 +107,23 @@ def test_asking_for_what_is_not_known_is_told(points):
 
 def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):
     notes: list[str] = []
-    points = seeded(room, TrainSettings(seeding="auto"), notes.append, silent)[0].points
+    points = seeded(room, TrainSettings(seeding="auto"), "cpu", notes.append, silent)[0].points
     assert len(points) > len(room.points)
     assert np.array_equal(points.originals.xyz, room.points.xyz)
     assert "--seeds scene" in notes[-1]
     bounded = TrainSettings(seeding="auto", strategy="none", cap_max=len(room.points) + 10)
-    assert len(seeded(room, bounded, notes.append, silent)[0].points) == len(room.points) + 10
+    assert (
+        len(seeded(room, bounded, "cpu", notes.append, silent)[0].points) == len(room.points) + 10
+    )
 
 
 def test_what_upsample_only_thinned_is_left_alone(room, tmp_path):
     write_scene(room.replace(points=room.points.select(slice(100))), tmp_path / "thin")
     thin, asked = load_scene(tmp_path / "thin"), TrainSettings(seeding="auto")
     (tmp_path / "thin" / MANIFEST).write_text('{"command": "upsample"}')
-    assert seeded(thin, asked, print, silent) == (thin, None)
+    assert seeded(thin, asked, "cpu", print, silent) == (thin, None)
     (tmp_path / "thin" / MANIFEST).write_text('{"command": "sfm"}')
-    assert len(seeded(thin, asked, lambda _: None, silent)[0].points) > len(thin.points)
+    assert len(seeded(thin, asked, "cpu", lambda _: None, silent)[0].points) > len(thin.points)
 
 
 @pytest.mark.parametrize(
@@ -135,7 +137,7 @@ def test_other_points_are_left_alone(settings, room):
     )
     scene = touched if settings == {"seeding": "auto"} else room
     notes: list[str] = []
-    assert seeded(scene, TrainSettings(**settings), notes.append, silent)[0] is scene
+    assert seeded(scene, TrainSettings(**settings), "cpu", notes.append, silent)[0] is scene
     assert not notes
 
 
@@ -143,7 +145,7 @@ def test_beginning_with_its_own_points_is_not_advised_where_there_are_none(room)
     settings = TrainSettings(seeding="auto", cap_max=500, max_steps=10)
     notes: list[str] = []
     empty = room.replace(points=room.points.select(slice(0)), tracks=None)
-    cloud = seeded(empty, settings, notes.append, silent)[0].points
+    cloud = seeded(empty, settings, "cpu", notes.append, silent)[0].points
     assert len(cloud)
     (said,) = [note for note in notes if note.startswith("Seeds by method auto")]
     assert "--seeds scene" not in said

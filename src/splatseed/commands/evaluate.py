@@ -191,7 +191,7 @@ def _evaluate(
         data_factor=task.data_factor,
         test_every=task.test_every,
         transform=options.transform,
-        device=pick_device(options.backend),
+        device=pick_device(options.backend, clock),
         cache_dir=user_cache_dir(),
         progress=clock,
     )

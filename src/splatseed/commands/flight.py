@@ -226,7 +226,7 @@ def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> 
 
     clock("prepare", 0.0)
     crop = None if options.crop is None else parse_crop(options.crop)
-    device = pick_device(options.backend)
+    device = pick_device(options.backend, clock)
     frame = None
     renderers = []
     for shown in models:

@@ -75,7 +75,7 @@ def run(arguments: list[str]) -> None:
     with stage_display() as clock:
         clock("read", 0.0)
         opened, beside = _opened(options)
-        device = pick_device(options.backend)
+        device = pick_device(options.backend, clock)
         viewer = Viewer(
             opened, options.host, port, device, most_points=options.max_points, beside=beside
         )

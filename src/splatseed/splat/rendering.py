@@ -13,13 +13,20 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from splatseed.render import rasterization
 from splatseed.views.view import View
 
-__all__ = ["CameraTensors", "camera_of", "photograph_of", "render_features", "render_view"]
+__all__ = [
+    "CameraTensors",
+    "camera_of",
+    "photograph_of",
+    "pixels_of",
+    "render_features",
+    "render_view",
+]
 
 
 class CameraTensors(NamedTuple):
@@ -41,8 +48,8 @@ def camera_of(view: View, device: torch.device) -> CameraTensors:
     kept = _CAMERAS.setdefault(view, {})
     if device not in kept:
         pose, K = (torch.from_numpy(np.array(each)) for each in (view.cam_from_world, view.K))
-        single = (each.to(torch.float32)[None].to(device) for each in (pose, K))
-        kept[device] = CameraTensors(*single, pose.to(device))
+        viewmats, Ks = (each.to(torch.float32)[None].to(device) for each in (pose, K))
+        kept[device] = CameraTensors(viewmats, Ks, pose.to(device))
     return kept[device]
 
 
@@ -95,10 +102,15 @@ def _rasterize(
 
 def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
     """The view's photograph as float32 from 0 to 1."""
+    return pixels_of(view, device).to(torch.float32).div_(255.0)
+
+
+def pixels_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
+    """The view's photograph in bytes."""
     # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be. From pinned
     # memory the GPU fetches it while it works on earlier steps.
     pixels = torch.tensor(view.photograph, pin_memory=device.type == "cuda")
-    return pixels.to(device, non_blocking=True).to(torch.float32).div_(255.0)
+    return pixels.to(device, non_blocking=True)
 
 
 def _harmonics(
@@ -106,4 +118,3 @@ def _harmonics(
 ) -> Tensor | tuple[Tensor, Tensor]:
     """The coefficients in use; unused ones would cost copies and optimiser steps for nothing."""
     return params["sh0"] if sh_degree == 0 else (params["sh0"], params["shN"])
-

@@ -2,30 +2,68 @@
 
 Promise: a requested GPU is used or an error, never silently replaced; a cloud too large to train is
 refused before the first step, with the number that fits, and a growing one is held at what fits.
+What is too much for a GPU all the same is told in a sentence with a number to try.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import torch
 
 from splatseed.errors import PointCloudError
 from splatseed.process.memory import free_memory
 from splatseed.process.torch_device import pick_torch_device
+from splatseed.progress import Progress, silent
+from splatseed.render.gsplat_kernels import load_kernels
 from splatseed.train.settings import BYTES_EACH, Backend
 
 __all__ = [
-    "BYTES_EACH", "Capacity", "check_fits", "device_name", "free_bytes", "peak_gpu_bytes",
-    "pick_device",
+    "BYTES_EACH", "Capacity", "check_fits", "device_name", "free_bytes", "gpu_memory_told",
+    "peak_gpu_bytes", "pick_device",
 ]  # fmt: skip
 
+FEWER = 0.8
+"""The part of the Gaussians to try again with where memory ended."""
 
-def pick_device(backend: Backend) -> torch.device:
-    """The device that a backend stands for; ``auto`` takes a GPU if PyTorch sees one.
+
+def pick_device(backend: Backend, progress: Progress = silent) -> torch.device:
+    """The device that a backend stands for, ready to render; ``auto`` takes a GPU if there is one.
+
+    Args:
+        backend: The user's choice.
+        progress: Called with the stage in which gsplat's kernels are built, the first time.
 
     Raises:
         ParameterError: CUDA is asked for and there is none.
+        MissingDependencyError: gsplat has no kernels for the GPU and they cannot be built here.
     """
-    return pick_torch_device(backend, "--backend")
+    device = pick_torch_device(backend, "--backend")
+    if device.type == "cuda":
+        load_kernels("--backend", progress)
+    return device
+
+
+@contextmanager
+def gpu_memory_told(count: Callable[[], int]) -> Iterator[None]:
+    """Turn the end of a GPU's memory in the block into one sentence.
+
+    Args:
+        count: The number of Gaussians at that time.
+
+    Raises:
+        PointCloudError: The memory did not suffice.
+    """
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError as error:
+        raise PointCloudError(
+            "Gaussians and photographs that fit into the GPU's memory",
+            found=f"no memory left with {count():,} Gaussians",
+            fix=f"Start again with --cap-max {round(FEWER * count())} or smaller photographs "
+            "(--data-factor), or end other programs on the GPU.",
+        ) from error
 
 
 def device_name(device: torch.device) -> str:
@@ -83,9 +121,10 @@ class Capacity:
 def free_bytes(device: torch.device) -> int | None:
     """Free memory of the device in bytes; None where the system does not tell."""
     if device.type == "cuda":
-        # PyTorch keeps freed blocks, which are free to us.
-        kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
-        return torch.cuda.mem_get_info(device)[0] + kept
+        # PyTorch keeps freed blocks, which are free to us but for what the next render and its
+        # graph take again: as much as at the peak so far.
+        kept = torch.cuda.memory_reserved(device) - torch.cuda.max_memory_allocated(device)
+        return max(0, torch.cuda.mem_get_info(device)[0] + kept)
     return free_memory()
 
 

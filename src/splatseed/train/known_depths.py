@@ -68,7 +68,7 @@ def known_depths(
             maps = tuple(stereo.map(i) for i in range(len(stereo.views)))
         else:
             compared = scene.replace(images=images)
-            size = stereo_size(images, settings)
+            size = stereo_size(images, settings, device.type)
             maps = stereo_depths(compared, seed=settings.seed, progress=progress, max_size=size)
         known = {each.name: each.depth for each in maps}
         _write(kept, known, time.perf_counter() - start)

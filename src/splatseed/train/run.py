@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseed.errors import OutputError, SceneNotFoundError
+from splatseed.errors import OutputError, PointCloudError, SceneNotFoundError
 from splatseed.evaluate.ssim import WINDOW
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
@@ -28,7 +28,13 @@ from splatseed.scores import CurvePoint, EvalResult, TrainingResult
 from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, training_frame
 from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
-from splatseed.train.device import check_fits, device_name, peak_gpu_bytes, pick_device
+from splatseed.train.device import (
+    check_fits,
+    device_name,
+    gpu_memory_told,
+    peak_gpu_bytes,
+    pick_device,
+)
 from splatseed.train.known_depths import known_depths, seconds_of
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
 from splatseed.train.record.config import check_same_seeds, make_config, resumed_settings
@@ -41,7 +47,7 @@ from splatseed.train.start import first_gaussians
 from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
 from splatseed.train.strategies import Strategy, make_strategy
 from splatseed.train.trainer import Trainer
-from splatseed.views.view import View, load_split, poses_of
+from splatseed.views.view import View, check_lens, load_split, poses_of
 
 __all__ = ["Render", "RunOptions", "Score", "TrainingRun", "prepare_run"]
 
@@ -109,8 +115,10 @@ def prepare_run(
     folder = _checked_folder(output, scene, options)
     begun = folder.read_config() if options.resume and folder.is_run else None
     settings = resumed_settings(begun, settings)
-    device = pick_device(settings.backend)
-    scene, stereo = seeded(scene, settings, note, progress)
+    for image in scene.images:
+        check_lens(image, scene.source.root if scene.source else None)
+    device = pick_device(settings.backend, progress)
+    scene, stereo = seeded(scene, settings, device.type, note, progress)
     trained = scene.split(settings.test_every)[0]
     seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
     check_fits(len(seeds), device)
@@ -136,15 +144,18 @@ def prepare_run(
     )
     strategy = make_strategy(settings, device, depths)
     state = _state(folder if begun else None, seeds, frame, near, settings, strategy, device)
+    if state.step:
+        note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
+    run = TrainingRun(folder, settings, frame, state, views)
+    progress("compile", 0.0)
+    with gpu_memory_told(run.count):
+        run.trainer.warm_up()
+    # What cannot render has failed by now, and leaves no folder.
     if not begun:
         state.watch.seconds += seconds  # the cost of growth includes finding depth
         folder.begin(config)
-    if state.step:
-        note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
-    board = _board(folder, state.step) if options.tensorboard else None
-    run = TrainingRun(folder, settings, frame, state, views, board)
-    progress("compile", 0.0)
-    run.trainer.warm_up()
+    if options.tensorboard:
+        run.log_to_tensorboard()
     return run
 
 
@@ -160,12 +171,6 @@ def _timed_depths(
     return depths, seconds
 
 
-def _board(folder: RunFolder, step: int) -> Board:
-    board = Board(folder.tensorboard, step)
-    folder.claim([folder.tensorboard])
-    return board
-
-
 class TrainingRun:
     """A run that is ready to train.
 
@@ -175,7 +180,6 @@ class TrainingRun:
         frame: The training frame.
         state: The run, at its first step or where it stopped.
         views: Training and test views, in the world.
-        board: TensorBoard's log, if requested.
     """
 
     def __init__(
@@ -185,17 +189,25 @@ class TrainingRun:
         frame: TrainingFrame,
         state: TrainState,
         views: tuple[Sequence[View], Sequence[View]],
-        board: Board | None = None,
     ) -> None:
         self.folder = folder
         self.settings = settings
         self.state = state
         self._frame = frame
-        self._board = board
+        self._board: Board | None = None
         self._saved = time.monotonic()
         self._saved_step = state.step or None
         train, test = ([frame.view(view) for view in part] for part in views)
         self.trainer = Trainer(state, settings, train, test, self._on_record)
+
+    def log_to_tensorboard(self) -> None:
+        """Also write TensorBoard's log, into the run's folder."""
+        self._board = Board(self.folder.tensorboard, self.state.step)
+        self.folder.claim([self.folder.tensorboard])
+
+    def count(self) -> int:
+        """The number of Gaussians."""
+        return len(self.state.params["means"])
 
     @property
     def device(self) -> str:
@@ -218,15 +230,27 @@ class TrainingRun:
 
         Raises:
             OutputError: The checkpoint or the curve cannot be written.
+            PointCloudError: The GPU's memory does not suffice; the checkpoint is of the last step.
         """
         with self._told_of_checkpoint():
             if self._saved_step is None:
                 self._save()  # fail now rather than after hours if the disk is full
-            done = self.trainer.run(on_step)
+            with gpu_memory_told(self.count):
+                done = self._run(on_step)
             if self._board:
                 self._board.close()
             self._save()  # for a finished run too: scoring and writing results may fail
         return done
+
+    def _run(self, on_step: Callable[[int], None]) -> bool:
+        """Train; if a GPU's memory ends, save the last whole step first."""
+        try:
+            return self.trainer.run(on_step)
+        except torch.cuda.OutOfMemoryError:
+            if self.trainer.is_whole:  # else the checkpoint before is the last whole one
+                self.trainer.clear_gradients()
+                self._save()
+            raise
 
     def finish(self, score: Score, progress: Progress = silent) -> TrainingResult:
         """Score the test views and write the results; the checkpoint, no longer needed, is removed.
@@ -240,8 +264,9 @@ class TrainingRun:
 
         Raises:
             OutputError: A result cannot be written.
+            PointCloudError: The GPU's memory does not suffice.
         """
-        with self._told_of_checkpoint():
+        with self._told_of_checkpoint(), gpu_memory_told(self.count):
             return self._finish(score, progress)
 
     def _finish(self, score: Score, progress: Progress) -> TrainingResult:
@@ -291,17 +316,17 @@ class TrainingRun:
 
     @contextmanager
     def _told_of_checkpoint(self) -> Iterator[None]:
-        """Say which step is saved, and how to resume, if writing fails or a signal cuts it off."""
+        """Say which step is saved, and how to resume, if the run is cut off."""
         try:
             yield
-        except (OutputError, KeyboardInterrupt) as error:
+        except (OutputError, PointCloudError, KeyboardInterrupt) as error:
             if self._saved_step is None:
                 raise
             kept = f"The run as of step {self._saved_step:,} is kept: continue it with --resume."
             if isinstance(error, KeyboardInterrupt):
                 error.add_note(kept)
                 raise
-            raise OutputError(
+            raise type(error)(
                 error.expected, found=error.found, fix=f"{error.fix} {kept}"
             ) from error
 

@@ -44,7 +44,11 @@ def most_seeds(settings: TrainSettings, cap: int) -> int:
 
 
 def seeded(
-    scene: Scene, settings: TrainSettings, note: Callable[[str], None], progress: Progress
+    scene: Scene,
+    settings: TrainSettings,
+    device: str,
+    note: Callable[[str], None],
+    progress: Progress,
 ) -> tuple[Scene, Stereo | None]:
     """The scene with the points that method ``auto`` makes, if the settings ask for them.
 
@@ -53,6 +57,7 @@ def seeded(
     Args:
         scene: A scene without points added by splatseed.
         settings: Their cap limits the points, and they say which photographs are held out.
+        device: Where training renders; see ``stereo_size``.
         note: Called with what was made, and how to do without.
         progress: Called with the stage and the fraction done.
 
@@ -78,7 +83,7 @@ def seeded(
             return results[-1]
 
     start = time.perf_counter()
-    size = stereo_size(scene.split(settings.test_every)[0], settings)
+    size = stereo_size(scene.split(settings.test_every)[0], settings, device)
     cloud = upsample(
         scene,
         Remembering(hold_out=settings.test_every, max_size=size),

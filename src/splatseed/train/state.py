@@ -26,7 +26,7 @@ from splatseed.train.strategies import Strategy
 
 __all__ = ["Stopwatch", "TrainState", "load_checkpoint", "save_checkpoint"]
 
-FORMAT = 3
+FORMAT = 4
 """Version of the checkpoint's content."""
 
 

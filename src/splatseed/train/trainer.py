@@ -3,7 +3,8 @@
 Notation: a step shows one training view; all cameras are in the training frame. Promise: on the CPU
 equal settings and seeds give equal bytes, whatever the number of threads and however often the run
 was interrupted: the order of the photographs is drawn from (seed, epoch), and PyTorch's generator,
-which the strategies use, is set from (seed, step) before each step.
+which the strategies use, is set from (seed, step) before each step. On a GPU a step waits for it
+only where gsplat does.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from splatseed.splat.rendering import photograph_of, render_view
 from splatseed.train.averaging import add_to_mean, take_mean
 from splatseed.train.losses import photometric_loss
 from splatseed.train.parameters import optimize
+from splatseed.train.photographs import Photographs
 from splatseed.train.record.curve import Record
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
@@ -45,6 +47,9 @@ class Trainer:
         train_views: The views to learn from, in the training frame.
         test_views: The views to evaluate on, likewise.
         on_record: Called with each record, and whether the test views were rendered for it.
+
+    Attributes:
+        is_whole: Whether the state is that between two steps, which a checkpoint may keep.
     """
 
     def __init__(
@@ -60,6 +65,8 @@ class Trainer:
         self.train_views = train_views
         self.test_views = test_views
         self.on_record = on_record
+        self.is_whole = True
+        self._photographs = Photographs(train_views, self.device)
         keep_freed_memory()
 
     def run(self, on_step: Callable[[int], None] = lambda _: None) -> bool:
@@ -87,7 +94,11 @@ class Trainer:
         """Render and compare once, so that kernels are compiled before the clock runs."""
         view = self.train_views[0]
         render, _ = render_view(self.state.params, view, self.settings.sh_degree)
-        photometric_loss(render, photograph_of(view, self.device)).backward()
+        photometric_loss(render, self._photographs.of(view)).backward()
+        self.clear_gradients()
+
+    def clear_gradients(self) -> None:
+        """Forget a step that did not reach its end."""
         for value in self.state.params.values():
             value.grad = None
 
@@ -101,9 +112,9 @@ class Trainer:
         """Take one step; returns the render and the photograph."""
         state, schedule = self.state, self.settings.schedule
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
-        torch.manual_seed(_step_seed(self.settings.seed, step))
+        self._seed_generators(_step_seed(self.settings.seed, step))
         view = self.train_views[self._view_index(step)]
-        photograph = photograph_of(view, self.device)
+        photograph = self._photographs.of(view)
         render, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
         # gsplat's strategies ask PyTorch to retain the gradient of the 2D means here.
         strategy.before(params, optimizers, step, info)
@@ -112,11 +123,19 @@ class Trainer:
         penalty = strategy.regularization(params)
         # The recorded loss is without the penalty, so that strategies can be compared.
         (loss if penalty is None else loss + penalty).backward()
+        self.is_whole = False
         optimize(params, optimizers, schedule.rates(step))
         strategy.observe(params, view, render, photograph, step)
         strategy.after(params, optimizers, step, info)
         self._average(step + 1)
+        self.is_whole = True
         return render.detach(), photograph
+
+    def _seed_generators(self, seed: int) -> None:
+        """As ``torch.manual_seed``, which also formats the stack for devices that are not used."""
+        torch.default_generator.manual_seed(seed)
+        if self.device.type == "cuda":
+            torch.cuda.manual_seed(seed)
 
     def _average(self, steps_done: int) -> None:
         """Average the Gaussians over the end of a run; the last step leaves their mean."""

@@ -84,7 +84,7 @@ def test_seeds_that_saw_the_test_views_are_known(scene, tmp_path, told, all_of_t
     write_scene(scene.replace(points=seeds), tmp_path / "out", provenance=told)
     again, notes = load_scene(tmp_path / "out"), []
     assert saw_all_photographs(again) == all_of_them
-    seeded(again, TrainSettings(seeding="scene"), notes.append, silent)
+    seeded(again, TrainSettings(seeding="scene"), "cpu", notes.append, silent)
     assert any("test views included" in note for note in notes) == all_of_them
     assert not saw_all_photographs(scene)
 

@@ -175,7 +175,7 @@ def _prepare(
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (PyTorch)
 
     every = spec.training.test_every
-    size = stereo_size(scene.split(every)[0], spec.settings)
+    size = stereo_size(scene.split(every)[0], spec.settings, spec.settings.backend)
     ways: dict[str, Any] = {
         "cache_dir": user_cache_dir(),
         "depths": bench / DEPTHS / f"{spec.scene_digest}_{every}_{size}_{spec.repeat}.npz",

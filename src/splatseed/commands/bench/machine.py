@@ -15,6 +15,7 @@ from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.local import LocalExecutor
 from splatseed.bench.running.watcher import Watcher
 from splatseed.commands.bench.options import Options
+from splatseed.console import stage_display
 from splatseed.process.memory import check_memory
 from splatseed.process.threads import cores, slot_environment
 from splatseed.requirements import require
@@ -105,7 +106,8 @@ def _local_machine(options: Options, backend: Backend) -> Machine:
     if backend == "cuda" or (backend == "auto" and _has_driver()):
         from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch, which takes seconds)
 
-        chosen = "cuda" if pick_device(backend).type == "cuda" else "cpu"
+        with stage_display() as clock:  # gsplat's kernels are built here, not by each run
+            chosen = "cuda" if pick_device(backend, clock).type == "cuda" else "cpu"
     gpus = _gpus() if chosen == "cuda" else []
     jobs = options.jobs or max(len(gpus), 1)
     threads = options.threads or max(1, cores() // jobs)

@@ -40,7 +40,8 @@ class Fixed(Strategy):
 class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
     """gsplat's strategy, but only as many Gaussians grow as there is room, largest gradients first.
 
-    On the CPU its running sums are computed differently, equal up to rounding.
+    Its running sums are computed differently, equal up to rounding: gsplat lists the visible
+    Gaussians, for which a GPU is waited for, and reduces rows of two, which is slow on the CPU.
     """
 
     capacity: Capacity
@@ -49,12 +50,13 @@ class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
     def _update_state(
         self, params: Parameters, state: Any, info: Any, packed: bool = False
     ) -> None:
-        if packed or params["means"].device.type != "cpu":
+        if packed:
             super()._update_state(params, state, info, packed)
             return
+        means = params["means"]
         for name in ("grad2d", "count"):
             if state[name] is None:
-                state[name] = torch.zeros(len(params["means"]))
+                state[name] = torch.zeros(len(means), device=means.device)
         _add_gradients(state, info)
 
     def _grow_gs(self, params: Parameters, optimizers: Any, state: Any, step: int) -> Any:
@@ -79,11 +81,7 @@ class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
 
 
 def _add_gradients(state: Any, info: Any) -> None:
-    """Count each visible Gaussian, and add up the lengths of the gradients of its 2D mean.
-
-    gsplat lists the visible Gaussians, gathers their gradients and reduces rows of two, which takes
-    several times as long as adding zeros for the others.
-    """
+    """Count each visible Gaussian, and add up the lengths of the gradients of its 2D mean."""
     radii, half_cameras = info["radii"], info["n_cameras"] / 2.0
     seen = (radii[..., 0] > 0) & (radii[..., 1] > 0)
     x, y = info["means2d"].grad.unbind(-1)

@@ -102,7 +102,7 @@ class Growing(Strategy):
             drawn = draw_candidates(
                 view, self.depths[view.name], error, photograph, self._drawn_each(len(pixels), step)
             )
-            self.state["candidates"] = join_candidates(self.state.get("candidates"), drawn)
+            self.state.setdefault("candidates", []).append(dict(drawn))
 
     def after(
         self,
@@ -122,10 +122,12 @@ class Growing(Strategy):
         if bool(needless.all()):
             return  # the run is lost either way, and an empty scene cannot be rendered
         # Candidates have no Gaussians yet: gsplat's operations must not see them in the state.
-        candidates = self.state.pop("candidates", None)
+        draws = self.state.pop("candidates", None)
         remove(params, optimizers, self.state, needless)
         count = len(params["means"])
-        wanted = self._room(count, step)
+        target = self._target(count, step)
+        wanted = min(self.capacity.limit(count, target) - count, round(FASTEST * count))
+        candidates = join_candidates(draws) if draws else None
         placed = min(round(PLACED * wanted), len(candidates["depths"])) if candidates else 0
         self._split(params, optimizers, wanted - placed)
         if candidates:
@@ -177,11 +179,12 @@ class Growing(Strategy):
         every = self.schedule.refine_every
         # The step at which this round ends.
         end = max(self.schedule.refine_start, math.ceil(step / every) * every)
-        wanted = self._room(count, end) + round(RECYCLED * count)
+        growth = min(self._target(count, end) - count, round(FASTEST * count))
+        wanted = growth + round(RECYCLED * count)
         return math.ceil(PLACED * wanted / max(1, every // LOOK_EVERY))
 
-    def _room(self, count: int, step: int) -> int:
-        """How many may be added now: the budget is reached evenly, at ``FULL_AT`` of the run."""
+    def _target(self, count: int, step: int) -> int:
+        """How many there should be after this round: the budget at ``FULL_AT`` of the run."""
         schedule, budget = self.schedule, self.capacity.cap or count
         rounds = max(
             1,
@@ -189,10 +192,9 @@ class Growing(Strategy):
             + 1,
         )
         done = (step - schedule.refine_start) // schedule.refine_every + 1
-        first = self.state["first"]
+        first: int = self.state["first"]
         # Linear from the seeds to the budget.
-        target = round(first + (budget - first) * min(1.0, done / rounds))
-        return min(self.capacity.limit(count, target) - count, round(FASTEST * count))
+        return round(first + (budget - first) * min(1.0, done / rounds))
 
 
 def _least(most_pixels: Float[Tensor, " M"]) -> float:

@@ -8,7 +8,7 @@ Gaussians; this reaches a leaf, a rod, or a piece of wall without a seed.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from gsplat.strategy.ops import duplicate
@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from splatseed.splat.gaussians import SH_C0
+from splatseed.splat.rendering import camera_of
 from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters
 from splatseed.views.view import View
 
@@ -23,7 +24,7 @@ __all__ = ["Candidates", "add_candidates", "draw_candidates", "join_candidates"]
 
 Candidates = Mapping[str, Tensor]
 """``means`` [M, 3], ``colors`` [M, 3] from the photograph, 0 to 1, ``depths`` [M], and ``sizes``
-[M], standard deviations: training units."""
+[M], standard deviations: training units; while they are collected also ``valid`` [M], bool."""
 OPACITY = 0.6
 """Opacity of a new Gaussian. It stands on a surface; a fainter one takes the rest of the run to
 show."""
@@ -40,12 +41,15 @@ def draw_candidates(
 ) -> Candidates:
     """Draw pixels of known depth with probability proportional to e^2.
 
+    There are always ``count``; those drawn twice or without depth are not ``valid``, and
+    ``join_candidates`` leaves them out: a number that the GPU had to tell would be waited for.
+
     Args:
         view: The view, in the training frame.
         depth: d, 0 where unknown; of any size, covering the whole photograph.
         error: The error e.
         photograph: Colours of new Gaussians, 0 to 1.
-        count: The most candidates; a pixel drawn twice counts once.
+        count: The number of draws.
     """
     height, width = error.shape
     # The map is coarser: each pixel takes the depth of the map's pixel that covers it.
@@ -56,10 +60,13 @@ def draw_candidates(
     worth = torch.where(d > 0, error.flatten() ** 2, 0.0).double().cumsum(0)
     # Inverse of the cumulative sum: pixel p is drawn with probability e_p^2 / sum e^2.
     drawn = torch.rand(count, dtype=torch.float64, device=worth.device) * worth[-1]
-    pixels = torch.unique(torch.searchsorted(worth, drawn, right=True))
-    pixels = pixels[(pixels < len(d)) & (worth[-1] > 0)]
+    pixels = torch.searchsorted(worth, drawn, right=True).sort().values
+    valid = (pixels < len(d)) & (worth[-1] > 0)
+    valid[1:] &= pixels[1:] != pixels[:-1]
+    pixels = pixels.clamp(max=len(d) - 1)
     d = d[pixels]
     return {
+        "valid": valid,
         "means": _unproject(view, pixels, d),
         "colors": photograph.reshape(-1, 3)[pixels],
         "depths": d,
@@ -73,16 +80,16 @@ def _unproject(
     """The pixels' centres in the training frame: x = R^T (d K^-1 (u, v, 1) - t)."""
     u = (pixels % view.width + 0.5 - float(view.K[0, 2])) / float(view.K[0, 0])
     v = (pixels // view.width + 0.5 - float(view.K[1, 2])) / float(view.K[1, 1])
-    pose = torch.as_tensor(view.cam_from_world, dtype=torch.float64, device=d.device)
+    pose = camera_of(view, d.device).cam_from_world
     in_camera = torch.stack([u * d, v * d, d], dim=1).double()
     return ((in_camera - pose[:3, 3]) @ pose[:3, :3]).float()
 
 
-def join_candidates(first: Candidates | None, second: Candidates) -> Candidates:
-    """Both, in order."""
-    if first is None:
-        return second
-    return {name: torch.cat([first[name], second[name]]) for name in first}
+def join_candidates(draws: Sequence[Candidates]) -> Candidates:
+    """The valid candidates of all draws, in order."""
+    joined = {name: torch.cat([each[name] for each in draws]) for name in draws[0]}
+    valid = joined.pop("valid").nonzero().squeeze(1)  # a GPU is waited for once, not for each
+    return {name: values[valid] for name, values in joined.items()}
 
 
 @torch.no_grad()

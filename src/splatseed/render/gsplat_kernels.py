@@ -1,0 +1,124 @@
+"""gsplat's CUDA kernels: found or built before any work, once, whoever asks first.
+
+gsplat 1.5.3 compiles them when they are first called, through PyTorch's extension builder. Left to
+itself it says "disabled" without a toolkit and fails at the first render; two processes that build
+at once delete each other's files. Promise: after ``load_kernels`` gsplat renders, or there was one
+error that says what is missing. Builds wait for each other at a lock beside them.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import redirect_stdout
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+import torch
+from filelock import FileLock
+
+from splatseed.errors import MissingDependencyError
+from splatseed.progress import Progress, silent
+from splatseed.requirements import require
+
+__all__ = ["load_kernels"]
+
+BACKEND = "gsplat.cuda._backend"
+"""gsplat's module that loads or builds its kernels when it is imported."""
+BUILDING = "building gsplat's kernels, some minutes, once"
+
+
+def load_kernels(option: str, progress: Progress = silent) -> None:
+    """Make sure that gsplat can render on CUDA; builds its kernels the first time.
+
+    Args:
+        option: The option that chooses the CPU instead, for errors.
+        progress: Called with the stage of building.
+
+    Raises:
+        MissingDependencyError: gsplat is absent, or has no compiled kernels and they cannot be
+            built here.
+    """
+    if _are_loaded():
+        return
+    require("gsplat")
+    _find_tools()
+    missing = [] if find_spec("gsplat.csrc") else _missing_tools()  # csrc: they came compiled
+    if missing:
+        raise _cannot_build(f"no {', no '.join(missing)}", option)
+    root = _build_root()
+    root.mkdir(parents=True, exist_ok=True)
+    with FileLock(root / "gsplat_cuda.splatseed.lock"):
+        if not any(root.rglob("gsplat_cuda.so")):
+            progress(BUILDING, 0.0)
+        try:
+            with redirect_stdout(io.StringIO()):  # gsplat's own line belongs to no output of ours
+                import_module(BACKEND)
+        except (ImportError, OSError, RuntimeError) as error:
+            lines = [line for line in str(error).splitlines() if "error" in line.lower()]
+            told = (lines or [type(error).__name__])[0].strip()[:200]
+            raise _cannot_build(f"{told} (nvcc {_nvcc_release()})", option) from error
+    if not _are_loaded():
+        raise _cannot_build("kernels that gsplat could not load", option)
+
+
+def _are_loaded() -> bool:
+    return getattr(sys.modules.get(BACKEND), "_C", None) is not None
+
+
+def _find_tools() -> None:
+    """Let programs of this environment be found, ninja above all, which pip installs beside Python.
+
+    A venv's command that is called without activating the venv has them not on its path.
+    """
+    here = str(Path(sys.executable).parent)
+    if here not in os.environ.get("PATH", "").split(os.pathsep):
+        os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", ""), here])
+
+
+def _missing_tools() -> list[str]:
+    """What a build needs and does not find."""
+    compiler = os.environ.get("CXX", "cl" if os.name == "nt" else "g++")
+    tools = {"nvcc": _nvcc(), compiler: shutil.which(compiler), "ninja": shutil.which("ninja")}
+    return [name for name, path in tools.items() if path is None]
+
+
+def _nvcc() -> str | None:
+    """Where gsplat finds nvcc: in CUDA's folder, else on the path."""
+    from torch.utils import cpp_extension  # noqa: PLC0415  (slow to import, for builds only)
+
+    home = cpp_extension.CUDA_HOME or os.environ.get("CUDA_HOME")
+    beside = Path(home, "bin", "nvcc.exe" if os.name == "nt" else "nvcc") if home else None
+    return str(beside) if beside and beside.is_file() else shutil.which("nvcc")
+
+
+def _nvcc_release() -> str:
+    """The release of the toolkit, such as 12.8; ``?`` if nvcc does not say."""
+    command = [_nvcc() or "nvcc", "--version"]
+    try:
+        said = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603  (as found)
+    except (OSError, subprocess.CalledProcessError):
+        return "?"
+    return said.stdout.partition("release ")[2].partition(",")[0] or "?"
+
+
+def _build_root() -> Path:
+    """The folder in which PyTorch builds extensions."""
+    from torch.utils import cpp_extension  # noqa: PLC0415  (slow to import, for builds only)
+
+    return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or cpp_extension.get_default_build_root())
+
+
+def _cannot_build(found: str, option: str) -> MissingDependencyError:
+    version = torch.version.cuda
+    toolkit = f"the CUDA toolkit {version}" if version else "the CUDA toolkit of PyTorch's release"
+    return MissingDependencyError(
+        "gsplat's compiled kernels, or nvcc, a C++ compiler and ninja to build them",
+        found=found,
+        fix=f"Install {toolkit}, which PyTorch was built with, and g++ (ninja comes with gsplat), "
+        f"or pass {option} cpu.",
+    )
