@@ -69,14 +69,18 @@ def _blur(planes: Float[Tensor, "P 3 H W"]) -> Float[Tensor, "P 3 H-10 W-10"]:
     """Windowed means where the window fits entirely."""
     across, down = _window(planes.device)
     columns = conv2d(planes.flatten(0, 1).unsqueeze(1), down)
-    return conv2d(columns, across).view(*planes.shape[:2], *(n - WINDOW + 1 for n in planes.shape[2:]))
+    return conv2d(columns, across).view(
+        *planes.shape[:2], *(n - WINDOW + 1 for n in planes.shape[2:])
+    )
 
 
 def _spread(maps: Float[Tensor, "P 3 h w"]) -> Float[Tensor, "P 3 h+10 w+10"]:
     """The transpose of ``_blur``."""
     across, down = _window(maps.device)
     rows = conv_transpose2d(maps.flatten(0, 1).unsqueeze(1), across)
-    return conv_transpose2d(rows, down).view(*maps.shape[:2], *(n + WINDOW - 1 for n in maps.shape[2:]))
+    return conv_transpose2d(rows, down).view(
+        *maps.shape[:2], *(n + WINDOW - 1 for n in maps.shape[2:])
+    )
 
 
 @lru_cache

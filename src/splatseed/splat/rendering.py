@@ -107,9 +107,10 @@ def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
 
 def pixels_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
     """The view's photograph in bytes."""
-    # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be. From pinned
-    # memory the GPU fetches it while it works on earlier steps.
-    pixels = torch.tensor(view.photograph, pin_memory=device.type == "cuda")
+    # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be.
+    pixels = torch.tensor(view.photograph)
+    if device.type == "cuda":  # from pinned memory a GPU fetches it while it works on earlier steps
+        pixels = pixels.pin_memory()
     return pixels.to(device, non_blocking=True)
 
 

@@ -1,0 +1,270 @@
+"""Training on a pretended GPU beside the CPU; ``test_pretended_gpu`` runs this in its own process.
+
+Held here: every operator's device, what gsplat's kernels check, optimisers and strategies while
+Gaussians come and go, checkpoints across devices, the waits of a step, TF32, and what a user reads
+when memory or the toolkit is missing.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import types
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import pretend_cuda as pc  # before PyTorch
+
+import fake_gsplat
+
+fake_gsplat.install()
+
+import numpy as np
+import pytest
+import torch
+
+from splatseed.errors import MissingDependencyError, PointCloudError
+from splatseed.evaluate import evaluate_views
+from splatseed.evaluate.images import l1_and_ssim_by_convolution, ssim_of_all
+from splatseed.io import load_scene
+from splatseed.render import gsplat_kernels
+from splatseed.synthetic import make_capture, write_capture
+from splatseed.train import TrainSettings, losses, photographs, prepare_run, trainer
+from splatseed.train.run import RunOptions
+
+STEPS = 16
+VIEWS = 7
+"""Training views: 9 less two test views."""
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("room")
+    capture = make_capture(0, num_views=VIEWS + 2, width=64, height=48)
+    return load_scene(write_capture(capture, folder / "room"))
+
+
+@pytest.fixture(autouse=True)
+def few_records(monkeypatch):
+    monkeypatch.setattr(trainer, "TESTS", 1)
+    monkeypatch.setattr(trainer, "RECORDS", 2)
+
+
+def _begin(room, output, strategy, backend, max_steps=STEPS, **ways):
+    settings = TrainSettings(strategy=strategy, backend=backend, max_steps=max_steps, cap_max=400)
+    return prepare_run(
+        room, output, settings, RunOptions(depths=output.parent / "depths.npz", **ways)
+    )
+
+
+def _waits():
+    """What waited for the GPU, but for gsplat's own code: by kind and place."""
+    ours = {key: n for key, n in pc.WHERE.items() if not key[1].startswith("gsplat/")}
+    return {key: n for key, n in ours.items() if key[0] not in {"queued copy", "isect: item"}}
+
+
+@pytest.mark.parametrize("strategy", ["default", "mcmc", "grow", "default-3dgs"])
+def test_a_run_on_cuda_takes_the_steps_of_the_cpu(room, tmp_path, strategy):
+    cpu = _begin(room, tmp_path / "cpu", strategy, "cpu")
+    cpu.train()
+    with pc.pretended_gpu():
+        gpu = _begin(room, tmp_path / "cuda", strategy, "cuda")
+        gpu.train()
+        assert all(each.is_cuda for each in gpu.state.params.values())
+        scores = gpu.finish(evaluate_views).scores
+    ours, theirs = ([r.num_gaussians for r in run.state.records] for run in (gpu, cpu))
+    np.testing.assert_allclose(ours, theirs, rtol=0.01)  # a gradient on the threshold
+    ours, theirs = ([r.loss for r in run.state.records] for run in (gpu, cpu))
+    np.testing.assert_allclose(ours, theirs, rtol=2e-3)
+    assert scores.psnr == pytest.approx(cpu.finish(evaluate_views).scores.psnr, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "held"), [("default", True), ("mcmc", True), ("grow", True), ("none", False)]
+)
+def test_a_step_does_not_wait_for_the_gpu(room, tmp_path, monkeypatch, strategy, held):
+    """Once each view was shown, but for rounds, which look at how many Gaussians they change."""
+    if not held:
+        monkeypatch.setattr(photographs, "SHARE", 0.0)
+    waits = {}
+
+    def count(step):
+        waits[step] = _waits()
+        pc.WHERE.clear()
+        if step == 3 * VIEWS:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pc.pretended_gpu():
+        run = _begin(room, tmp_path / "run", strategy, "cuda", max_steps=3000)
+        every = run.settings.schedule.refine_every
+        pc.WHERE.clear()
+        assert not run.train(count)
+    plain = [step for step in waits if step > VIEWS and (step - 1) % every]
+    assert len(plain) > VIEWS
+    assert {step: waits[step] for step in plain} == {step: {} for step in plain}
+
+
+@pytest.mark.parametrize(
+    ("strategy", "order"),
+    [("default", ("cpu", "cuda")), ("mcmc", ("cuda", "cpu")), ("grow", ("cuda", "cpu"))],
+)
+def test_a_checkpoint_goes_on_on_the_other_device(room, tmp_path, strategy, order):
+    def stop(step):
+        if step == STEPS // 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pc.pretended_gpu():
+        first = _begin(room, tmp_path / "run", strategy, order[0])
+        assert not first.train(stop)
+        then = _begin(room, tmp_path / "run", strategy, order[1], resume=True)
+        assert then.state.step == STEPS // 2
+        assert then.train()
+        assert then.trainer.device.type == order[1]
+        for optimizer in then.state.optimizers.values():
+            moments = [v for s in optimizer.state.values() for k, v in s.items() if k != "step"]
+            assert {each.device.type for each in moments} == {order[1]}
+
+
+@pytest.mark.parametrize("during", ["render", "optimize"])
+def test_the_end_of_memory_is_told_and_keeps_the_last_whole_step(
+    room, tmp_path, monkeypatch, during
+):
+    """A step cut off in its middle is not kept; the checkpoint before it is."""
+    calls = []
+
+    def fails(*given):
+        calls.append(given)
+        if len(calls) == 6:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+        return work(*given)
+
+    name = {"render": "photometric_loss", "optimize": "optimize"}[during]
+    work = getattr(trainer, name)
+    with pc.pretended_gpu():
+        run = _begin(room, tmp_path / "run", "default", "cuda")
+        monkeypatch.setattr(trainer, name, fails)
+        kept = 5 if during == "render" else 0
+        with pytest.raises(PointCloudError, match=f"as of step {kept} is kept") as caught:
+            run.train()
+        assert f"--cap-max {round(0.8 * run.count())}" in caught.value.fix
+        monkeypatch.undo()
+        monkeypatch.setattr(trainer, "TESTS", 1)
+        again = _begin(room, tmp_path / "run", "default", "cuda", resume=True)
+        assert again.state.step == kept
+        assert again.train()
+
+
+def test_memory_that_ends_before_the_first_step_leaves_no_folder(room, tmp_path, monkeypatch):
+    def fails(*_):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr(trainer, "photometric_loss", fails)
+    with pc.pretended_gpu(), pytest.raises(PointCloudError, match="--cap-max"):
+        _begin(room, tmp_path / "run", "default", "cuda")
+    assert not (tmp_path / "run").exists()
+
+
+def test_without_a_toolkit_one_error_comes_before_any_work(room, tmp_path, monkeypatch):
+    monkeypatch.delitem(sys.modules, gsplat_kernels.BACKEND)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    for name in ("CUDA_HOME", "CUDA_PATH", "CXX"):
+        monkeypatch.delenv(name, raising=False)
+    stages = []
+    settings = TrainSettings(backend="cuda", max_steps=STEPS, seeding="auto")
+    with pc.pretended_gpu(), pytest.raises(MissingDependencyError) as caught:
+        prepare_run(room, tmp_path / "run", settings, progress=lambda s, _: stages.append(s))
+    assert "g++" in caught.value.found
+    assert "ninja" not in caught.value.found  # it lies beside this Python, not on the path
+    assert "--backend cpu" in caught.value.fix
+    assert not stages
+    assert not (tmp_path / "run").exists()
+
+
+def test_memory_counts_what_the_next_render_takes_again(monkeypatch):
+    from splatseed.train.device import Capacity, free_bytes
+
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (3 << 30, 24 << 30))
+    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda *_: 10 << 30)
+    monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda *_: 8 << 30)
+    assert free_bytes(pc.GPU) == 5 << 30  # 3 unreserved, 2 in blocks that no step has used
+    capacity = Capacity(None, pc.GPU)
+    assert capacity.limit(1000, 10**9) == capacity.held_at == 1000 + (5 << 30) // 2000
+
+
+def _pair():
+    rng = np.random.default_rng(0)
+    ramps = np.linspace(0.2, 0.9, 40)[:, None, None], np.linspace(0.5, 1, 31)[:, None]
+    x = (ramps[0] * ramps[1] * np.ones(3)).astype(np.float32)
+    y = np.clip(x + rng.normal(0, 0.03, x.shape), 0, 1).astype(np.float32)
+    return torch.from_numpy(x), torch.from_numpy(y)
+
+
+def _loss(x, y):
+    x = x.clone().requires_grad_()
+    value = losses.photometric_loss(x, y)
+    value.backward()
+    return float(value.detach()), x.grad.cpu()
+
+
+def test_the_loss_on_cuda_is_that_of_the_cpu_whatever_tf32_does():
+    x, y = _pair()
+    value, gradient = _loss(x, y)
+    assert torch.backends.cudnn.allow_tf32  # PyTorch's default
+    with pc.pretended_gpu():
+        found, found_gradient = _loss(x.to("cuda"), y.to("cuda"))
+        scored = ssim_of_all(x.to("cuda"), y.to("cuda"))
+    assert torch.backends.cudnn.allow_tf32
+    assert found == pytest.approx(value, rel=1e-5)
+    assert scored == pytest.approx(ssim_of_all(x, y), abs=1e-5)
+    torch.testing.assert_close(found_gradient, gradient, rtol=1e-3, atol=1e-7)
+
+
+def test_tf32_would_have_been_noticed(monkeypatch):
+    from contextlib import nullcontext
+
+    x, y = _pair()
+    monkeypatch.setattr(torch.backends.cudnn, "flags", lambda **_: nullcontext())
+    with pc.pretended_gpu():
+        ssim = l1_and_ssim_by_convolution(x.to("cuda"), y.to("cuda"), 0.0, 1.0)[1]
+    assert abs(float(ssim.cpu()) - ssim_of_all(x, y)) > 1e-3
+
+
+def test_the_loss_takes_few_operators():
+    x, y = _pair()
+    with pc.pretended_gpu():
+        x, y = x.to("cuda"), y.to("cuda")
+        _loss(x, y)  # the window is copied once
+        pc.COUNTS.clear()
+        x.requires_grad_()
+        losses.photometric_loss(x, y).backward()
+    assert pc.COUNTS["launch"] <= 80  # of them about half are views, which launch nothing
+
+
+def test_fused_ssim_is_taken_where_it_is_installed(monkeypatch):
+    calls = []
+
+    def fused_ssim(x, y, padding):
+        calls.append((tuple(x.shape), x.is_contiguous(), padding))
+        return (x - y).mean()
+
+    module = types.SimpleNamespace(fused_ssim=fused_ssim)
+    monkeypatch.setitem(sys.modules, "fused_ssim", module)
+    losses._fused_ssim.cache_clear()
+    x, y = _pair()
+    with pc.pretended_gpu():
+        found, _ = _loss(x.to("cuda"), y.to("cuda"))
+    losses._fused_ssim.cache_clear()
+    assert calls == [((1, 3, 40, 31), True, "valid")]
+    expected = 0.8 * (x - y).abs().mean() + 0.2 * (1 - (x - y).mean())
+    assert found == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_mixing_devices_is_noticed():
+    with pc.pretended_gpu():
+        gpu = torch.zeros(3, device="cuda")
+        with pytest.raises(RuntimeError, match="same device"):
+            gpu + torch.ones(3)
+        with pytest.raises(TypeError, match="convert cuda:0"):
+            gpu.numpy()
