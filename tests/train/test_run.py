@@ -395,6 +395,21 @@ def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(begin, monkeypatch):
         begin(backend="cuda")
 
 
+def test_a_distorted_lens_is_refused_before_seeds_are_made(room, tmp_path, monkeypatch):
+    monkeypatch.setattr(run_module, "seeded", None)
+    bent = [
+        dataclasses.replace(
+            image,
+            intrinsics=dataclasses.replace(
+                image.intrinsics, model="OPENCV", params=(*image.intrinsics.params, 0.1, 0, 0, 0)
+            ),
+        )
+        for image in room.images
+    ]
+    with pytest.raises(SceneFormatError, match="splatseed undistort"):
+        prepare_run(room.replace(images=tuple(bent)), tmp_path / "run", TrainSettings())
+
+
 def test_a_disk_that_is_full_among_the_results_leaves_none(begin, monkeypatch):
     run = begin(max_steps=30)
     run.train()
