@@ -270,10 +270,23 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(room, tmp_path,
 
 def test_previews_show_something(room, tmp_path, splatseed):
     out = tmp_path / "out"
-    run = splatseed("upsample", room, "-o", out, "--preview")
+    run = splatseed("upsample", room, "-o", out, "--preview", "--preview-methods")
     for name in ("preview.png", "preview_methods.png", "preview_maps.png"):
         assert str(out / name) in run.out
         _assert_drawn(out / name)
+
+
+def test_a_preview_runs_the_method_asked_for_and_no_other(room, tmp_path, splatseed, monkeypatch):
+    def runs(self, *_):
+        raise AssertionError(type(self))
+
+    for other in ("linear", "voronoi", "cover", "stereo", "auto"):
+        monkeypatch.setattr(METHODS[other], "__call__", runs)
+    out = tmp_path / "out"
+    run = splatseed("upsample", room, "--method", "mls", "-o", out, "--preview")
+    assert (run.code, run.err) == (0, "")
+    _assert_drawn(out / "preview.png")
+    assert not (out / "preview_methods.png").exists()
 
 
 def test_only_methods_that_begin_with_stereo_show_its_maps(room, tmp_path, splatseed):
@@ -368,5 +381,5 @@ def test_photographs_without_points_are_seeded_and_drawn(room, tmp_path, splatse
     run = splatseed("upsample", bare, "--preview", "-o", out)
     assert (run.code, run.err) == (0, "")
     assert len(load_scene(out).points) > 500
-    pictures = ("", "_methods", "_origins", "_cells", "_maps")
+    pictures = ("", "_origins", "_cells", "_maps")
     assert all((out / f"preview{name}.png").stat().st_size > 5000 for name in pictures)

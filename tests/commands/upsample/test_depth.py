@@ -161,8 +161,8 @@ def test_previews_show_depth_where_there_is_some(room, tmp_path, splatseed, monk
     monkeypatch.setattr(
         preview, "preview_methods", lambda _s, clouds, _p: shown.append(set(clouds))
     )
-    splatseed("upsample", room, "-o", tmp_path / "a", "--preview")
-    upsample(splatseed, room, tmp_path / "b", "--depth", room, "--preview")
+    splatseed("upsample", room, "-o", tmp_path / "a", "--preview-methods")
+    upsample(splatseed, room, tmp_path / "b", "--depth", room, "--preview-methods")
     assert shown[1] - shown[0] == {"depth"}
 
 

@@ -28,7 +28,7 @@ from splatseed.commands.upsample.flags import (
 from splatseed.commands.upsample.output import (
     PICTURES,
     summarise,
-    write_map_preview,
+    write_methods_preview,
     write_previews,
 )
 from splatseed.commands.upsample.plan_line import (
@@ -143,7 +143,9 @@ class Options:
     tile_points: Annotated[int | None, number_flag(int, "by the memory")] = None
     """Most points in a tile."""
     preview: bool = False
-    """Also write pictures: before and after, every method, origins, cells covered, stereo maps."""
+    """Also write pictures: before and after, origins, cells covered, the method's stereo maps."""
+    preview_methods: bool = False
+    """Also run every other method that fits the scene, and write a picture of all side by side."""
     gaussians: Annotated[
         Path | None, tyro.conf.arg(constructor=Path, help_behavior_hint="(default: none)")
     ] = None
@@ -309,11 +311,14 @@ def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
             notes.append(f"The initial Gaussians are in {visible(options.gaussians)}.")
         if options.preview:
             write_previews(
+                scene, seeds, options.method, method, options.seed, options.output, clock
+            )
+        if options.preview_methods:
+            write_methods_preview(
                 scene, seeds, total, methods, options.method, options.seed, options.output, clock
             )
-            write_map_preview(scene, method, options.seed, options.output, clock)
         seconds = clock.seconds()
-    files = {"alignment": brought.aligned, "pictures": PICTURES if options.preview else ()}
+    files = {"alignment": brought.aligned, "pictures": PICTURES}
     summarise(options.scene, scene, seeds, report, seconds, checks, options.output, files)
     for sentence in notes:
         print_note(sentence)
@@ -451,7 +456,7 @@ def _announce(
 
 def _idle(options: Options, methods: dict[str, Upsampler]) -> list[str]:
     """Methods whose flags were changed although they are not used."""
-    if options.preview:  # previews draw all methods
+    if options.preview_methods:  # which draws all of them
         return []
     plain = {name: configure(name, options.profile) for name in methods}
     changed = {name for name in methods if methods[name] != plain[name]}

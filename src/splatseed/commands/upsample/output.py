@@ -20,21 +20,63 @@ from splatseed.seeding.upsampling import CELL
 from splatseed.upsample import Upsampler, chooses_number, methods_for, upsample
 from splatseed.upsample.registry import origin_name
 
-__all__ = ["PICTURES", "summarise", "write_map_preview", "write_previews"]
+__all__ = ["PICTURES", "summarise", "write_methods_preview", "write_previews"]
 
-MAPS = "preview_maps.png"
-PICTURES = (
+PAIR, ALL, ORIGINS, CELLS, MAPS = PICTURES = (
     "preview.png",
     "preview_methods.png",
     "preview_origins.png",
     "preview_cells.png",
-    MAPS,
+    "preview_maps.png",
 )
 PHOTOGRAPHS_SHOWN = 4
 """Methods whose cells and maps are drawn."""
 
 
 def write_previews(
+    scene: Scene,
+    seeds: PointCloud,
+    name: str,
+    method: Upsampler,
+    seed: int,
+    folder: Path,
+    clock: StageClock,
+) -> None:
+    """Draw before and after; with photographs also origins, covered cells and stereo's maps.
+
+    Args:
+        scene: The scene, with the originals that were used.
+        seeds: The points that were written.
+        name: The name of the method that made them.
+        method: That method.
+        seed: The seed that was used.
+        folder: Where the pictures go.
+        clock: Told the stages.
+    """
+    from splatseed.preview import (  # noqa: PLC0415  (Pillow)
+        preview_maps,
+        preview_origins,
+        preview_pair,
+    )
+
+    clock("preview", 0.0)
+    preview_pair(scene, seeds, folder / PAIR, title=name)
+    if scene.has_photographs:
+        clock("preview", 0.4)
+        preview_origins(scene, seeds, folder / ORIGINS)
+        clock("preview", 0.6)
+        _draw_cells(scene, seeds, folder / CELLS)
+    if isinstance(method, Stereo):
+        shown = _some_of(photographed(scene, method.hold_out))
+        # Recomputed for the few that are shown: keeping all maps would take as much memory as the
+        # views.
+        maps = method.maps(scene, shown, seed, clock)
+        clock("preview", 0.9)
+        preview_maps(scene, maps, folder / MAPS)
+    clock("preview", 1.0)
+
+
+def write_methods_preview(
     scene: Scene,
     seeds: PointCloud,
     total: int | None,
@@ -44,7 +86,7 @@ def write_previews(
     folder: Path,
     clock: StageClock,
 ) -> None:
-    """Draw before and after, and every method; with photographs, origins and covered cells too.
+    """Run the scene's other methods too, and draw all of them side by side.
 
     Args:
         scene: The scene, with the originals that were used.
@@ -53,14 +95,10 @@ def write_previews(
         methods: All methods, with their parameters.
         method: The one that made ``seeds``.
         seed: The seed that was used.
-        folder: Where the pictures go.
+        folder: Where the picture goes.
         clock: Told the stages.
     """
-    from splatseed.preview import (  # noqa: PLC0415  (Pillow)
-        preview_methods,
-        preview_origins,
-        preview_pair,
-    )
+    from splatseed.preview import preview_methods  # noqa: PLC0415  (Pillow)
 
     clouds = {}
     for name in dict.fromkeys((*methods_for(scene), method)):
@@ -74,13 +112,7 @@ def write_previews(
                 scene, methods[name], num_points=number, seed=seed, progress=clock
             )
     clock("preview", 0.0)
-    preview_pair(scene, seeds, folder / PICTURES[0], title=method)
-    clock("preview", 0.5)
-    preview_methods(scene, clouds, folder / PICTURES[1])
-    if scene.has_photographs:
-        clock("preview", 0.7)
-        preview_origins(scene, seeds, folder / PICTURES[2])
-        _draw_cells(scene, seeds, folder / PICTURES[3])
+    preview_methods(scene, clouds, folder / ALL)
     clock("preview", 1.0)
 
 
@@ -98,30 +130,6 @@ def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
         for view, old, new in zip(views, before, after, strict=True)
     ]
     preview_cells(shown, path)
-
-
-def write_map_preview(
-    scene: Scene, method: Upsampler, seed: int, folder: Path, clock: StageClock
-) -> None:
-    """Draw stereo's maps of some photographs, if the method begins with stereo.
-
-    Args:
-        scene: The scene as the method got it.
-        method: The method that was used.
-        seed: The seed that was used.
-        folder: Where the picture goes.
-        clock: Told the stages.
-    """
-    from splatseed.preview import preview_maps  # noqa: PLC0415  (Pillow)
-
-    if isinstance(method, Stereo):
-        shown = _some_of(photographed(scene, method.hold_out))
-        # Recomputed for the few that are shown: keeping all maps would take as much memory as the
-        # views.
-        maps = method.maps(scene, shown, seed, clock)
-        clock("preview", 0.9)
-        preview_maps(scene, maps, folder / MAPS)
-        clock("preview", 1.0)
 
 
 def _some_of(images: Sequence[Image]) -> list[int]:

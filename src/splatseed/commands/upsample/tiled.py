@@ -50,7 +50,16 @@ MEMORY = 4 << 30
 """Bytes that may be used where neither user nor system says."""
 READ = 2.5
 """Bytes that a scene takes for each byte of COLMAP's files."""
-WHOLE = ("budget", "cover_cell", "verify", "preview", "gaussians", "depth_maps", "cloud_files")
+WHOLE = (
+    "budget",
+    "cover_cell",
+    "verify",
+    "preview",
+    "preview_methods",
+    "gaussians",
+    "depth_maps",
+    "cloud_files",
+)
 """Options that need all points in memory."""
 
 
