@@ -73,7 +73,6 @@ REFUSED: dict[str, dict[str, Any]] = {
         "colors": (torch.zeros(N, 1, 3), np.zeros((N, 3, 3), np.float32)),
     },
     "absgrad of five channels": {"absgrad": True, "colors": torch.zeros(N, 5), "backgrounds": None},
-    "batches": {"means": torch.zeros(1, N, 3)},
 }
 
 

@@ -1,13 +1,15 @@
 """The ``info`` of ``rasterization``: gsplat's dictionary, with its costly entries computed lazily.
 
-Notation: N Gaussians, C cameras, G = C N, or if packed the number of visible ones, camera by
-camera. Promise: gsplat 1.5.3's keys, shapes and types; a training step does not pay for the lists
-of intersections, which are made when one of them is first read.
+Notation: N Gaussians, C cameras, B batches, I = B C images, batch by batch; G = I N, or if packed
+the number of visible ones, image by image. Promise: gsplat 1.5.3's keys, shapes and types; a
+training step does not pay for the lists of intersections, which are made when one of them is first
+read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -47,6 +49,11 @@ class Info(dict[str, Any]):
     ``in``, ``len``, ``keys()`` and printing know all names and make nothing; whatever returns an
     entry makes it, and so does copying the dictionary.
     """
+
+    def __init__(self, batch: tuple[int, ...], entries: Mapping[str, Any]) -> None:
+        """Entries by name, of scenes with these batch dimensions."""
+        super().__init__(entries)
+        self.batch = batch
 
     def __getitem__(self, name: str) -> Any:
         if super().__getitem__(name) is _Wait.UNTIL_READ:
@@ -99,52 +106,76 @@ class Info(dict[str, Any]):
 
     def _intersections(self) -> Intersections:
         """The intersections of the Gaussians in the order listed here."""
-        depths, cameras = self["depths"], self["camera_ids"]
-        if cameras is None:
-            cameras = torch.arange(len(depths)).repeat_interleave(depths.shape[1])
-        names = ("n_cameras", "width", "height", "tile_size")
+        depths = self["depths"]
+        images = self["n_batches"] * self["n_cameras"]
+        if self["camera_ids"] is None:
+            owners = torch.arange(images).repeat_interleave(depths.shape[-1])
+        else:
+            owners = self.image_ids()
+        sizes = (self[name] for name in ("width", "height", "tile_size"))
         made = intersect(
-            self["means2d"].reshape(-1, 2), self["radii"].reshape(-1, 2), depths.flatten(), cameras,
-            Grid(*(self[name] for name in names)),
+            self["means2d"].reshape(-1, 2), self["radii"].reshape(-1, 2), depths.flatten(), owners,
+            Grid(images, *sizes),
         )  # fmt: skip
-        return made._replace(tiles_per_gauss=made.tiles_per_gauss.view_as(depths))
+        return made._replace(
+            tiles_per_gauss=made.tiles_per_gauss.view_as(depths),
+            isect_offsets=made.isect_offsets.view(
+                *self.batch, self["n_cameras"], *made.isect_offsets.shape[1:]
+            ),
+        )
+
+    def image_ids(self) -> Tensor:
+        """The image of each packed Gaussian, [G]."""
+        ids: Tensor = self["batch_ids"] * self["n_cameras"] + self["camera_ids"]
+        return ids
 
 
 _LISTS = Intersections._fields
 
 
-def make_info(views: Sequence[View], packed: bool, width: int, height: int, tile_size: int) -> Info:
-    """The ``info`` of C cameras.
+def make_info(
+    views: Sequence[View],
+    batch: tuple[int, ...],
+    packed: bool,
+    width: int,
+    height: int,
+    tile_size: int,
+) -> Info:
+    """The ``info`` of I images.
 
     Args:
         views: The N Gaussians in each.
-        packed: Whether only visible Gaussians are listed, camera by camera; stacked otherwise.
+        batch: Batch dimensions, of product B.
+        packed: Whether only visible Gaussians are listed, image by image; stacked otherwise.
         width: Pixels.
         height: Pixels.
         tile_size: Side in pixels of the tiles in the lists.
     """
+    batches = math.prod(batch)
+    cameras = len(views) // batches
     grid = Grid(len(views), width, height, tile_size)
     return Info(
+        batch,
         {
-            **(_packed(views) if packed else _stacked(views)),
+            **(_packed(views, cameras) if packed else _stacked(views, (*batch, cameras))),
             "tile_width": grid.columns,
             "tile_height": grid.rows,
             **dict.fromkeys(_LISTS, _Wait.UNTIL_READ),
             "width": width,
             "height": height,
             "tile_size": tile_size,
-            "n_batches": 1,
-            "n_cameras": len(views),
-        }
+            "n_batches": batches,
+            "n_cameras": cameras,
+        },
     )
 
 
-def _packed(views: Sequence[View]) -> dict[str, Tensor]:
+def _packed(views: Sequence[View], cameras: int) -> dict[str, Tensor]:
     ids = [torch.nonzero(is_seen(view.radii))[:, 0] for view in views]
-    cameras = torch.cat([torch.full_like(each, c) for c, each in enumerate(ids)])
+    images = torch.cat([torch.full_like(each, image) for image, each in enumerate(ids)])
     entries = {
-        "batch_ids": torch.zeros_like(cameras),
-        "camera_ids": cameras,
+        "batch_ids": images // cameras,
+        "camera_ids": images % cameras,
         "gaussian_ids": torch.cat(ids),
     }
     for name in View._fields:
@@ -153,10 +184,11 @@ def _packed(views: Sequence[View]) -> dict[str, Tensor]:
     return entries
 
 
-def _stacked(views: Sequence[View]) -> dict[str, Tensor | None]:
-    """Camera by camera along a new axis; a single camera's entries are not copied."""
+def _stacked(views: Sequence[View], shape: tuple[int, ...]) -> dict[str, Tensor | None]:
+    """Image by image along axes of ``shape``; a single image's entries are not copied."""
     entries: dict[str, Tensor | None] = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
     for name in View._fields:
         tensors = [getattr(view, name) for view in views]
-        entries[name] = tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)
+        stacked = tensors[0][None] if len(tensors) == 1 else torch.stack(tensors)
+        entries[name] = stacked.view(*shape, *stacked.shape[1:])
     return entries

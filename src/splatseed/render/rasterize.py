@@ -8,7 +8,7 @@ distributed rendering, rolling shutter) is refused, never ignored.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -62,16 +62,20 @@ def rasterization(
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render N Gaussians into C pinhole cameras; differentiable.
 
+    "..." are batch dimensions, none or several, the same in all tensors: every batch has Gaussians
+    and cameras of its own.
+
     Args:
-        means: Centres, world, float32 [N, 3].
-        quats: wxyz rotations of any length but 0, [N, 4].
-        scales: Standard deviations (not their logarithms), [N, 3].
-        opacities: 0 to 1, [N].
-        colors: [N, D] or [C, N, D]; with ``sh_degree`` coefficients [N, K, 3] or [C, N, K, 3].
-            Beyond gsplat, the first coefficient [N, 1, 3] and the rest [N, K - 1, 3] may come as a
-            pair, as trainers keep them: joining them would take a quarter of a training step.
-        viewmats: cam_from_world, OpenCV axes, [C, 4, 4].
-        Ks: Pinhole matrices in px, [C, 3, 3].
+        means: Centres, world, float32 [..., N, 3].
+        quats: wxyz rotations of any length but 0, [..., N, 4].
+        scales: Standard deviations (not their logarithms), [..., N, 3].
+        opacities: 0 to 1, [..., N].
+        colors: [..., N, D] or [..., C, N, D]; with ``sh_degree`` coefficients [..., N, K, 3] or
+            [..., C, N, K, 3]. Beyond gsplat, the first coefficient [..., N, 1, 3] and the rest
+            [..., N, K - 1, 3] may come as a pair, as trainers keep them: joining them would take a
+            quarter of a training step.
+        viewmats: cam_from_world, OpenCV axes, [..., C, 4, 4].
+        Ks: Pinhole matrices in px, [..., C, 3, 3].
         width: Pixels.
         height: Pixels.
         near_plane: Smallest z.
@@ -81,22 +85,24 @@ def rasterization(
         sh_degree: Degree of spherical harmonics, 0 to 3; None uses colours directly.
         packed: Whether ``info`` lists visible Gaussians only; the image is the same.
         tile_size: Side in pixels of the tiles in ``info``'s lists; rendering uses tiles of its own.
-        backgrounds: Colours behind everything, [C, D].
+        backgrounds: Colours behind everything, [..., C, D].
         render_mode: Colour, depth accumulated (D) or expected (ED), or both.
         sparse_grad: Whether the gradients of means, quats and scales through projection are sparse
-            (COO) and list only the visible Gaussians; needs ``packed``. Means that also get a
-            gradient from the harmonics' directions have a dense one, as in gsplat.
+            (COO) and list only the visible Gaussians; needs ``packed`` and no batch dimensions.
+            Means that also get a gradient from the harmonics' directions have a dense one, as in
+            gsplat.
         absgrad: Whether ``info["means2d"].absgrad`` is set by backward.
         rasterize_mode: "antialiased" compensates opacities for the blur.
         channel_chunk: Accepted for compatibility with gsplat.
         unsupported: gsplat's further arguments; only their defaults are accepted.
 
     Returns:
-        Colours [C, H, W, D] (with depth as the last channel if requested), alphas [C, H, W, 1], and
-        ``info``, gsplat's dictionary: means2d, radii, depths, conics, opacities ([C, N, ...], or
-        for ``packed`` [G, ...] with batch_ids, camera_ids and gaussian_ids, otherwise None); width,
-        height, tile_size, tile_width, tile_height (in tiles), n_batches, n_cameras; and, made when
-        first read, tiles_per_gauss, isect_ids, flatten_ids, isect_offsets.
+        Colours [..., C, H, W, D] (with depth as the last channel if requested), alphas
+        [..., C, H, W, 1], and ``info``, gsplat's dictionary: means2d, radii, depths, conics,
+        opacities ([..., C, N, ...], or for ``packed`` [G, ...] with batch_ids, camera_ids and
+        gaussian_ids, otherwise None); width, height, tile_size, tile_width, tile_height (in tiles),
+        n_batches (all dimensions' product), n_cameras (of a batch); and, made when first read,
+        tiles_per_gauss, isect_ids, flatten_ids, isect_offsets [..., C, tile_height, tile_width].
 
     Raises:
         ParameterError: An argument that the CPU rasteriser does not support, or tensors that are
@@ -120,13 +126,12 @@ def rasterization(
 
         return on_cuda(  # type: ignore[no-any-return]  # gsplat is untyped
             means, quats, scales, opacities,
-            torch.cat(colors, dim=1) if isinstance(colors, tuple) else colors,
+            torch.cat(colors, dim=-2) if isinstance(colors, tuple) else colors,
             viewmats, Ks, width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree,
             packed, tile_size, backgrounds, render_mode,
             sparse_grad, absgrad, rasterize_mode, channel_chunk, **unsupported,
         )  # fmt: skip
     check_unsupported(unsupported)
-    check_sparse(sparse_grad, packed)
     check_numbers(
         width, height, tile_size, near_plane, eps2d, sh_degree,
         render_mode=(render_mode, RenderMode), rasterize_mode=(rasterize_mode, RasterizeMode),
@@ -137,22 +142,28 @@ def rasterization(
          "viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds},
         sh_degree,
     )  # fmt: skip
-    antialiased = rasterize_mode == "antialiased"
-    views = [
-        _project(
-            means, quats, scales, opacities, viewmats[camera],
-            Lens(_intrinsics(Ks[camera]), width, height, near_plane, far_plane, eps2d, radius_clip,
-                 antialiased),
-            sparse_grad,
-        )
-        for camera in range(len(viewmats))
-    ]  # fmt: skip
-    shades = [
-        _with_depth(_colors(means, colors, viewmats, camera, view, sh_degree), view, render_mode)
-        for camera, view in enumerate(views)
-    ]
+    batch = tuple(means.shape[:-2])
+    check_sparse(sparse_grad, packed, batch)
+    parts = colors if isinstance(colors, tuple) else (colors,)
+    views: list[View] = []
+    shades: list[Tensor] = []
+    for scene in _unbatched(batch, means, quats, scales, opacities, viewmats, Ks, *parts):
+        gaussians, poses, intrinsics = scene[:4], scene[4], scene[5]
+        projected = [
+            _project(
+                gaussians, poses[camera],
+                Lens(_intrinsics(intrinsics[camera]), width, height, near_plane, far_plane, eps2d,
+                     radius_clip, rasterize_mode == "antialiased"),
+                sparse_grad,
+            )
+            for camera in range(len(poses))
+        ]  # fmt: skip
+        for camera, view in enumerate(projected):
+            shade = _colors(scene[0], scene[6:], poses, camera, view, sh_degree)
+            shades.append(_with_depth(shade, view, render_mode))
+        views += projected
     check_absgrad(absgrad, shades[0].shape[1])
-    info = make_info(views, packed, width, height, tile_size)
+    info = make_info(views, batch, packed, width, height, tile_size)
     images, alphas = _blend(views, shades, info, _background(backgrounds, render_mode), absgrad)
     if render_mode in {"ED", "RGB+ED"}:
         # Accumulated depth is a sum of weights times z; divided by their sum it is the mean z.
@@ -161,21 +172,22 @@ def rasterization(
     return images, alphas, info
 
 
+def _unbatched(batch: tuple[int, ...], *tensors: Tensor) -> Iterable[tuple[Tensor, ...]]:
+    """One scene after the other: all tensors without their batch dimensions."""
+    if not batch:
+        return [tensors]
+    return zip(*(each.flatten(0, len(batch) - 1).unbind() for each in tensors), strict=True)
+
+
 def _intrinsics(K: Tensor) -> np.ndarray:
     return np.asarray(K.detach().to(torch.float32).contiguous().numpy())
 
 
-def _project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    viewmat: Tensor,
-    lens: Lens,
-    sparse: bool,
-) -> View:
+def _project(gaussians: Sequence[Tensor], viewmat: Tensor, lens: Lens, sparse: bool) -> View:
+    """Means, quats, scales and opacities in one camera."""
+    opacities = gaussians[3]
     radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
-        means, quats, scales, opacities, viewmat, lens, sparse
+        *gaussians, viewmat, lens, sparse
     )
     if lens.antialiased:
         opacities = opacities * compensations
@@ -184,14 +196,14 @@ def _project(
 
 def _colors(
     means: Tensor,
-    colors: Tensor | tuple[Tensor, Tensor],
+    colors: Sequence[Tensor],
     viewmats: Tensor,
     camera: int,
     view: View,
     sh_degree: int | None,
 ) -> Tensor:
-    """Colours of N Gaussians in one camera, [N, D]."""
-    base, rest = colors if isinstance(colors, tuple) else (colors, None)
+    """Colours of N Gaussians in one camera, [N, D]; ``colors`` is one tensor or a pair."""
+    base, rest = colors if len(colors) == 2 else (colors[0], None)
     if base.dim() == (3 if sh_degree is None else 4):
         base = base[camera]
     if sh_degree is None:
@@ -225,29 +237,34 @@ def _blend(
     backgrounds: Tensor | None,
     absgrad: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Images [C, H, W, D] and alphas [C, H, W, 1], by way of ``info["means2d"]``."""
-    means2d, ids = info["means2d"], info["gaussian_ids"]
+    """Images [..., C, H, W, D] and alphas [..., C, H, W, 1], by way of ``info["means2d"]``."""
+    means2d, ids, batch = info["means2d"], info["gaussian_ids"], info.batch
+    owners = None if ids is None else info.image_ids()
     if absgrad:
         means2d.absgrad = torch.zeros_like(means2d)
     images, alphas = [], []
-    for camera, (view, colors) in enumerate(zip(views, shades, strict=True)):
-        rows: Any = camera if ids is None else info["camera_ids"] == camera
+    places = np.ndindex(*batch, info["n_cameras"])
+    if backgrounds is not None:
+        backgrounds = backgrounds.reshape(len(views), -1)
+    for image, (place, view, colors) in enumerate(zip(places, views, shades, strict=True)):
+        rows: Any = place if owners is None else owners == image
         shapes: tuple[Tensor, ...] = (view.conics, colors, view.opacities)
         depths, radii = view.depths, view.radii
         if ids is not None:  # a full slice would be copied by backward
             each = ids[rows]
             shapes, depths, radii = tuple(t[each] for t in shapes), depths[each], radii[each]
-        image, alpha = Blend.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
+        pixels, alpha = Blend.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
             means2d[rows], *shapes,
-            None if backgrounds is None else backgrounds[camera],
+            None if backgrounds is None else backgrounds[image],
             depths, radii, info["width"], info["height"],
             partial(_keep_absgrad, means2d, rows) if absgrad else None,
         )  # fmt: skip
-        images.append(image)
+        images.append(pixels)
         alphas.append(alpha[..., None])
     # Copied even for one camera: backward reads the image, so in-place changes by the caller must
     # not reach it.
-    return torch.stack(images), torch.stack(alphas)
+    size = (*batch, info["n_cameras"], info["height"], info["width"], -1)
+    return torch.stack(images).view(size), torch.stack(alphas).view(size)
 
 
 def _keep_absgrad(means2d: Any, rows: Any, gradient: Tensor) -> None:

@@ -1,8 +1,9 @@
 """Checks of ``rasterization``'s arguments on the CPU; kernels rely on them to skip bounds checks.
 
-Notation: N Gaussians, C cameras, D channels, K coefficients a channel, as in ``rasterization``.
-Promise: whatever the kernels could not read, and whatever only gsplat's CUDA code does, raises one
-``ParameterError`` here; nothing is ignored and nothing is rendered first.
+Notation: N Gaussians, C cameras, D channels, K coefficients a channel, batch dimensions before all
+of them, as in ``rasterization``. Promise: whatever the kernels could not read, and whatever only
+gsplat's CUDA code does, raises one ``ParameterError`` here; nothing is ignored and nothing is
+rendered first.
 """
 
 from __future__ import annotations
@@ -114,50 +115,66 @@ def check_tensors(
         optional = each is None and name == "backgrounds"
         _require(fits or optional, f"{name} as a float32 tensor on the CPU, like means", each)
     shapes = {name: tuple(each.shape) for name, each in tensors.items() if each is not None}
-    n, cameras = shapes["means"][:1], shapes["viewmats"][:1]
-    _require(n, "means of shape [N, 3]", tensors["means"])
-    _require(cameras not in {(), (0,)}, "viewmats of at least one camera", tensors["viewmats"])
+    *batch, n, _ = shapes["means"] if len(shapes["means"]) > 1 else (0, 0, 0)
+    _require(0 not in batch, "means of shape [..., N, 3], no batch dimension 0", tensors["means"])
+    _check_shapes(
+        {"means": (*batch, n, 3), "quats": (*batch, n, 4), "scales": (*batch, n, 3),
+         "opacities": (*batch, n)},
+        tensors,
+    )  # fmt: skip
+    cameras = shapes["viewmats"][-3] if len(shapes["viewmats"]) == len(batch) + 3 else 0
+    like = _words(*batch, "C", 4, 4)
+    _require(cameras, f"viewmats of shape {like}, of at least one camera", tensors["viewmats"])
+    leading = (*batch, cameras)
     if isinstance(colors, tuple):
-        _check_pair(colors, n, sh_degree)
+        _check_pair(colors, (*batch, n), sh_degree)
     else:
-        _check_colors(colors, n, cameras, sh_degree)
-    channels = parts[0].shape[-1]
-    expected = {
-        "means": (*n, 3), "quats": (*n, 4), "scales": (*n, 3), "opacities": n,
-        "viewmats": (*cameras, 4, 4), "Ks": (*cameras, 3, 3), "backgrounds": (*cameras, channels),
-    }  # fmt: skip
+        _check_colors(colors, (*batch, n), (*leading, n), sh_degree)
+    _check_shapes(
+        {"viewmats": (*leading, 4, 4), "Ks": (*leading, 3, 3),
+         "backgrounds": (*leading, parts[0].shape[-1])},
+        tensors,
+    )  # fmt: skip
+
+
+def _check_shapes(
+    expected: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor | None]
+) -> None:
     for name, shape in expected.items():
-        fits = shapes.get(name, shape) == shape
-        _require(fits, f"{name} of shape {list(shape)}", tensors[name])
+        found = tensors[name]
+        fits = found is None or tuple(found.shape) == shape
+        _require(fits, f"{name} of shape {list(shape)}", found)
+
+
+def _words(*sizes: object) -> str:
+    return f"[{', '.join(map(str, sizes))}]"
 
 
 def _check_colors(
-    colors: Any, n: tuple[int, ...], cameras: tuple[int, ...], sh_degree: int | None
+    colors: Any, shared: tuple[int, ...], own: tuple[int, ...], sh_degree: int | None
 ) -> None:
     """Colours shared by the cameras or one set per camera: the number of axes decides."""
-    terms = 0 if sh_degree is None else (sh_degree + 1) ** 2
-    one, axes = ("D", 2) if sh_degree is None else (f"K >= {terms}, 3", 3)
     shape = tuple(colors.shape)
-    shared = shape[1:] if len(shape) == axes + 1 and shape[:1] == cameras else shape
-    fits = len(shared) == axes and shared[:1] == n and shared[-1] >= 1
-    if fits and sh_degree is not None:
-        fits = shared[1] >= terms and shared[2] == 3
-    sizes = f"N = {n[0]}, C = {cameras[0]}"
-    _require(fits, f"colors of shape [N, {one}] or [C, N, {one}] ({sizes})", colors)
+    if sh_degree is None:
+        fits, ends = shape[:-1] in {shared, own} and shape[-1] >= 1, ["D"]
+    else:
+        terms = (sh_degree + 1) ** 2
+        ends = [f"K >= {terms}", "3"]
+        fits = shape[:-2] in {shared, own} and shape[-2] >= terms and shape[-1] == 3
+    shapes = f"{_words(*shared, *ends)} or {_words(*own, *ends)}"
+    _require(fits, f"colors of shape {shapes}", colors)
 
 
-def _check_pair(colors: tuple[Tensor, ...], n: tuple[int, ...], sh_degree: int | None) -> None:
+def _check_pair(colors: tuple[Tensor, ...], shared: tuple[int, ...], sh_degree: int | None) -> None:
     """The first coefficient and the rest."""
-    degree = -1 if sh_degree is None else sh_degree
+    terms = 0 if sh_degree is None else sh_degree * (sh_degree + 2)
     base, *others = (tuple(part.shape) for part in colors)
-    fits = degree >= 0 and base == (*n, 1, 3) and len(others) == 1 and len(others[0]) == 3
+    fits = sh_degree is not None and base == (*shared, 1, 3) and len(others) == 1
     if fits:
-        terms = degree * (degree + 2)
-        fits = others[0][::2] == (*n, 3) and others[0][1] >= terms
-    expected = (
-        "with an sh_degree, a pair of colors of shapes [N, 1, 3] and [N, (sh_degree + 1)^2 - 1, 3]"
-    )
-    _require(fits, f"{expected} (N = {n[0]})", [base, *others])
+        rest = others[0]
+        fits = (*rest[:-2], *rest[-1:]) == (*shared, 3) and rest[-2] >= terms
+    shapes = f"{_words(*shared, 1, 3)} and {_words(*shared, f'K >= {terms}', 3)}"
+    _require(fits, f"with an sh_degree, a pair of colors of shapes {shapes}", [base, *others])
 
 
 def check_absgrad(absgrad: bool, channels: int) -> None:
@@ -170,13 +187,14 @@ def check_absgrad(absgrad: bool, channels: int) -> None:
     _require(not absgrad or channels <= CHANNELS, limit, channels)
 
 
-def check_sparse(sparse_grad: bool, packed: bool) -> None:
-    """Refuse sparse gradients without packing, as gsplat does.
+def check_sparse(sparse_grad: bool, packed: bool, batch: tuple[int, ...]) -> None:
+    """Refuse sparse gradients without packing or in batches, as gsplat does.
 
     Raises:
-        ParameterError: ``sparse_grad`` without ``packed``.
+        ParameterError: ``sparse_grad`` without ``packed``, or with batch dimensions.
     """
     _require(packed or not sparse_grad, "packed=True with sparse_grad=True", packed)
+    _require(not (sparse_grad and batch), "no batch dimensions with sparse_grad=True", list(batch))
 
 
 def _require(fits: object, expected: str, found: object) -> None:
