@@ -1,16 +1,12 @@
 """gsplat on CUDA and our CPU rasteriser on the same inputs: image, alpha and every gradient.
 
-Run on a machine with CUDA and gsplat 1.5.3::
+They agree where at most ``ODD_ONES`` of the entries differ by more than ``TOLERANCE`` of the
+largest. gsplat works in float32 with a fast exponential and adds gradients in any order; now and
+then a pixel falls on the other side of the cut-off at 1/255, hence the allowance. What ``grow``
+measures, each Gaussian's pixels and errors, is compared as well.
 
-    python benchmarks/gpu/compare_gsplat.py --golden tests/render/golden_gsplat.npz
-
-Prints, by case and array, the largest difference over the largest entry, and exits with 1 where
-more than ``ODD_ONES`` of the entries differ by more than ``TOLERANCE``. gsplat works in float32
-with a fast exponential and adds gradients in any order; now and then a pixel falls on the other
-side of the cut-off at 1/255, hence the allowance. ``--golden`` keeps the small cases, inputs and
-gsplat's results, for the tests of machines without a GPU.
-
-The golden file (.npz) holds float32 arrays ``case/inputs/NAME`` and ``case/outputs/NAME`` and, as
+The golden file (.npz) keeps the small cases, inputs and gsplat's results, for the tests of machines
+without a GPU: float32 arrays ``case/inputs/NAME`` and ``case/outputs/NAME`` and, as
 ``case/options``, the other arguments in JSON. Outputs are ``image``, ``alpha`` and ``d_NAME``, the
 gradient of sum (image - 0.3)^2 + sum (alpha - 0.5)^2; ``d_means2d`` and ``absgrad`` where not
 packed.
@@ -18,9 +14,7 @@ packed.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,11 +22,17 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from splatseed.errors import OutputError
 from splatseed.render import rasterization
+from splatseed.train.strategies.contributions import contributions
+from splatseed.views.view import View
+
+__all__ = ["ODD_ONES", "TOLERANCE", "compare"]
 
 TOLERANCE = 1e-3
 ODD_ONES = 1e-4
 MAX_GOLDEN_BYTES = 100_000
+CROWD_SIZE = (400, 300)
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")
 
 Arrays = dict[str, np.ndarray]
@@ -46,24 +46,36 @@ class Case(NamedTuple):
     golden: bool
 
 
-def main() -> int:
-    """Compare all cases; 0 if they agree, 1 if not, 2 without a GPU."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--golden", type=Path, help="write the small cases to this .npz")
-    arguments = parser.parse_args()
-    if not torch.cuda.is_available():
-        print("expected a CUDA device; found none. Run this on a machine with a GPU.")
-        return 2
-    agrees, kept = True, {}
-    for name, case in cases().items():
-        theirs = run(_gsplat(), case, "cuda")
-        ours = run(rasterization, case, "cpu")
-        agrees &= report(name, ours, theirs)
+def compare(crowd: int, golden: str | None) -> list[dict[str, Any]]:
+    """All cases: ``case``, ``worst`` array with its differences, and ``problem``, empty if none.
+
+    Args:
+        crowd: How many Gaussians the larger cases have.
+        golden: Where to keep the small cases, if anywhere.
+    """
+    found, kept = [], {}
+    for name, case in cases(crowd).items():
+        try:
+            theirs = run(_gsplat(), case, "cuda")
+            found.append(difference(name, run(rasterization, case, "cpu"), theirs))
+        except Exception as error:  # noqa: BLE001  (reported; the other cases go on)
+            found.append(_failed(name, error))
+            continue
         if case.golden:
             kept.update(_flat(name, case, theirs))
-    if arguments.golden:
-        _write(arguments.golden, kept)
-    return 0 if agrees else 1
+    try:
+        case = _case(8, n=crowd, size=CROWD_SIZE)
+        found.append(difference("contributions", _shares(case, "cpu"), _shares(case, "cuda")))
+    except Exception as error:  # noqa: BLE001  (likewise)
+        found.append(_failed("contributions", error))
+    if golden:
+        _write(Path(golden), kept)
+    return found
+
+
+def _failed(name: str, error: Exception) -> dict[str, Any]:
+    told = f"{name}: {type(error).__name__}: {error}"
+    return {"case": name, "worst": ["failed", "", ""], "problem": told}
 
 
 def _gsplat() -> Callable[..., Any]:
@@ -72,10 +84,10 @@ def _gsplat() -> Callable[..., Any]:
     return theirs  # type: ignore[no-any-return]  # gsplat is untyped
 
 
-def cases() -> dict[str, Case]:
+def cases(crowd_of: int) -> dict[str, Case]:
     """Small ones to keep, and crowds as training sees them."""
     small = {"n": 32, "size": (21, 13)}
-    crowd = {"n": 30_000, "size": (400, 300)}
+    crowd = {"n": crowd_of, "size": CROWD_SIZE}
     antialiased = {"rasterize_mode": "antialiased", "render_mode": "RGB+ED"}
     return {
         "degree 3": _case(0, **small, coefficients=16, sh_degree=3),
@@ -115,6 +127,8 @@ def _case(
         "Ks": np.tile([[width, 0, width / 2], [0, width, 0.45 * height], [0, 0, 1]], (2, 1, 1)),
         "backgrounds": rng.random((2, 3 if coefficients else channels)),
     }  # fmt: skip
+    if options.get("packed", True):
+        del arrays["backgrounds"]  # gsplat 1.5.3 refuses them with packed: it asserts another shape
     inputs = {name: array.astype(np.float32) for name, array in arrays.items()}
     return Case(inputs, {"width": width, "height": height, **options}, golden=n < 100)
 
@@ -130,13 +144,12 @@ def _viewmat(rng: np.random.Generator, distance: float) -> np.ndarray:
 def run(rasterize: Callable[..., Any], case: Case, device: str) -> Arrays:
     """Images, alphas and gradients of one case, as arrays."""
     tensors = {name: torch.from_numpy(array).to(device) for name, array in case.inputs.items()}
-    for name in INPUTS:
-        tensors[name].requires_grad_()
+    leaves = {name: tensors[name].requires_grad_() for name in INPUTS if name in tensors}
     image, alpha, info = rasterize(**tensors, **case.options)
     info["means2d"].retain_grad()
     ((image - 0.3).square().sum() + (alpha - 0.5).square().sum()).backward()
     results = {"image": image, "alpha": alpha}
-    results |= {f"d_{name}": tensors[name].grad for name in INPUTS}
+    results |= {f"d_{name}": leaf.grad for name, leaf in leaves.items()}
     if not case.options.get("packed", True):
         results["d_means2d"] = info["means2d"].grad
     if case.options.get("absgrad"):
@@ -144,16 +157,36 @@ def run(rasterize: Callable[..., Any], case: Case, device: str) -> Arrays:
     return {name: each.detach().cpu().numpy() for name, each in results.items()}
 
 
-def report(name: str, ours: Arrays, theirs: Arrays) -> bool:
-    """Print one line an array; whether all of them agree."""
-    agree = True
-    print(f"{name}\n  {'array':<16}{'largest':>10}{'beyond':>10}   (tolerance {TOLERANCE})")
+def _shares(case: Case, device: str) -> Arrays:
+    """Each Gaussian's pixels and errors in the case's first view; the error is a ramp over it."""
+    inputs = {name: torch.from_numpy(array).to(device) for name, array in case.inputs.items()}
+    params = {
+        "means": inputs["means"],
+        "quats": inputs["quats"],
+        "scales": inputs["scales"].log(),
+        "opacities": inputs["opacities"].logit(1e-4),
+    }
+    width, height = case.options["width"], case.options["height"]
+    pose, K = (case.inputs[name][0].astype(np.float64) for name in ("viewmats", "Ks"))
+    view = View("", np.empty((0, 0, 3), np.uint8), K, width, height, pose)
+    ramp = torch.linspace(0, 1, width, device=device).expand(height, -1).contiguous()
+    pixels, errors = contributions(params, view, ramp)
+    return {"pixels": pixels.cpu().numpy(), "errors": errors.cpu().numpy()}
+
+
+def difference(name: str, ours: Arrays, theirs: Arrays) -> dict[str, Any]:
+    """The array that differs most, and which have too many entries that do."""
+    odd, largest = {}, {}
     for key, expected in theirs.items():
         relative = np.abs(ours[key] - expected) / max(float(np.abs(expected).max()), 1e-12)
-        odd = float((~(relative <= TOLERANCE)).mean())
-        agree &= odd <= ODD_ONES
-        print(f"  {key:<16}{relative.max():>10.1e}{odd:>10.1e}{'' if odd <= ODD_ONES else '  !'}")
-    return agree
+        odd[key], largest[key] = float((~(relative <= TOLERANCE)).mean()), float(relative.max())
+    worst = max(theirs, key=lambda key: (odd[key], largest[key]))
+    wrong = ", ".join(f"{key} ({odd[key]:.1e})" for key in theirs if odd[key] > ODD_ONES)
+    return {
+        "case": name,
+        "worst": [worst, f"{largest[worst]:.1e}", f"{odd[worst]:.1e}"],
+        "problem": f"{name}: too many entries differ in {wrong}" if wrong else "",
+    }
 
 
 def _flat(name: str, case: Case, outputs: Arrays) -> dict[str, Any]:
@@ -167,11 +200,8 @@ def _flat(name: str, case: Case, outputs: Arrays) -> dict[str, Any]:
 
 def _write(path: Path, arrays: dict[str, Any]) -> None:
     np.savez_compressed(path, **arrays)
-    size = path.stat().st_size
-    print(f"wrote {path}, {size} bytes")
-    if size > MAX_GOLDEN_BYTES:
-        print(f"WARNING: more than {MAX_GOLDEN_BYTES} bytes is too much to keep with the tests")
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    if (size := path.stat().st_size) > MAX_GOLDEN_BYTES:
+        raise OutputError(
+            f"a golden file of at most {MAX_GOLDEN_BYTES:,} bytes, to keep with the tests",
+            found=f"{size:,}", fix="Make the small cases smaller.",
+        )  # fmt: skip
