@@ -39,7 +39,8 @@ Drawn = tuple[UInt8[np.ndarray, "H W 3"] | None, str]
 """A picture, or None and the reason why there is none."""
 NOTHING = "points only"
 MOST_MOVING = 250_000
-"""Gaussians rendered while a camera moves: projecting a million takes longer than all pixels."""
+"""Gaussians rendered while a camera moves, on the CPU: projecting a million takes longer there than
+all pixels. A GPU, which projects millions in milliseconds, renders all."""
 CELL = 8
 """Side in pixels of the cells that are tested for seeds."""
 PHOTOGRAPH_SIDE = 1600
@@ -75,9 +76,9 @@ class Entry:
 
     @cached_property
     def quick_renderer(self) -> ModelRenderer:
-        """A renderer of the most visible Gaussians, for moving cameras; of all if there are few."""
-        gaussians = self.shown.gaussians
-        if gaussians is None or len(gaussians) <= MOST_MOVING:
+        """A renderer for moving cameras, of the most visible Gaussians where all would be slow."""
+        gaussians, on_gpu = self.shown.gaussians, getattr(self._device, "type", "cpu") == "cuda"
+        if gaussians is None or on_gpu or len(gaussians) <= MOST_MOVING:
             return self.renderer
         return ModelRenderer(most_seen(gaussians, MOST_MOVING), self.frame, self._device)
 

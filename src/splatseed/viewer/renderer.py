@@ -60,7 +60,11 @@ class ModelRenderer:
             "scales": torch.exp(tensors["scales"] + math.log(frame.scale)),
             "opacities": torch.sigmoid(tensors["opacities"]),
         }
-        self._colors = (tensors["sh0"], tensors["shN"]) if self._degree else tensors["sh0"]
+        colors = (tensors["sh0"], tensors["shN"]) if self._degree else tensors["sh0"]
+        if isinstance(colors, tuple) and self._means.is_cuda:
+            # gsplat takes them joined, our own rasteriser in two: joined once, not for every frame.
+            colors = torch.cat(colors, dim=1)
+        self._colors = colors
 
     @torch.no_grad()
     def color(self, view: View) -> Float32[np.ndarray, "H W 3"]:
