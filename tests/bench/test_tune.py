@@ -162,6 +162,15 @@ def test_too_little_time_is_refused_before_anything_begins(scene_path, tmp_path,
     assert not list(tmp_path.iterdir())
 
 
+def test_ten_minutes_are_taken_and_told_before_anything_begins(
+    scene_path, tmp_path, here, splatseed
+):
+    here["most"] = 0
+    out = splatseed("tune", scene_path, "-o", tmp_path / "tuned").out
+    minutes = re.search(r"about (\d+) min in all \(--minutes\)", out)
+    assert 5 <= int(minutes[1]) <= 11
+
+
 def test_no_arm_has_more_than_growth_can_reach(scene_path, tmp_path, here, splatseed, monkeypatch):
     monkeypatch.setattr(tune, "_climb", lambda *_: True)
     words = ("--minutes", "999", "--budget", "99999", "-o", tmp_path / "tuned")

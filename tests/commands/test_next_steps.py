@@ -105,6 +105,20 @@ def test_info_advises_what_upsample_does(bent, tmp_path, monkeypatch, splatseed)
     assert lines_of(splatseed("info", bent).out) == [first]
 
 
+def test_a_scene_is_named_as_it_was_typed(own_room, tmp_path, monkeypatch, splatseed):
+    monkeypatch.chdir(own_room)
+    run = splatseed("upsample", ".", "--method", "mls", "-o", "../out")
+    ours, *others = run.out.partition("train it with\n")[2].splitlines()
+    assert ours.split()[1:] == ["splatseed", "train", "../out", "-o", "../out-run"]
+    assert others
+    assert all(str(tmp_path.resolve() / "out") in line for line in others)
+    monkeypatch.chdir(tmp_path / "out")  # "." has nothing that -run could be appended to
+    advised = lines_of(splatseed("info", ".").out)
+    assert ["train", ".", "-o", str(tmp_path.resolve() / "out") + "-run"] in [
+        words[:4] for words in advised
+    ]
+
+
 @pytest.mark.parametrize("kept", ["none", "some", "no folder"])
 def test_nothing_is_to_be_trained_without_its_photographs(kept, own_room, tmp_path, splatseed):
     images = own_room / "images"

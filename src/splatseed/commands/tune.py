@@ -80,8 +80,8 @@ class Options:
 
     scene: Annotated[Path, tyro.conf.Positional]
     """The scene, with photographs."""
-    minutes: float = 30.0
-    """Approximate time to take."""
+    minutes: float = 10.0
+    """Approximate time to take; more of it trains longer, and tells smaller differences apart."""
     output: Annotated[
         Path | None,
         tyro.conf.arg(
@@ -206,7 +206,7 @@ def _kept_if_begun(folder: Path) -> Iterator[None]:
 def _check(options: Options) -> None:
     check_least(options, 1, "max_steps", "long_side", "jobs", "threads")
     if not 0 < options.minutes < math.inf:
-        raise ParameterError("--minutes above 0", found=f"{options.minutes}", fix="Try 30.")
+        raise ParameterError("--minutes above 0", found=f"{options.minutes}", fix="Try 10.")
     for name, needed in (("methods", SFM), ("strategies", "default")):
         if needed not in getattr(options, name):
             raise ParameterError(
@@ -286,7 +286,7 @@ def _announce(study: _Study, rungs: Sequence[Rung]) -> None:
     OUT.print(
         f"{visible(facts.name)}: {facts.num_images} views that are not for the test, every "
         f"{TEST_EVERY}th held out; {facts.num_points:,} points\n  -> {steps}, the last twice\n  -> "
-        f"about {spoken_time(seconds)}; {study.machine.words}\n  -> {visible(study.folder)}",
+        f"about {spoken_time(seconds)} in all (--minutes); {study.machine.words}\n  -> {visible(study.folder)}",
         soft_wrap=True,
     )
     if study.budget != study.options.budget:

@@ -30,7 +30,7 @@ PAIR, ALL, ORIGINS, CELLS, MAPS = PICTURES = (
     "preview_maps.png",
 )
 PHOTOGRAPHS_SHOWN = 4
-"""Methods whose cells and maps are drawn."""
+"""Photographs whose cells and maps are drawn."""
 
 
 def write_previews(

@@ -238,7 +238,7 @@ def _check_options(options: Options, source: Source, in_memory: str) -> None:
     given = [name for name in WHOLE if getattr(options, name)]
     if given:
         flag = {"cover_cell": "cover", "depth_maps": "depth", "cloud_files": "cloud"}
-        names = ", ".join(f"--{flag.get(name, name)}" for name in given)
+        names = ", ".join(f"--{flag.get(name, name).replace('_', '-')}" for name in given)
         raise ParameterError(
             "no option that looks at all points at once while a cloud is worked on in tiles",
             found=names,

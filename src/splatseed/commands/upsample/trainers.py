@@ -61,17 +61,16 @@ def training_commands(
         >>> dict(training_commands(Path("/data/out"), "colmap"))["graphdeco"]
         'python train.py -s /data/out -m /data/out-graphdeco --eval'
     """
-    # Trainers are run from their own checkouts, so a relative path would miss.
-    path = path.resolve()
-    scene = quoted(path)
-    run, *result = (
-        quoted(f"{path}-{name}") for name in ("run", "gsplat", "graphdeco", "lichtfeld")
-    )
+    # Other trainers are run from their own checkouts, so a relative path would miss.
+    full = path.resolve()
+    own = full if path.name in {"", ".."} else path  # such a name has nothing to be appended to
+    scene = quoted(full)
+    result = [quoted(f"{full}-{name}") for name in ("gsplat", "graphdeco", "lichtfeld")]
     gsplat = f"--data_dir {scene} --data_factor 1 --result_dir {result[0]}"
     colmap = written_format != "transforms"
     layout = " colmap --colmap-path sparse/0 --downscale-factor 1" if colmap else ""
     commands = {
-        "splatseed": f"splatseed train {scene} -o {run}",
+        "splatseed": f"splatseed train {quoted(own)} -o {quoted(f'{own}-run')}",
         "gsplat": f"python examples/simple_trainer.py default {gsplat}",
         "graphdeco": f"python train.py -s {scene} -m {result[1]} --eval",
         "nerfstudio": f"ns-train splatfacto --data {scene}{layout}",
