@@ -352,9 +352,11 @@ def test_dependencies_are_those_that_are_imported():
     for path in SOURCE.rglob("*.py"):
         imported = {name.split(".")[0] for name in _imports(path)}
         needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
+        needed -= {"fused_ssim"} if path.name == "losses.py" else set()  # taken where it is there
         part = path.relative_to(SOURCE).parts[0]
         trains = part in {"render", "splat", "evaluate", "train", "viewer", "commands"}
-        trains = trains or path.name == "torch_device.py"  # loads torch for those rooms
+        # These load torch, and gsplat's kernels, for those rooms.
+        trains = trains or path.name in {"torch_device.py", "gsplat_kernels.py"}
         allowed = base | more if trains else base
         allowed = base | names["depth"] if part == "monocular" else allowed
         allowed = base | names["cluster"] if path.name == "ray_tasks.py" else allowed

@@ -238,5 +238,5 @@ if __name__ == "__main__":
     try:
         sys.exit(main(tyro.cli(Options, description=__doc__, prog="python -m benchmarks.gpu")))
     except SplatseedError as error:
-        ERR.print(str(error))
+        ERR.print(str(error), soft_wrap=True)
         sys.exit(2)

@@ -34,7 +34,7 @@ from splatseed.errors import SplatseedError
 from splatseed.splat.frame import TrainingFrame, training_frame
 from splatseed.splat.gaussians import Gaussians, initial_gaussians
 from splatseed.splat.rendering import render_view
-from splatseed.train import losses, trainer as loop
+from splatseed.train import losses
 from splatseed.train.near_depths import near_depths
 from splatseed.train.parameters import make_optimizers, make_parameters
 from splatseed.train.seeds import usable_seeds
@@ -145,7 +145,7 @@ def _stages(trainer: Trainer) -> dict[str, Sequence[Place]]:
         **RENDER_STAGES,
         "loss": [(losses._Loss, "forward")],  # noqa: SLF001  (there is no public way)
         "loss backward": [(losses._Loss, "backward")],  # noqa: SLF001  (there is no public way)
-        "photograph": [(loop, "photograph_of")],
+        "photograph": [(trainer._photographs, "of")],  # noqa: SLF001  (likewise)
         "Adam": [(each, name) for each in optimizers for name in ("step", "zero_grad")],
         "strategy": [(strategy, "before"), (strategy, "after")],
     }

@@ -16,13 +16,29 @@ LOAD = "import importlib, sys; [importlib.import_module(name) for name in sys.ar
 
 def test_every_benchmark_finds_what_it_imports():
     pytest.importorskip("gsplat", reason="some need PyTorch and gsplat's strategies")
-    modules = [name for name in MODULES if not name.startswith("benchmarks.gpu.")]
-    assert len(modules) > 20
+    assert len(MODULES) > 20
     run = subprocess.run(
-        [sys.executable, "-c", LOAD, *modules],
+        [sys.executable, "-c", LOAD, *MODULES],
         cwd=ROOT,
         capture_output=True,
         check=False,
         text=True,
     )
     assert run.returncode == 0, run.stderr
+
+
+def test_without_a_gpu_its_benchmark_is_one_sentence():
+    torch = pytest.importorskip("torch", reason="it asks PyTorch for a GPU")
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    run = subprocess.run(
+        [sys.executable, "-m", "benchmarks.gpu"],
+        cwd=ROOT,
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+    assert (run.returncode, run.stdout) == (2, "")
+    assert run.stderr == (
+        "expected a GPU; found none that PyTorch sees. Run this on a machine that has one.\n"
+    )

@@ -21,7 +21,7 @@ TOLERANCE = 1e-3
 @pytest.fixture(scope="module")
 def golden() -> dict[str, np.ndarray]:
     if not GOLDEN.is_file():
-        pytest.skip(f"{GOLDEN.name} not there: benchmarks/gpu/compare_gsplat.py writes it on a GPU")
+        pytest.skip(f"{GOLDEN.name} not there: benchmarks.gpu --golden writes it on a GPU")
     with np.load(GOLDEN) as file:
         return dict(file)
 

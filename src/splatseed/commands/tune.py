@@ -286,7 +286,8 @@ def _announce(study: _Study, rungs: Sequence[Rung]) -> None:
     OUT.print(
         f"{visible(facts.name)}: {facts.num_images} views that are not for the test, every "
         f"{TEST_EVERY}th held out; {facts.num_points:,} points\n  -> {steps}, the last twice\n  -> "
-        f"about {spoken_time(seconds)} in all (--minutes); {study.machine.words}\n  -> {visible(study.folder)}",
+        f"about {spoken_time(seconds)} in all (--minutes); {study.machine.words}\n"
+        f"  -> {visible(study.folder)}",
         soft_wrap=True,
     )
     if study.budget != study.options.budget:

@@ -22,7 +22,7 @@ from splatseed.evaluate.images import psnr, psnr_within, ssim_of_all
 from splatseed.evaluate.lpips import Lpips
 from splatseed.progress import Progress, silent
 from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
-from splatseed.splat.rendering import photograph_of
+from splatseed.splat.photographs import photograph_of
 from splatseed.views.view import View
 
 __all__ = ["Covisible", "Render", "evaluate_views"]

@@ -1,4 +1,4 @@
-"""The PyTorch device that a user's choice stands for.
+"""The PyTorch device that a user's choice stands for, and its free memory.
 
 Promise: a requested GPU is used, or there is an error: it is never silently replaced. PyTorch is
 imported only when a device is picked.
@@ -9,11 +9,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 from splatseed.errors import ParameterError
+from splatseed.process.memory import free_memory
 
 if TYPE_CHECKING:  # PyTorch may be absent, and takes a while to load
     import torch
 
-__all__ = ["pick_torch_device"]
+__all__ = ["free_bytes", "pick_torch_device"]
 
 
 def pick_torch_device(choice: Literal["auto", "cpu", "cuda"], option: str) -> torch.device:
@@ -36,3 +37,15 @@ def pick_torch_device(choice: Literal["auto", "cpu", "cuda"], option: str) -> to
             fix=f"Pass {option} cpu, or install PyTorch's CUDA build.",
         )
     return torch.device("cuda" if seen and choice != "cpu" else "cpu")
+
+
+def free_bytes(device: torch.device) -> int | None:
+    """Free memory of the device in bytes; None where the system does not tell."""
+    if device.type == "cuda":
+        import torch  # noqa: PLC0415  (see the promise)
+
+        # PyTorch keeps freed blocks, which are free to us but for what the next render and its
+        # graph take again: as much as at the peak so far.
+        kept = torch.cuda.memory_reserved(device) - torch.cuda.max_memory_allocated(device)
+        return max(0, torch.cuda.mem_get_info(device)[0] + kept)
+    return free_memory()

@@ -2,7 +2,7 @@
 
 Notation: gsplat's parameter dict as tensors: ``means``, ``scales`` (logarithms), ``quats``,
 ``opacities`` (logits), ``sh0``, ``shN``. Promise: one rasteriser call serves training and scoring
-on CPU and CUDA alike; a view's camera is copied to a GPU once, and a photograph without waiting.
+on CPU and CUDA alike; a view's camera is copied to a GPU once.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from splatseed.render import rasterization
@@ -22,8 +22,6 @@ from splatseed.views.view import View
 __all__ = [
     "CameraTensors",
     "camera_of",
-    "photograph_of",
-    "pixels_of",
     "render_features",
     "render_view",
 ]
@@ -98,20 +96,6 @@ def _rasterize(
         packed=False,
     )
     return images.squeeze(0), info  # unlike indexing, its backward allocates no image of zeros
-
-
-def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
-    """The view's photograph as float32 from 0 to 1."""
-    return pixels_of(view, device).to(torch.float32).div_(255.0)
-
-
-def pixels_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
-    """The view's photograph in bytes."""
-    # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be.
-    pixels = torch.tensor(view.photograph)
-    if device.type == "cuda":  # from pinned memory a GPU fetches it while it works on earlier steps
-        pixels = pixels.pin_memory()
-    return pixels.to(device, non_blocking=True)
 
 
 def _harmonics(

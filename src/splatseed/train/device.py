@@ -13,14 +13,13 @@ from contextlib import contextmanager
 import torch
 
 from splatseed.errors import PointCloudError
-from splatseed.process.memory import free_memory
-from splatseed.process.torch_device import pick_torch_device
+from splatseed.process.gsplat_kernels import load_kernels
+from splatseed.process.torch_device import free_bytes, pick_torch_device
 from splatseed.progress import Progress, silent
-from splatseed.render.gsplat_kernels import load_kernels
 from splatseed.train.settings import BYTES_EACH, Backend
 
 __all__ = [
-    "BYTES_EACH", "Capacity", "check_fits", "device_name", "free_bytes", "gpu_memory_told",
+    "BYTES_EACH", "Capacity", "check_fits", "device_name", "gpu_memory_told",
     "peak_gpu_bytes", "pick_device",
 ]  # fmt: skip
 
@@ -116,16 +115,6 @@ class Capacity:
         fits = count + free // BYTES_EACH
         self.held_at = self.held_at or fits
         return fits
-
-
-def free_bytes(device: torch.device) -> int | None:
-    """Free memory of the device in bytes; None where the system does not tell."""
-    if device.type == "cuda":
-        # PyTorch keeps freed blocks, which are free to us but for what the next render and its
-        # graph take again: as much as at the peak so far.
-        kept = torch.cuda.memory_reserved(device) - torch.cuda.max_memory_allocated(device)
-        return max(0, torch.cuda.mem_get_info(device)[0] + kept)
-    return free_memory()
 
 
 def peak_gpu_bytes(device: torch.device) -> int | None:

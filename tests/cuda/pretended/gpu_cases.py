@@ -29,9 +29,10 @@ from splatseed.errors import MissingDependencyError, PointCloudError
 from splatseed.evaluate import evaluate_views
 from splatseed.evaluate.images import l1_and_ssim_by_convolution, ssim_of_all
 from splatseed.io import load_scene
-from splatseed.render import gsplat_kernels
+from splatseed.process import gsplat_kernels
+from splatseed.splat import photographs
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train import TrainSettings, losses, photographs, prepare_run, trainer
+from splatseed.train import TrainSettings, losses, prepare_run, trainer
 from splatseed.train.run import RunOptions
 
 STEPS = 16
@@ -183,7 +184,8 @@ def test_without_a_toolkit_one_error_comes_before_any_work(room, tmp_path, monke
 
 
 def test_memory_counts_what_the_next_render_takes_again(monkeypatch):
-    from splatseed.train.device import Capacity, free_bytes
+    from splatseed.process.torch_device import free_bytes
+    from splatseed.train.device import Capacity
 
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (3 << 30, 24 << 30))
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda *_: 10 << 30)

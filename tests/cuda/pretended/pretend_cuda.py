@@ -78,6 +78,22 @@ class Pretend(torch.Tensor):
         return (_rebuilt, (self.elem.detach(), self.requires_grad))
 
 
+def check_input(dtype=torch.float32, **tensors):
+    for name, t in tensors.items():
+        if t is None:
+            continue
+        if not isinstance(t, Pretend):
+            raise RuntimeError(f"{name} must be a CUDA tensor")
+        if not t.is_contiguous():
+            raise RuntimeError(f"{name} must be contiguous")
+        if dtype is not None and t.dtype != dtype:
+            raise RuntimeError(f"expected scalar type {dtype} but found {t.dtype} for {name}")
+
+
+def elem(t):
+    return t.elem.detach() if isinstance(t, Pretend) else t
+
+
 def _rebuilt(elem, requires_grad):
     return Pretend(elem).requires_grad_(requires_grad)
 

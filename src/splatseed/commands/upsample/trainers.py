@@ -63,14 +63,13 @@ def training_commands(
     """
     # Other trainers are run from their own checkouts, so a relative path would miss.
     full = path.resolve()
-    own = full if path.name in {"", ".."} else path  # such a name has nothing to be appended to
     scene = quoted(full)
     result = [quoted(f"{full}-{name}") for name in ("gsplat", "graphdeco", "lichtfeld")]
     gsplat = f"--data_dir {scene} --data_factor 1 --result_dir {result[0]}"
     colmap = written_format != "transforms"
     layout = " colmap --colmap-path sparse/0 --downscale-factor 1" if colmap else ""
     commands = {
-        "splatseed": f"splatseed train {quoted(own)} -o {quoted(f'{own}-run')}",
+        "splatseed": f"splatseed train {quoted(path)} -o {quoted(f'{path}-run')}",
         "gsplat": f"python examples/simple_trainer.py default {gsplat}",
         "graphdeco": f"python train.py -s {scene} -m {result[1]} --eval",
         "nerfstudio": f"ns-train splatfacto --data {scene}{layout}",

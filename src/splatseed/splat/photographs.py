@@ -13,11 +13,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from splatseed.splat.rendering import photograph_of, pixels_of
-from splatseed.train.device import free_bytes
+from splatseed.process.torch_device import free_bytes
 from splatseed.views.view import View
 
-__all__ = ["Photographs"]
+__all__ = ["Photographs", "photograph_of"]
 
 SHARE = 0.25
 """Most of a GPU's free memory that photographs may take."""
@@ -45,5 +44,19 @@ class Photographs:
         if self._held is None:
             return photograph_of(view, self._device)
         if view not in self._held:
-            self._held[view] = pixels_of(view, self._device)
+            self._held[view] = _pixels_of(view, self._device)
         return self._held[view].to(torch.float32).div_(255.0)
+
+
+def photograph_of(view: View, device: torch.device) -> Float[Tensor, "H W 3"]:
+    """The view's photograph as float32 from 0 to 1."""
+    return _pixels_of(view, device).to(torch.float32).div_(255.0)
+
+
+def _pixels_of(view: View, device: torch.device) -> UInt8[Tensor, "H W 3"]:
+    """The view's photograph in bytes."""
+    # A copy: PyTorch warns on stderr about read-only arrays, which a view's may be.
+    pixels = torch.tensor(view.photograph)
+    if device.type == "cuda":  # from pinned memory a GPU fetches it while it works on earlier steps
+        pixels = pixels.pin_memory()
+    return pixels.to(device, non_blocking=True)

@@ -13,6 +13,7 @@ import os
 import shutil
 import subprocess
 import sys
+import sysconfig
 from contextlib import redirect_stdout
 from importlib import import_module
 from importlib.util import find_spec
@@ -71,11 +72,11 @@ def _are_loaded() -> bool:
 
 
 def _find_tools() -> None:
-    """Let programs of this environment be found, ninja above all, which pip installs beside Python.
+    """Let programs of this environment be found, ninja above all, which gsplat brings.
 
-    A venv's command that is called without activating the venv has them not on its path.
+    They are not on the path of a venv's command that is called without activating the venv.
     """
-    here = str(Path(sys.executable).parent)
+    here = sysconfig.get_path("scripts")
     if here not in os.environ.get("PATH", "").split(os.pathsep):
         os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", ""), here])
 
