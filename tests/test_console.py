@@ -72,6 +72,15 @@ def terminal(monkeypatch):
     return drawn
 
 
+def test_a_terminal_sees_what_is_left(terminal):
+    with stage_display(remaining=True) as clock:
+        clock.expect("features", "matching", "mapping")
+        clock("features", 0.5)
+    drawn = [terminal.getvalue().rfind(stage) for stage in ("features", "matching", "mapping")]
+    assert 0 <= drawn[0] < drawn[1] < drawn[2]
+    assert list(clock.seconds()) == ["features"]
+
+
 def test_a_terminal_sees_the_stages(terminal, capsys):
     with stage_display() as clock:
         clock("read", 1.0)

@@ -15,11 +15,13 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     Progress as Bar,
+    Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
@@ -59,6 +61,16 @@ TOLD_AFTER = 3.0
 """Compilations shorter than this many seconds are not logged."""
 
 
+class _Bars(BarColumn):
+    """Bars that stand still until their stage begins; Rich's would pulse."""
+
+    def render(self, task: Task) -> ProgressBar:
+        """The bar of a stage."""
+        bar = super().render(task)
+        bar.pulse = False
+        return bar
+
+
 class StageClock:
     """A ``Progress`` that times the stages and, within ``stage_display``, shows them."""
 
@@ -76,9 +88,16 @@ class StageClock:
         if not self._started or self._started[-1][0] != stage:
             self._started.append((stage, time.perf_counter()))
         if self._bar is not None:
-            if stage not in self._tasks:
-                self._tasks[stage] = self._bar.add_task(stage, total=1.0)
+            self.expect(stage)
+            self._bar.start_task(self._tasks[stage])
             self._bar.update(self._tasks[stage], completed=fraction)
+
+    def expect(self, *stages: str) -> None:
+        """Show stages that are still to come, so that the user sees what is left."""
+        if self._bar is not None:
+            for stage in stages:
+                if stage not in self._tasks:
+                    self._tasks[stage] = self._bar.add_task(stage, total=1.0, start=False)
 
     def seconds(self) -> dict[str, float]:
         """Wall time of each stage so far, in order of first appearance."""
@@ -149,7 +168,7 @@ def stage_display(
         return
     left = (TextColumn("left", markup=False), TimeRemainingColumn()) if remaining else ()
     named = TextColumn("{task.description}", markup=False)
-    columns = (named, BarColumn(), TimeElapsedColumn(), *left)
+    columns = (named, _Bars(), TimeElapsedColumn(), *left)
     with (
         Bar(*columns, console=ERR, transient=True) as bar,
         clock.shown_on(bar),

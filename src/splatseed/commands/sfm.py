@@ -65,7 +65,7 @@ class Options:
     """One lens for all photographs of a size; not used with --poses-from."""
     device: DeviceName = "auto"
     """Where features are detected and matched; auto takes a GPU if pycolmap can use one."""
-    max_image_size: int = 3200
+    max_image_size: int = 1600
     """Longer sides are reduced to this many pixels for feature detection."""
     seed: int = 0
     """Seed of every random choice."""
@@ -81,7 +81,7 @@ def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "sfm", arguments)
     _check(options)
-    with stage_display() as clock:
+    with stage_display(remaining=True) as clock:
         clock("prepare", 0.0)
         if is_video(options.images):
             report = _of_video(options, clock)
@@ -128,6 +128,8 @@ def _of_video(options: Options, clock: StageClock) -> SfmReport:
 
 
 def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport:
+    solved = "mapping" if options.poses_from is None else "triangulation"
+    clock.expect("features", "matching", solved, "undistortion")
     common: dict[str, Any] = {
         "matcher": options.matcher or ("sequential" if is_video(options.images) else "exhaustive"),
         "device": options.device,

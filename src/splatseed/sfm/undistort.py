@@ -55,7 +55,7 @@ def undistort(
     with staged(images, Path(output), kind="undistort", overwrite=overwrite) as staging:
         work = staging / ".work" / "distorted"
         distorted = write_scene(scene, work, format="colmap", require_points=False).path
-        settings = Settings("exhaustive", "cpu", 3200, 0, threads)  # only threads matters
+        settings = Settings("exhaustive", "cpu", 1600, 0, threads)  # only threads matters
         job = UndistortJob(images, staging, settings, distorted / "sparse" / "0")
         log = staging / ".work" / "log.txt"
         outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
