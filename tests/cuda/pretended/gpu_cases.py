@@ -31,9 +31,14 @@ from splatseed.evaluate.images import l1_and_ssim_by_convolution, ssim_of_all
 from splatseed.io import load_scene
 from splatseed.process import gsplat_kernels
 from splatseed.splat import photographs
+from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import TrainSettings, losses, prepare_run, trainer
 from splatseed.train.run import RunOptions
+from splatseed.viewer import pictures
+from splatseed.viewer.renderer import model_frame
+from splatseed.viewer.shown import Shown
+from splatseed.views.view import load_split
 
 STEPS = 16
 VIEWS = 7
@@ -261,6 +266,20 @@ def test_fused_ssim_is_taken_where_it_is_installed(monkeypatch):
     assert calls == [((1, 3, 40, 31), True, "valid")]
     expected = 0.8 * (x - y).abs().mean() + 0.2 * (1 - (x - y).mean())
     assert found == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_the_viewer_renders_all_gaussians_while_the_camera_moves(room, monkeypatch):
+    gaussians = initial_gaussians(room.points)
+    shown = Shown("room", Path("room"), room, gaussians)
+    frame = model_frame(gaussians, room)
+    monkeypatch.setattr(pictures, "MOST_MOVING", len(gaussians) // 2)
+    view = load_split(room)[0][0]
+    with pc.pretended_gpu():
+        entry = pictures.Entry(shown, frame, pc.GPU)
+        assert entry.quick_renderer is entry.renderer
+        found = entry.renderer.color(view)
+    expected = pictures.Entry(shown, frame).renderer.color(view)
+    np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
 def test_mixing_devices_is_noticed():
