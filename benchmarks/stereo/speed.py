@@ -18,6 +18,7 @@ from benchmarks.common.memory import status_bytes
 from benchmarks.stereo.peer import costs_of_planes
 
 import splatseed as ss
+from splatseed.pointcloud import PointCloud
 from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.fusion import fuse
 from splatseed.stereo.patchmatch import QuadImages, begin, sweep
@@ -115,15 +116,22 @@ def _best(function: Callable[[], Any], repeats: int = REPEATS) -> float:
     return min(seconds)
 
 
-def whole_run(folder: str, clock: Clock, threads_used: int) -> dict[str, Any]:
-    """Seconds by stage of photographs to seeds, seeds, and the process's peak memory in bytes."""
+def whole_run(folder: str, clock: Clock, threads_used: int, *, points: bool) -> dict[str, Any]:
+    """Seconds by stage of photographs to seeds, seeds, and the process's peak memory in bytes.
+
+    Args:
+        folder: The scene.
+        clock: What seconds are.
+        threads_used: By which processor time is divided.
+        points: Whether its points are known beforehand.
+    """
     scene = ss.load_scene(folder)
+    if not points:
+        scene = scene.replace(points=PointCloud.empty(), tracks=None)
     settings = StereoSettings(grid=GRID)
+    few = scene.images[:2]
     fuse(
-        find_stereo(
-            load_views(scene, scene.images[:2]), scene.images[:2], find_visibility(scene), settings
-        ),
-        CELL,
+        find_stereo(load_views(scene, few), few, find_visibility(scene), settings), CELL
     )  # compiles
     read = time.perf_counter if clock == "wall" else lambda: time.process_time() / threads_used
     stages: dict[str, float] = {}
