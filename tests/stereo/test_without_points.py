@@ -12,7 +12,7 @@ from splatseed.depthmap import DepthMap
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Scene
-from splatseed.stereo import stereo_depths
+from splatseed.stereo import stereo_depths, without_points
 from splatseed.stereo.without_points import SAMPLES, glimpse, known_visibility
 from splatseed.views.pairs import choose_by_pose
 from splatseed.views.view import load_views
@@ -104,10 +104,19 @@ def test_depth_maps_stand_in_for_points(kind, plane):
         assert plane.surfaces.distance(visibility.xyz).max() < 1e-4
 
 
-def test_points_are_taken_where_there_are_some(plane):
+@pytest.mark.parametrize("enough", [True, False])
+def test_points_are_taken_where_half_of_the_images_see_enough(plane, enough, monkeypatch):
+    seen = find_visibility(plane.scene)
+    counts = [len(seen.rows_of(image)) for image in plane.scene.images]
+    least = np.median(counts) + (0 if enough else 1)
+    monkeypatch.setattr(without_points, "LEAST_SEEN", least)
     maps = Maps({plane.scene.images[0].name: DepthMap(np.ones((80, 96), np.float32))})
-    visibility = known_visibility(plane.scene.replace(depths=maps))
-    np.testing.assert_array_equal(visibility.xyz, find_visibility(plane.scene).xyz)
+    instead = known_visibility(plane.scene.replace(depths=maps))
+    if enough:
+        np.testing.assert_array_equal(instead.xyz, seen.xyz)
+    else:
+        assert len(instead.xyz) == SAMPLES**2
+        assert not len(known_visibility(plane.scene).xyz)
 
 
 def test_pairs_by_pose_look_the_same_way_from_another_place():

@@ -1,4 +1,4 @@
-"""Points for a scene that has none: from its depth maps, or from a glimpse at small photographs.
+"""Points for a scene that has too few: from its depth maps, or a glimpse at small photographs.
 
 Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, in two steps: a few views
 over every depth, then all views over the depths seen by those few. Promise: as for all of stereo,
@@ -27,7 +27,11 @@ from splatseed.views.visibility import Visibility, find_visibility
 __all__ = ["TOO_FEW", "glimpse", "known_visibility"]
 
 TOO_FEW = 30
-"""A scene with fewer points counts as having none."""
+"""Points that are not worth being searched around."""
+LEAST_SEEN = 300
+"""A scene counts as having no points if half of its images see fewer. A glimpse takes two or three
+times as long as what follows, and then as many pixels become known as with about 800 points an
+image: on fern .50, where 300 points an image give .49, 80 give .45 and 8 give .41."""
 SMALL = 200
 """Longer side of a small photograph, in pixels."""
 LOOK = StereoSettings(grid=2, sweeps=6, tolerance=0.03, max_cost=0.4)
@@ -48,13 +52,13 @@ SAMPLES = 18
 
 
 def known_visibility(scene: Scene) -> Visibility:
-    """The points that each image sees: from SfM, else sampled from the scene's depth maps."""
+    """The points that each image sees: from SfM, else sampled from depth maps, else none."""
     visibility, maps = find_visibility(scene), scene.depths
-    if len(visibility.xyz) >= TOO_FEW or maps is None:
+    if np.median([len(visibility.rows_of(image)) for image in scene.images]) >= LEAST_SEEN:
         return visibility
-    known = [image for image in scene.images if image.name in maps]
-    places = [_places(image, maps.read(image.name)) for image in known]
-    return _unseen(np.concatenate(places)) if places else visibility
+    known = [image for image in scene.images if maps is not None and image.name in maps]
+    places = [_places(image, maps.read(image.name)) for image in known if maps is not None]
+    return _unseen(np.concatenate([np.empty((0, 3)), *places]))
 
 
 def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
