@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from splatseed import load_scene
 from splatseed.commands.demo import command as demo
 from splatseed.errors import MissingDependencyError
 from splatseed.scores import CurvePoint, TrainingResult
@@ -15,14 +16,14 @@ from splatseed.scores import CurvePoint, TrainingResult
 WORDS = ("demo", "--views", "4", "--ratio", "2", "--no-preview")
 
 
-def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
+def test_the_demo_trains_from_each_set_of_seeds(splatseed, tmp_path):
     pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
     out = tmp_path / "demo"
     run = splatseed(*WORDS, "--preview", "-o", out, "--train-steps", "44")
     assert run.code == 0, run
     seeded = json.loads((out / "scene_auto/splatseed.json").read_text())
     counts = {}
-    for name in ("sfm", "auto"):
+    for name in ("random", "poses_auto", "sfm", "auto"):
         metrics = json.loads((out / f"run_{name}/metrics.json").read_text())
         config = json.loads((out / f"run_{name}/config.json").read_text())
         assert metrics["steps"] == 44
@@ -31,6 +32,10 @@ def test_the_demo_trains_from_both_sets_of_seeds(splatseed, tmp_path):
         counts[name] = metrics["num_gaussians"]
         assert f"{metrics['psnr']:.2f}" in run.out
     assert counts["auto"] == seeded["num_points"]
+    alone = load_scene(out / "scene_poses_auto").points
+    assert len(alone) > seeded["num_original"]
+    assert not alone.num_original  # no point of the scene was known
+    assert len(load_scene(out / "scene_random").points) == 100_000
     assert seeded["num_original"] < counts["sfm"] <= counts["auto"]  # a round adds half at most
     assert "no error bars" in run.out
     with Image.open(out / "preview_trained.png") as file:

@@ -3,8 +3,9 @@
 It photographs a synthetic room, finds points as Structure-from-Motion would, writes them as a
 COLMAP scene, reads that back, upsamples it and shows the result. Then it does so by every method,
 and measures how far the new points lie from the true surfaces and how well they cover them. Then,
-if PyTorch and gsplat are installed, it trains briefly from the original points and from the
-upsampled ones, and compares. A second process compiles kernels ahead of the first.
+if PyTorch and gsplat are installed, it trains briefly and compares: from poses alone, where a
+trainer starts at random, and from the points as they are and upsampled. A second process compiles
+kernels ahead of the first.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ class Options:
     seed: int = 0
     """The same seed gives the same demo."""
     train_steps: int = 500
-    """Training steps from each of two sets of seeds; 0 for no training."""
+    """Training steps from each of four sets of seeds; 0 for no training."""
     training: Literal["now", "later", "only"] = "now"
     """When to train: now, at the end; later, while PyTorch is being installed; only, in a
     demo folder that was made with later."""
@@ -90,19 +91,26 @@ def _check(options: Options) -> None:
 
 
 def _train(options: Options, ahead: KernelsAhead) -> bool:
-    """Train from both sets of seeds and compare, if the required packages are installed."""
+    """Train from each set of seeds and compare, if the required packages are installed."""
     try:
         require("torch", "gsplat")
     except MissingDependencyError as error:
         print_note(f"not trained: {error.found} installed. {error.fix}")
         return False
     # These import PyTorch.
-    from splatseed.commands.demo.training import Arm, train_arm, write_comparison  # noqa: PLC0415  (loads with its use)
+    from splatseed.commands.demo.training import (  # noqa: PLC0415  (loads with its use)
+        POSES_ALONE,
+        Arm,
+        seed_poses_alone,
+        train_arm,
+        write_comparison,
+    )
     from splatseed.train.settings import TrainSettings  # noqa: PLC0415  (loads with its use)
 
     folder = options.output
     runs = [f"run_{name}" for name in ("sfm", SHOWN)]
-    add_files(folder, [*runs, TRAINED_PICTURE])
+    alone = [f"{kind}_{name}" for name in POSES_ALONE.values() for kind in ("scene", "run")]
+    add_files(folder, [*runs, *alone, TRAINED_PICTURE])
     seeded = json.loads((folder / f"scene_{SHOWN}" / MANIFEST).read_text(encoding="utf-8"))
     arms = [
         Arm("SfM seeds", folder / "scene", folder / runs[0]),
@@ -116,6 +124,7 @@ def _train(options: Options, ahead: KernelsAhead) -> bool:
     )
     with stage_display() as clock:
         wait(ahead, TRAINING, clock)
+        arms = [*seed_poses_alone(folder, options.seed, clock), *arms]
         trained = [train_arm(arm, settings, clock) for arm in arms]
         if options.preview:
             write_comparison(trained, folder / TRAINED_PICTURE)
@@ -124,7 +133,7 @@ def _train(options: Options, ahead: KernelsAhead) -> bool:
 
 
 def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None:
-    """Both runs side by side, and what they do and do not show."""
+    """The runs side by side, and what they do and do not show."""
     from splatseed.commands.demo.training import total_seconds  # noqa: PLC0415  (as above)
 
     least = min(total_seconds(each) for each in trained)
@@ -138,6 +147,7 @@ def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None
     print_pairs(
         "what this shows",
         [
+            ("poses alone", "the first two rows know no points: trainers then start at random"),
             ("fixed", "3DGS's densification, and the most Gaussians"),
             ("seconds", "of training and making the seeds; the last column is during training,"),
             ("", "before the mean that a run ends with is taken"),

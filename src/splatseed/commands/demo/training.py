@@ -1,7 +1,7 @@
-"""The demo's training: the same few steps from the SfM seeds and from the upsampled ones.
+"""The demo's training: the same few steps from seeds with and without the scene's points.
 
-Promise: the two runs differ only in their seeds, and end with the same number of Gaussians; the
-time to make seeds is counted; the view that is shown is chosen before any is rendered.
+Promise: runs differ only in their seeds, and have the same number of Gaussians at most; the time to
+make seeds is counted; the view that is shown is chosen before any is rendered.
 """
 
 from __future__ import annotations
@@ -13,21 +13,36 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from splatseed.commands.demo.methods import SHOWN, upsample_by
 from splatseed.console import StageClock
 from splatseed.evaluate import evaluate_views
-from splatseed.io import load_scene
+from splatseed.io import load_scene, write_scene
+from splatseed.pointcloud import PointCloud
 from splatseed.preview import Tile, write_grid
 from splatseed.scores import TrainingResult
+from splatseed.seeding.random_start import random_start
 from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
 
-__all__ = ["Arm", "TrainedArm", "psnr_after", "total_seconds", "train_arm", "write_comparison"]
+__all__ = [
+    "POSES_ALONE",
+    "Arm",
+    "TrainedArm",
+    "psnr_after",
+    "seed_poses_alone",
+    "total_seconds",
+    "train_arm",
+    "write_comparison",
+]
+
+POSES_ALONE = {"random start": "random", f"{SHOWN}, poses alone": f"poses_{SHOWN}"}
+"""Arms that know no points, and how their folders end."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """One of the two runs.
+    """One of the runs.
 
     Args:
         label: Names its seeds.
@@ -57,6 +72,24 @@ class TrainedArm:
     result: TrainingResult
     photograph: UInt8[np.ndarray, "H W 3"]
     render: Float32[np.ndarray, "H W 3"]
+
+
+def seed_poses_alone(folder: Path, seed: int, clock: StageClock) -> list[Arm]:
+    """Scenes in the demo's folder whose seeds come from poses and photographs, not from points."""
+    scene = load_scene(folder / "scene").replace(points=PointCloud.empty(), tracks=None)
+    arms: list[Arm] = []
+    for label, name in POSES_ALONE.items():
+        before = sum(clock.seconds().values())
+        clock("seed poses alone", len(arms) / len(POSES_ALONE))
+        if name == "random":
+            points = random_start(scene, np.random.default_rng(seed))
+        else:
+            points = upsample_by(SHOWN, scene, 1.0, seed)
+        seconds = sum(clock.seconds().values()) - before
+        path = folder / f"scene_{name}"
+        write_scene(scene.replace(points=points), path, provenance={"method": label})
+        arms.append(Arm(label, path, folder / f"run_{name}", seconds))
+    return arms
 
 
 def train_arm(arm: Arm, settings: TrainSettings, clock: StageClock) -> TrainedArm:
