@@ -1,58 +1,93 @@
-"""The picture on the README's first screen: a test photograph, 3DGS's densification, and ``grow``.
+"""README's first picture and table: poses without points, on the test views of several captures.
 
-Both are trained from Structure-from-Motion's points, to the same number of Gaussians, in the same
-seconds: ``grow`` trains for ``max_steps``, then ``default`` for as many steps as it makes in the
-seconds that ``grow`` took, stereo included. Notation: the *gain* of a view is its PSNR under
-``grow`` minus that under ``default``. Promise: the view shown is the one whose gain is the median
-over the test views; the window, a third of it wide, is where the two differ most in squared error.
+Each capture's points are taken away. The *random start* is what gsplat begins with then, under
+3DGS's densification: for ``max_steps``, and again for as many steps as fit into the seconds that
+*ours* takes, seeding included. Ours is seeded by ``auto`` from the training photographs alone, and
+trained with ``default`` and with ``grow``. SfM's own points, under ``default``, show what could be
+had. All have the same number of Gaussians at most, ``rho`` per pixel. Seconds are the processor's,
+on one thread.
 
-    python -m benchmarks.training.front_page SCENE -o PICTURE.png
+Promise: nothing is chosen by hand. The *gain* of a view or a capture is the PSNR of ours with
+``grow`` minus that of the random start at equal seconds; the picture shows the capture, and of it
+the view, of median gain, and the window, a third of it wide, in which the two differ most in
+squared error.
+
+    python -m benchmarks.training.front_page -o PICTURE.png
 """
 
 from __future__ import annotations
 
+import json
+import os
+import statistics
 import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import numpy as np
 import tyro
-from jaxtyping import Float, UInt8
+from benchmarks.common.children import call
+from benchmarks.common.clouds import find_scenes
+from benchmarks.common.machine import describe
+from benchmarks.common.markdown import table
+from benchmarks.training.baseline import say
+from jaxtyping import UInt8
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 import splatseed as ss
-from splatseed.console import stage_display
+from splatseed.errors import SplatseedError
 from splatseed.evaluate import EvalResult, evaluate_views
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+from splatseed.seeding.random_start import random_start
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.run import TrainingRun
 from splatseed.train.settings import StrategyName
 from splatseed.views import View
+from splatseed.views.photographs import user_cache_dir
+
+__all__ = ["train_all"]
 
 Window = tuple[slice, slice]
 
+CAPTURES = ("fern", "fox", "treehill", "bonsai", "stone_horse", "face", "dorm", "desk")
 WIDE = 9.0
 """Inches; a hundred pixels each."""
 PART = 3
 """The window's sides, as a part of the photograph's."""
-TITLES = ("photograph", "3DGS's densification", "splatseed's grow")
+TITLES = ("photograph", "random start", "splatseed")
+ARMS = {
+    "random": "random start",
+    "random, equal": "random start, as many seconds",
+    "auto": "auto",
+    "grow": "auto + grow",
+    "sfm": "SfM's points",
+}
 
 
 @dataclass(frozen=True)
 class Options:
-    """Train a scene twice at equal seconds, and draw the test view with the median gain."""
+    """Train captures without their points, print the table, and draw the median one."""
 
-    scene: tyro.conf.Positional[Path]
-    """A scene with photographs."""
     output: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
     """The PNG to write."""
+    scenes: tuple[str, ...] = CAPTURES
+    """Captures, by their names in the folder of captures."""
     rho: float = 0.25
     """Gaussians per pixel of a photograph at the size that is trained."""
     max_steps: int = 1500
-    """Steps of grow."""
+    """Steps of all but the random start at equal seconds."""
     data_factor: int = 2
     """By how much photographs are made smaller."""
+    jobs: int = os.cpu_count() or 1
+    """Captures at a time, on one thread each."""
+    cache: Path = user_cache_dir().parent / "benchmarks" / "front_page"
+    """Where results are kept; a capture that is there is not trained again."""
 
 
 class Trained(NamedTuple):
@@ -62,47 +97,125 @@ class Trained(NamedTuple):
     scores: EvalResult
     seconds: float
 
+    def told(self) -> dict[str, float]:
+        """What the table needs."""
+        return {
+            "psnr": self.scores.psnr,
+            "ssim": self.scores.ssim,
+            "gaussians": self.run.count(),
+            "steps": self.run.settings.max_steps,
+            "seconds": self.seconds,
+        }
 
-def main() -> None:
-    """Train, draw, and print what the picture shows."""
-    options = tyro.cli(Options)
+
+def main(options: Options) -> None:
+    """Train what is not there yet, draw, and print."""
+    options.cache.mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(options.jobs) as pool:
+        results = list(pool.map(lambda name: _result(name, options), options.scenes))
+    gains = [_gain(each) for each in results]
+    at = int(np.argsort(gains)[len(gains) // 2])
+    with np.load(_kept(options.scenes[at], options).with_suffix(".npz")) as kept:
+        pictures = [kept[name] for name in ("photograph", "random, equal", "grow")]
+        words = [str(each) for each in kept["words"]]
+        view = str(kept["view"])
+    _draw(pictures, words, options.output)
+    print(f"{describe()}\n\nrho {options.rho:g}, {options.max_steps:,} steps; PSNR / SSIM\n")
+    rows = [
+        [name, *(_cell(each[arm]) for arm in ARMS), f"{gain:+.2f}"]
+        for name, each, gain in zip(options.scenes, results, gains, strict=True)
+    ]
+    means = [
+        f"{statistics.mean(r[arm]['psnr'] for r in results):.2f} / "
+        f"{statistics.mean(r[arm]['ssim'] for r in results):.3f}"
+        for arm in ARMS
+    ]
+    rows.append(["mean", *means, f"{statistics.mean(gains):+.2f}"])
+    print(table(["capture", *ARMS.values(), "gain, dB"], rows))
+    print(f"\nThe picture: {options.scenes[at]}, {view}.")
+
+
+def _kept(name: str, options: Options) -> Path:
+    part = f"{name}_{options.rho:g}_{options.max_steps}_{options.data_factor}"
+    return options.cache / f"{part}.json"
+
+
+def _result(name: str, options: Options) -> dict[str, Any]:
+    path = _kept(name, options)
+    if not path.is_file():
+        say(f"{name} ...")
+        told = call(
+            "benchmarks.training.front_page:train_all", threads=1,
+            scene=str(find_scenes() / name), pictures=str(path.with_suffix(".npz")),
+            rho=options.rho, max_steps=options.max_steps, data_factor=options.data_factor,
+        )  # fmt: skip
+        path.write_text(json.dumps(told))
+        say(f"  {name}: {_gain(told):+.2f} dB")
+    return cast("dict[str, Any]", json.loads(path.read_text()))
+
+
+def _gain(result: dict[str, Any]) -> float:
+    return float(result["grow"]["psnr"] - result["random, equal"]["psnr"])
+
+
+def _cell(told: dict[str, float]) -> str:
+    return (
+        f"{told['psnr']:.2f} / {told['ssim']:.3f} ({told['steps']:,}, {told['seconds']:.0f} s, "
+        f"{told['gaussians'] / 1000:.1f}k)"
+    )
+
+
+def train_all(
+    scene: str, pictures: str, rho: float, max_steps: int, data_factor: int
+) -> dict[str, dict[str, float]]:
+    """All runs of one capture; the renders of its median view go into ``pictures``, an .npz."""
+    whole = ss.load_scene(Path(scene))
+    bare = whole.replace(points=PointCloud.empty(), tracks=None)
+    dice = bare.replace(points=random_start(bare, np.random.default_rng(0)))
+    camera = whole.images[0].camera
+    cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
+
+    def train(start: Scene, strategy: StrategyName, steps: int = max_steps) -> Trained:
+        settings = TrainSettings(
+            strategy=strategy, max_steps=steps, backend="cpu", data_factor=data_factor,
+            cap_max=cap, seeding="auto" if start is bare else "scene",
+        )  # fmt: skip
+        return _train(start, settings)
+
+    for strategy in ("default", "grow"):
+        train(bare, cast("StrategyName", strategy), 4)  # loads kernels, which takes seconds
+    runs = {"grow": train(bare, "grow"), "auto": train(bare, "default")}
+    # A run's cost per step grows with its Gaussians, so the trial is as long as the other.
+    runs["random"] = train(dice, "default")
+    steps = round(max_steps * runs["grow"].seconds / runs["random"].seconds)
+    runs["random, equal"] = train(dice, "default", max(steps, max_steps))
+    runs["sfm"] = train(whole, "default")
+    _keep_median(runs["random, equal"], runs["grow"], Path(pictures))
+    return {name: each.told() for name, each in runs.items()}
+
+
+def _train(scene: Scene, settings: TrainSettings) -> Trained:
     with tempfile.TemporaryDirectory() as folder:
-        _train(options, "grow", 1, Path(folder) / "kernels")  # loads them, which takes seconds
-        ours = _train(options, "grow", options.max_steps, Path(folder) / "grow")
-        # A run's cost per step grows with its Gaussians, so the trial is as long as the other.
-        trial = _train(options, "default", options.max_steps, Path(folder) / "trial")
-        steps = round(options.max_steps * ours.seconds / trial.seconds)
-        base = _train(options, "default", steps, Path(folder) / "default")
-    gains = _gains(base, ours)
+        start = time.process_time()
+        run = prepare_run(scene, Path(folder) / "run", settings)
+        run.train()
+        seconds = time.process_time() - start
+    scores = evaluate_views(run.trainer.render, run.trainer.test_views)
+    return Trained(run, scores, seconds)
+
+
+def _keep_median(base: Trained, ours: Trained, path: Path) -> None:
+    """Keep the photograph and the two renders of the view of median gain."""
+    before, after = ([view.psnr for view in each.scores.per_image] for each in (base, ours))
+    gains = np.subtract(after, before)
     at = int(np.argsort(gains)[len(gains) // 2])
     view = ours.run.trainer.test_views[at]
-    pictures = [view.photograph, _rendered(base, view), _rendered(ours, view)]
-    _draw(pictures, [_words(base, at), _words(ours, at)], options.output)
-    print(f"view {view.name}: gain {gains[at]:.2f} dB; all views: {np.sort(gains).round(2)}")
-    for each in (base, ours):
-        print(_summary(each))
-
-
-def _train(options: Options, strategy: str, steps: int, folder: Path) -> Trained:
-    scene = ss.load_scene(options.scene)
-    camera = scene.images[0].camera
-    pixels = (camera.width // options.data_factor) * (camera.height // options.data_factor)
-    settings = TrainSettings(
-        strategy=cast("StrategyName", strategy), max_steps=steps, backend="cpu",
-        data_factor=options.data_factor, cap_max=round(options.rho * pixels),
-    )  # fmt: skip
-    with stage_display() as clock:
-        run = prepare_run(scene, folder, settings, progress=clock)
-        run.train(lambda step: clock(f"train {strategy}", step / steps))
-    if run.state.step < steps:
-        raise SystemExit(130)  # interrupted: half a run is not compared
-    scores = evaluate_views(run.trainer.render, run.trainer.test_views)
-    return Trained(run, scores, run.state.watch.seconds)
-
-
-def _gains(base: Trained, ours: Trained) -> Float[np.ndarray, " V"]:
-    return np.array(
-        [b.psnr - a.psnr for a, b in zip(base.scores.per_image, ours.scores.per_image, strict=True)]
+    np.savez_compressed(
+        path,
+        photograph=view.photograph,
+        **{"random, equal": _rendered(base, view), "grow": _rendered(ours, view)},
+        words=[_words(base, at), _words(ours, at)],
+        view=view.name,
     )
 
 
@@ -116,16 +229,7 @@ def _words(trained: Trained, at: int) -> str:
     return f"{view.psnr:.1f} dB, SSIM {view.ssim:.2f}"
 
 
-def _summary(trained: Trained) -> str:
-    run, scores = trained.run, trained.scores
-    count = len(run.state.params["means"])
-    return (
-        f"{run.settings.strategy}: {scores.psnr:.2f} dB, SSIM {scores.ssim:.4f} on all test views; "
-        f"{count:,} Gaussians, {run.settings.max_steps:,} steps, {trained.seconds:.1f} s"
-    )
-
-
-def _window(pictures: list[UInt8[np.ndarray, "H W 3"]]) -> Window:
+def _window(pictures: Sequence[UInt8[np.ndarray, "H W 3"]]) -> Window:
     """Where the two renders differ most in squared error."""
     truth, base, ours = (np.asarray(each, np.float64) for each in pictures)
     differs = np.abs(((base - truth) ** 2).sum(axis=2) - ((ours - truth) ** 2).sum(axis=2))
@@ -139,7 +243,7 @@ def _window(pictures: list[UInt8[np.ndarray, "H W 3"]]) -> Window:
     return slice(int(top), int(top) + height), slice(int(left), int(left) + width)
 
 
-def _draw(pictures: list[UInt8[np.ndarray, "H W 3"]], words: list[str], path: Path) -> None:
+def _draw(pictures: Sequence[UInt8[np.ndarray, "H W 3"]], words: Sequence[str], path: Path) -> None:
     window = _window(pictures)
     height, width = pictures[0].shape[:2]
     figure = Figure(figsize=(WIDE, 2 * WIDE / 3 * height / width + 0.55), dpi=100)
@@ -167,4 +271,7 @@ def _frame(window: Window) -> Rectangle:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main(tyro.cli(Options, description=__doc__))
+    except SplatseedError as error:
+        raise SystemExit(str(error)) from None
