@@ -30,10 +30,10 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, Split
 from splatseed.sfm import reconstruct, triangulate, worker
 from splatseed.sfm.features import Run
-from splatseed.sfm.mapping import _advice
 from splatseed.sfm.orientation import clear_orientation
 from splatseed.sfm.photos import Photo
 from splatseed.sfm.settings import MatcherName, Settings
+from splatseed.sfm.solving.mapping import _advice
 
 pycolmap = pytest.importorskip("pycolmap")
 

@@ -26,7 +26,14 @@ from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.output.staging import check_output
 from splatseed.literal import counted, quoted, visible
-from splatseed.sfm import DeviceName, MatcherName, SfmReport, reconstruct, triangulate
+from splatseed.sfm import (
+    DeviceName,
+    MatcherName,
+    Refinement,
+    SfmReport,
+    reconstruct,
+    triangulate,
+)
 from splatseed.sfm.photos import name_some
 from splatseed.sfm.video import pick_frames
 
@@ -49,6 +56,8 @@ class Options:
         Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
     ] = None
     """A scene whose poses and intrinsics are kept, so that only points are triangulated."""
+    refine_poses: bool = False
+    """Refine the poses of --poses-from, as a phone's or SLAM's that are off by a degree or two."""
     matcher: Annotated[
         MatcherName | None,
         tyro.conf.arg(
@@ -101,6 +110,12 @@ def _check(options: Options) -> None:
     if options.frames != Options.frames and not is_video(options.images):
         found = f"the folder {visible(options.images)}"
         raise ParameterError("a video with --frames", found=found, fix="Leave --frames out.")
+    if options.refine_poses and options.poses_from is None:
+        raise ParameterError(
+            "--poses-from with --refine-poses",
+            found="none",
+            fix="Name a scene with the poses, or leave --refine-poses out to have all poses found.",
+        )
     own = [name for name in OF_LENS if getattr(options, name) != getattr(Options, name)]
     if options.poses_from is not None and own:
         raise ParameterError(
@@ -128,8 +143,10 @@ def _of_video(options: Options, clock: StageClock) -> SfmReport:
 
 
 def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport:
-    solved = "mapping" if options.poses_from is None else "triangulation"
-    clock.expect("features", "matching", solved, "undistortion")
+    solved = ["mapping"] if options.poses_from is None else ["triangulation"]
+    if options.refine_poses:
+        solved.insert(0, "refinement")
+    clock.expect("features", "matching", *solved, "undistortion")
     common: dict[str, Any] = {
         "matcher": options.matcher or ("sequential" if is_video(options.images) else "exhaustive"),
         "device": options.device,
@@ -150,7 +167,7 @@ def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport
             **common,
         )
     poses = load_scene(options.poses_from, require_points=False)
-    return triangulate(images, poses, options.output, **common)
+    return triangulate(images, poses, options.output, refine_poses=options.refine_poses, **common)
 
 
 def _tell_photographs(
@@ -165,6 +182,28 @@ def _tell_photographs(
         print_note(f"Left out: {counted(len(them), 'image')} {what}, {name_some(them)}.")
 
 
+def _of_refinement(refinement: Refinement | None) -> list[tuple[str, str]]:
+    """Rows on the poses, if they were to be refined."""
+    if refinement is None:
+        return []
+    before, after = refinement.error_before, refinement.error_after
+    if refinement.kept:
+        return [
+            ("poses", f"kept as given, at {before:.3f} px: refined, they gain less than 0.1 px")
+        ]
+    return [
+        ("at the given poses", f"mean {before:.3f} px, refined {after:.3f} px"),
+        (
+            "cameras moved",
+            f"median {refinement.median_shift:.3g} units, largest {refinement.largest_shift:.3g}",
+        ),
+        (
+            "cameras turned",
+            f"median {refinement.median_turn:.2f} degrees, largest {refinement.largest_turn:.2f}",
+        ),
+    ]
+
+
 def _summarise(options: Options, report: SfmReport) -> None:
     seconds = ", ".join(f"{stage} {time:.1f}" for stage, time in report.seconds.items())
     rows = [
@@ -172,6 +211,7 @@ def _summarise(options: Options, report: SfmReport) -> None:
         ("points", f"{report.num_points:,}"),
         ("track length", f"mean {report.mean_track_length:.2f} images"),
         ("reprojection error", f"mean {report.mean_reprojection_error:.3f} px"),
+        *_of_refinement(report.refinement),
         ("seconds", seconds),
         ("output", str(report.path)),
     ]

@@ -1,9 +1,10 @@
 """Structure-from-Motion: photographs to a scene folder, by pycolmap.
 
 ``reconstruct`` finds poses, lenses and points; ``triangulate`` finds points for poses that are
-already known (an RGB-D capture, a simulator, another tool's calibration); ``undistort`` removes
-lens distortion from a scene. All write the folder that every 3DGS trainer reads: undistorted
-``images/`` and ``sparse/0/*.bin`` with PINHOLE cameras.
+already known (an RGB-D capture, a simulator, another tool's calibration) and can refine those poses
+where a phone or SLAM made them; ``undistort`` removes lens distortion from a scene. All write the
+folder that every 3DGS trainer reads: undistorted ``images/`` and ``sparse/0/*.bin`` with PINHOLE
+cameras.
 
 Promise: the output appears whole or not at all, and every failure is one of ``splatseed.errors``.
 pycolmap is an optional dependency (``pip install "pycolmap>=4.0"``), imported when it is needed.
@@ -15,8 +16,16 @@ varying order, and bundle adjustment can amplify that: 20 photographs gave 4095 
 """
 
 from splatseed.sfm.pipeline import reconstruct, triangulate
-from splatseed.sfm.report import SfmReport
+from splatseed.sfm.report import Refinement, SfmReport
 from splatseed.sfm.settings import DeviceName, MatcherName
 from splatseed.sfm.undistort import undistort
 
-__all__ = ["DeviceName", "MatcherName", "SfmReport", "reconstruct", "triangulate", "undistort"]
+__all__ = [
+    "DeviceName",
+    "MatcherName",
+    "Refinement",
+    "SfmReport",
+    "reconstruct",
+    "triangulate",
+    "undistort",
+]

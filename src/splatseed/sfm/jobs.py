@@ -7,7 +7,7 @@ leaves the scene there, with its scratch files in ``staging/.work``.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
@@ -15,9 +15,11 @@ from splatseed.scene import Image
 from splatseed.sfm.cameras import guess_cameras, known_cameras
 from splatseed.sfm.export import export_scene
 from splatseed.sfm.features import Run, find_features, match_features, write_database
-from splatseed.sfm.mapping import map_images, triangulate_points
 from splatseed.sfm.photos import Photo
+from splatseed.sfm.report import Refinement
 from splatseed.sfm.settings import Settings
+from splatseed.sfm.solving.mapping import map_images, triangulate_points
+from splatseed.sfm.solving.refinement import refine
 from splatseed.sfm.stages import Stages
 
 __all__ = ["Job", "Outcome", "ReconstructJob", "TriangulateJob", "UndistortJob"]
@@ -32,6 +34,7 @@ class Outcome:
     mean_track_length: float
     mean_reprojection_error: float
     seconds: Mapping[str, float]
+    refinement: Refinement | None = None
 
 
 @dataclass(frozen=True)
@@ -76,12 +79,14 @@ class TriangulateJob:
         staging: Where the scene is made.
         settings: The settings of the run.
         pairs: The photographs, each with its pose and intrinsics.
+        refine_poses: Whether the poses are refined first.
     """
 
     image_dir: Path
     staging: Path
     settings: Settings
     pairs: tuple[tuple[Photo, Image], ...]
+    refine_poses: bool
 
     def run(self, stages: Stages) -> Outcome:
         """Do it, in this process."""
@@ -90,9 +95,12 @@ class TriangulateJob:
         write_database(run, cameras, images)
         find_features(run, [photo.name for photo, _ in self.pairs])
         match_features(run)
-        model_dir = triangulate_points(run, cameras, images, [image for _, image in self.pairs])
+        poses, refinement = [image for _, image in self.pairs], None
+        if self.refine_poses:
+            poses, refinement = refine(run, cameras, images, poses)
+        model_dir = triangulate_points(run, cameras, images, poses)
         export_scene(run, model_dir, self.staging)
-        return _outcome(run, self.staging)
+        return replace(_outcome(run, self.staging), refinement=refinement)
 
 
 @dataclass(frozen=True)

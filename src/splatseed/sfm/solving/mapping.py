@@ -1,6 +1,7 @@
 """Mapping: from verified matches to a model, with poses unknown or known.
 
-Both functions return the folder of a COLMAP model in the run's scratch folder.
+``map_images`` and ``triangulate_points`` return the folder of a COLMAP model in the run's scratch
+folder.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from splatseed.scene import Image
 from splatseed.sfm.features import Run
 from splatseed.sfm.photos import Photo, name_some
 
-__all__ = ["map_images", "triangulate_points"]
+__all__ = ["map_images", "posed_model", "rigid", "triangulate_points"]
 
 
 SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
@@ -125,7 +126,7 @@ def triangulate_points(
     options.max_extra_param = math.inf  # a known lens is trusted: Kinects have a k3 above 1
     model_dir = run.work / "model"
     model_dir.mkdir()
-    posed = _posed_model(pycolmap, cameras, images, poses)
+    posed = posed_model(pycolmap, cameras, images, poses)
     model = run.stages.run(
         "triangulation",
         lambda: pycolmap.triangulate_points(
@@ -148,14 +149,19 @@ def triangulate_points(
     return model_dir
 
 
-def _posed_model(
+def posed_model(
     pycolmap: Any, cameras: Sequence[Any], images: Sequence[Any], poses: Sequence[Image]
 ) -> Any:
+    """A ``pycolmap.Reconstruction`` of ``images`` at ``poses``, given in the same order."""
     model = pycolmap.Reconstruction()
     for camera in cameras:
         model.add_camera_with_trivial_rig(camera)
     for image, pose in zip(images, poses, strict=True):
-        rotation = pycolmap.Rotation3d(np.roll(pose.quat, -1))  # wxyz to xyzw
-        cam_from_world = pycolmap.Rigid3d(rotation, pose.translation)
-        model.add_image_with_trivial_frame(image, cam_from_world)
+        model.add_image_with_trivial_frame(image, rigid(pycolmap, pose))
     return model
+
+
+def rigid(pycolmap: Any, image: Image) -> Any:
+    """The pose of ``image``, cam_from_world, as a ``pycolmap.Rigid3d``."""
+    rotation = pycolmap.Rotation3d(np.roll(image.quat, -1))  # wxyz to xyzw
+    return pycolmap.Rigid3d(rotation, image.translation)

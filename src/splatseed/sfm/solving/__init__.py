@@ -1,0 +1,1 @@
+"""Poses and points from verified matches: mapping, triangulation, refinement of given poses."""
