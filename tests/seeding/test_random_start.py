@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from splatseed.seeding.random_start import random_start
+from splatseed.seeding.poses_alone.random_start import random_start
 from splatseed.synthetic import make_capture
 
 

@@ -168,7 +168,7 @@ def find_problems(
             f"{regions.mean:.0%} of the images' area has no point: upsampling fills between "
             "points, but only photographs or depth maps can fill a bare wall"
         )
-    if (astray := _features_astray(scene)) > 0:
+    if cloud.num_points and (astray := _features_astray(scene)):
         problems.append(
             f"{astray:,} features of the photographs name points, but no point has a track: the "
             "points were put in later, and a trainer that reads features takes wrong ones for them;"
@@ -193,8 +193,8 @@ def _without_points(scene: Scene) -> str:
     if not scene.has_photographs:
         return "there are no points to upsample"
     return (
-        "there are no points yet: splatseed upsample makes some from the photographs (method auto),"
-        " splatseed sfm --poses-from triangulates some"
+        "there are no points yet: splatseed upsample makes some from the photographs, by comparing "
+        "them (method auto), splatseed sfm --poses-from triangulates some"
     )
 
 

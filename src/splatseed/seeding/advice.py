@@ -139,7 +139,8 @@ def advise(
     """
     if not measured.num_points:
         maps = "Its depth maps can give some, too: --method depth --no-align --num-points N."
-        none = "There are no points to begin with."
+        how = ": depth comes from comparing the photographs" if measured.photographs else ""
+        none = f"There are no points to begin with{how}."
         return Advice("auto", (none, maps) if measured.depth_maps else (none,))
     if not measured.photographs:
         return Advice("mls", ("Without photographs and their poses, points are interpolated.",))

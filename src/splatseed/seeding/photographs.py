@@ -8,13 +8,14 @@ looked at.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
-from splatseed.errors import SceneNotFoundError
+from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.pointcloud import ATTRIBUTES, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
@@ -34,6 +35,7 @@ __all__ = [
     "PhotographMethod",
     "Stereo",
     "cover_cloud",
+    "has_points",
     "photographed",
     "read_views",
     "with_cover",
@@ -138,13 +140,24 @@ class Stereo(PhotographMethod):
         stereo = self.find(given, only)
         return tuple(stereo.map(i) for i in only)
 
+    def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
+        """The new points of a scene; without points, its poses are checked first."""
+        if not has_points(scene):
+            from splatseed.seeding.poses_alone.pose_check import check_poses  # noqa: PLC0415  (loads with its use)
+
+            check_poses(scene, photographed(scene, self.hold_out), progress)
+        return super().seed(scene, rng, progress)
+
     def _look(self, given: _Given) -> NewPoints:
         from splatseed.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
 
-        seeds = fuse(self.find(given), self.spacing, given.progress)
+        start = time.perf_counter()
+        stereo = self.find(given)
+        seeds = fuse(stereo, self.spacing, given.progress)
         source = np.full(len(seeds), source_code("stereo"), np.uint8)
+        notes = () if has_points(given.scene) else (_known(stereo, time.perf_counter() - start),)
         return NewPoints(
-            seeds.xyz, seeds.rgb, (), seeds.normals, seeds.sizes, seeds.confidence, source
+            seeds.xyz, seeds.rgb, notes, seeds.normals, seeds.sizes, seeds.confidence, source
         )
 
     def find(self, given: _Given, only: Sequence[int] | None = None) -> FoundStereo:
@@ -169,6 +182,16 @@ class Cover(PhotographMethod):
 
     name: ClassVar[str] = "cover"
 
+    def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
+        """The new points of a scene, which needs some already: their depths are carried on."""
+        if not scene.points.originals.finite.any():
+            raise PointCloudError(
+                "points for the method cover, which carries their depths into the gaps",
+                found="none",
+                fix="Choose --method auto, which compares the photographs first.",
+            )
+        return super().seed(scene, rng, progress)
+
     def _look(self, given: _Given) -> NewPoints:
         originals = given.scene.points.originals
         return cover_cloud(given.views, originals, self.cell, given.rng, given.progress)
@@ -191,6 +214,14 @@ class Auto(Stereo):
         return _join(seeds, gaps)
 
 
+def has_points(scene: Scene) -> bool:
+    """Whether there are enough points for stereo to begin from; else photographs must do."""
+    from splatseed.stereo.without_points import TOO_FEW  # noqa: PLC0415  (kernels load with use)
+
+    points = scene.points.originals
+    return int(np.count_nonzero(points.distinct)) >= TOO_FEW
+
+
 def photographed(
     scene: Scene, hold_out: int = 0, *, without: str = "choose --method mls"
 ) -> tuple[Image, ...]:
@@ -207,6 +238,12 @@ def photographed(
     folder = scene.source.image_dir if scene.source else None
     ordered = sorted(scene.images, key=lambda image: image.name)
     used = list(scene.split(hold_out)[0]) if hold_out else ordered
+    if ordered and not used:
+        raise SceneNotFoundError(
+            "photographs beside those held out for testing",
+            found=f"none: all {len(ordered)} are held out",
+            fix="Add photographs to the scene.",
+        )
     if folder is not None:
         used = [image for image in used if (folder / image.name).is_file()]
     if folder is None or not used:
@@ -262,6 +299,15 @@ def with_cover(
     source = np.full(len(new.xyz), code, np.uint8)
     known = {name: getattr(new, name) for name in ATTRIBUTES}
     return PointCloud.concatenate(points, PointCloud(new.xyz, new.rgb, source, **known))
+
+
+def _known(stereo: FoundStereo, seconds: float) -> str:
+    """What comparing photographs found, and how long it took, in a sentence."""
+    share = np.mean([stereo.kept(i).mean() for i in range(len(stereo.views))])
+    return (
+        f"There were no points to begin from: comparing the photographs gave {share:.0%} of their "
+        f"pixels a confirmed depth, in {seconds:.0f} s."
+    )
 
 
 def _join(first: NewPoints, second: NewPoints) -> NewPoints:

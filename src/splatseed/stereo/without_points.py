@@ -24,7 +24,7 @@ from splatseed.views.pairs import choose_by_pose, choose_sources
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility, find_visibility
 
-__all__ = ["TOO_FEW", "glimpse", "known_visibility"]
+__all__ = ["TOO_FEW", "any_depth", "glimpse", "known_visibility"]
 
 TOO_FEW = 30
 """Points that are not worth being searched around."""
@@ -135,7 +135,7 @@ def _spread_of_depth(
     looked = np.unique(np.linspace(0, len(views) - 1, LOOKED_AT).round().astype(np.int64))
     hints: list[Hints | None] = [None] * len(views)
     for i in looked:
-        hints[i] = _any_depth(views, int(i), sources[i])
+        hints[i] = any_depth(views, int(i), sources[i])
     stereo = match_views(views, hints, sources, LOOK, seed, progress)
     good = [stereo.planes[i][0][stereo.costs[i] < GOOD] for i in looked]
     told = np.array([np.quantile(w, [0.1, 0.5, 0.9]) if len(w) else [np.nan] * 3 for w in good])
@@ -146,8 +146,15 @@ def _spread_of_depth(
     return np.asarray(told[nearest])
 
 
-def _any_depth(views: Sequence[View], i: int, sources: Int64[np.ndarray, " K"]) -> Hints | None:
-    """From the depth where the photograph hardly moves to where it moves by its width."""
+def any_depth(views: Sequence[View], i: int, sources: Int64[np.ndarray, " K"]) -> Hints | None:
+    """Hints from the depth at which a photograph hardly moves to that at which it leaves its width.
+
+    Args:
+        views: The photographs.
+        i: Which.
+        sources: The views that it is compared with, int64 [K]; -1 = none. Without any, or where all
+            are in its own place, there are no hints.
+    """
     others = sources[sources >= 0]
     apart = [np.linalg.norm(_camera(views[j]).center - _camera(views[i]).center) for j in others]
     # A sideways step b moves a point at inverse depth w by focal b w pixels.

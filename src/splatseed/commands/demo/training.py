@@ -20,7 +20,7 @@ from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.preview import Tile, write_grid
 from splatseed.scores import TrainingResult
-from splatseed.seeding.random_start import random_start
+from splatseed.seeding.poses_alone.random_start import random_start
 from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings

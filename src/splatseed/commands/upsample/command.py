@@ -32,6 +32,7 @@ from splatseed.commands.upsample.output import (
     write_previews,
 )
 from splatseed.commands.upsample.plan_line import (
+    found_how,
     method_words,
     number_words,
     parameters_of,
@@ -112,6 +113,8 @@ class Options:
     """What their values are: planar depth, distance along the ray, or inverse depth."""
     depth_scale: Annotated[float | None, number_flag(float, "what the folder says")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
+    ignore_depth: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Without points: compare photographs without looking at the depth maps of an RGB-D capture."""
     no_align: tyro.conf.FlagCreatePairsOff[bool] = False
     """For --method depth: take metric depth and poses as given (--depth.no-align)."""
     cloud_files: Annotated[
@@ -411,7 +414,9 @@ def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, floa
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
     scene = load_originals(options.scene, require_points="points" in traits_of(method).needs)
-    if options.method == "depth" and options.depth_maps is None:
+    if options.ignore_depth:
+        scene = scene.replace(depths=None)
+    elif options.method == "depth" and options.depth_maps is None:
         scene = with_own_depths(scene)
     if options.depth_maps is not None:
         maps = find_depths(
@@ -445,10 +450,11 @@ def _announce(
     ):
         print_note(f"Profile paper changes nothing for method {options.method}.")
     kind = scene.source.format if scene.source else "memory"
+    how = found_how(scene, method)
     size = f"{counted(len(scene.images), 'image')}, {counted(len(scene.points), 'point')}"
     OUT.print(
         f"{visible(options.scene)} ({kind}, {size})\n"
-        f"  -> {method_words(options.method, method, options.profile)}\n  "
+        f"  -> {method_words(options.method, method, options.profile)}{how}\n  "
         f"-> {visible(options.output)} ({number}, seed {options.seed}){takes}",
         soft_wrap=True,
     )

@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+from splatseed.scene import Scene
+from splatseed.seeding.photographs import Stereo, has_points
 from splatseed.upsample import Profile, Upsampler, configure
 
-__all__ = ["method_words", "number_words", "parameters_of"]
+__all__ = ["found_how", "method_words", "number_words", "parameters_of"]
 
 TOLD_ELSEWHERE = {"files", "transform", "memory", "alone"}
 """Parameters of a cloud that other lines tell."""
@@ -51,3 +53,16 @@ def number_words(total: int | None, most: int | None, changed_by: Sequence[str] 
         return "as many points as the photographs need"
     before = f" before {' and '.join(changed_by)}" if changed_by else ""
     return f"{total:,} points{before}"
+
+
+def found_how(scene: Scene, method: Upsampler) -> str:
+    """How a method that compares photographs finds depth without points; empty with points.
+
+    Args:
+        scene: The scene.
+        method: The method that makes its points.
+    """
+    if not isinstance(method, Stereo) or has_points(scene):
+        return ""
+    where = "" if scene.depths is None else ", around its depth maps"
+    return f": no points, so depth is found by comparing photographs{where}"
