@@ -44,7 +44,7 @@ from splatseed.errors import SplatseedError
 from splatseed.evaluate import EvalResult, evaluate_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.random_start import random_start
+from splatseed.seeding.poses_alone.random_start import random_start
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.run import TrainingRun
 from splatseed.train.settings import StrategyName
