@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 import splatseed as ss
+from splatseed.commands.upsample.refining import refined
+from splatseed.console import StageClock
 from splatseed.evaluate import evaluate_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
@@ -33,11 +35,13 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "stereo": {"method": "stereo"},
     "auto": {"method": "auto"},
     "auto, no points": {"method": "auto", "points": False},
+    "auto, refined": {"method": "auto", "points": False, "refined": True},
     "random as gsplat": {"random": "gsplat"},
     "random as nerfstudio": {"random": "nerfstudio"},
 }
 """How seeds are made, by what the table calls them; at ratio 1 nothing is added to SfM's points,
-and without points these are taken away first."""
+and without points these are taken away first; *refined* is with ``--refine-poses``, which
+triangulates some again."""
 TEST_EVERY = 8
 
 
@@ -85,8 +89,16 @@ def _seeds(scene: Scene, arm: str, most: int, seed: int) -> PointCloud:
         return random_start(scene, np.random.default_rng(seed), chosen["random"])
     if not chosen.pop("points", True):
         scene = scene.replace(points=PointCloud.empty(), tracks=None)
+    if chosen.pop("refined", False):
+        scene = _triangulated(scene, seed)
     name = chosen.pop("method")
     looks = hasattr(ss.METHODS[name], "hold_out")
     method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)
     points = ss.upsample(scene, method, budget=most, **chosen)
     return points.select(points.distinct)
+
+
+def _triangulated(scene: Scene, seed: int) -> Scene:
+    """The scene with points from the features of its training photographs, at its own poses."""
+    shown = scene.replace(images=scene.split(TEST_EVERY)[0])
+    return scene.replace(points=refined(shown, seed, StageClock())[0].points, tracks=None)

@@ -113,6 +113,8 @@ class Options:
     """What their values are: planar depth, distance along the ray, or inverse depth."""
     depth_scale: Annotated[float | None, number_flag(float, "what the folder says")] = None
     """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
+    refine_poses: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
     ignore_depth: tyro.conf.FlagCreatePairsOff[bool] = False
     """Without points: compare photographs without looking at the depth maps of an RGB-D capture."""
     no_align: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -287,6 +289,11 @@ def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
         scene = _read(options, methods[options.method])
         if options.gaussians is not None:
             photographed(scene, without="leave out --gaussians")  # views bound their sizes
+        if options.refine_poses:
+            from splatseed.commands.upsample.refining import refined  # noqa: PLC0415  (loads with its use)
+
+            scene, told = refined(scene, options.seed, clock)
+            notes.append(told)
         options = _settle(options, scene, notes)
         plain = cast("Cloud", methods[CLOUD])
         brought = bring_clouds(options.bringing, scene, plain, clock)

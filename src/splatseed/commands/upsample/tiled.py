@@ -54,6 +54,7 @@ WHOLE = (
     "budget",
     "cover_cell",
     "verify",
+    "refine_poses",
     "preview",
     "preview_methods",
     "gaussians",
