@@ -26,7 +26,7 @@ from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.seeds import SEEDS_SHARE
 from splatseed.upsample import configure
 
-__all__ = ["ARMS", "TEST_EVERY", "train"]
+__all__ = ["ARMS", "TEST_EVERY", "train", "triangulated"]
 
 ARMS: Mapping[str, Mapping[str, Any]] = {
     "sfm": {"method": "linear", "ratio": 1},
@@ -90,7 +90,7 @@ def _seeds(scene: Scene, arm: str, most: int, seed: int) -> PointCloud:
     if not chosen.pop("points", True):
         scene = scene.replace(points=PointCloud.empty(), tracks=None)
     if chosen.pop("refined", False):
-        scene = _triangulated(scene, seed)
+        scene = triangulated(scene, seed)
     name = chosen.pop("method")
     looks = hasattr(ss.METHODS[name], "hold_out")
     method = configure(name, hold_out=TEST_EVERY) if looks else configure(name)
@@ -98,7 +98,12 @@ def _seeds(scene: Scene, arm: str, most: int, seed: int) -> PointCloud:
     return points.select(points.distinct)
 
 
-def _triangulated(scene: Scene, seed: int) -> Scene:
-    """The scene with points from the features of its training photographs, at its own poses."""
+def triangulated(scene: Scene, seed: int) -> Scene:
+    """The scene with points from the features of its training photographs, at its own poses.
+
+    Args:
+        scene: A scene with photographs.
+        seed: Seed of every random choice.
+    """
     shown = scene.replace(images=scene.split(TEST_EVERY)[0])
     return scene.replace(points=refined(shown, seed, StageClock())[0].points, tracks=None)
