@@ -22,7 +22,7 @@ from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
 from benchmarks.seeds.depth import at_hand
 from benchmarks.stereo.arms import ARMS, FOLIAGE, Arm, scores_of
-from benchmarks.stereo.points import PointScore
+from benchmarks.stereo.points import FEW, PointScore
 from benchmarks.stereo.speed import NUM_VIEWS, prepare_views
 from benchmarks.stereo.truth import TRUE_SCENES, Score, prepare
 
@@ -37,7 +37,7 @@ WHOLE_TARGET = "30 s, 2 GB"
 THREADS = 2
 PEER_ROWS = 40
 POINTS_OF = ("treehill", "fern", "fox", "bonsai")
-PARTS = ("speed", "whole", "truth", "pairs", "points", "bare", "foliage")
+PARTS = ("speed", "whole", "truth", "pairs", "points", "few", "bare", "foliage")
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,8 @@ class Settings:
 
     parts: tuple[str, ...] = PARTS
     """speed: a hypothesis; whole: 100 views; truth: against true depth; pairs: OpenCV's semi-global
-    matching, likewise; points: against SfM's points; bare: without points; foliage: treehill."""
+    matching, likewise; points: against SfM's points; few: begun from a few of these; bare: without
+    points; foliage: treehill."""
     scenes: tuple[str, ...] = TRUE_SCENES
     """Where depth is known."""
     arms: tuple[str, ...] = tuple(ARMS)
@@ -155,6 +156,21 @@ def print_points(settings: Settings) -> None:
     _print_against_points(settings, settings.captures, settings.arms)
 
 
+def print_few(settings: Settings) -> None:
+    """From which number on SfM's points show better where to search than small photographs do."""
+    find_scenes()
+    header = ["begun from", "seen by an image", "kept", "CPU s"]
+    for name in settings.captures:
+        found = call(
+            "benchmarks.stereo.points:score_few", threads=1, name=name, limit=settings.limit
+        )
+        rows = [
+            [f"{count:,} points" if count else "none", f"{seen:.0f}", f"{kept:.1%}", f"{s:.1f}"]
+            for count, (seen, kept, s) in zip(FEW, found, strict=True)
+        ]
+        print(f"{table([f'{name}: {header[0]}', *header[1:]], rows)}\n", flush=True)
+
+
 def print_foliage(settings: Settings) -> None:
     """What finer windows, more views and smaller steps do on leaves."""
     _print_against_points(settings, ("treehill",), tuple(FOLIAGE))
@@ -211,6 +227,7 @@ PRINTERS: dict[str, Callable[[Settings], None]] = {
     "truth": print_truth,
     "pairs": print_pairs,
     "points": print_points,
+    "few": print_few,
     "bare": print_bare,
     "foliage": print_foliage,
 }

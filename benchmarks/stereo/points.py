@@ -23,7 +23,10 @@ from splatseed.stereo.settings import StereoSettings
 from splatseed.views.view import data_factor, load_views
 from splatseed.views.visibility import Visibility, find_visibility
 
-__all__ = ["PointScore", "score_points"]
+__all__ = ["FEW", "PointScore", "score_few", "score_points"]
+
+FEW = (0, 30, 300, 3000)
+"""How many of a capture's points stereo begins from, drawn at random; 0: none."""
 
 
 @dataclass(frozen=True)
@@ -64,17 +67,45 @@ def score_points(
     return {name: asdict(_score(name, StereoSettings(**settings), limit)) for name in names}
 
 
+def score_few(name: str, limit: int) -> list[list[float]]:
+    """From each of ``FEW``: points that an image sees, share of pixels kept, processor seconds.
+
+    Args:
+        name: The capture's folder.
+        limit: Photographs at most.
+    """
+    scene = ss.load_scene(find_scenes() / name)
+    images = scene.split()[0][:limit]
+    views = load_views(scene, images, data_factor=2)
+    everything, settings = find_visibility(scene), StereoSettings()
+    find_stereo(views[:2], images[:2], everything, settings)  # compiled
+    order = np.random.default_rng(0).permutation(len(everything.xyz))
+    rows = []
+    for count in FEW:
+        mine = np.isin(np.arange(len(order)), order[:count])[everything.point_idx]
+        told = _only(everything, mine)
+        if not count:
+            told = Visibility(np.empty((0, 3)), np.empty(0, np.int64), {}, {})
+        started = time.process_time()
+        stereo = find_stereo(views, images, told, settings)
+        seconds = time.process_time() - started
+        seen = float(np.median([told.count.get(image.image_id, 0) for image in images]))
+        kept = np.mean([stereo.kept(i).mean() for i in range(len(views))])
+        rows.append([seen, float(kept), seconds])
+    return rows
+
+
 def _score(name: str, settings: StereoSettings, limit: int) -> PointScore:
     scene = ss.load_scene(find_scenes() / name)
     images = scene.split()[0][:limit]
     views = load_views(scene, images, data_factor=data_factor(images, settings.max_size))
     visibility = find_visibility(scene)
-    told = _every_second(visibility, 0)
+    told = _only(visibility, visibility.point_idx % 2 == 0)
     find_stereo(views[:2], images[:2], told, settings)  # compiled
     started = time.process_time()
     stereo = find_stereo(views, images, told, settings)
     seconds = time.process_time() - started
-    held_out = _every_second(visibility, 1)
+    held_out = _only(visibility, visibility.point_idx % 2 == 1)
     errors = [_errors(stereo, i, held_out.of(image)) for i, image in enumerate(images)]
     error = np.concatenate(errors)
     known = np.isfinite(error)
@@ -88,9 +119,8 @@ def _score(name: str, settings: StereoSettings, limit: int) -> PointScore:
     )
 
 
-def _every_second(visibility: Visibility, first: int) -> Visibility:
-    """Half of the points; who sees them stays known."""
-    mine = visibility.point_idx % 2 == first
+def _only(visibility: Visibility, mine: np.ndarray) -> Visibility:
+    """Some of what the images see."""
     before = np.concatenate([[0], np.cumsum(mine)])
     start = {key: int(before[at]) for key, at in visibility.start.items()}
     count = {

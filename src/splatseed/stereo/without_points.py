@@ -30,8 +30,8 @@ TOO_FEW = 30
 """Points that are not worth being searched around."""
 LEAST_SEEN = 300
 """A scene counts as having no points if half of its images see fewer. A glimpse takes two or three
-times as long as what follows, and then as many pixels become known as with about 800 points an
-image: on fern .50, where 300 points an image give .49, 80 give .45 and 8 give .41."""
+times as long as what follows, and as many pixels become known as from 800 points an image: of
+fern's .49, where 80 points an image give .44 and 8 give .41 (benchmarks/stereo)."""
 SMALL = 200
 """Longer side of a small photograph, in pixels."""
 LOOK = StereoSettings(grid=2, sweeps=6, tolerance=0.03, max_cost=0.4)
