@@ -49,7 +49,7 @@ from splatseed.scene import Scene
 from splatseed.seeding.poses_alone.random_start import random_start
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.run import TrainingRun
-from splatseed.train.settings import StrategyName
+from splatseed.train.settings import Seeding, StrategyName
 from splatseed.views import View
 from splatseed.views.photographs import user_cache_dir
 
@@ -58,6 +58,8 @@ __all__ = ["train_all"]
 Window = tuple[slice, slice]
 
 CAPTURES = ("fern", "fox", "treehill", "bonsai", "stone_horse", "face", "dorm", "desk")
+MOST_MATCHED = 150
+"""Photographs up to which points are triangulated too: each is matched with every other."""
 WIDE = 9.0
 """Inches; a hundred pixels each."""
 PART = 3
@@ -71,6 +73,7 @@ ARMS = {
     "refined": "--refine-poses, auto + grow",
     "sfm": "SfM's points",
 }
+OURS: dict[str, StrategyName] = {"grow": "grow", "auto": "default"}
 
 
 @dataclass(frozen=True)
@@ -125,12 +128,16 @@ def main(options: Options) -> None:
     _draw(pictures, words, options.output)
     print(f"{describe()}\n\nrho {options.rho:g}, {options.max_steps:,} steps; PSNR / SSIM\n")
     rows = [
-        [name, *(_cell(each[arm]) for arm in ARMS), f"{gain:+.2f}"]
+        [name, *(_cell(each.get(arm)) for arm in ARMS), f"{gain:+.2f}"]
         for name, each, gain in zip(options.scenes, results, gains, strict=True)
     ]
     means = [
-        f"{statistics.mean(r[arm]['psnr'] for r in results):.2f} / "
-        f"{statistics.mean(r[arm]['ssim'] for r in results):.3f}"
+        " / ".join(
+            f"{statistics.mean(each[arm][score] for each in results):.{digits}f}"
+            for score, digits in (("psnr", 2), ("ssim", 3))
+        )
+        if all(arm in each for each in results)
+        else ""
         for arm in ARMS
     ]
     rows.append(["mean", *means, f"{statistics.mean(gains):+.2f}"])
@@ -161,7 +168,9 @@ def _gain(result: dict[str, Any]) -> float:
     return float(result["grow"]["psnr"] - result["random, equal"]["psnr"])
 
 
-def _cell(told: dict[str, float]) -> str:
+def _cell(told: dict[str, float] | None) -> str:
+    if told is None:
+        return ""
     return (
         f"{told['psnr']:.2f} / {told['ssim']:.3f} ({told['steps']:,}, {told['seconds']:.0f} s, "
         f"{told['gaussians'] / 1000:.1f}k)"
@@ -174,25 +183,28 @@ def train_all(
     """All runs of one capture; the renders of its median view go into ``pictures``, an .npz."""
     whole = ss.load_scene(Path(scene))
     bare = whole.replace(points=PointCloud.empty(), tracks=None)
-    begun = time.perf_counter()  # it works in a process of its own
-    posed = triangulated(bare, 0)
-    triangulating = time.perf_counter() - begun
     dice = bare.replace(points=random_start(bare, np.random.default_rng(0)))
     camera = whole.images[0].camera
     cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
 
-    def train(start: Scene, strategy: StrategyName, steps: int = max_steps) -> Trained:
+    def train(
+        start: Scene, strategy: StrategyName, steps: int = max_steps, seeding: Seeding = "scene"
+    ) -> Trained:
         settings = TrainSettings(
             strategy=strategy, max_steps=steps, backend="cpu", data_factor=data_factor,
-            cap_max=cap, seeding="auto" if start in (bare, posed) else "scene",
+            cap_max=cap, seeding=seeding,
         )  # fmt: skip
         return _train(start, settings)
 
     for strategy in ("default", "grow"):
-        train(bare, cast("StrategyName", strategy), 4)  # loads kernels, which takes seconds
-    runs = {"grow": train(bare, "grow"), "auto": train(bare, "default")}
-    refined = train(posed, "grow")
-    runs["refined"] = refined._replace(seconds=refined.seconds + triangulating)
+        train(bare, cast("StrategyName", strategy), 4, "auto")  # loads kernels: it takes seconds
+    runs = {name: train(bare, of, seeding="auto") for name, of in OURS.items()}
+    if len(bare.images) <= MOST_MATCHED:
+        begun = time.perf_counter()  # it works in a process of its own
+        posed = triangulated(bare, 0)
+        triangulating = time.perf_counter() - begun
+        refined = train(posed, "grow", seeding="auto")
+        runs["refined"] = refined._replace(seconds=refined.seconds + triangulating)
     # A run's cost per step grows with its Gaussians, so the trial is as long as the other.
     runs["random"] = train(dice, "default")
     steps = round(max_steps * runs["grow"].seconds / runs["random"].seconds)
