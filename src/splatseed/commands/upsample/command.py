@@ -92,9 +92,9 @@ class Options:
     method: str = DEFAULT_METHOD
     """The method that makes new points; --method NAME --help shows its flags."""
     ratio: Annotated[float | None, number_flag(float, "4, unless --num-points is given")] = None
-    """Points in all, as a multiple of the originals, for methods that interpolate."""
+    """Points in all over originals, for methods that interpolate."""
     num_points: Annotated[int | None, number_flag(int, "by the ratio")] = None
-    """Points in all, instead of a ratio."""
+    """Points in all, not a ratio."""
     budget: Annotated[str | None, budget_flag()] = None
     """Most points in all: a number, or 0.25rho for a quarter of a full photograph's pixels."""
     cover_cell: Annotated[int | None, cover_flag()] = None
@@ -106,7 +106,7 @@ class Options:
     profile: Profile = "default"
     """Defaults of the methods' flags: improved ones, or those of the paper's text."""
     depth_maps: Annotated[Path | None, depth_folder_flag()] = None
-    """For --method depth: a folder of depth maps, in any layout that docs/formats.md lists."""
+    """For --method depth: a folder of maps, as docs/formats.md lists them."""
     depth_kind: Annotated[
         DepthKind | None, default_flag("what the folder says, else z", "{z,ray,inverse}")
     ] = None
@@ -123,8 +123,8 @@ class Options:
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),
     ] = ()
-    """Seeds from a scan or dense cloud (docs/scans.md), alone or beside --method auto, stereo,
-    cover or depth."""
+    """Seeds from a scan or dense cloud (docs/scans.md), alone or beside
+    auto, stereo, cover or depth."""
     cloud_transform: Annotated[
         Path | None,
         tyro.conf.arg(name="transform", constructor=Path, help_behavior_hint="(default: none)"),
@@ -156,11 +156,11 @@ class Options:
     ] = None
     """Also write the initial Gaussians as a 3DGS .ply, for trainers that start from one."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
-    """Layout to write; auto keeps the input's."""
+    """Layout to write: auto is the input's."""
     copy_images: bool = False
-    """Copy the images instead of linking to them."""
+    """Copy images, do not link them."""
     overwrite: bool = False
-    """Replace an output folder that splatseed wrote before."""
+    """Replace an output of splatseed's."""
 
     @property
     def memory_bytes(self) -> int | None:
