@@ -34,7 +34,7 @@ MARKS = {
     "PyTorch installed": ".venv/.train",
     "every method measured (geometry.csv)": "demo/geometry.csv",
     "every method shown (preview_errors.png)": "demo/preview_errors.png",
-    "both runs trained (preview_trained.png)": "demo/preview_trained.png",
+    "all runs trained (preview_trained.png)": "demo/preview_trained.png",
 }
 POLL = 0.1
 

@@ -196,8 +196,8 @@ def train_all(
         )  # fmt: skip
         return _train(start, settings)
 
-    for strategy in ("default", "grow"):
-        train(bare, cast("StrategyName", strategy), 4, "auto")  # loads kernels: it takes seconds
+    for strategy in OURS.values():
+        train(bare, strategy, 4, "auto")  # loads kernels: it takes seconds
     runs = {name: train(bare, of, seeding="auto") for name, of in OURS.items()}
     if len(bare.images) <= MOST_MATCHED:
         begun = time.perf_counter()  # it works in a process of its own
