@@ -26,8 +26,8 @@ from splatseed.errors import SplatseedError
 
 __all__: list[str] = []
 
-Key = tuple[str, str, str, float, int, int, int]
-"""Capture, arm, strategy, rho, steps, data factor, seed."""
+Key = tuple[str, str, str, float, int, int, int, int]
+"""Capture, arm, strategy, rho, steps, data factor, seed, training views."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,8 @@ class Settings:
     """Runs of each arm on each capture, with seeds 0, 1, ..."""
     data_factor: int = 2
     """By how much photographs are made smaller."""
+    views: int = 0
+    """Training photographs, evenly chosen by name; 0 = all."""
     jobs: int = os.cpu_count() or 1
     """Runs at a time, on one thread each."""
     ledger: Path = Path("seeding.jsonl")
@@ -56,12 +58,13 @@ class Settings:
 
 def run(key: Key, scenes: Path, ledger: Path) -> None:
     """One run, and its line in the ledger."""
-    scene, arm, strategy, rho, max_steps, data_factor, seed = key
+    scene, arm, strategy, rho, max_steps, data_factor, seed, views = key
     say(f"{scene}, {arm}, {strategy}, rho {rho:g}, seed {seed} ...")
     result = call(
         "benchmarks.training.seeding_arms:train", threads=1, scene=str(scenes / scene), arm=arm,
         strategy=strategy,
         rho=rho, max_steps=max_steps, data_factor=data_factor, seed=seed,
+        views=views,
     )  # fmt: skip
     write_line(ledger, key, result)
     say(f"  {scene}, {arm}, {strategy}: {result['psnr']:.2f} dB")
@@ -75,7 +78,7 @@ def wanted(settings: Settings) -> Iterable[Key]:
                 for arm in settings.arms:
                     for scene in settings.scenes:
                         steps, factor = settings.max_steps, settings.data_factor
-                        yield scene, arm, strategy, rho, steps, factor, seed
+                        yield scene, arm, strategy, rho, steps, factor, seed, settings.views
 
 
 def rows(results: Mapping[Any, Mapping[str, Any]], settings: Settings) -> Iterable[list[str]]:
@@ -98,7 +101,7 @@ def _means(
 ) -> list[float]:
     """The means over the seeds; empty until all have been run."""
     rest = (settings.max_steps, settings.data_factor)
-    runs = [results.get((*arm, *rest, seed)) for seed in range(settings.seeds)]
+    runs = [results.get((*arm, *rest, seed, settings.views)) for seed in range(settings.seeds)]
     names = ("psnr", "ssim", "gaussians", "seeds", "seeding", "seconds")
     known = [each for each in runs if each]
     if len(known) < len(runs):

@@ -20,7 +20,7 @@ from splatseed.commands.upsample.refining import refined
 from splatseed.console import StageClock
 from splatseed.evaluate import evaluate_views
 from splatseed.pointcloud import PointCloud
-from splatseed.scene import Scene
+from splatseed.scene import Scene, Split
 from splatseed.seeding.poses_alone.random_start import random_start
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.seeds import SEEDS_SHARE
@@ -36,25 +36,28 @@ ARMS: Mapping[str, Mapping[str, Any]] = {
     "auto": {"method": "auto"},
     "auto, no points": {"method": "auto", "points": False},
     "auto, refined": {"method": "auto", "points": False, "refined": True},
+    "triangulated": {"method": "linear", "ratio": 1, "points": False, "refined": True},
     "random as gsplat": {"random": "gsplat"},
     "random as nerfstudio": {"random": "nerfstudio"},
 }
 """How seeds are made, by what the table calls them; at ratio 1 nothing is added to SfM's points,
 and without points these are taken away first; *refined* is with ``--refine-poses``, which
-triangulates some again."""
+triangulates some again. SfM's points were made from all photographs, those held out too;
+*triangulated* are only those of the features of the training photographs."""
 TEST_EVERY = 8
 
 
 def train(
-    scene: str, arm: str, strategy: str, rho: float, max_steps: int, data_factor: int, seed: int
-) -> dict[str, float]:
-    """One run.
+    scene: str, arm: str, strategy: str, rho: float, max_steps: int, data_factor: int, seed: int,
+    views: int,
+) -> dict[str, float]:  # fmt: skip
+    """One run, from so many of the training photographs, evenly chosen by name; 0 = all.
 
     Scores, Gaussians, seeds, and seconds: of seeding and of training by the clock, of training by
     the processor, and ``whole_processor``, from the scene in memory to the last step.
     """
     whole = ss.load_scene(Path(scene))
-    validation = whole.replace(images=whole.split(TEST_EVERY)[0])
+    validation = _validation(whole, views)
     camera = validation.images[0].camera
     cap = round(rho * (camera.width // data_factor) * (camera.height // data_factor))
     start, begun = time.perf_counter(), time.process_time()
@@ -80,6 +83,17 @@ def train(
         "processor": processor,
         "whole_processor": whole,
     }
+
+
+def _validation(whole: Scene, views: int) -> Scene:
+    """The training views, of which some are held out; of the others only so many are left."""
+    validation = whole.replace(images=whole.split(TEST_EVERY)[0])
+    shown, held = validation.split(TEST_EVERY)
+    if views:
+        places = np.linspace(0, len(shown) - 1, views).round().astype(int)
+        shown = tuple(shown[i] for i in np.unique(places))
+    split = Split(*(frozenset(each.name for each in part) for part in (shown, held)), "benchmark")
+    return validation.replace(images=(*shown, *held), listed=split)
 
 
 def _seeds(scene: Scene, arm: str, most: int, seed: int) -> PointCloud:

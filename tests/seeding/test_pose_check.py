@@ -106,6 +106,14 @@ def test_only_scenes_without_points_are_checked_and_say_what_was_found(room, pos
     assert len(notes) == 1
 
 
+def test_too_few_points_vouch_for_the_poses_but_are_not_begun_from(room, monkeypatch):
+    monkeypatch.setattr(pose_check, "check_poses", None)
+    notes, every = [], len(room.points) // 100
+    few = room.replace(points=room.points.select(np.arange(len(room.points)) % every == 0))
+    upsample(few, "stereo", note=notes.append)
+    assert [note.split(":")[0] for note in notes] == ["There were too few points to begin from"]
+
+
 def test_cover_needs_points(room, poses):
     with pytest.raises(
         PointCloudError, match=r"points for the method cover.*found none.*--method auto"

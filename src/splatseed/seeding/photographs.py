@@ -34,6 +34,7 @@ __all__ = [
     "Cover",
     "PhotographMethod",
     "Stereo",
+    "begins_from_points",
     "cover_cloud",
     "has_points",
     "photographed",
@@ -155,7 +156,8 @@ class Stereo(PhotographMethod):
         stereo = self.find(given)
         seeds = fuse(stereo, self.spacing, given.progress)
         source = np.full(len(seeds), source_code("stereo"), np.uint8)
-        notes = () if has_points(given.scene) else (_known(stereo, time.perf_counter() - start),)
+        seconds = time.perf_counter() - start
+        notes = () if begins_from_points(given.scene) else (_known(given.scene, stereo, seconds),)
         return NewPoints(
             seeds.xyz, seeds.rgb, notes, seeds.normals, seeds.sizes, seeds.confidence, source
         )
@@ -215,11 +217,19 @@ class Auto(Stereo):
 
 
 def has_points(scene: Scene) -> bool:
-    """Whether there are enough points for stereo to begin from; else photographs must do."""
+    """Whether there are points that vouch for the poses, as far as points can."""
     from splatseed.stereo.without_points import TOO_FEW  # noqa: PLC0415  (kernels load with use)
 
     points = scene.points.originals
     return int(np.count_nonzero(points.distinct)) >= TOO_FEW
+
+
+def begins_from_points(scene: Scene) -> bool:
+    """Whether there are enough points for stereo to search around; else photographs must do."""
+    from splatseed.stereo.without_points import enough_points  # noqa: PLC0415  (kernels load with use)
+    from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
+
+    return enough_points(find_visibility(scene), scene.images)
 
 
 def photographed(
@@ -301,12 +311,13 @@ def with_cover(
     return PointCloud.concatenate(points, PointCloud(new.xyz, new.rgb, source, **known))
 
 
-def _known(stereo: FoundStereo, seconds: float) -> str:
+def _known(scene: Scene, stereo: FoundStereo, seconds: float) -> str:
     """What comparing photographs found, and how long it took, in a sentence."""
+    points = "too few" if has_points(scene) else "no"
     share = np.mean([stereo.kept(i).mean() for i in range(len(stereo.views))])
     return (
-        f"There were no points to begin from: comparing the photographs gave {share:.0%} of their "
-        f"pixels a confirmed depth, in {seconds:.0f} s."
+        f"There were {points} points to begin from: comparing the photographs gave {share:.0%} of "
+        f"their pixels a confirmed depth, in {seconds:.0f} s."
     )
 
 

@@ -24,7 +24,7 @@ from splatseed.views.pairs import choose_by_pose, choose_sources
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility, find_visibility
 
-__all__ = ["TOO_FEW", "any_depth", "glimpse", "known_visibility"]
+__all__ = ["TOO_FEW", "any_depth", "enough_points", "glimpse", "known_visibility"]
 
 TOO_FEW = 30
 """Points that are not worth being searched around."""
@@ -54,11 +54,17 @@ SAMPLES = 18
 def known_visibility(scene: Scene) -> Visibility:
     """The points that each image sees: from SfM, else sampled from depth maps, else none."""
     visibility, maps = find_visibility(scene), scene.depths
-    if np.median([len(visibility.rows_of(image)) for image in scene.images]) >= LEAST_SEEN:
+    if enough_points(visibility, scene.images):
         return visibility
     known = [image for image in scene.images if maps is not None and image.name in maps]
     places = [_places(image, maps.read(image.name)) for image in known if maps is not None]
     return _unseen(np.concatenate([np.empty((0, 3)), *places]))
+
+
+def enough_points(visibility: Visibility, images: Sequence[Image]) -> bool:
+    """Whether depth can be searched around points: half of the images see ``LEAST_SEEN``."""
+    seen = [len(visibility.rows_of(image)) for image in images]
+    return bool(seen) and bool(np.median(seen) >= LEAST_SEEN)
 
 
 def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Visibility:

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from splatseed.scene import Scene
-from splatseed.seeding.photographs import Stereo, has_points
+from splatseed.seeding.photographs import Stereo, begins_from_points, has_points
 from splatseed.upsample import Profile, Upsampler, configure
 
 __all__ = ["found_how", "method_words", "number_words", "parameters_of"]
@@ -56,13 +56,14 @@ def number_words(total: int | None, most: int | None, changed_by: Sequence[str] 
 
 
 def found_how(scene: Scene, method: Upsampler) -> str:
-    """How a method that compares photographs finds depth without points; empty with points.
+    """How a method that compares photographs finds depth without enough points; else empty.
 
     Args:
         scene: The scene.
         method: The method that makes its points.
     """
-    if not isinstance(method, Stereo) or has_points(scene):
+    if not isinstance(method, Stereo) or begins_from_points(scene):
         return ""
+    points = "too few" if has_points(scene) else "no"
     where = "" if scene.depths is None else ", around its depth maps"
-    return f": no points, so depth is found by comparing photographs{where}"
+    return f": {points} points, so depth is found by comparing photographs{where}"
