@@ -55,9 +55,14 @@ def _refuse_note(path: Path) -> None:
 def config_of(path: Path) -> Mapping[str, Any]:
     """The config of a run, named by its folder or its result; empty for what belongs to no run.
 
+    Its scene is the one that was trained.
+
     Raises:
         SceneFormatError: It cannot be read.
     """
     folder = RunFolder(path if path.is_dir() else path.parent)
     named = path.is_dir() or path == folder.gaussians
-    return folder.read_config() if named and folder.is_run else {}
+    if not (named and folder.is_run):
+        return {}
+    config = folder.read_config()
+    return {**config, "scene": folder.scene_of(config)}

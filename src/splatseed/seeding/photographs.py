@@ -19,7 +19,7 @@ from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.pointcloud import ATTRIBUTES, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
-from splatseed.stereo.settings import MOST_GRID
+from splatseed.stereo.settings import MOST_GRID, TOO_FEW
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
@@ -143,11 +143,17 @@ class Stereo(PhotographMethod):
 
     def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
         """The new points of a scene; without points, its poses are checked first."""
-        if not has_points(scene):
-            from splatseed.seeding.poses_alone.pose_check import check_poses  # noqa: PLC0415  (loads with its use)
+        if has_points(scene):
+            return super().seed(scene, rng, progress)
+        from splatseed.seeding.poses_alone.pose_check import check_poses  # noqa: PLC0415  (loads with its use)
+        from splatseed.seeding.poses_alone.pose_error import pose_error  # noqa: PLC0415  (loads with its use)
 
-            check_poses(scene, photographed(scene, self.hold_out), progress)
-        return super().seed(scene, rng, progress)
+        images = photographed(scene, self.hold_out)
+        check_poses(scene, images, progress)
+        error = pose_error(scene, images, progress)
+        made = super().seed(scene, rng, progress)
+        warnings = (error.warning,) if error and error.warning else ()
+        return made._replace(notes=(*made.notes, *warnings))
 
     def _look(self, given: _Given) -> NewPoints:
         from splatseed.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
@@ -218,8 +224,6 @@ class Auto(Stereo):
 
 def has_points(scene: Scene) -> bool:
     """Whether there are points that vouch for the poses, as far as points can."""
-    from splatseed.stereo.without_points import TOO_FEW  # noqa: PLC0415  (kernels load with use)
-
     points = scene.points.originals
     return int(np.count_nonzero(points.distinct)) >= TOO_FEW
 

@@ -17,9 +17,9 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Image
 from splatseed.stereo.matching import match_views
 from splatseed.stereo.result import Stereo
-from splatseed.stereo.settings import StereoSettings
+from splatseed.stereo.settings import TOO_FEW, StereoSettings
 from splatseed.stereo.start import Hints, hints_from
-from splatseed.stereo.without_points import TOO_FEW, glimpse
+from splatseed.stereo.without_points import glimpse
 from splatseed.views.pairs import choose_sources
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility

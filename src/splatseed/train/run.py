@@ -37,12 +37,18 @@ from splatseed.train.device import (
 )
 from splatseed.train.known_depths import known_depths, seconds_of
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
-from splatseed.train.record.config import check_same_seeds, make_config, resumed_settings
+from splatseed.train.record.config import (
+    check_same_seeds,
+    make_config,
+    resumed_reading,
+    resumed_settings,
+)
 from splatseed.train.record.curve import Record, write_curve_csv, write_curve_png
 from splatseed.train.record.folder import RunFolder, write_json
+from splatseed.train.record.scene import scene_as_read
 from splatseed.train.record.tensorboard import Board
 from splatseed.train.seeds import seeded, usable_seeds
-from splatseed.train.settings import TrainSettings
+from splatseed.train.settings import AS_IT_IS, Reading, TrainSettings
 from splatseed.train.start import first_gaussians
 from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
 from splatseed.train.strategies import Strategy, make_strategy
@@ -73,6 +79,7 @@ class RunOptions:
             on the same photographs with the same seed; nowhere when left out. Each run's time
             counts what finding it took.
         seeding_knew: Whether that time is already counted as making the seeds.
+        reading: What to do with the scene before.
     """
 
     resume: bool = False
@@ -81,6 +88,7 @@ class RunOptions:
     cache_dir: Path | None = None
     depths: Path | None = None
     seeding_knew: bool = False
+    reading: Reading = AS_IT_IS
 
 
 def prepare_run(
@@ -108,21 +116,25 @@ def prepare_run(
         SceneFormatError: A camera, a photograph or the run to resume cannot be used.
         PointCloudError: Too few points, or more than fit into memory.
         ParameterError: No GPU although one was requested; settings that differ from the run's.
-        MissingDependencyError: TensorBoard is asked for and absent.
+        ReconstructionError: Poses cannot be refined.
+        MissingDependencyError: TensorBoard or pycolmap is needed and absent.
     """
     options = options or RunOptions()
     _check_images(scene)
     folder = _checked_folder(output, scene, options)
     begun = folder.read_config() if options.resume and folder.is_run else None
     settings = resumed_settings(begun, settings)
+    reading = resumed_reading(begun, options.reading)
     for image in scene.images:
         check_lens(image, scene.source.root if scene.source else None)
     device = pick_device(settings.backend, progress)
+    earlier = folder if begun else None
+    scene = posed = scene_as_read(scene, reading, earlier, settings.seed, note, progress)
     scene, stereo = seeded(scene, settings, device.type, note, progress)
     trained = scene.split(settings.test_every)[0]
     seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
     check_fits(len(seeds), device)
-    config = make_config(scene, seeds, settings, device)
+    config = make_config(scene, seeds, settings, device, reading)
     if begun:
         check_same_seeds(folder.config, begun, config)
     views = load_split(
@@ -143,7 +155,7 @@ def prepare_run(
         progress,
     )
     strategy = make_strategy(settings, device, depths)
-    state = _state(folder if begun else None, seeds, frame, near, settings, strategy, device)
+    state = _state(earlier, seeds, frame, near, settings, strategy, device)
     if state.step:
         note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
     run = TrainingRun(folder, settings, frame, state, views)
@@ -153,7 +165,7 @@ def prepare_run(
     # What cannot render has failed by now, and leaves no folder.
     if not begun:
         state.watch.seconds += seconds  # the cost of growth includes finding depth
-        folder.begin(config)
+        folder.begin(config, posed if reading.refine_poses else None)
     if options.tensorboard:
         run.log_to_tensorboard()
     return run

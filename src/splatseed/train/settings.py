@@ -16,11 +16,13 @@ from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_sch
 
 __all__ = [
     "AS_3DGS",
+    "AS_IT_IS",
     "BUDGET",
     "BYTES_EACH",
     "LEAST_GAUSSIANS",
     "Backend",
     "Placing",
+    "Reading",
     "Seeding",
     "StrategyName",
     "TrainSettings",
@@ -45,6 +47,19 @@ after 4,000 steps and at least level after 10,000; beyond that it was not measur
 BYTES_EACH = 2000
 """Memory per Gaussian in training: its 59 numbers, their gradients and two moments (944 bytes),
 and as much again for the rasteriser's lists and for copies while Gaussians are added."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What to do with a scene before it is trained."""
+
+    refine_poses: bool = False
+    """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
+    ignore_depth: bool = False
+    """Without points: compare photographs without looking at the depth maps of an RGB-D capture."""
+
+
+AS_IT_IS = Reading()
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def _open_run(folder: RunFolder, scene_path: Path | None) -> Shown:
             fix=f"Continue it: splatseed train SCENE -o {folder.path} --resume.",
         )
     config, scene = folder.read_config(), None
-    named = scene_path or config.get("scene")
+    named = scene_path or folder.scene_of(config)
     if named is not None:
         try:
             scene = load_scene(Path(named), require_points=False)

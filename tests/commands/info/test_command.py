@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -86,9 +85,8 @@ def test_an_rgbd_capture(tmp_path, splatseed):
     assert _rows(run.out)["format"] == "rgbd"
     assert f"splatseed sfm {tmp_path / 'results'}" in run.out
     assert "no points yet: splatseed upsample makes some from the photographs" in run.out
-    assert re.search(
-        rf"^  seeds +splatseed upsample {tmp_path} --budget \d+ ", run.out, re.MULTILINE
-    )
+    assert "cannot be compared: expected at least two photographs with a pose" in run.out
+    assert "  seeds" not in run.out
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ def test_the_commands_to_train_with_name_what_is_there(room, tmp_path, splatseed
 
 def _commands(out):
     """Trainer to the words of its command, from the last lines of the output."""
-    lines = out.partition("train it with\n")[2].splitlines()
+    lines = out.partition("train it with\n")[2].partition("note: ")[0].splitlines()
     return {line.split()[0]: shlex.split(line)[1:] for line in lines}
 
 

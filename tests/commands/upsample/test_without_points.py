@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -22,24 +21,6 @@ def bare(room, tmp_path) -> Path:
     for path in folder.glob("*.ply"):
         path.unlink()
     (folder / "splatseed.json").unlink(missing_ok=True)
-    return folder
-
-
-@pytest.fixture
-def rgbd(room, tmp_path) -> Path:
-    """The room in Replica's layout."""
-    folder = tmp_path / "rgbd"
-    (folder / "results").mkdir(parents=True)
-    images = sorted(load_scene(room).images, key=lambda image: image.name)
-    for number, image in enumerate(images):
-        for kind, place in (("frame", "images"), ("depth", "depths")):
-            shutil.copy(room / place / image.name, folder / f"results/{kind}{number:06d}.png")
-    poses = [np.linalg.inv(image.camera.cam_from_world).ravel() for image in images]
-    np.savetxt(folder / "traj.txt", poses)
-    camera, K = images[0].camera, images[0].camera.K
-    sizes = {"w": camera.width, "h": camera.height, "scale": 5000}
-    focal = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    (folder / "cam_params.json").write_text(json.dumps({"camera": {**sizes, **focal}}))
     return folder
 
 

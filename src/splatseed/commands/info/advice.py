@@ -92,7 +92,7 @@ def advice_rows(advice: Advice, measured: Measured, planned: Planned) -> list[tu
 
 
 def advice_commands(
-    path: Path, scene: Scene, advice: Advice, planned: Planned
+    path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool = False
 ) -> list[tuple[str, str]]:
     """The commands that follow the advice, each of which works on this scene.
 
@@ -101,6 +101,7 @@ def advice_commands(
         scene: The scene.
         advice: The advice.
         planned: How it will be trained.
+        refine: Whether its poses should be refined.
     """
     trains, first = not untrainable(scene), []
     if trains and is_distorted(scene):
@@ -114,6 +115,7 @@ def advice_commands(
     else:
         how = f"--method {advice.method} --ratio 4"
         how = f"--budget {planned.most_seeds}" if advice.method == "auto" else how
+        how = f"{how} --refine-poses" if refine else how
         first.append(("seeds", f"splatseed upsample {source} {how} -o OUT"))
         train = f"splatseed train OUT {training}"
     if not trains:

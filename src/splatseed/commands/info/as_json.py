@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from splatseed.commands.info.poses import Poses
 from splatseed.console import OUT
 from splatseed.diagnostics.scene import CloudStatistics, EmptyRegions, TrackStatistics
 from splatseed.scene import Scene
@@ -28,6 +29,7 @@ def print_json(
     cloud: CloudStatistics,
     tracks: TrackStatistics | None,
     regions: EmptyRegions | None,
+    poses: Poses | None,
     alignments: Mapping[str, Alignment] | None,
     problems: Sequence[str],
 ) -> None:
@@ -49,6 +51,7 @@ def print_json(
         "points": asdict(cloud),
         "tracks": None if tracks is None else asdict(tracks),
         "empty": None if regions is None else asdict(regions),
+        "poses": None if poses is None else asdict(poses),
         "depth": None if alignments is None else {k: asdict(a) for k, a in alignments.items()},
         "problems": list(problems),
     }

@@ -15,6 +15,7 @@ import tyro
 from splatseed.commands.depth.next_steps import number_for, use
 from splatseed.commands.info.advice import advice_commands, advice_for, advice_rows
 from splatseed.commands.info.as_json import print_json
+from splatseed.commands.info.poses import Poses, look_at_poses
 from splatseed.commands.options import parse_options
 from splatseed.commands.planned import Planned
 from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
@@ -103,11 +104,14 @@ def run(arguments: list[str]) -> None:
         problems = find_problems(scene, cloud, None if was_upsampled(scene) else regions)
         alignments = _alignments(options, scene, clock)
         known = _known_depths(options, scene, clock)
-        problems = (*problems, *_unfit_maps(scene, alignments or {}))
+        poses = look_at_poses(scene, clock)
+        doubts = [poses.problem] if poses and poses.problem else []
+        problems = (*problems, *_unfit_maps(scene, alignments or {}), *doubts)
     if options.json:
-        print_json(scene, cloud, tracks, regions, alignments, problems)
+        print_json(scene, cloud, tracks, regions, poses, alignments, problems)
         return
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
+    rows += poses.rows() if poses else []
     usable = scene
     if alignments and len(scene.points) and all(each.rejected for each in alignments.values()):
         usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
@@ -123,7 +127,7 @@ def run(arguments: list[str]) -> None:
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
-        print_commands("next", _next_commands(options, usable, known))
+        print_commands("next", _next_commands(options, usable, known, poses))
 
 
 def _read(options: Options) -> Scene:
@@ -173,23 +177,26 @@ def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
     return [f"{maps} cannot be aligned with the points, and are left out"] if unfit else []
 
 
-def _next_commands(options: Options, scene: Scene, known: int) -> list[tuple[str, str]]:
+def _next_commands(
+    options: Options, scene: Scene, known: int, poses: Poses | None
+) -> list[tuple[str, str]]:
     """What to do next with the scene, or what there is to choose from."""
     if scene.depths is not None and options.depth and len(scene.points) and not is_distorted(scene):
         planned = Planned.of(scene, options.budget, options.max_steps)
         number = number_for(len(scene.points), known, planned.most_seeds)
         how = f"{_reading(options)}{number}"
         return [("", use(options.scene, options.depth, how)[1])]
-    advised = []
-    if len(scene.points) or scene.has_photographs:
+    advised, refine = [], poses is not None and poses.refine
+    if len(scene.points) or ((poses is None or poses.usable) and scene.has_photographs):
         planned = Planned.of(scene, options.budget, options.max_steps)
         advice, _ = advice_for(scene, planned, None)
-        advised = advice_commands(options.scene, scene, advice, planned)[:1]
+        advised = advice_commands(options.scene, scene, advice, planned, refine=refine)[:1]
     if len(scene.points):
         return [("", advised[0][1])]
     images = scene.source.image_dir if scene.source else None
     photographs = "IMAGES" if images is None else quoted(images)
     points = f"splatseed sfm {photographs} --poses-from {quoted(options.scene)} -o OUT"
+    points = f"{points} --refine-poses" if refine else points
     maps = _from_maps(options, scene, known)
     return [*advised, *maps, ("or points" if advised or maps else "points", points)]
 

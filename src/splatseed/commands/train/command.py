@@ -44,8 +44,10 @@ from splatseed.seeding.amounts import parse_budget
 from splatseed.train.record.folder import RunFolder
 from splatseed.train.seeds import why_not_seeded
 from splatseed.train.settings import (
+    AS_IT_IS,
     BUDGET,
     LEAST_GAUSSIANS,
+    Reading,
     Seeding,
     StrategyName,
     TrainSettings,
@@ -99,6 +101,8 @@ class Options:
     ] = None
     """Start from the points that method auto makes of the training photographs, or from the scene's
     points as they are."""
+    reading: Annotated[Reading, tyro.conf.arg(name="")] = AS_IT_IS
+    """What to do with the scene before; its fields are options of their own."""
     resume: bool = False
     """Resume the run in the output folder, with its own settings; begin it if there is none."""
     tensorboard: bool = False
@@ -157,7 +161,8 @@ def _prepare(
     from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (imports PyTorch)
 
     clock("read", 0.0)
-    scene = load_scene(options.scene, require_points=options.seeds == "scene")
+    has_points = options.seeds == "scene" and not options.reading.refine_poses
+    scene = load_scene(options.scene, require_points=has_points)
     for warning in scene.warnings:
         note(warning)
     if scene.listed is not None:
@@ -170,6 +175,7 @@ def _prepare(
         overwrite=options.overwrite,
         tensorboard=options.tensorboard,
         cache_dir=user_cache_dir(),
+        reading=options.reading,
     )
     return prepare_run(scene, options.output, settings, how, note=note, progress=clock)
 

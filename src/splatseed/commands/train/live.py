@@ -66,7 +66,8 @@ def watched(training: TrainingRun, scene: Path, port: int | None) -> Iterator[Wa
         return
     from splatseed.viewer.training import TrainingViewer  # noqa: PLC0415  (imports PyTorch)
 
-    loaded = load_scene(scene, require_points=False)
+    posed = training.folder.scene  # there is one if poses were refined
+    loaded = load_scene(posed if posed.is_dir() else scene, require_points=False)
     viewer = TrainingViewer(training, loaded, scene.name or str(scene), HOST, port)
     OUT.print(f"  -> watch it at http://localhost:{port}")
     OUT.file.flush()

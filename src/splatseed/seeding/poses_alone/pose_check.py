@@ -21,6 +21,7 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.literal import quoted
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
+from splatseed.seeding.poses_alone.pose_error import pose_error
 from splatseed.stereo.matching import match_views
 from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.without_points import any_depth
@@ -70,13 +71,16 @@ WRITTEN = {
 """What each format's poses are."""
 
 
-def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = silent) -> None:
+def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = silent) -> float:
     """Refuse photographs that cannot be compared at their poses, within seconds.
 
     Args:
         scene: A scene with photographs, whose points are not used.
         images: The images whose photographs are to be compared.
         progress: Called with the stage and the fraction done.
+
+    Returns:
+        The largest share of pixels whose depth other photographs confirm, of those looked at.
 
     Raises:
         SceneNotFoundError: There are fewer than two.
@@ -101,6 +105,7 @@ def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = sile
         if np.mean(shares) <= NIL:
             raise _apart_error(scene, images, float(np.mean(shares)))
     progress("check poses", 1.0)
+    return max(shares)
 
 
 def _check_places(poses: Poses) -> None:
@@ -159,6 +164,14 @@ def _apart_error(scene: Scene, images: Sequence[Image], share: float) -> SceneFo
             f"photographs that show the same places, at the poses of {scene.source.root}",
             found=f"no two of {len(images)} whose pictures overlap at any depth",
             fix=f"Take more photographs in between, or find the poses anew: {new}.",
+        )
+    error = pose_error(scene, images)
+    if error is not None and not error.exact:
+        return SceneFormatError(
+            f"photographs that agree at the poses of {scene.source.root}",
+            found=f"a depth that others confirm at {share:.1%} of their pixels; they miss each "
+            f"other by about {error}",
+            fix=f"Mend the poses with --refine-poses, or find them anew: {new}.",
         )
     return SceneFormatError(
         f"photographs that agree at the poses of {scene.source.root}",

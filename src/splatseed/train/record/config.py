@@ -19,9 +19,9 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.train.device import device_name
 from splatseed.train.seeds import seeds_digest
-from splatseed.train.settings import TrainSettings
+from splatseed.train.settings import AS_IT_IS, Reading, TrainSettings
 
-__all__ = ["check_same_seeds", "make_config", "resumed_settings"]
+__all__ = ["check_same_seeds", "make_config", "resumed_reading", "resumed_settings"]
 
 WHERE = {"backend"}
 """Settings that may change when a run is resumed."""
@@ -30,13 +30,18 @@ OPTIONS = {"seeding": "seeds"}
 
 
 def make_config(
-    scene: Scene, seeds: PointCloud, settings: TrainSettings, device: torch.device
+    scene: Scene,
+    seeds: PointCloud,
+    settings: TrainSettings,
+    device: torch.device,
+    reading: Reading = AS_IT_IS,
 ) -> dict[str, Any]:
     """The content of config.json."""
     return {
         "splatseed": _version("splatseed"),
         "scene": str(scene.source.root.resolve()) if scene.source else None,
-        "points": _points_path(scene),
+        "points": None if reading.refine_poses else _points_path(scene),
+        **dataclasses.asdict(reading),
         **dataclasses.asdict(settings),
         "device": device_name(device),
         "seeds": {"count": len(seeds), "digest": seeds_digest(seeds)},
@@ -79,6 +84,29 @@ def resumed_settings(begun: Mapping[str, Any] | None, asked: TrainSettings) -> T
             raise _differs(field.name, then, now)
         changes[field.name] = then
     return dataclasses.replace(asked, **changes)
+
+
+def resumed_reading(begun: Mapping[str, Any] | None, asked: Reading) -> Reading:
+    """How a resumed run reads its scene; as asked for if there is none.
+
+    Args:
+        begun: The run's config.
+        asked: What the user asks for; what is left out is as the run has it.
+
+    Raises:
+        ParameterError: The run began otherwise.
+    """
+    if begun is None:
+        return asked
+    then = Reading(**{f.name: begun.get(f.name) is True for f in dataclasses.fields(Reading)})
+    for name, now in dataclasses.asdict(asked).items():
+        if now and not getattr(then, name):
+            raise ParameterError(
+                f"no --{name.replace('_', '-')}, as when the run began",
+                found="it",
+                fix="Leave the option out to resume, or start again with --overwrite.",
+            )
+    return then
 
 
 def _check_kind(name: str, then: object, default: object) -> None:

@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from splatseed.errors import OutputError, SceneFormatError
+from splatseed.io import write_scene
 from splatseed.io.files import read_text
 from splatseed.io.output.staging import MANIFEST, add_files, atomic_file, check_apart, check_output
+from splatseed.scene import Scene
 
 __all__ = ["RunFolder", "write_json"]
 
@@ -77,6 +79,11 @@ class RunFolder:
         return self.path / "tensorboard"
 
     @property
+    def scene(self) -> Path:
+        """The scene at refined poses, if the run refined them."""
+        return self.path / "scene"
+
+    @property
     def is_run(self) -> bool:
         """Whether a run has begun here."""
         return (self.path / MANIFEST).is_file() and self.config.is_file()
@@ -106,8 +113,12 @@ class RunFolder:
                 fix=f"Pass {go_on}--overwrite to replace it, or choose another.",
             )
 
-    def begin(self, config: Mapping[str, object]) -> None:
+    def begin(self, config: Mapping[str, object], refined: Scene | None = None) -> None:
         """Make the folder, empty but for the config; removes what ``check`` allowed to replace.
+
+        Args:
+            config: What to record of the run.
+            refined: The scene at refined poses, if they were refined: the folder keeps it.
 
         Raises:
             OutputError: It cannot be written.
@@ -124,8 +135,12 @@ class RunFolder:
         # The mark first: a run that is interrupted here can be replaced.
         files = [self.config, self.checkpoint, self.metrics, self.gaussians]
         files += [self.curve_csv, self.curve_png, self.path / MANIFEST]
+        files += [] if refined is None else [self.scene]
         mark = {"command": KIND, "version": config["splatseed"]}
         write_json(self.path / MANIFEST, {**mark, "files": [path.name for path in files]})
+        if refined is not None:  # before the config, so that no run lacks it
+            # COLMAP's layout keeps poses to the bit.
+            write_scene(refined, self.scene, format="colmap")
         write_json(self.config, config)
 
     @contextmanager
@@ -180,6 +195,15 @@ class RunFolder:
         if not isinstance(config, dict):
             raise _unreadable(self.config, type(config).__name__)
         return config
+
+    def scene_of(self, config: Mapping[str, Any]) -> Any:
+        """Where the scene lies that the run trained: in its folder if poses were refined.
+
+        Args:
+            config: The run's; without a scene of its own, what it says of one is passed on.
+        """
+        refined = config.get("refine_poses") is True
+        return str(self.scene.resolve()) if refined else config.get("scene")
 
 
 def _move(path: Path, target: Path) -> None:

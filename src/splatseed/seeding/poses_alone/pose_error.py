@@ -1,0 +1,230 @@
+"""By how much photographs miss each other at their poses.
+
+What lies along an epipolar line is depth's; what lies across it is the poses' fault.
+
+Notation: view i and its partner j, which is turned into i's orientation first, so that a point at
+inverse depth w moves from pixel p to ``K (K^-1 p + w c)``, c the partner's step. A *corner* of i is
+looked for in a band along that line; the *miss* is how far beside the line it is found. Promise: a
+corner counts only where one place of the band is clearly most alike; the scene's scale plays no
+part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobel, uniform_filter
+from scipy.signal import correlate
+
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image, Scene
+from splatseed.stereo.settings import StereoSettings
+from splatseed.views.pairs import choose_by_pose
+from splatseed.views.view import View, data_factor, load_views
+
+__all__ = ["PoseError", "pose_error"]
+
+Gray = Float64[np.ndarray, "H W"]
+
+SIDE = 400
+"""Longer side of the photographs that are compared, in pixels."""
+LOOKS, PARTNERS = 5, 2
+"""Photographs looked at, and those that each is compared with."""
+CORNERS = 100
+"""Corners of a photograph, at most."""
+APART = 9
+"""Pixels between corners, at least."""
+HALF = 5
+"""A patch is 2 HALF + 1 pixels wide."""
+REACH = 24
+"""Largest miss that is looked for, in pixels."""
+FARTHEST = 0.3
+"""A band's length: what a point moves at most, in widths of a photograph."""
+ALIKE, CLEARLY = 0.85, 0.1
+"""Least correlation of a corner's best place, and by how much it is above any other."""
+LEAST_FOUND = 8
+"""Corners of a pair that must be found for it to count."""
+LEAST_PAIRS = 1 / 3
+"""Share of the pairs that must count; half of them do on the hardest of ten captures."""
+BY_CHANCE = 10.0
+"""Pixels of a median that corners found by chance reach, as they are spread over ``REACH``."""
+MOST_MISSED = 1.0
+"""Pixels at stereo's size up to which poses are exact; COLMAP's and those of two depth cameras are
+0.1 to 0.9, and 2 or more with half a degree of noise (docs/known_poses.md)."""
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """By how much photographs miss each other.
+
+    Args:
+        px: Median over pairs, in pixels of the photographs as they are stored.
+        degrees: The turn of a camera that moves its picture as far.
+        exact: Whether it is a pixel at most, at the size at which stereo compares photographs.
+    """
+
+    px: float
+    degrees: float
+    exact: bool
+
+    def __str__(self) -> str:
+        return f"{self.px:.2g} px ({self.degrees:.2g} degrees)"
+
+    @property
+    def warning(self) -> str:
+        """What to do about it, in a sentence; empty if the poses are exact."""
+        if self.exact:
+            return ""
+        return (
+            f"The photographs miss each other by about {self} at these poses, and comparing them "
+            "needs a pixel: --refine-poses may mend that."
+        )
+
+
+def pose_error(
+    scene: Scene, images: Sequence[Image], progress: Progress = silent
+) -> PoseError | None:
+    """Measure how exact the poses of photographs are, in a few seconds.
+
+    Args:
+        scene: A scene with photographs, whose points are not used.
+        images: The images whose photographs are compared; two at least.
+        progress: Called with the stage and the fraction done.
+
+    Returns:
+        None if too few corners are found again, as on plain walls or at poses that are far off.
+
+    Raises:
+        SceneFormatError: A photograph cannot be used.
+    """
+    poses = np.array([image.camera.cam_from_world for image in images])
+    partners = choose_by_pose(poses, PARTNERS)
+    looked = np.unique(np.linspace(0, len(images) - 1, LOOKS).round().astype(np.int64))
+    factor = data_factor(images, SIDE)
+    misses, pairs = [], 0
+    for number, i in enumerate(looked.tolist()):
+        others = [j for j in partners[i].tolist() if j >= 0]
+        some = [images[k] for k in (i, *others)]
+        view, *rest = load_views(scene, some, data_factor=factor, undistort=True)
+        pairs += len(rest)
+        for other in rest:
+            found = np.abs(_misses(view, other))
+            if len(found) >= LEAST_FOUND:
+                miss = float(np.median(found))
+                misses.append((miss, np.degrees(np.arctan(miss / view.K[0, 0]))))
+        progress("measure poses", (number + 1) / len(looked))
+    if len(misses) < max(1.0, LEAST_PAIRS * pairs):
+        return None
+    px, degrees = np.median(misses, axis=0).tolist()
+    if px > BY_CHANCE:
+        return None
+    exact = px * factor <= MOST_MISSED * data_factor(images, StereoSettings.max_size)
+    return PoseError(px * factor, degrees, exact)
+
+
+def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
+    """How far beside their epipolar lines the corners of a view are found, in pixels."""
+    j_from_i = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
+    margin = int(FARTHEST * view.width) + REACH + 2 * HALF
+    image = _gray(view)
+    turned = _turned(_gray(other), other.K, j_from_i[:3, :3], view, margin)
+    # c: the step in i's axes, as R d + w t = R (d + w R' t).
+    step = view.K @ (j_from_i[:3, :3].T @ j_from_i[:3, 3])
+    found = []
+    for p in _corners(image):
+        # d/dw of K (K^-1 p + w c), at w = 0: where a far point begins to move.
+        along = step[:2] - step[2] * p
+        length = np.linalg.norm(along)
+        if length < 1e-9 * max(1.0, abs(step[2])):
+            continue
+        miss = _miss(image, turned, p, along / length, margin, FARTHEST * view.width)
+        if miss is not None:
+            found.append(miss)
+    return np.array(found)
+
+
+def _gray(view: View) -> Gray:
+    return np.asarray(view.photograph.mean(axis=2))
+
+
+def _turned(
+    image: Gray, K: Float64[np.ndarray, "3 3"], R: Float64[np.ndarray, "3 3"], view: View,
+    margin: int,
+) -> Gray:  # fmt: skip
+    """A photograph in the view's orientation, with a margin; NaN where it shows nothing."""
+    rows, columns = view.height + 2 * margin, view.width + 2 * margin
+    v, u = np.indices((rows, columns)) - margin + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ (K @ R @ np.linalg.inv(view.K)).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    behind = rays[..., 2] <= 0
+    places = np.where(behind, -1.0, [y - 0.5, x - 0.5])
+    return np.asarray(map_coordinates(image, places, order=1, cval=np.nan))
+
+
+def _corners(image: Gray) -> Float64[np.ndarray, "N 2"]:
+    """Pixels (column, row) around which a photograph changes most in every direction."""
+    x, y = sobel(image, axis=1), sobel(image, axis=0)
+    xx, xy, yy = (gaussian_filter(each, 2.0) for each in (x * x, x * y, y * y))
+    # The smaller eigenvalue of the structure tensor.
+    least = 0.5 * (xx + yy - np.hypot(xx - yy, 2 * xy))
+    peaks = (least == maximum_filter(least, APART)) & (least > 0)
+    row, column = np.nonzero(peaks)
+    best = np.argsort(-least[peaks], kind="stable")[:CORNERS]
+    return np.stack([column[best], row[best]], axis=1) + 0.5
+
+
+def _miss(
+    image: Gray, turned: Gray, p: Float64[np.ndarray, " 2"], along: Float64[np.ndarray, " 2"],
+    margin: int, farthest: float,
+) -> float | None:  # fmt: skip
+    """How far beside its line a corner is found; None unless one place is clearly best."""
+    patch = _sample(image, p, along, (-HALF, HALF), (-HALF, HALF))
+    # A little backwards, too: with wrong poses a far point may seem to be behind infinity.
+    start, stop = -HALF - REACH, HALF + int(farthest)
+    if not np.isfinite(patch).all():  # beyond the picture's border
+        return None
+    band = _sample(turned, p + margin, along, (start, stop), (-HALF - REACH, HALF + REACH))
+    scores = _correlation(patch, band)
+    at = np.unravel_index(np.argmax(scores), scores.shape)
+    best, (column, row) = scores[at], at
+    rest = scores.copy()
+    rest[max(column - HALF, 0) : column + HALF + 1, max(row - HALF, 0) : row + HALF + 1] = -1.0
+    inside = 0 < row < scores.shape[1] - 1
+    if best < ALIKE or best - rest.max() < CLEARLY or not inside:
+        return None
+    before, after = scores[column, row - 1], scores[column, row + 1]
+    # The peak of a parabola through three correlations.
+    bend = 2 * best - before - after
+    return float(row - REACH + (0.5 * (after - before) / bend if bend > 0 else 0.0))
+
+
+def _sample(
+    image: Gray, p: Float64[np.ndarray, " 2"], along: Float64[np.ndarray, " 2"],
+    length: tuple[int, int], width: tuple[int, int],
+) -> Gray:  # fmt: skip
+    """Values on a grid along a line through p and across it; NaN outside."""
+    a = np.arange(length[0], length[1] + 1)[:, None]
+    b = np.arange(width[0], width[1] + 1)[None]
+    x = p[0] - 0.5 + a * along[0] - b * along[1]
+    y = p[1] - 0.5 + a * along[1] + b * along[0]
+    return np.asarray(map_coordinates(image, [y, x], order=1, cval=np.nan))
+
+
+def _correlation(patch: Gray, band: Gray) -> Gray:
+    """The normalised correlation of a patch at each place of a band; -1 where unknown."""
+    known = np.isfinite(band)
+    filled = np.where(known, band, 0.0)
+    one = patch - patch.mean()
+    # sum (b - mean b) a = sum b a, as the sum of a is 0.
+    product = correlate(filled, one, mode="valid", method="fft")
+    inner = (slice(HALF, -HALF), slice(HALF, -HALF))
+    mean, square, share = (
+        uniform_filter(each, 2 * HALF + 1)[inner]
+        for each in (filled, filled * filled, known.astype(np.float64))
+    )
+    spread = np.sqrt(np.maximum(square - mean * mean, 1e-6) * patch.size)
+    return np.where(share > 1 - 1e-9, product / (spread * np.linalg.norm(one)), -1.0)
