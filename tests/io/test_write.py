@@ -153,6 +153,10 @@ def test_rigs_and_frames_are_copied_byte_for_byte(scene_dir, tmp_path, rng):
     report = write_scene(scene.replace(images=(other, *scene.images[1:])), tmp_path / "renamed")
     assert "Rigs" in " ".join(report.notes)
     assert not (tmp_path / "renamed/sparse/0/frames.bin").exists()
+    # Frames hold poses, too: those of before would contradict refined ones.
+    moved = replace(scene.images[0], translation=scene.images[0].translation + 1e-3)
+    write_scene(scene.replace(images=(moved, *scene.images[1:])), tmp_path / "moved")
+    assert not (tmp_path / "moved/sparse/0/frames.bin").exists()
 
 
 def test_rigs_as_text_are_left_out_and_told(scene_dir, tmp_path):

@@ -39,6 +39,7 @@ __all__ = ["write_colmap", "write_json", "write_split", "write_transforms"]
 _ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json")  # gsplat's examples read them if present
 _MODEL_EXTRAS = ("depth_params.json",)  # graphdeco's trainer reads it if present
 _RIG_FILES = ("rigs", "frames")
+_SAME_POSE = 1e-9  # relative and absolute; a pose that went through other formats is that near
 
 
 def write_colmap(scene: Scene, folder: Path) -> tuple[list[str], dict[str, Path]]:
@@ -147,10 +148,12 @@ def write_split(scene: Scene, folder: Path) -> None:
 def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
     """The model's rigs and frames if they are valid for the output, else a note saying why not."""
     there = [f"{name}.bin" for name in _RIG_FILES if (model_dir / f"{name}.bin").is_file()]
-    if there and _has_all_images(scene, model_dir):
+    if there and _has_same_images(scene, model_dir):
         return there, []
     if there:
-        return [], ["Rigs and frames were left out: the scene no longer has the same images."]
+        return [], [
+            "Rigs and frames were left out: the scene no longer has the same images and poses."
+        ]
     if any((model_dir / f"{name}.txt").is_file() for name in _RIG_FILES):
         return [], [
             "Rigs and frames were left out: as text they would not be read beside the binary model."
@@ -158,12 +161,15 @@ def _rigs(scene: Scene, model_dir: Path) -> tuple[list[str], list[str]]:
     return [], []
 
 
-def _has_all_images(scene: Scene, model_dir: Path) -> bool:
-    """Whether the scene still has exactly the images of its model."""
-    _, images = read_model_cameras(model_dir)
-    return {(im.image_id, im.name) for im in images} == {
-        (im.image_id, im.name) for im in scene.images
+def _has_same_images(scene: Scene, model_dir: Path) -> bool:
+    """Whether the scene still has the images of its model, at their poses, which frames repeat."""
+    poses = {(im.image_id, im.name): im.camera.cam_from_world for im in scene.images}
+    before = {
+        (im.image_id, im.name): im.camera.cam_from_world for im in read_model_cameras(model_dir)[1]
     }
+    return poses.keys() == before.keys() and all(
+        np.allclose(poses[key], before[key], rtol=_SAME_POSE, atol=_SAME_POSE) for key in poses
+    )
 
 
 def _model_notes(scene: Scene, model: Renumbered) -> list[str]:
