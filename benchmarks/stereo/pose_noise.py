@@ -22,7 +22,7 @@ import tyro
 from benchmarks.common.clouds import find_scenes
 from benchmarks.common.machine import describe
 from benchmarks.common.markdown import table
-from benchmarks.stereo.truth import load, prepare, relative_error
+from benchmarks.stereo.truth import first, load, prepare, relative_error
 from benchmarks.training.baseline import say
 from scipy.spatial.transform import Rotation
 
@@ -51,6 +51,8 @@ class Options:
     """Captures by their names in the folder of captures, or the made room."""
     degrees: tuple[float, ...] = (0.0, 0.1, 0.5, 1.0, 2.0)
     """Noise."""
+    limit: int = 24
+    """Photographs at most, the first by name: features are matched between all of them."""
     cache: Path = user_cache_dir().parent / "benchmarks"
     """Where the made room is kept."""
 
@@ -69,6 +71,7 @@ def _rows(name: str, options: Options) -> Iterator[list[str]]:
     scene = load(name, options.cache) if name == MADE else ss.load_scene(
         find_scenes() / name, require_points=False
     )  # fmt: skip
+    scene = first(scene, options.limit)
     for degrees in options.degrees:
         say(f"{name}, {degrees:g} degrees ...")
         noisy = _with_noise(scene, degrees, np.random.default_rng(0))

@@ -79,6 +79,19 @@ def test_plain_photographs_tell_nothing(room, monkeypatch):
     assert _measured(_turned(room, 0.0)) is None
 
 
+def test_masked_corners_do_not_count(room, monkeypatch):
+    plain, seen = pose_error.load_views, []
+
+    def masked(*arguments, **options):
+        views = plain(*arguments, **options)
+        seen.extend(views)
+        return [replace(v, mask=np.zeros((v.height, v.width), np.bool_)) for v in views]
+
+    monkeypatch.setattr(pose_error, "load_views", masked)
+    assert _measured(_turned(room, 0.0)) is None
+    assert seen
+
+
 def test_seeds_at_inexact_poses_come_with_a_warning(room, monkeypatch):
     monkeypatch.setattr(pose_check, "TURNS", {"nothing": lambda poses: poses})
     notes = []

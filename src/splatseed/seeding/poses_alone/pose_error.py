@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobel, uniform_filter
 from scipy.signal import correlate
 
@@ -134,7 +134,7 @@ def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
     # c: the step in i's axes, as R d + w t = R (d + w R' t).
     step = view.K @ (j_from_i[:3, :3].T @ j_from_i[:3, 3])
     found = []
-    for p in _corners(image):
+    for p in _corners(image, view.mask):
         # d/dw of K (K^-1 p + w c), at w = 0: where a far point begins to move.
         along = step[:2] - step[2] * p
         length = np.linalg.norm(along)
@@ -165,13 +165,18 @@ def _turned(
     return np.asarray(map_coordinates(image, places, order=1, cval=np.nan))
 
 
-def _corners(image: Gray) -> Float64[np.ndarray, "N 2"]:
-    """Pixels (column, row) around which a photograph changes most in every direction."""
+def _corners(image: Gray, mask: Bool[np.ndarray, "H W"] | None) -> Float64[np.ndarray, "N 2"]:
+    """Pixels (column, row) around which a photograph changes most in every direction.
+
+    Masked ones are left out: a turntable's background does not turn with it.
+    """
     x, y = sobel(image, axis=1), sobel(image, axis=0)
     xx, xy, yy = (gaussian_filter(each, 2.0) for each in (x * x, x * y, y * y))
     # The smaller eigenvalue of the structure tensor.
     least = 0.5 * (xx + yy - np.hypot(xx - yy, 2 * xy))
     peaks = (least == maximum_filter(least, APART)) & (least > 0)
+    if mask is not None:
+        peaks &= mask
     row, column = np.nonzero(peaks)
     best = np.argsort(-least[peaks], kind="stable")[:CORNERS]
     return np.stack([column[best], row[best]], axis=1) + 0.5
