@@ -51,9 +51,9 @@ LEAST_PAIRS = 1 / 3
 """Share of the pairs that must count; half of them do on the hardest of ten captures."""
 BY_CHANCE = 10.0
 """Pixels of a median that corners found by chance reach, as they are spread over ``REACH``."""
-MOST_MISSED = 1.0
-"""Pixels at stereo's size up to which poses are exact; COLMAP's and those of two depth cameras are
-0.1 to 0.9, and 2 or more with half a degree of noise (docs/known_poses.md)."""
+MOST_MISSED = 0.5
+"""Pixels at stereo's size up to which poses are exact. COLMAP's are 0.1 to 0.5 on eight captures;
+at 0.55, a tenth of a degree of noise, fern keeps 0.6 of its depths (benchmarks/stereo)."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class PoseError:
     Args:
         px: Median over pairs, in pixels of the photographs as they are stored.
         degrees: The turn of a camera that moves its picture as far.
-        exact: Whether it is a pixel at most, at the size at which stereo compares photographs.
+        exact: Whether it is half a pixel at most, at the size at which stereo compares photographs.
     """
 
     px: float
@@ -80,7 +80,7 @@ class PoseError:
             return ""
         return (
             f"The photographs miss each other by about {self} at these poses, and comparing them "
-            "needs a pixel: --refine-poses may mend that."
+            "needs half a pixel: --refine-poses may mend that."
         )
 
 
