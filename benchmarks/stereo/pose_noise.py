@@ -2,8 +2,9 @@
 
 Notation: noise of d degrees turns each camera by a rotation vector of d degrees at root mean
 square, and moves it by d percent of the cameras' *extent*, the distance of the farthest from their
-centroid. What is *left* after refining is the median over the cameras, after the best similarity
-between both sets of centres, since nothing can tell the mean of the noise from the world's frame.
+centroid. What is *left* after refining is the median over the cameras: of their turn against the
+mean turn of all, and of their step after the best similarity between both sets of centres, since
+nothing can tell the mean of the noise from the world's frame.
 *Told* is what ``info`` says; *known* is the share of pixels with a depth that others confirm, and
 *true* that of these within 5% of a depth camera's. Promise: captures are only read.
 
@@ -120,17 +121,18 @@ def _seen(scene: Scene, truth: Scene) -> list[str]:
 def _left(scene: Scene, found: Scene) -> str:
     """Degrees, and percent of the cameras' extent, that the poses are still off."""
     posed = {image.name: image.camera for image in found.images}
-    true = [image.camera for image in scene.images]
-    centers = np.stack([camera.center for camera in true])
-    fit = fit_similarity(np.stack([posed[image.name].center for image in scene.images]), centers)
-    turns, steps = [], []
-    for image, camera in zip(scene.images, true, strict=True):
-        other = posed[image.name]
-        turn = other.cam_from_world[:3, :3] @ fit.rotation.T @ camera.cam_from_world[:3, :3].T
-        turns.append(np.degrees(Rotation.from_matrix(turn).magnitude()))
-        steps.append(np.linalg.norm(fit.matrix @ [*other.center, 1.0] - camera.center))
-    extent = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
-    return f"{np.median(turns):.3f}, {100 * np.median(steps) / extent:.2f}"
+    pairs = [(image.camera, posed[image.name]) for image in scene.images]
+    true, other = (np.stack([pair[k].center for pair in pairs]) for k in (0, 1))
+    fit = fit_similarity(other, true)
+    moved = np.c_[other, np.ones(len(other))] @ fit.matrix.T
+    steps = np.linalg.norm(moved - true, axis=1)
+    extent = np.linalg.norm(true - true.mean(axis=0), axis=1).max()
+    # The turn of one world against the other, by each camera; their mean is the frames'.
+    turns = Rotation.from_matrix(
+        [a.cam_from_world[:3, :3].T @ b.cam_from_world[:3, :3] for a, b in pairs]
+    )
+    apart = np.degrees((turns * turns.mean().inv()).magnitude())
+    return f"{np.median(apart):.3f}, {100 * np.median(steps) / extent:.2f}"
 
 
 if __name__ == "__main__":
