@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 
 import splatseed as ss
-from splatseed.commands.upsample.refining import refined
-from splatseed.console import StageClock
 from splatseed.evaluate import evaluate_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene, Split
 from splatseed.seeding.poses_alone.random_start import random_start
+from splatseed.sfm.refining import refined
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.seeds import SEEDS_SHARE
 from splatseed.upsample import configure
@@ -120,4 +119,4 @@ def triangulated(scene: Scene, seed: int) -> Scene:
         seed: Seed of every random choice.
     """
     shown = scene.replace(images=scene.split(TEST_EVERY)[0])
-    return scene.replace(points=refined(shown, seed, StageClock())[0].points, tracks=None)
+    return scene.replace(points=refined(shown, seed)[0].points, tracks=None)

@@ -48,9 +48,9 @@ ALIKE, CLEARLY = 0.85, 0.1
 LEAST_FOUND = 8
 """Corners of a pair that must be found for it to count."""
 LEAST_PAIRS = 1 / 3
-"""Share of the pairs that must count; half of them do on the hardest of ten captures."""
+"""Share of the pairs that must count; at sound poses of eight captures six of ten and more do."""
 BY_CHANCE = 10.0
-"""Pixels of a median that corners found by chance reach, as they are spread over ``REACH``."""
+"""A median of so many pixels may be chance: misses found by chance are spread over ``REACH``."""
 MOST_MISSED = 0.5
 """Pixels at stereo's size up to which poses are exact. COLMAP's are 0.1 to 0.5 on eight captures;
 at 0.55, a tenth of a degree of noise, fern keeps 0.6 of its depths (benchmarks/stereo)."""
@@ -188,10 +188,10 @@ def _miss(
 ) -> float | None:  # fmt: skip
     """How far beside its line a corner is found; None unless one place is clearly best."""
     patch = _sample(image, p, along, (-HALF, HALF), (-HALF, HALF))
-    # A little backwards, too: with wrong poses a far point may seem to be behind infinity.
-    start, stop = -HALF - REACH, HALF + int(farthest)
     if not np.isfinite(patch).all():  # beyond the picture's border
         return None
+    # A little backwards, too: with wrong poses a far point may seem to be behind infinity.
+    start, stop = -HALF - REACH, HALF + int(farthest)
     band = _sample(turned, p + margin, along, (start, stop), (-HALF - REACH, HALF + REACH))
     scores = _correlation(patch, band)
     at = np.unravel_index(np.argmax(scores), scores.shape)
