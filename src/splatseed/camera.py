@@ -16,15 +16,6 @@ from jaxtyping import Float, Float64
 
 from splatseed.errors import SceneFormatError
 
-__all__ = [
-    "CAMERA_MODELS",
-    "Camera",
-    "CameraModel",
-    "Intrinsics",
-    "quat_from_rotation",
-    "rotation_from_quat",
-]
-
 
 class CameraModel(NamedTuple):
     """One of COLMAP's camera models."""

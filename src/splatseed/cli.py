@@ -23,8 +23,6 @@ from splatseed.errors import ParameterError, ReconstructionError, SplatseedError
 from splatseed.literal import did_you_mean, visible
 from splatseed.process.interruption import Termination, exit_code
 
-__all__ = ["main"]
-
 VERBS = {
     "upsample": "Add points to a scene and write it for any 3DGS trainer.",
     "train": "Train 3D Gaussians on a scene, on a GPU or on the CPU.",

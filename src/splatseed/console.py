@@ -28,18 +28,6 @@ from rich.text import Text
 from splatseed.kernels.compilation import watched
 from splatseed.literal import visible
 
-__all__ = [
-    "ERR",
-    "OUT",
-    "LiteralConsole",
-    "StageClock",
-    "print_commands",
-    "print_note",
-    "print_pairs",
-    "print_table",
-    "stage_display",
-]
-
 
 class LiteralConsole(Console):
     """A console without markup, emoji and highlighting, that escapes what terminals act on."""

@@ -18,8 +18,6 @@ from jaxtyping import Float32, Float64
 from splatseed.camera import Camera
 from splatseed.errors import SceneFormatError
 
-__all__ = ["ASPECT_SLACK", "DepthKind", "DepthMap", "DepthMaps"]
-
 DepthKind = Literal["z", "ray", "inverse"]
 """What a value is: planar depth z along the camera's axis, distance along the pixel's ray, or an
 inverse depth of the form a / z + b (what most monocular networks predict)."""

@@ -20,19 +20,6 @@ from __future__ import annotations
 
 from functools import partial
 
-__all__ = [
-    "InputError",
-    "MissingDependencyError",
-    "OutputError",
-    "ParameterError",
-    "PointCloudError",
-    "ReconstructionError",
-    "SceneFormatError",
-    "SceneNotFoundError",
-    "SplatseedError",
-    "TaskLostError",
-]
-
 
 class SplatseedError(Exception):
     """Base of every error raised on purpose.

@@ -18,16 +18,6 @@ from jaxtyping import Float64
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.literal import quoted
 
-__all__ = [
-    "distort",
-    "fold_radius",
-    "image_points",
-    "rays_through",
-    "undistort_command",
-    "undistort_first",
-    "undistorted",
-]
-
 DIRECTIONS, STEPS = 8, 1024
 """Number of rays along which a fold is searched for, and of samples on each."""
 TRIES, DIFFERENCE, ARRIVED = 30, 1e-6, 1e-9

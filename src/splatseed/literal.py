@@ -14,16 +14,6 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
 
-__all__ = [
-    "agreeing",
-    "beginning",
-    "counted",
-    "did_you_mean",
-    "quoted",
-    "told",
-    "visible",
-]
-
 MOST_TOLD = 160
 OBJECT = re.compile(r"<[\w.]+[^<>]*(?: at 0x[0-9a-f]+|name=[^<>]*)>")
 """How Python shows an object that has no text of its own."""

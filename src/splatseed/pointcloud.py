@@ -19,8 +19,6 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 from splatseed.errors import PointCloudError
 from splatseed.literal import visible
 
-__all__ = ["ATTRIBUTES", "GENERATED", "ORIGINAL", "PointCloud"]
-
 ORIGINAL = 0
 """The ``source`` code of points that were in the input."""
 

@@ -12,8 +12,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from typing import TypeAlias
 
-__all__ = ["Progress", "blocks", "in_threads", "silent", "thread_limit"]
-
 Progress: TypeAlias = Callable[[str, float], None]
 
 thread_limit: ContextVar[int | None] = ContextVar("thread_limit", default=None)

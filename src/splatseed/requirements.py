@@ -10,8 +10,6 @@ from shlex import quote
 from splatseed.errors import MissingDependencyError
 from splatseed.literal import quoted
 
-__all__ = ["INSTALL", "install_command", "require"]
-
 INSTALL = {
     "torch": "torch>=2.4",
     "gsplat": "gsplat>=1.5.3,<1.6",

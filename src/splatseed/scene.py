@@ -20,18 +20,6 @@ from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.depthmap import DepthMaps
 from splatseed.pointcloud import ORIGINAL, PointCloud
 
-__all__ = [
-    "NO_POINT",
-    "Image",
-    "LeftOut",
-    "Observations",
-    "Scene",
-    "SceneFormat",
-    "SceneSource",
-    "Split",
-    "Tracks",
-]
-
 NO_POINT = -1
 """The point id of a feature that belongs to no point."""
 

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
-__all__ = ["Similarity", "fit_similarity", "similarity_of"]
-
 _TOLERANCE = 1e-3
 """Largest deviation of rotation @ rotation.T from the identity."""
 

@@ -11,8 +11,6 @@ from splatseed.commands.options import known_options
 from splatseed.commands.spelling import options_of
 from splatseed.errors import ParameterError
 
-__all__ = ["completion_script"]
-
 SHELLS = ("bash", "zsh")
 FILES = "complete -o default -F _splatseed splatseed"
 ZSH = "autoload -U +X bashcompinit && bashcompinit\n"

@@ -27,8 +27,6 @@ from splatseed.views.photographs import user_cache_dir
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.evaluate import EvalResult, Lpips
 
-__all__ = ["run"]
-
 PathOrNone = Annotated[
     Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
 ]

@@ -29,8 +29,6 @@ from splatseed.train.settings import TrainSettings
 if TYPE_CHECKING:
     from splatseed.splat.gaussians import Gaussians
 
-__all__ = ["run"]
-
 
 @dataclass(frozen=True)
 class Options:

@@ -24,8 +24,6 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
     from splatseed.viewer.shown import Shown
     from splatseed.views.view import View
 
-__all__ = ["run"]
-
 MOST_SIDE = 1280
 LEAST_SIDE = 16
 MOST_FRAMES = 20_000

@@ -12,8 +12,6 @@ from splatseed.io.load import is_scene
 from splatseed.literal import quoted
 from splatseed.train.record.folder import RunFolder
 
-__all__ = ["config_of", "model_file"]
-
 
 def model_file(path: Path) -> Path:
     """The file of a model's Gaussians; for a run, its result.

@@ -18,8 +18,6 @@ import tyro
 from splatseed.errors import ParameterError
 from splatseed.literal import agreeing, did_you_mean
 
-__all__ = ["check_least", "known_options", "parse_options"]
-
 Options = TypeVar("Options")
 
 COLOR = re.compile(r"\x1b\[[0-9;]*m")

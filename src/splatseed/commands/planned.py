@@ -11,8 +11,6 @@ from splatseed.train.schedule import FULL_RUN
 from splatseed.train.seeds import most_seeds
 from splatseed.train.settings import BUDGET, TrainSettings
 
-__all__ = ["Planned"]
-
 
 @dataclass(frozen=True)
 class Planned:

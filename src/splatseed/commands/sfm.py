@@ -37,8 +37,6 @@ from splatseed.sfm import (
 from splatseed.sfm.photos import name_some
 from splatseed.sfm.video import pick_frames
 
-__all__ = ["run"]
-
 NAMES_SHOWN = 5
 OF_LENS = ("camera_model", "shared_camera")
 """Options for a lens that is not known yet."""

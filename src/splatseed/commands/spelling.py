@@ -11,8 +11,6 @@ from importlib import import_module
 
 from splatseed.commands.options import known_options
 
-__all__ = ["in_options", "options_of"]
-
 FIELD = re.compile(r"(?<![\w./-])[a-z][a-z0-9]*(?:[_.][a-z0-9_]+)+(?!\.\w|[\w/-])")
 PLAIN = re.compile(r"(?<=^expected )[a-z]+(?= (?:of|from|to be|between|above|below|at) )")
 """A name of one word is a name only where a range follows."""

@@ -50,8 +50,6 @@ from splatseed.process.interruption import exit_code
 from splatseed.seeding.amounts import parse_budget
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 
-__all__ = ["Options", "run"]
-
 SCENE = "scene"
 MINUTE = 60.0
 EQUAL = 0.99

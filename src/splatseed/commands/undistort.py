@@ -18,8 +18,6 @@ from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
 from splatseed.sfm import undistort
 
-__all__ = ["run"]
-
 
 @dataclass(frozen=True)
 class Options:

@@ -25,8 +25,6 @@ from splatseed.train.settings import Backend
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.viewer.shown import Shown
 
-__all__ = ["run"]
-
 MOST_OPENED = 12
 LOCAL = {"127.0.0.1", "localhost", "::1"}
 

@@ -30,8 +30,6 @@ from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
 from splatseed.views.visibility import SeenPoints, camera_points, find_visibility
 
-__all__ = ["Alignment", "Fit", "align", "align_map", "reject_outliers", "trust_units", "values_at"]
-
 Fit = Literal["robust", "least-squares"]
 """Medians and reweighting, or the paper's equation 7."""
 

@@ -25,8 +25,6 @@ from splatseed.depth.voxel_thinning import thin_by_voxels
 from splatseed.errors import PointCloudError
 from splatseed.progress import Progress, in_threads
 
-__all__ = ["DISTRUSTED", "NEAR_EDGE", "UNCONFIRMED", "Candidates", "choose", "gather"]
-
 SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
 """Tiers, in the order in which they are used up; the last is never used."""
 PIECE = 4

@@ -21,8 +21,6 @@ from splatseed.depth.views import Reduced
 from splatseed.kernels.jit import inline
 from splatseed.views.projection import place
 
-__all__ = ["Support", "find_support"]
-
 THROUGH = 2.0
 """Clearly farther: by this many tolerances, as both depths have errors."""
 

@@ -13,14 +13,6 @@ from jaxtyping import Float64
 
 from splatseed.kernels.jit import inline
 
-__all__ = [
-    "SIGMA_OF_MEDIAN",
-    "least_squares_line",
-    "least_squares_scale",
-    "median_scale",
-    "robust_line",
-]
-
 PAIRS = 256
 """Pairs of points whose lines are tried; nothing is random, as they follow the R2 sequence."""
 GOLDEN = np.array([0.7548776662466927, 0.5698402909980532])

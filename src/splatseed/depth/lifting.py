@@ -28,8 +28,6 @@ from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 from splatseed.views.visibility import find_visibility
 
-__all__ = ["Lifted", "lift"]
-
 OVERSAMPLING = 1.4
 """Candidates per new point, when views are compared or points spread."""
 MAX_OVERSAMPLING = 16.0

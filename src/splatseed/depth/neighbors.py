@@ -18,8 +18,6 @@ from splatseed.progress import Progress, in_threads
 from splatseed.views.parallax import cosine_between
 from splatseed.views.projection import place
 
-__all__ = ["choose_neighbors"]
-
 SAMPLES = 40
 """Candidates of a view by which its neighbours are judged."""
 MIN_SAMPLES = 4

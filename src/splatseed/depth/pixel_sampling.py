@@ -16,8 +16,6 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from splatseed.depth.settings import Settings
 from splatseed.kernels.jit import inline
 
-__all__ = ["Drawn", "sample_pixels"]
-
 CELLS = 64
 """Most cells along the longer side of a map."""
 

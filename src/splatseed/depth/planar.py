@@ -17,8 +17,6 @@ from splatseed.errors import SceneFormatError
 from splatseed.kernels.jit import inline
 from splatseed.scene import Image
 
-__all__ = ["PlanarDepth", "lift_pixels", "map_camera", "ray_length"]
-
 
 def map_camera(depth: DepthMap, image: Image) -> Camera:
     """The camera of an image in the pixels of its map.

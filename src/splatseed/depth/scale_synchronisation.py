@@ -26,8 +26,6 @@ from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, in_threads
 from splatseed.views.projection import place
 
-__all__ = ["synchronize_scales"]
-
 SAMPLES = 96
 """Candidates of a view that are compared with each neighbour."""
 PAIRS = 6

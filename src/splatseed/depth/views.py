@@ -31,8 +31,6 @@ from splatseed.views.visibility import SeenPoints, Visibility, camera_points
 if TYPE_CHECKING:
     from PIL import Image as PilImage
 
-__all__ = ["Reader", "Reduced", "View"]
-
 GRID = 256
 """Longer side of a reduced copy: at most 7 bytes x 256 x 256 per image are kept."""
 

@@ -18,8 +18,6 @@ from jaxtyping import Bool, Float32, Float64
 from splatseed.kernels.hashing import scramble
 from splatseed.kernels.jit import inline, kernel, parallel_range
 
-__all__ = ["thin_by_voxels"]
-
 BUCKETS = 32
 """Parts of the hash range that are processed in parallel."""
 SAMPLED = 2

@@ -18,8 +18,6 @@ from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
 
-__all__ = ["FAR_SPACINGS", "GeometryScore", "far_share", "local_spacing", "measure", "spacing"]
-
 NEIGHBORS = 6
 """Neighbours whose mean distance is the spacing: those of a point in a hexagonal pattern."""
 

@@ -16,10 +16,6 @@ from jaxtyping import Float64
 from splatseed.progress import Progress, silent
 from splatseed.scene import NO_POINT, Image, Scene
 
-__all__ = ["EMPTY_CELLS", "CloudStatistics", "EmptyRegions", "TrackStatistics",
-           "cloud_statistics", "empty_regions",
-           "find_problems", "track_statistics"]  # fmt: skip
-
 PERCENTILES = (5, 25, 50, 75, 95)
 EMPTY_CELLS = 32
 """Empty regions are counted on a grid with this many cells along an image's longer side."""

@@ -9,8 +9,6 @@ from splatseed.io.files import odd_kind
 from splatseed.literal import agreeing, visible
 from splatseed.scene import Scene
 
-__all__ = ["is_distorted", "untrainable"]
-
 
 def untrainable(scene: Scene) -> str:
     """Why no trainer can use the scene, and what to do, in a sentence; empty if nothing is missing.

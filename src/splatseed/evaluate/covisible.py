@@ -29,8 +29,6 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world, grid_of
 from splatseed.views.view import View, data_factor, poses_of
 
-__all__ = ["LEAST_VIEWS", "find_covisible", "pixel_masks", "read_covisible", "write_covisible"]
-
 LEAST_VIEWS = 2
 """Training views that must see a pixel."""
 CELLS = 100

@@ -16,8 +16,6 @@ from torch.nn.functional import conv2d, conv_transpose2d, pad
 
 from splatseed.evaluate.ssim import C1, C2, WINDOW, l1_and_ssim, window_weights
 
-__all__ = ["l1_and_ssim_by_convolution", "psnr", "psnr_within", "ssim_of_all"]
-
 
 @torch.no_grad()
 def l1_and_ssim_by_convolution(

@@ -29,17 +29,6 @@ from splatseed.errors import MissingDependencyError, SceneFormatError, SceneNotF
 from splatseed.io.files import odd_kind
 from splatseed.requirements import require
 
-__all__ = [
-    "GIVE_PATH",
-    "LPIPS_NETS",
-    "Backbone",
-    "Conv",
-    "Lpips",
-    "LpipsNet",
-    "load_lpips",
-    "lpips_is_here",
-]
-
 LpipsNet = Literal["vgg", "alex"]
 
 # Each channel of an image in [-1, 1] becomes (value - SHIFT) / SCALE, as in the metric's code.

@@ -25,8 +25,6 @@ from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
 from splatseed.splat.photographs import photograph_of
 from splatseed.views.view import View
 
-__all__ = ["Covisible", "Render", "evaluate_views"]
-
 Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
 """Which pixels of each test view at least two training views see, by the view's name."""
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]

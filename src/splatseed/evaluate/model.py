@@ -39,15 +39,6 @@ from splatseed.splat.pictures import beside_photograph, picture_name, write_pict
 from splatseed.splat.rendering import render_view
 from splatseed.views.view import View, load_views, poses_of
 
-__all__ = [
-    "TrainedModel",
-    "evaluate_model",
-    "frame_of_scene",
-    "gaussian_renderer",
-    "load_model",
-    "write_renders",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class TrainedModel:

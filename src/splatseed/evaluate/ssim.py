@@ -40,8 +40,6 @@ from splatseed.kernels.simd import (
     subtract,
 )
 
-__all__ = ["WINDOW", "l1_and_ssim", "window_weights"]
-
 WINDOW = 11
 """Side of the Gaussian window."""
 SIGMA = 1.5

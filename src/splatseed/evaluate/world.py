@@ -27,14 +27,6 @@ from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import Gaussians
 from splatseed.views.view import View
 
-__all__ = [
-    "GSPLAT",
-    "NO_TRANSFORM",
-    "check_world",
-    "find_transform",
-    "view_in",
-]
-
 GSPLAT, NO_TRANSFORM = "gsplat", "none"
 """Words that name a transform: that of gsplat's examples, and none, without any check."""
 APART = 8.0

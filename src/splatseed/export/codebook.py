@@ -11,8 +11,6 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatseed.progress import Progress, silent
 
-__all__ = ["codebook", "codes", "palette"]
-
 CODES = 256
 LLOYD_STEPS = 20
 """Alternations of assigning values to codes and moving codes to the means."""

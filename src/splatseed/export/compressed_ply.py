@@ -25,8 +25,6 @@ from splatseed.io.binary import ByteReader
 from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, parse_header
 from splatseed.splat.gaussians import SH_C0, Gaussians
 
-__all__ = ["decode", "encode"]
-
 CHUNK = 256
 """Gaussians per chunk."""
 AXES = ("x", "y", "z")

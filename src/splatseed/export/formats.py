@@ -9,8 +9,6 @@ from pathlib import Path
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.literal import beginning, did_you_mean
 
-__all__ = ["ELSEWHERE", "FORMATS", "SUFFIXES", "Format", "detect_format", "format_of_name"]
-
 CONVERTER = "npx @playcanvas/splat-transform"
 """The converter by the authors of SOG and compressed PLY."""
 _HEADER = 1 << 20

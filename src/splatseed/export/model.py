@@ -20,8 +20,6 @@ from splatseed.progress import Progress, silent
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.ply import read_gaussians, write_gaussians
 
-__all__ = ["read_model", "write_model"]
-
 _DECODERS: dict[str, Callable[[Path], Gaussians]] = {
     "ply": read_gaussians,
     "compressed-ply": compressed_ply.decode,

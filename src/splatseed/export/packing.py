@@ -9,16 +9,6 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
-__all__ = [
-    "SH_COUNTS",
-    "from_smallest_three",
-    "morton_order",
-    "opacity_bytes",
-    "opacity_logits",
-    "smallest_three",
-    "unit_quats",
-]
-
 SH_COUNTS = (0, 3, 8, 15)
 """Coefficients beyond the first, by the degree of the spherical harmonics."""
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])

@@ -10,8 +10,6 @@ from jaxtyping import Bool, Float64
 from splatseed.errors import ParameterError
 from splatseed.splat.gaussians import Gaussians
 
-__all__ = ["Crop", "check_opacity", "keep_gaussians", "parse_crop"]
-
 
 @dataclass(frozen=True, eq=False)
 class Crop:

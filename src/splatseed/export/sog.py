@@ -34,8 +34,6 @@ from splatseed.literal import told
 from splatseed.progress import Progress, silent
 from splatseed.splat.gaussians import Gaussians
 
-__all__ = ["decode", "encode"]
-
 Pixels = UInt8[np.ndarray, "N 4"]
 
 VERSION = 2

@@ -30,8 +30,6 @@ from splatseed.process.memory import check_memory
 from splatseed.requirements import require
 from splatseed.splat.gaussians import Gaussians
 
-__all__ = ["decode", "encode"]
-
 MAGIC = b"NGSP"
 HEADER = struct.Struct("<4sIIBBBB")
 STREAMS = struct.Struct("<I12x")

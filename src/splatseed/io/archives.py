@@ -8,8 +8,6 @@ import tokenize
 import zipfile
 import zlib
 
-__all__ = ["ARCHIVE_FAILURES", "ARRAY_FAILURES"]
-
 ARRAY_FAILURES = (
     *(ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError, SyntaxError),
     EOFError,

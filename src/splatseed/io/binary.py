@@ -17,8 +17,6 @@ from splatseed.errors import SceneFormatError
 from splatseed.io.files import read_bytes
 from splatseed.literal import beginning
 
-__all__ = ["ByteReader"]
-
 _COUNT = struct.Struct("<Q")
 
 

@@ -15,8 +15,6 @@ from splatseed.io.colmap.ids import without_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut, Scene
 
-__all__ = ["clean_scene", "cloud_warnings"]
-
 _FAR_OUT = (
     1e4  # times the inner half of the points: the sky of outdoor scenes is at some hundred times
 )

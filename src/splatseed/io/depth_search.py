@@ -15,8 +15,6 @@ from splatseed.io.depth.matching import match_by_name
 from splatseed.io.rgbd.tum import find_tum_depths, is_tum
 from splatseed.scene import Scene
 
-__all__ = ["find_depths", "search_depths", "with_own_depths"]
-
 
 def find_depths(
     scene: Scene, path: Path, *, kind: DepthKind | None = None, scale: float | None = None

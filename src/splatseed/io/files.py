@@ -16,17 +16,6 @@ from typing import BinaryIO
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.process.memory import free_memory
 
-__all__ = [
-    "VIDEO_SUFFIXES",
-    "is_video",
-    "odd_kind",
-    "open_file",
-    "other_spelling",
-    "read_bytes",
-    "read_file",
-    "read_text",
-]
-
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 
 _KINDS = (

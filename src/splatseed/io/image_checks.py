@@ -13,8 +13,6 @@ from splatseed.io.files import odd_kind, open_file, other_spelling
 from splatseed.literal import agreeing, told
 from splatseed.scene import Image, Scene
 
-__all__ = ["image_warnings", "lens_warnings", "warnings_but_lens"]
-
 _MAX_OPENED = 32  # files whose size is compared
 
 

@@ -26,8 +26,6 @@ from splatseed.io.split import follow_lists
 from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneSource
 
-__all__ = ["check_there", "is_scene", "load_originals", "load_scene"]
-
 _TRANSFORMS = "transforms.json"
 _ABOVE = 3
 """Folders above a file in which its scene is looked for: images may lie in folders of their own."""

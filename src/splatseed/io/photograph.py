@@ -22,14 +22,6 @@ from splatseed.scene import Scene
 if TYPE_CHECKING:
     from PIL import Image as PilImage
 
-__all__ = [
-    "check_photograph",
-    "decode_photograph",
-    "open_photograph",
-    "photograph_bytes",
-    "photograph_folder",
-]
-
 _CHECK_SCALE = 8
 """JPEGs are checked at an eighth of their size: all bytes are read, few pixels are computed."""
 _WIDE_GREY = ("I", "F")

@@ -13,8 +13,6 @@ from jaxtyping import Float64
 from splatseed.errors import ParameterError
 from splatseed.scene import Scene
 
-__all__ = ["check_precision", "offset_of", "recentred"]
-
 RESOLUTION = 1e-4
 """Steps of single precision coarser than this share of the cameras' spread show in renders."""
 

@@ -19,8 +19,6 @@ from splatseed.io.files import read_bytes
 from splatseed.literal import counted
 from splatseed.scene import Scene, Split
 
-__all__ = ["MODEL_LISTS", "ROOT_LISTS", "follow_lists", "split_fields"]
-
 ROOT_LISTS = ("train_list.txt", "test_list.txt", "validation_list.txt", "train.txt", "test.txt")
 """Lists in a scene's folder."""
 MODEL_LISTS = ("test.txt",)

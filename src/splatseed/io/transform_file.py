@@ -17,8 +17,6 @@ from splatseed.io.files import read_bytes
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, similarity_of
 
-__all__ = ["NERFSTUDIO", "read_cloud_transform", "read_json", "similarity_in"]
-
 NERFSTUDIO = "dataparser_transforms.json"
 _KEYS = ("transform", "matrix", "transform_matrix", "transformation")
 _FIX = "Give 3 or 4 rows of 4 numbers, as text or JSON."

@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeAlias
 
-__all__ = ["Watcher", "tell", "watched"]
-
 Watcher: TypeAlias = Callable[[bool], None]
 """Called with True when a compilation begins, with False when it ends; compilations can nest."""
 

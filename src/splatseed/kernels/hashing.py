@@ -10,8 +10,6 @@ import numpy as np
 
 from splatseed.kernels.jit import inline
 
-__all__ = ["FREE", "scramble", "slot_of"]
-
 FREE = np.uint64(0)
 """A free slot of a table of keys."""
 

@@ -23,8 +23,6 @@ from splatseed.kernels.compilation import tell
 from splatseed.kernels.sharing import compile_once
 from splatseed.kernels.sources import source_digest
 
-__all__ = ["always_inline", "inline", "kernel", "parallel_range"]
-
 # TBB, where a distribution ships it, can hang at interpreter exit; a user's own choice stands.
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]  # type: ignore[attr-defined]  # absent from Numba's stubs

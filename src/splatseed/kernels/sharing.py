@@ -17,8 +17,6 @@ from numba.core.compiler_lock import global_compiler_lock
 
 from splatseed.kernels.compilation import tell
 
-__all__ = ["compile_once"]
-
 
 def compile_once(compiled: Any) -> None:
     """Let a kernel be compiled by one process at a time.

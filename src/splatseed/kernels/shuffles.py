@@ -15,8 +15,6 @@ from numba.extending import intrinsic
 
 from splatseed.kernels.simd import INDEX, LANES, VECTOR, f32x16
 
-__all__ = ["lane", "permutation", "three_sums", "triple"]
-
 UNDEFINED = ir.Constant(VECTOR, ir.Undefined)
 I32 = ir.IntType(32)
 

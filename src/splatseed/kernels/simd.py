@@ -23,33 +23,6 @@ from numba.extending import intrinsic, models, register_model
 
 from splatseed.kernels.jit import inline
 
-__all__ = [
-    "LANES",
-    "add",
-    "aligned",
-    "any_greater",
-    "broadcast",
-    "broadcast_element",
-    "call_lanes",
-    "divide",
-    "element",
-    "exp_of_eighth",
-    "fma",
-    "fnma",
-    "in_all_lanes",
-    "lane_sum",
-    "load",
-    "load_columns",
-    "minimum",
-    "multiply",
-    "negative_magnitude",
-    "prefetch",
-    "select_greater",
-    "store",
-    "store_transposed",
-    "subtract",
-]
-
 LANES = 16
 QUARTER = LANES // 4
 """Lanes that are loaded at a time by ``load_columns``."""

@@ -16,8 +16,6 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
-__all__ = ["reached_files", "source_digest"]
-
 Packages: TypeAlias = tuple[tuple[str, Path], ...]
 """Names and folders of the packages whose files count."""
 

@@ -32,8 +32,6 @@ from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 
-__all__ = ["DepthReport", "estimate_depths"]
-
 BYTES_A_PIXEL = 3 + 4 * 3 + 4
 """Bytes per pixel of a photograph in a network: its colours, these as floats, and its depth."""
 Size = tuple[int, int]

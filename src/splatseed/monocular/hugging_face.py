@@ -35,8 +35,6 @@ from splatseed.literal import quoted
 from splatseed.monocular.network import DeviceName, Meaning, meaning_of, one_line
 from splatseed.process.torch_device import pick_torch_device
 
-__all__ = ["HuggingFaceNetwork", "load_hugging_face"]
-
 EXAMPLE = "depth-anything/Depth-Anything-V2-Small-hf"
 _ID = re.compile(r"\w[\w.-]*/\w[\w.-]*")
 _UNUSED = re.compile(r"fusion_stage\.layers\.0\.residual_layer1\.")

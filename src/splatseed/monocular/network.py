@@ -16,8 +16,6 @@ from jaxtyping import Float32, UInt8
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError
 
-__all__ = ["DepthNetwork", "DeviceName", "Meaning", "meaning_of", "one_line"]
-
 DeviceName = Literal["auto", "cpu", "cuda"]
 
 _METRIC = {

@@ -22,8 +22,6 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.monocular.network import DeviceName, Meaning, meaning_of, one_line
 from splatseed.monocular.preparation import InputForm, Preparation, complete, json_beside
 
-__all__ = ["OnnxNetwork", "load_onnx"]
-
 _TYPES: dict[str, np.dtype[Any]] = {
     "tensor(float)": np.dtype(np.float32),
     "tensor(float16)": np.dtype(np.float16),

@@ -21,8 +21,6 @@ from PIL import Image as PilImage
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.files import read_text
 
-__all__ = ["InputForm", "Preparation", "complete", "json_beside"]
-
 Channels = tuple[float, float, float]
 
 

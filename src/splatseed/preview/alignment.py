@@ -14,8 +14,6 @@ from splatseed.preview.points import render_points
 from splatseed.scene import Scene
 from splatseed.views.viewpoint import choose_camera, choose_image
 
-__all__ = ["preview_alignment"]
-
 SIDE = 800
 GREY = 150
 NEAR, FAR = np.array([0, 114, 178]), np.array([213, 94, 0])

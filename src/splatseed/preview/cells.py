@@ -18,8 +18,6 @@ from PIL import Image as PillowImage
 from splatseed.errors import ParameterError
 from splatseed.preview.page import Tile, centered, fitted, write_grid
 
-__all__ = ["CoveredView", "cell_picture", "preview_cells"]
-
 EMPTY = np.array([214.0, 20.0, 190.0])
 """Magenta, the rarest colour in photographs."""
 BLEND = 0.6

@@ -22,8 +22,6 @@ from splatseed.preview.points import render_points
 from splatseed.scene import Scene
 from splatseed.views.viewpoint import choose_camera, choose_image
 
-__all__ = ["preview_errors", "preview_methods", "preview_pair"]
-
 PAIR_SIDE = 800
 
 

@@ -12,8 +12,6 @@ from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.preview.page import GRID_SIDE, INK, PAPER, font
 
-__all__ = ["UNKNOWN", "color_bar", "heat", "map_colors", "usual_range"]
-
 UNKNOWN = (150, 150, 150)
 RANGE = (2, 98)
 """Percentiles of a map's values between which its colours vary."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-__all__ = ["font_families", "font_file", "plain"]
-
 _WIDE = (
     "Noto Sans CJK JP",
     "Noto Sans CJK SC",

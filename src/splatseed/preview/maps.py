@@ -21,8 +21,6 @@ from splatseed.preview.page import Tile, centered, fitted, write_grid
 from splatseed.preview.photographs import photograph_or_blank
 from splatseed.scene import Scene
 
-__all__ = ["ViewMaps", "depth_picture", "map_tiles", "normal_picture", "preview_maps"]
-
 SIDE = 440
 LABEL = 40
 """Characters of a label that fit above a tile."""

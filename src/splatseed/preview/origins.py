@@ -24,8 +24,6 @@ from splatseed.scene import Scene
 from splatseed.upsample.registry import SOURCE_CODES, origin_name
 from splatseed.views.viewpoint import choose_camera, choose_image
 
-__all__ = ["origin_colors", "origin_legend", "origin_picture", "preview_origins"]
-
 SIDE = 800
 POINT_SIZE = 3.0
 COLORS: Mapping[int, tuple[int, int, int]] = MappingProxyType(

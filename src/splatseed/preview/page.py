@@ -18,18 +18,6 @@ from PIL import Image as PillowImage, ImageDraw, ImageFont
 from splatseed.io.output.staging import atomic_file
 from splatseed.preview.fonts import font_file
 
-__all__ = [
-    "GRID_SIDE",
-    "INK",
-    "PAPER",
-    "Tile",
-    "centered",
-    "columns_for",
-    "fitted",
-    "font",
-    "write_grid",
-]
-
 GRID_SIDE = 600
 """Longer side of a picture in a grid, in pixels."""
 

@@ -13,8 +13,6 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.scene import Image, Scene
 
-__all__ = ["photograph_at", "photograph_or_blank"]
-
 BLANK = (230, 230, 230)
 
 

@@ -15,8 +15,6 @@ from splatseed.kernels.jit import inline
 from splatseed.pointcloud import PointCloud
 from splatseed.preview.page import PAPER
 
-__all__ = ["render_points"]
-
 DISCS_PER_SIDE = 340
 """A disc at the median depth is the picture's longer side divided by this: 2.4 px at 800."""
 

@@ -12,8 +12,6 @@ import ctypes
 import sys
 from contextlib import suppress
 
-__all__ = ["keep_freed_memory"]
-
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """glibc's mallopt(3): free bytes at the top of the heap before they are returned; the smallest
 block that gets its own mapping."""

@@ -26,8 +26,6 @@ from splatseed.errors import MissingDependencyError
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 
-__all__ = ["load_kernels"]
-
 BACKEND = "gsplat.cuda._backend"
 """gsplat's module that loads or builds its kernels when it is imported."""
 BUILDING = "building gsplat's kernels, some minutes, once"

@@ -11,8 +11,6 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-__all__ = ["child_command", "child_environment", "safe_children"]
-
 SAFE = "PYTHONSAFEPATH"
 """The variable that keeps the working directory out of an interpreter's ``sys.path``."""
 

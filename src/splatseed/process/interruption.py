@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-__all__ = ["Interruption", "Termination", "exit_code", "interruption"]
-
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

@@ -12,8 +12,6 @@ from pathlib import Path
 
 from splatseed.errors import ParameterError
 
-__all__ = ["bytes_of", "check_memory", "free_memory", "option_of", "words_of"]
-
 CGROUP = Path("/sys/fs/cgroup")
 SUFFIXES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 

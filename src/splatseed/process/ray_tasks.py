@@ -19,8 +19,6 @@ from typing import Any, Generic, TypeVar
 from splatseed.errors import ParameterError
 from splatseed.requirements import require
 
-__all__ = ["LOSSES", "Cluster", "Flights", "Landing", "Share", "ray_cluster"]
-
 LOSSES = 3
 """How often a task is restarted whose node or worker was lost."""
 POLL_SECONDS = 0.5

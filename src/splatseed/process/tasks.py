@@ -25,8 +25,6 @@ from splatseed.process.ray_tasks import LOSSES, Cluster, Flights, Share
 from splatseed.process.threads import few_threads
 from splatseed.progress import Progress
 
-__all__ = ["HereTasks", "ProcessTasks", "RayTasks", "Tasks"]
-
 Call = tuple[Any, ...]
 """The arguments of a task."""
 

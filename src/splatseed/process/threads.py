@@ -11,8 +11,6 @@ from contextlib import contextmanager
 
 from splatseed.progress import thread_limit
 
-__all__ = ["cores", "few_threads", "slot_environment"]
-
 THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
     "OMP_NUM_THREADS",

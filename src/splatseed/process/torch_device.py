@@ -14,8 +14,6 @@ from splatseed.process.memory import free_memory
 if TYPE_CHECKING:  # PyTorch may be absent, and takes a while to load
     import torch
 
-__all__ = ["free_bytes", "pick_torch_device"]
-
 
 def pick_torch_device(choice: Literal["auto", "cpu", "cuda"], option: str) -> torch.device:
     """The device of a choice; ``auto`` takes a GPU if PyTorch sees one.

@@ -20,8 +20,6 @@ from torch.autograd.function import once_differentiable
 from splatseed.render import blending, blending_vjp, harmonics as sh, layout, projection
 from splatseed.render.binning import RECORD, TILE, TileLists, depth_order, list_tiles, row_order
 
-__all__ = ["Blend", "Harmonics", "Lens", "Project", "is_seen"]
-
 GREATEST = np.float32(1e6)
 """Opacities above this are clamped: beyond 1 they only make a Gaussian wider."""
 ALIGNMENT = 64

@@ -27,8 +27,6 @@ from jaxtyping import Float32, Int32, Int64, UInt32
 
 from splatseed.kernels.jit import always_inline, inline, kernel, parallel_range
 
-__all__ = ["LOWEST", "RECORD", "TILE", "TileLists", "depth_order", "list_tiles", "row_order"]
-
 TILE = 8
 """Pixels along a tile's side: four blocks of 4 x 4, one vector each, fit the registers."""
 RECORD = 16

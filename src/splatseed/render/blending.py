@@ -49,8 +49,6 @@ from splatseed.kernels.simd import (
 )
 from splatseed.render.binning import LOWEST, RECORD, TILE
 
-__all__ = ["BLOCKS", "CHANNELS", "MAX_ALPHA", "STOP", "forward"]
-
 CHANNELS = 4
 """Channels per pass; the fourth takes time only where it is used."""
 BLOCKS = 4

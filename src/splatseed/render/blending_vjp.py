@@ -48,8 +48,6 @@ from splatseed.kernels.simd import (
 from splatseed.render.binning import LOWEST, RECORD, TILE
 from splatseed.render.blending import BLOCKS, CHANNELS, MAX_ALPHA, STOP
 
-__all__ = ["SUMS", "backward", "sum_spans"]
-
 SUMS = 16
 """Numbers per span, each summed over its pixels:
 

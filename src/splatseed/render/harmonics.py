@@ -35,8 +35,6 @@ from splatseed.kernels.simd import (
     store,
 )
 
-__all__ = ["MAX_DEGREE", "TABLES", "TERMS", "harmonics", "harmonics_vjp"]
-
 MAX_DEGREE = 3
 TERMS = 16
 """Basis functions of degree 3: 1 + 3 + 5 + 7; also the lanes of a vector."""

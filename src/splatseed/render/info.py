@@ -19,8 +19,6 @@ from torch import Tensor
 from splatseed.render.autograd import is_seen
 from splatseed.render.intersections import Grid, Intersections, intersect
 
-__all__ = ["Info", "View", "make_info"]
-
 
 class View(NamedTuple):
     """N Gaussians in one camera."""

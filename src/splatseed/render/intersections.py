@@ -19,8 +19,6 @@ from torch import Tensor
 
 from splatseed.render.autograd import is_seen
 
-__all__ = ["Grid", "Intersections", "intersect"]
-
 
 class Grid(NamedTuple):
     """The tiles of C images of one size."""

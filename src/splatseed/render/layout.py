@@ -20,8 +20,6 @@ from splatseed.kernels.simd import LANES
 from splatseed.render.binning import RECORD, TILE
 from splatseed.render.blending import BLOCKS, CHANNELS
 
-__all__ = ["from_blocks", "gather", "mark_visible", "scatter", "to_blocks"]
-
 NEEDLE = 1.0 - 2.0**-22
 """The largest factor below 1 after which float32 rounding still leaves an ellipse."""
 RGB = 3

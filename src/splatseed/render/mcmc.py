@@ -11,8 +11,6 @@ import gsplat
 
 from splatseed.render.relocation import mcmc_on_cpu
 
-__all__ = ["MCMCStrategy"]
-
 
 class MCMCStrategy(gsplat.MCMCStrategy):  # type: ignore[misc]  # gsplat has no types
     """gsplat's ``MCMCStrategy``, which relocates and adds Gaussians, for CPU tensors too.

@@ -22,8 +22,6 @@ import numpy as np
 
 from splatseed.kernels.jit import always_inline, kernel, parallel_range
 
-__all__ = ["CHUNKS", "EDGE", "MAX_SIGMAS", "MIN_ALPHA", "project", "project_vjp"]
-
 MIN_ALPHA = 1.0 / 255.0
 """Smallest opacity that is drawn."""
 MAX_SIGMAS = 3.33

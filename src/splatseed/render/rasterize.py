@@ -27,8 +27,6 @@ from splatseed.render.validation import (
 )
 from splatseed.requirements import require
 
-__all__ = ["rasterization"]
-
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
 GSPLAT_TILE = 16

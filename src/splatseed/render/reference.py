@@ -12,8 +12,6 @@ from torch import Tensor
 
 from splatseed.render.projection import EDGE, MAX_SIGMAS, MIN_ALPHA
 
-__all__ = ["rasterize_reference"]
-
 MAX_ALPHA = 0.999
 """Largest alpha: see ``blending``."""
 STOP = 1e-4

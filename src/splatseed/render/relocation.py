@@ -24,8 +24,6 @@ from torch.nn.functional import normalize
 
 from splatseed.requirements import require
 
-__all__ = ["compute_relocation", "covariances", "mcmc_on_cpu"]
-
 
 def compute_relocation(
     opacities: Float[Tensor, " N"] | Float[Tensor, "N 1"],

@@ -19,8 +19,6 @@ from splatseed.errors import ParameterError
 from splatseed.render.blending import CHANNELS
 from splatseed.render.harmonics import MAX_DEGREE
 
-__all__ = ["check_absgrad", "check_numbers", "check_sparse", "check_tensors", "check_unsupported"]
-
 CUDA_ONLY: Mapping[str, object] = {
     "distributed": False,
     "camera_model": "pinhole",

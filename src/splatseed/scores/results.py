@@ -13,8 +13,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Self
 
-__all__ = ["NOT_ASKED", "CurvePoint", "EvalResult", "TrainingResult", "ViewScore"]
-
 NOT_ASKED = "not asked for"
 
 

@@ -23,19 +23,6 @@ import numpy as np
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 
-__all__ = [
-    "AS_IT_IS",
-    "ROOM",
-    "SEEDED",
-    "Advice",
-    "Layout",
-    "Measured",
-    "advise",
-    "camera_layout",
-    "measure",
-    "stereo_agreement",
-]
-
 Layout: TypeAlias = Literal["facing one way", "around something", "through a place"]
 AS_IT_IS = "sfm"
 """The advice to leave the points as they are."""

@@ -7,8 +7,6 @@ import re
 
 from splatseed.errors import ParameterError
 
-__all__ = ["RHO", "parse_budget"]
-
 RHO = "rho"
 """The unit of Gaussians per pixel of a photograph."""
 DECIMAL = re.compile(r"\d+,\d+(rho|k|m)")

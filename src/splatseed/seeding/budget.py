@@ -26,8 +26,6 @@ from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.seeding.coverage import check_points, grid_from_world, project_block
 from splatseed.views.view import View
 
-__all__ = ["median_pixels", "thin"]
-
 CLOSEST = 4
 """Views in which a kept point is marked: enough for neighbours to share one, few enough to be
 quick."""

@@ -32,8 +32,6 @@ from splatseed.seeding.guess import (
 )
 from splatseed.views.view import View
 
-__all__ = ["CoverSeeds", "cover"]
-
 WITNESSES = 12
 """Other views that are asked whether they look through a seed."""
 WITNESS_CELL = 8

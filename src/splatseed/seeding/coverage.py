@@ -28,19 +28,6 @@ from splatseed.progress import Progress, silent
 from splatseed.views.projection import place
 from splatseed.views.view import View
 
-__all__ = [
-    "HIDING",
-    "NEARER",
-    "cell_counts",
-    "cell_depths",
-    "check_points",
-    "covered_cells",
-    "covered_share",
-    "grid_from_world",
-    "grid_of",
-    "project_block",
-]
-
 NEARER = 0.1
 """By what fraction of a cell's depth its neighbours must be nearer to hide it."""
 HIDING = 5

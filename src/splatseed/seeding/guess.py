@@ -24,8 +24,6 @@ from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world
 from splatseed.views.projection import place
 from splatseed.views.view import View
 
-__all__ = ["Witnesses", "call_witnesses", "guess_depths", "lift", "world_from_grid"]
-
 SECTORS = 8
 
 

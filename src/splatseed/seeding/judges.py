@@ -20,8 +20,6 @@ from splatseed.views.pairs import views_of_points
 from splatseed.views.projection import place
 from splatseed.views.view import View
 
-__all__ = ["JUDGES", "choose_judges"]
-
 JUDGES = 2
 """Views that judge a point; the better verdict counts, as one of them may not see it after all."""
 WITNESSES = 2

@@ -28,20 +28,6 @@ if TYPE_CHECKING:
     from splatseed.stereo.result import Stereo as FoundStereo
     from splatseed.views.view import View
 
-__all__ = [
-    "MAX_SIZE",
-    "Auto",
-    "Cover",
-    "PhotographMethod",
-    "Stereo",
-    "begins_from_points",
-    "cover_cloud",
-    "has_points",
-    "photographed",
-    "read_views",
-    "with_cover",
-]
-
 MAX_SIZE = 800
 """Longer side in pixels at which photographs are used."""
 

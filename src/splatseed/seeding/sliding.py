@@ -22,8 +22,6 @@ from splatseed.kernels.jit import always_inline, inline
 from splatseed.kernels.simd import LANES
 from splatseed.stereo.cost import NOISE, SAMPLES, best_cost, prepare_window
 
-__all__ = ["REACH", "slide"]
-
 REACH = 1.5
 """How far a point may move, in spacings."""
 OFFSETS = 13

@@ -18,8 +18,6 @@ from splatseed.progress import Progress, in_threads, silent
 from splatseed.upsample.neighbors import Neighbors, PreparedCloud, prepare
 from splatseed.upsample.surfaces.frames import local_frames
 
-__all__ = ["Surroundings", "survey"]
-
 NEIGHBORS = 16
 """Neighbours that determine a normal, as for mls."""
 FLAT = 0.4

@@ -18,8 +18,6 @@ from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views, wi
 from splatseed.upsample.registry import source_code
 from splatseed.views.view import View, data_factor, poses_of
 
-__all__ = ["frames_of", "points_within", "thin_to"]
-
 COVER, CLOUD = source_code("cover"), source_code("cloud")
 MOST_COVER = 0.1
 """Largest part of a budget for cover's guesses; their cells grow until they fit."""

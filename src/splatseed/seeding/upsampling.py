@@ -23,18 +23,6 @@ from splatseed.upsample import Profile, Upsampler, upsample as add_points
 from splatseed.upsample.method import NewPoints
 from splatseed.upsample.registry import source_code
 
-__all__ = [
-    "CELL",
-    "DEFAULT_METHOD",
-    "FALLBACK",
-    "INTERPOLATING",
-    "add_cover",
-    "add_verified",
-    "method_for",
-    "share_covered",
-    "upsample",
-]
-
 DEFAULT_METHOD, FALLBACK = "auto", "mls"
 """The default method, and its replacement for scenes without photographs."""
 CELL = 8

@@ -28,8 +28,6 @@ from splatseed.views.pairs import choose_sources
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility
 
-__all__ = ["BARE_CONFIDENCE", "MAX_COST", "verify"]
-
 NUM_SOURCES = 5
 """Views that a judge is compared with."""
 MAX_COST = 0.4

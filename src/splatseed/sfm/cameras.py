@@ -14,8 +14,6 @@ from splatseed.scene import Image
 from splatseed.sfm.features import Run
 from splatseed.sfm.photos import Photo
 
-__all__ = ["guess_cameras", "known_cameras"]
-
 
 def guess_cameras(
     run: Run, photos: Sequence[Photo], camera_model: str, *, shared: bool

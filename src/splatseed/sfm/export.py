@@ -15,8 +15,6 @@ from splatseed.errors import OutputError
 from splatseed.sfm.features import Run
 from splatseed.sfm.orientation import clear_orientation
 
-__all__ = ["drop_repeats", "export_scene"]
-
 
 def export_scene(run: Run, model_dir: Path, staging: Path, *, distinct: bool = True) -> None:
     """Write the model of ``model_dir`` to ``staging`` with distortion removed.

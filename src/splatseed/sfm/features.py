@@ -18,8 +18,6 @@ from splatseed.sfm.photos import name_some
 from splatseed.sfm.settings import Settings
 from splatseed.sfm.stages import Stages
 
-__all__ = ["Run", "find_features", "match_features", "write_database"]
-
 _BLOCK_IMAGES = 16  # matches are committed, and progress is visible, per block of 16 x 16 pairs
 
 

@@ -22,8 +22,6 @@ from splatseed.sfm.solving.mapping import map_images, triangulate_points
 from splatseed.sfm.solving.refinement import refine
 from splatseed.sfm.stages import Stages
 
-__all__ = ["Job", "Outcome", "ReconstructJob", "TriangulateJob", "UndistortJob"]
-
 
 @dataclass(frozen=True)
 class Outcome:

@@ -12,8 +12,6 @@ from pathlib import Path
 
 from PIL import Image as PilImage
 
-__all__ = ["clear_orientation"]
-
 _TAG = 0x0112
 _UPRIGHT = 1
 _EXIF = b"Exif\0\0"

@@ -21,8 +21,6 @@ from splatseed.io.output.manifest import kind_of
 from splatseed.literal import quoted, told
 from splatseed.scene import Image, Scene
 
-__all__ = ["Photo", "Photographs", "find_photos", "match_poses", "name_some"]
-
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
 _FOREIGN_SUFFIXES = frozenset(
     {".heic", ".heif", ".avif", ".webp", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf",

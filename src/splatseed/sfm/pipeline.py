@@ -15,7 +15,8 @@ from shutil import rmtree
 from typing import TypeAlias
 
 from splatseed.io.output.layouts import write_split
-from splatseed.io.output.staging import MANIFEST, output_folder
+from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.output.staging import output_folder
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.sfm.jobs import Outcome, ReconstructJob, TriangulateJob
@@ -29,8 +30,6 @@ from splatseed.sfm.settings import (
     check_installed,
 )
 from splatseed.sfm.worker import run_job
-
-__all__ = ["OnPhotos", "reconstruct", "staged", "triangulate"]
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]]], None]
 

@@ -14,8 +14,6 @@ from splatseed.scene import Scene
 from splatseed.sfm.pipeline import triangulate
 from splatseed.sfm.report import SfmReport
 
-__all__ = ["refined", "with_refined"]
-
 
 def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene, str]:
     """The scene at refined poses, with the points that its photographs' features give.

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["Refinement", "SfmReport"]
-
 
 @dataclass(frozen=True)
 class Refinement:

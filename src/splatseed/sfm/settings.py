@@ -14,16 +14,6 @@ from splatseed.camera import CAMERA_MODELS
 from splatseed.errors import MissingDependencyError, ParameterError
 from splatseed.requirements import install_command
 
-__all__ = [
-    "DeviceName",
-    "MatcherName",
-    "Settings",
-    "check_camera_model",
-    "check_cuda",
-    "check_installed",
-    "require_pycolmap",
-]
-
 MatcherName: TypeAlias = Literal["exhaustive", "sequential"]
 DeviceName: TypeAlias = Literal["auto", "cpu", "cuda"]
 

@@ -15,8 +15,6 @@ from typing import Any, TypeVar
 from splatseed.errors import ReconstructionError
 from splatseed.progress import Progress
 
-__all__ = ["Stages"]
-
 T = TypeVar("T")
 
 _POLL_SECONDS = 0.1

@@ -15,8 +15,6 @@ from splatseed.sfm.pipeline import staged
 from splatseed.sfm.settings import Settings, check_installed
 from splatseed.sfm.worker import run_job
 
-__all__ = ["undistort"]
-
 
 def undistort(
     scene: Scene,

@@ -23,8 +23,6 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 
-__all__ = ["PickedFrames", "pick_frames"]
-
 LOOK_WIDTH = 256
 """Width in pixels at which frames are analysed."""
 BLOCK = 64

@@ -27,8 +27,6 @@ from splatseed.sfm.jobs import Job, Outcome
 from splatseed.sfm.settings import check_cuda, require_pycolmap
 from splatseed.sfm.stages import Stages
 
-__all__ = ["run_job", "serve"]
-
 _CHILD = "from splatseed.sfm.worker import serve; serve()"
 _REASON = re.compile(r"what\(\):\s*(.*)|^[EF]\d{8}\s.*?\]\s*(.*)", re.MULTILINE)
 

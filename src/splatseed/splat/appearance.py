@@ -19,8 +19,6 @@ from splatseed.seeding.coverage import NEARER, cell_depths, grid_of
 from splatseed.splat.gaussians import SH_C0
 from splatseed.views.view import View
 
-__all__ = ["SH_C1", "fit_harmonics"]
-
 SH_C1 = 0.4886025119029199
 """Constant of degree 1, sqrt(3 / (4 pi))."""
 NUM_FITTED = 4

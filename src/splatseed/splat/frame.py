@@ -19,8 +19,6 @@ from splatseed.pointcloud import PointCloud
 from splatseed.splat.gaussians import Gaussians
 from splatseed.views.view import View
 
-__all__ = ["SCENE_SCALE", "TrainingFrame", "stray_note", "stray_views", "training_frame"]
-
 SCENE_SCALE = 1.1
 """Scene size for the strategies and the learning rate of positions: the cameras' extent plus a
 tenth, as in 3DGS."""

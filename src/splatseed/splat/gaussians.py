@@ -16,8 +16,6 @@ from jaxtyping import Float, Float32, Float64
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
 
-__all__ = ["SH_C0", "Gaussians", "initial_gaussians", "neighbor_distances"]
-
 SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)); colour = 0.5 + SH_C0 * sh0."""
 NEIGHBORS = 3

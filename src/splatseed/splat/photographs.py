@@ -16,8 +16,6 @@ from torch import Tensor
 from splatseed.process.torch_device import free_bytes
 from splatseed.views.view import View
 
-__all__ = ["Photographs", "photograph_of"]
-
 SHARE = 0.25
 """Most of a GPU's free memory that photographs may take."""
 

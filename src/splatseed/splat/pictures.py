@@ -13,8 +13,6 @@ from jaxtyping import Float32, UInt8
 
 from splatseed.io.output.staging import atomic_file
 
-__all__ = ["FULL_ERROR", "beside_photograph", "error_map", "picture_name", "write_picture"]
-
 FULL_ERROR = 0.25
 """The error that is drawn brightest."""
 GAP = 4

@@ -21,8 +21,6 @@ from splatseed.io.ply.foreign import refuse_packed
 from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, parse_header
 from splatseed.splat.gaussians import Gaussians
 
-__all__ = ["read_gaussians", "write_gaussians"]
-
 XYZ = ("x", "y", "z")
 NORMAL = ("nx", "ny", "nz")
 DC = ("f_dc_0", "f_dc_1", "f_dc_2")

@@ -19,13 +19,6 @@ from torch import Tensor
 from splatseed.render import rasterization
 from splatseed.views.view import View
 
-__all__ = [
-    "CameraTensors",
-    "camera_of",
-    "render_features",
-    "render_view",
-]
-
 
 class CameraTensors(NamedTuple):
     """A view's camera on a device."""

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 from splatseed.kernels.jit import inline
 
-__all__ = ["confirm"]
-
 
 @inline
 def confirm(

@@ -42,8 +42,6 @@ from splatseed.kernels.simd import (
 )
 from splatseed.stereo.quads import sample, square_root
 
-__all__ = ["BEST", "SAMPLES", "UNSEEN", "best_cost", "prepare_window"]
-
 RADIUS, STRIDE = 2, 2
 SIDE = 2 * RADIUS + 1
 SAMPLES = SIDE * SIDE

@@ -24,8 +24,6 @@ from splatseed.views.pairs import choose_sources
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility
 
-__all__ = ["find_stereo"]
-
 
 def find_stereo(
     views: Sequence[View],

@@ -22,8 +22,6 @@ from splatseed.progress import Progress, silent
 from splatseed.stereo.matching import other_from_view
 from splatseed.stereo.result import Stereo
 
-__all__ = ["StereoSeeds", "block_means", "fuse"]
-
 SAME = 0.03
 """Relative difference of depth up to which two seeds in a cell count as one."""
 

@@ -14,8 +14,6 @@ from jaxtyping import Float32, UInt8
 
 from splatseed.camera import Camera
 
-__all__ = ["StereoMap"]
-
 
 @dataclass(frozen=True, eq=False)
 class StereoMap:

@@ -22,8 +22,6 @@ from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import Hints, first_planes
 from splatseed.views.view import View
 
-__all__ = ["check_stereo_memory", "make_quad_images", "match_views", "other_from_view"]
-
 BYTES_A_DEPTH = 3 * 4 + 4 + 1
 """A view's planes, costs, and agreement bits."""
 

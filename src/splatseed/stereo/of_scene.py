@@ -11,8 +11,6 @@ from splatseed.scene import Scene
 from splatseed.stereo.maps import StereoMap
 from splatseed.stereo.settings import StereoSettings
 
-__all__ = ["stereo_depths"]
-
 
 def stereo_depths(
     scene: Scene,

@@ -24,8 +24,6 @@ from splatseed.kernels.jit import always_inline, inline
 from splatseed.kernels.simd import LANES
 from splatseed.stereo.cost import SAMPLES, best_cost, prepare_window
 
-__all__ = ["QuadImages", "begin", "sweep"]
-
 ARM = 11
 """How far a plane may propagate in one visit, in grid points."""
 REFINEMENTS = 3

@@ -20,8 +20,6 @@ from numba.extending import intrinsic
 from splatseed.kernels.jit import inline
 from splatseed.kernels.simd import INDEX, LANES, VECTOR, call_lanes, f32x16, in_all_lanes
 
-__all__ = ["grey_image", "make_quads", "sample", "square_root"]
-
 BYTE = 8
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 """ITU-R BT.601."""

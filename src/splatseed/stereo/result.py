@@ -16,8 +16,6 @@ from splatseed.stereo.maps import StereoMap
 from splatseed.stereo.settings import StereoSettings
 from splatseed.views.view import View
 
-__all__ = ["Stereo"]
-
 
 @dataclass(frozen=True, eq=False)
 class Stereo:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from splatseed.errors import ParameterError
 
-__all__ = ["LEAST_SIZE", "MOST_GRID", "TOO_FEW", "StereoSettings"]
-
 TOO_FEW = 30
 """Points that are not worth being searched around, and vouch for no pose."""
 LEAST_SIZE = 32

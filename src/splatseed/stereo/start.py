@@ -13,8 +13,6 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from scipy.spatial import cKDTree
 
-__all__ = ["Hints", "first_planes", "hints_from"]
-
 NEAREST = 3
 """Points whose depth is tried as a fronto-parallel plane."""
 FITTED = 8

@@ -24,8 +24,6 @@ from splatseed.views.pairs import choose_by_pose, choose_sources
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility, find_visibility
 
-__all__ = ["any_depth", "enough_points", "glimpse", "known_visibility"]
-
 LEAST_SEEN = 300
 """A scene counts as having no points if half of its images see fewer. A glimpse takes two or three
 times as long as what follows, and as many pixels become known as from 800 points an image: of

@@ -27,8 +27,6 @@ from splatseed.synthetic.room import BARE, Room, build_room, orbit_cameras
 from splatseed.synthetic.surfaces import Union
 from splatseed.synthetic.tracks import TrackedPoints, track_points
 
-__all__ = ["DEPTH_SCALE", "Capture", "make_capture", "write_capture"]
-
 DEPTH_SCALE = 5000
 """Depth PNGs hold metres times this, rounded to 16 bits (as TUM's); 0 = no depth."""
 

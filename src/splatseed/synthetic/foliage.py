@@ -16,8 +16,6 @@ from jaxtyping import Float, Float64
 from splatseed.kernels.jit import inline
 from splatseed.synthetic.surfaces import Sphere
 
-__all__ = ["Discs"]
-
 
 @dataclass(frozen=True, eq=False)
 class Discs:

@@ -19,8 +19,6 @@ from splatseed.camera import Camera
 from splatseed.synthetic.room import Room
 from splatseed.synthetic.surfaces import Surface
 
-__all__ = ["pixel_rays", "render_view", "render_views", "visible"]
-
 SUN = np.array([0.48, 0.30, 0.82]) / np.linalg.norm([0.48, 0.30, 0.82])
 """Direction to the sun."""
 AMBIENT = 0.45

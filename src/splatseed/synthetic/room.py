@@ -18,8 +18,6 @@ from splatseed.synthetic.texture import Mottled, Plain, Texture, Tiles
 from splatseed.synthetic.wavy import SineSheet
 from splatseed.views.viewpoint import look_at
 
-__all__ = ["BARE", "Room", "build_room", "orbit_cameras"]
-
 BARE = "bare wall"
 """Name of the surface without texture."""
 

@@ -16,16 +16,6 @@ from jaxtyping import Float64
 from splatseed.synthetic.surfaces import Cylinder, Rectangle, Sphere, Surface, Union, yaw_frame
 from splatseed.synthetic.wavy import SineSheet
 
-__all__ = [
-    "SHAPES",
-    "box_corner",
-    "cylinder",
-    "parallel_plates",
-    "plane",
-    "sine_sheet",
-    "sphere",
-]
-
 
 def plane(tilt: float = 35.0, center: Float64[np.ndarray, " 3"] | None = None) -> Rectangle:
     """A 2 x 2 square turned by ``tilt`` degrees about the x axis; 90 makes it a wall."""

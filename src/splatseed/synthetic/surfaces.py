@@ -17,8 +17,6 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
-__all__ = ["Box", "Cylinder", "Rectangle", "Sphere", "Surface", "Union", "yaw_frame"]
-
 
 class Surface(Protocol):
     """What the demo scene and the benchmarks need from a surface."""

@@ -16,8 +16,6 @@ from jaxtyping import Float, Float64
 
 from splatseed.kernels.jit import inline
 
-__all__ = ["Mottled", "Plain", "Texture", "Tiles", "value_noise"]
-
 Color = tuple[float, float, float]
 
 

@@ -20,8 +20,6 @@ from splatseed.camera import Camera
 from splatseed.synthetic.raycast import visible
 from splatseed.synthetic.surfaces import Surface
 
-__all__ = ["TrackNoise", "TrackedPoints", "corner_strength", "find_corners", "track_points"]
-
 MIN_STRENGTH = 6e-5
 """Least corner strength of a feature, for grey values 0..1: above that of a bare wall, below that
 of texture."""

@@ -15,8 +15,6 @@ from jaxtyping import Float, Float64
 
 from splatseed.synthetic.surfaces import slab_interval
 
-__all__ = ["SineSheet"]
-
 _BISECTIONS = 36
 """Halvings of a bracket that starts as a small part of the sheet."""
 

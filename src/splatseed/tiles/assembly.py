@@ -21,8 +21,6 @@ from splatseed.tiles.store import TileStore
 from splatseed.tiles.work import WorkFolder
 from splatseed.upsample.methods.bounding_box import in_box
 
-__all__ = ["box_points", "new_points", "originals"]
-
 Piece = tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]
 
 

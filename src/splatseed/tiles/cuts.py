@@ -14,8 +14,6 @@ from jaxtyping import Float32, Int32
 
 from splatseed.kernels.jit import kernel, parallel_range
 
-__all__ = ["Cuts", "cut_up"]
-
 
 @dataclass
 class Cuts:

@@ -21,8 +21,6 @@ from splatseed.tiles.stream import stream_state
 from splatseed.tiles.work import WorkFolder
 from splatseed.upsample import neighbors
 
-__all__ = ["draw"]
-
 
 def draw(work: WorkFolder, num_new: int, seed: int, progress: Progress) -> None:
     """Draw the bases of all new points.

@@ -19,8 +19,6 @@ from splatseed.tiles.store import Points, TileStore
 from splatseed.upsample.nearest_points import distances_of, nearest_others, sort_rows
 from splatseed.upsample.neighbors import Neighbors, PreparedCloud
 
-__all__ = ["Neighborhood", "find_neighborhood", "neighbors_of", "prepared"]
-
 QUERY_BLOCK = 1 << 13
 NOBODY = np.iinfo(np.int64).max
 """The rank of a neighbour that was not found yet."""

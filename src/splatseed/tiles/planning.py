@@ -14,8 +14,6 @@ from splatseed.process.memory import option_of, words_of
 from splatseed.tiles.work import free_space
 from splatseed.upsample.nearest import NearestMethod
 
-__all__ = ["TilePlan", "check_disk", "choose_jobs", "plan_tiles"]
-
 PROCESS = 300 << 20
 """Memory of a process before it holds any points: libraries, compiled kernels, and their slack."""
 PER_POINT, PER_NEIGHBOR, PER_NEW = 200, 20, 100

@@ -19,8 +19,6 @@ from splatseed.pointcloud import FARTHEST
 from splatseed.progress import Progress
 from splatseed.tiles.work import WorkFolder
 
-__all__ = ["GREY", "Frame", "Rows", "origin_of", "read_rows", "without_origin"]
-
 GREY = 128
 """The colour of points without one."""
 SAMPLE = 1 << 20

@@ -21,8 +21,6 @@ from splatseed.tiles.steps import made_name
 from splatseed.tiles.store import TileStore
 from splatseed.tiles.work import WorkFolder
 
-__all__ = ["find_repeats", "repeated", "repeats_known"]
-
 STRAY = np.dtype([("xyz", "<f4", 3), ("number", "<i8")])
 """A new point beyond the walls of the tile that made it, and its number in the output."""
 STRAYS, FLAGS, STEP = "strays", "repeated", "repeats"

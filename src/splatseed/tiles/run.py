@@ -31,8 +31,6 @@ from splatseed.upsample import Upsampler, planned_size
 from splatseed.upsample.methods.bounding_box import BoundingBox
 from splatseed.upsample.nearest import NearestMethod
 
-__all__ = ["Request", "Tiled", "check_tileable", "make_tiled"]
-
 LAYOUT = 3
 """Changes with the files of the work folder, so that another version's are not gone on with."""
 

@@ -20,8 +20,6 @@ from splatseed.io.output.earlier import number_of_originals
 from splatseed.scene import Scene
 from splatseed.upsample.neighbors import trusted_originals
 
-__all__ = ["FileSource", "SceneSource", "Source"]
-
 
 class Source(ABC):
     """Points that may be too many for memory.

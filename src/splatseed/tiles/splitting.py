@@ -22,8 +22,6 @@ from splatseed.tiles.cuts import Cuts, cut_up
 from splatseed.tiles.reading import Rows
 from splatseed.tiles.work import WorkFolder
 
-__all__ = ["CELLS", "RECORD", "cells_of", "split", "tile_name"]
-
 RECORD = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("row", "<i8")])
 """A point of a tile."""
 CELLS = 8

@@ -21,8 +21,6 @@ from splatseed.upsample.method import NewPoints
 from splatseed.upsample.nearest import NearestMethod
 from splatseed.upsample.neighbors import Bases
 
-__all__ = ["made_name", "place_tile", "weigh_tile", "weighed_name"]
-
 KNOWN = "known_"
 """Begins the names of arrays that the method has found."""
 

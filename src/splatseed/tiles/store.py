@@ -18,8 +18,6 @@ from splatseed.tiles.splitting import CELLS, RECORD, cells_of, tile_name
 from splatseed.tiles.work import WorkFolder
 from splatseed.upsample.neighbors import least_distance
 
-__all__ = ["Points", "TileStore"]
-
 
 @dataclass(frozen=True, eq=False)
 class Points:

@@ -16,8 +16,6 @@ from jaxtyping import Float32, Int64
 
 from splatseed.kernels.jit import inline, kernel, parallel_range
 
-__all__ = ["TileDraws", "stream_state"]
-
 MULTIPLIER = 0x2360ED051FC65DA44385DF649FCCF645
 """PCG64's a."""
 WORD = 1 << 64

@@ -23,8 +23,6 @@ from splatseed.io.files import read_text
 from splatseed.io.output.leftovers import remove_tree
 from splatseed.literal import visible
 
-__all__ = ["WorkFolder", "free_space", "open_work", "work_path"]
-
 JOB = "job.json"
 PARTIAL = ".partial"
 

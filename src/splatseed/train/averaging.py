@@ -13,8 +13,6 @@ import torch
 
 from splatseed.train.parameters import Parameters
 
-__all__ = ["add_to_mean", "take_mean"]
-
 COUNT = "count"
 
 

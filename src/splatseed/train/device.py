@@ -18,11 +18,6 @@ from splatseed.process.torch_device import free_bytes, pick_torch_device
 from splatseed.progress import Progress, silent
 from splatseed.train.settings import BYTES_EACH, Backend
 
-__all__ = [
-    "BYTES_EACH", "Capacity", "check_fits", "device_name", "gpu_memory_told",
-    "peak_gpu_bytes", "pick_device",
-]  # fmt: skip
-
 FEWER = 0.8
 """The part of the Gaussians to try again with where memory ended."""
 

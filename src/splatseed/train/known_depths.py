@@ -27,8 +27,6 @@ from splatseed.stereo.result import Stereo
 from splatseed.train.settings import TrainSettings
 from splatseed.train.stereo_size import stereo_size
 
-__all__ = ["known_depths", "seconds_of"]
-
 
 def known_depths(
     scene: Scene,

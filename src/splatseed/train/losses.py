@@ -19,8 +19,6 @@ from torch import Tensor
 from splatseed.evaluate.images import l1_and_ssim_by_convolution
 from splatseed.evaluate.ssim import l1_and_ssim
 
-__all__ = ["SSIM_WEIGHT", "photometric_loss"]
-
 SSIM_WEIGHT = 0.2
 
 

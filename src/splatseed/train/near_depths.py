@@ -16,8 +16,6 @@ from jaxtyping import Bool, Float, Float32
 
 from splatseed.views.view import View
 
-__all__ = ["near_depths"]
-
 MOST_PROJECTIONS = 20_000_000
 """Limit on points times views: beyond it, an even subset of the views is used."""
 LEAST_VIEWS = 64

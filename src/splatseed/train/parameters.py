@@ -21,18 +21,6 @@ from splatseed.splat.frame import SCENE_SCALE
 from splatseed.splat.gaussians import Gaussians
 from splatseed.train.schedule import Schedule
 
-__all__ = [
-    "NEAR_DEPTHS",
-    "Optimizers",
-    "Parameters",
-    "as_parameters",
-    "gaussians_of",
-    "make_optimizers",
-    "make_parameters",
-    "optimize",
-    "yardsticks",
-]
-
 Parameters = torch.nn.ParameterDict
 Optimizers = dict[str, torch.optim.Optimizer]
 

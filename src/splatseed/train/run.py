@@ -55,8 +55,6 @@ from splatseed.train.strategies import Strategy, make_strategy
 from splatseed.train.trainer import Trainer
 from splatseed.views.view import View, check_lens, load_split, poses_of
 
-__all__ = ["Render", "RunOptions", "Score", "TrainingRun", "prepare_run"]
-
 KnownDepths: TypeAlias = Mapping[str, Float[Tensor, "h w"]]
 Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
 Score: TypeAlias = Callable[[Render, Sequence[View]], EvalResult]

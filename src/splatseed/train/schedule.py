@@ -16,8 +16,6 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-__all__ = ["FULL_RUN", "LEARNING_RATES", "Densification", "Schedule", "make_schedule"]
-
 Densification = Literal["default", "grow", "mcmc", "none"]
 
 FULL_RUN = 30_000

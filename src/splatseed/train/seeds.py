@@ -25,15 +25,6 @@ from splatseed.views.view import View
 if TYPE_CHECKING:
     from splatseed.stereo.result import Stereo
 
-__all__ = [
-    "SEEDS_SHARE",
-    "most_seeds",
-    "seeded",
-    "seeds_digest",
-    "usable_seeds",
-    "why_not_seeded",
-]
-
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
 """Most seeds as a fraction of the cap, for strategies that add Gaussians; others may use it all."""
 

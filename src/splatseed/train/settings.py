@@ -14,20 +14,6 @@ import tyro
 from splatseed.errors import ParameterError
 from splatseed.train.schedule import FULL_RUN, Densification, Schedule, make_schedule
 
-__all__ = [
-    "AS_3DGS",
-    "AS_IT_IS",
-    "BUDGET",
-    "BYTES_EACH",
-    "LEAST_GAUSSIANS",
-    "Backend",
-    "Placing",
-    "Reading",
-    "Seeding",
-    "StrategyName",
-    "TrainSettings",
-]
-
 StrategyName = Literal[
     "auto", "default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs"
 ]

@@ -19,8 +19,6 @@ from splatseed.train.near_depths import near_depths
 from splatseed.train.settings import TrainSettings
 from splatseed.views.view import View
 
-__all__ = ["first_gaussians", "gaussians_of_scene"]
-
 
 def first_gaussians(
     seeds: PointCloud, views: Sequence[View], settings: TrainSettings

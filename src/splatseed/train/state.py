@@ -24,8 +24,6 @@ from splatseed.train.record.curve import Record
 from splatseed.train.schedule import Schedule
 from splatseed.train.strategies import Strategy
 
-__all__ = ["Stopwatch", "TrainState", "load_checkpoint", "save_checkpoint"]
-
 FORMAT = 4
 """Version of the checkpoint's content."""
 

@@ -15,8 +15,6 @@ from splatseed.scene import Image
 from splatseed.stereo.settings import StereoSettings
 from splatseed.train.settings import TrainSettings
 
-__all__ = ["PER_RENDERED", "stereo_size"]
-
 PER_RENDERED: Mapping[str, float] = MappingProxyType({"cpu": 0.13, "cuda": 0.01})
 """Most pixels compared per pixel rendered in training, by the device that renders: stereo then
 takes about a quarter of training's seconds (on the CPU: fern, 0.045: 5 of 47 s; bonsai at 1,500

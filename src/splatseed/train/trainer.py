@@ -30,8 +30,6 @@ from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
 from splatseed.views.view import View
 
-__all__ = ["Trainer"]
-
 RECORDS = 200
 """Number of records in the curve of a run."""
 TESTS = 20

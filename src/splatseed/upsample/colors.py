@@ -12,8 +12,6 @@ from jaxtyping import Float32, UInt8
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
-__all__ = ["interpolate_colors"]
-
 FLOOR = 0.01
 """Lower limit of distances, in units of the base point's spacing."""
 

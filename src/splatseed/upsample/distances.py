@@ -6,8 +6,6 @@ import numpy as np
 
 from splatseed.kernels.jit import kernel, parallel_range
 
-__all__ = ["fill_distances"]
-
 
 @kernel
 def fill_distances(xyz, idx, least, out):  # type: ignore[no-untyped-def]  # Numba's types

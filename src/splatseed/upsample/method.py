@@ -30,8 +30,6 @@ from splatseed.errors import ParameterError
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 
-__all__ = ["Need", "NewPoints", "Traits", "Upsampler", "check_fields", "require", "traits_of"]
-
 
 class NewPoints(NamedTuple):
     """What a method returns: positions, colours, and optional attributes of its points."""

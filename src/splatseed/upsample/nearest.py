@@ -28,8 +28,6 @@ from splatseed.upsample.neighbors import (
     sound_bases,
 )
 
-__all__ = ["Draws", "Known", "NearestMethod", "blended"]
-
 OUTLIER_CHECK_NEIGHBORS = 8
 
 Known: TypeAlias = Mapping[str, np.ndarray]

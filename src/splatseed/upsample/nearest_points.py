@@ -14,8 +14,6 @@ import numpy as np
 from jaxtyping import Float64, Int32, Int64
 from scipy.spatial import cKDTree
 
-__all__ = ["distances_of", "nearest_others", "sort_rows"]
-
 AT_ONCE = 1 << 20
 """Neighbours fetched at once for points at whose k-th distance there are several."""
 FEW = 1 << 22

@@ -26,20 +26,6 @@ from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Scene
 from splatseed.upsample.nearest_points import distances_of, nearest_others
 
-__all__ = [
-    "Bases",
-    "Neighbors",
-    "PreparedCloud",
-    "draw_bases",
-    "draw_blocks",
-    "draw_in_block",
-    "least_distance",
-    "prepare",
-    "prepare_scene",
-    "sound_bases",
-    "trusted_originals",
-]
-
 SPACING_NEIGHBORS = 6
 """Nearest points over which the spacing h is averaged."""
 OUTLIER_NEIGHBORS = 16

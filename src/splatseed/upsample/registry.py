@@ -18,8 +18,6 @@ from splatseed.errors import ParameterError
 from splatseed.pointcloud import GENERATED, ORIGINAL
 from splatseed.upsample.method import Upsampler
 
-__all__ = ["METHODS", "SOURCE_CODES", "add_built_in", "origin_name", "source_code"]
-
 GROUP = "splatseed.methods"
 
 BUILT_IN = {

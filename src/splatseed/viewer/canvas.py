@@ -14,8 +14,6 @@ from splatseed.camera import Camera, quat_from_rotation, rotation_from_quat
 from splatseed.splat.frame import TrainingFrame
 from splatseed.views.view import View
 
-__all__ = ["canvas_view", "fitted_fov", "laid_onto", "stage_pose"]
-
 NO_PIXELS = np.empty((0, 0, 3), np.uint8)
 
 

@@ -12,14 +12,6 @@ from splatseed.progress import Progress, silent
 from splatseed.viewer.renderer import ModelRenderer
 from splatseed.views.view import View
 
-__all__ = [
-    "as_bytes",
-    "depth_colors",
-    "depth_range",
-    "flight_frames",
-    "split_picture",
-]
-
 LINE = 2
 WHITE = 255
 SAMPLES = 7

@@ -13,8 +13,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["FrameLoop"]
-
 MOVING_SECONDS = 0.12
 """Seconds a frame may take while the camera moves."""
 STILL_AFTER = 0.2

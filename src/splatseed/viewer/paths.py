@@ -28,8 +28,6 @@ from splatseed.viewer.renderer import CORE, resized
 from splatseed.views.view import View
 from splatseed.views.viewpoint import look_at
 
-__all__ = ["check_path", "focus_of", "orbit", "path_of_file", "smooth_path", "views_from"]
-
 SMOOTHING = 0.02
 """Standard deviation of the filter along a path, as a fraction of the path's length."""
 FINE = 8

@@ -33,8 +33,6 @@ from splatseed.viewer.renderer import ModelRenderer
 from splatseed.viewer.shown import Shown
 from splatseed.views.view import View, poses_of
 
-__all__ = ["NOTHING", "Drawn", "Entry"]
-
 Drawn = tuple[UInt8[np.ndarray, "H W 3"] | None, str]
 """A picture, or None and the reason why there is none."""
 NOTHING = "points only"

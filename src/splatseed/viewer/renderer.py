@@ -21,8 +21,6 @@ from splatseed.splat.frame import TrainingFrame, training_frame
 from splatseed.splat.gaussians import Gaussians
 from splatseed.views.view import View, poses_of
 
-__all__ = ["CORE", "ModelRenderer", "model_frame", "resized"]
-
 CORE = 0.6
 """Share of Gaussians, nearest to their median, that the frame of a lone model is fitted to."""
 LEAST_ALPHA = 0.05

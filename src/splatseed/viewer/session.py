@@ -24,8 +24,6 @@ from splatseed.viewer.pictures import NOTHING, Drawn, Entry
 from splatseed.viewer.stage import add_cameras, add_clouds, clouds_of, point_size
 from splatseed.views.view import View
 
-__all__ = ["MOST_POINTS", "Session"]
-
 MOST_PIXELS = 1_600_000
 """The most pixels of a full picture; on larger canvases it is stretched."""
 THUMBNAIL = 96

@@ -21,8 +21,6 @@ from splatseed.scene import Scene
 from splatseed.splat.gaussians import Gaussians
 from splatseed.train.record.folder import RunFolder
 
-__all__ = ["Shown", "open_shown", "share_a_world"]
-
 MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
 _HEADER = 1 << 16
 

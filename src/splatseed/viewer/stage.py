@@ -19,8 +19,6 @@ from splatseed.splat.frame import TrainingFrame
 from splatseed.upsample.registry import origin_name
 from splatseed.viewer.canvas import stage_pose
 
-__all__ = ["Cloud", "add_cameras", "add_clouds", "clouds_of", "point_size"]
-
 MOST_CAMERAS = 400
 """Most cameras that are drawn; of more, an even subset."""
 FRUSTUM, LEAST_FRUSTUM, MOST_FRUSTUM = 0.5, 0.008, 0.05

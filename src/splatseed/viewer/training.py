@@ -25,8 +25,6 @@ from splatseed.viewer.shown import Shown
 from splatseed.viewer.viewer import Viewer
 from splatseed.views.view import View, poses_of
 
-__all__ = ["TrainingViewer"]
-
 REFRESH_SECONDS = 2.0
 """Seconds between pictures that are sent unasked."""
 PATIENCE = 60.0

@@ -13,8 +13,6 @@ from splatseed.errors import OutputError, ParameterError
 from splatseed.io.output.staging import atomic_file
 from splatseed.requirements import require
 
-__all__ = ["VIDEO_SUFFIXES", "check_video_name", "even_size", "write_video"]
-
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov")
 """File name suffixes that can be written, all holding H.264."""
 QUALITY = 8

@@ -29,8 +29,6 @@ from splatseed.viewer.shown import Shown
 from splatseed.views.view import poses_of
 from splatseed.views.viewpoint import choose_camera, choose_image
 
-__all__ = ["Viewer", "free_port"]
-
 MOST_PORT = 65535
 STEP_BACK = 0.6
 """How far behind the first camera a browser begins, on the stage, so that it sees that camera."""

@@ -15,8 +15,6 @@ from jaxtyping import Float64, Int64
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.views.parallax import cosine_between
 
-__all__ = ["choose_by_pose", "choose_sources", "views_of_points"]
-
 LEAST, FULL, WIDE, MOST = 1.0, 4.0, 15.0, 45.0
 """Degrees between which the weight rises, stays full, and falls."""
 ALIKE = 30.0

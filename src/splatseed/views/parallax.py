@@ -9,8 +9,6 @@ import numpy as np
 
 from splatseed.kernels.jit import always_inline
 
-__all__ = ["cosine_between"]
-
 
 @always_inline
 def cosine_between(point, first, second):  # type: ignore[no-untyped-def]  # Numba's types

@@ -25,8 +25,6 @@ from splatseed.io.photograph import decode_photograph, open_photograph, photogra
 if TYPE_CHECKING:
     from PIL import Image as PilImage
 
-__all__ = ["load_photograph", "user_cache_dir"]
-
 FILTER = "box-2"
 """Part of the key: change it whenever the downsampling changes."""
 

@@ -13,8 +13,6 @@ import numpy as np
 
 from splatseed.kernels.jit import inline
 
-__all__ = ["place"]
-
 
 @inline
 def place(point, matrix):  # type: ignore[no-untyped-def]  # Numba's types

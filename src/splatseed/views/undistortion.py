@@ -17,8 +17,6 @@ from splatseed.camera import Intrinsics
 from splatseed.kernels.jit import inline
 from splatseed.lens import distort, fold_radius
 
-__all__ = ["undistort"]
-
 ROWS = 64
 """Rows computed at a time, which bounds the memory of their rays."""
 

@@ -24,8 +24,6 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.views.photographs import load_photograph
 
-__all__ = ["View", "check_lens", "data_factor", "load_split", "load_views", "poses_of"]
-
 ASPECT_SLACK = 0.02
 """By how much a file's aspect ratio may differ from its camera's: the rounding of a copy."""
 READERS = 4

@@ -14,8 +14,6 @@ from splatseed.camera import Camera
 from splatseed.errors import PointCloudError
 from splatseed.scene import Image, Scene
 
-__all__ = ["choose_camera", "choose_image", "look_at"]
-
 SAMPLE = 20_000
 """Points considered when choosing a camera."""
 

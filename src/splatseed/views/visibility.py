@@ -19,8 +19,6 @@ from splatseed.camera import Camera
 from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Image, Scene
 
-__all__ = ["SeenPoints", "Visibility", "camera_points", "find_visibility"]
-
 CELLS = 40
 """Columns and rows of the grid over an image in whose cells points hide each other."""
 

@@ -20,8 +20,6 @@ from splatseed.bench.analysis.tables import Cell, Table, words
 from splatseed.bench.planning.records import RunRow
 from splatseed.train.settings import StrategyName
 
-__all__ = ["Change", "Comparison", "change_table", "compare", "only_table", "settings_table"]
-
 Arm = tuple[StrategyName, Variant]
 Place = tuple[StrategyName, str, Variant]
 

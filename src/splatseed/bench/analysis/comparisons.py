@@ -15,8 +15,6 @@ from splatseed.bench.analysis.psnr_tables import gain_cell
 from splatseed.bench.analysis.study import Study, Variant, budget_words
 from splatseed.bench.analysis.tables import Cell, Table, number, words
 
-__all__ = ["EQUAL", "equal_count_table", "ratio_table", "strategy_table"]
-
 EQUAL = 0.01
 """By how much equal numbers of Gaussians may differ."""
 

@@ -20,8 +20,6 @@ from splatseed.bench.planning.records import RunResult
 from splatseed.scores import CurvePoint
 from splatseed.train.settings import StrategyName
 
-__all__ = ["Reached", "convergence_table", "reach", "speed"]
-
 
 @dataclass(frozen=True)
 class Reached:

@@ -17,8 +17,6 @@ from splatseed.bench.analysis.tables import Cell, Table, number, words
 from splatseed.bench.planning.records import RunResult
 from splatseed.train.settings import StrategyName
 
-__all__ = ["cost_table", "mean_of", "quality_table"]
-
 QUALITY_NOTE = (
     "Means over the scenes that a method and sfm both have: compare methods of equally many "
     "scenes. Co-visible PSNR is over the pixels that at least two training views see. PSNR and "

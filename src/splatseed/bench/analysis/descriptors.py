@@ -28,8 +28,6 @@ from splatseed.scene import Image, Scene
 if TYPE_CHECKING:  # SciPy and Numba
     from splatseed.upsample.neighbors import PreparedCloud
 
-__all__ = ["DESCRIPTIONS", "Descriptors", "describe", "read_descriptors", "write_descriptors"]
-
 NEIGHBORS = 16
 VIEWS = 24
 """Number of views, evenly spaced, for gaps, empty area and texture."""

@@ -27,8 +27,6 @@ from splatseed.bench.analysis.statistics import (
 from splatseed.bench.analysis.study import BASELINE, Study, Variant
 from splatseed.train.settings import StrategyName
 
-__all__ = ["Gains", "MeanGains", "clear_best", "gains", "mean_gains", "scores"]
-
 Key = TypeVar("Key")
 
 

@@ -23,9 +23,6 @@ from splatseed.bench.analysis.gains import Gains
 from splatseed.bench.analysis.statistics import LEVEL, holm
 from splatseed.bench.analysis.tables import Cell, Table, number, words
 
-__all__ = ["FEWEST", "Guideline", "fewest_scenes", "guideline_table", "guidelines",
-           "rank_correlation", "scene_table", "verdict", "winner_table"]  # fmt: skip
-
 EXACT = 8
 """Up to this many scenes, all orders are enumerated (40,320); beyond, t approximates well."""
 FEWEST = 3

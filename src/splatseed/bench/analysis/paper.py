@@ -14,8 +14,6 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 
-__all__ = ["DATASETS", "PAPER_STEPS", "PaperCost", "PaperDataset", "dataset_of", "paper_dataset"]
-
 PAPER_STEPS = 30_000
 DATASETS = {"mipnerf360": "Mip-NeRF360", "replica": "Replica"}
 PSNR_FILES = {"mipnerf360": "table1_mipnerf360_psnr.csv", "replica": "table2_replica_psnr.csv"}

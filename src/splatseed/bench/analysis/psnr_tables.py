@@ -26,8 +26,6 @@ from splatseed.bench.analysis.study import BASELINE, Cell as Runs, Study, Varian
 from splatseed.bench.analysis.tables import Cell, Table, number, words
 from splatseed.train.settings import StrategyName
 
-__all__ = ["MARKS", "gain_cell", "gain_table", "mean_gain_table", "psnr_tables"]
-
 NOISE, CLEAR, ONE_RUN = "~", "†", "(1 run)"
 
 MARKS = (

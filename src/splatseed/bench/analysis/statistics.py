@@ -20,10 +20,6 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float64
 
-__all__ = ["LEVEL", "Difference", "Verdict", "adjusted", "difference", "holm", "over_scenes",
-           "over_views_and_repeats",
-           "paired_differences", "pooled_noise", "these_scenes"]  # fmt: skip
-
 LEVEL = 0.05
 """A difference is a claim when its adjusted p is at most this."""
 EXACT = 1e-9

@@ -20,8 +20,6 @@ from splatseed.bench.planning.records import SFM, SHARED, RunResult, RunRow, Run
 from splatseed.train.settings import StrategyName
 from splatseed.upsample import METHODS
 
-__all__ = ["BASELINE", "Cell", "Study", "Variant", "budget_words", "studies", "variant_of"]
-
 STRATEGIES: tuple[StrategyName, ...] = get_args(StrategyName)
 
 Cell = Mapping[int, RunResult]

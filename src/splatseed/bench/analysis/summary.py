@@ -18,8 +18,6 @@ from splatseed.bench.planning.records import RunResult
 from splatseed.literal import counted
 from splatseed.train.settings import StrategyName
 
-__all__ = ["decibels", "summary"]
-
 
 def summary(study: Study, strategy: StrategyName) -> tuple[str, ...]:
     """The conclusions on a strategy, a sentence or two each.

@@ -17,9 +17,6 @@ from pathlib import Path
 
 from splatseed.io.output.staging import atomic_file
 
-__all__ = ["Cell", "Table", "cell_text", "number", "to_csv", "to_markdown", "to_tex", "words",
-           "write_table"]  # fmt: skip
-
 LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
     "{": r"\{", "}": r"\}", "~": r"$\sim$", "^": r"\^{}", "±": r"$\pm$", "†": r"$\dagger$",

@@ -22,8 +22,6 @@ from splatseed.io.photograph import photograph_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 
-__all__ = ["cloud_digest", "depth_digest", "scene_digest"]
-
 Item = TypeVar("Item")
 
 SIZE = 16

@@ -26,8 +26,6 @@ from splatseed.train.schedule import Densification
 from splatseed.train.settings import TrainSettings
 from splatseed.upsample import METHODS, chooses_number
 
-__all__ = ["Estimator"]
-
 TESTS = 21
 """How often the test views are rendered: during training, and at the end."""
 RENDER_SHARE = 0.3

@@ -31,8 +31,6 @@ from splatseed.seeding.amounts import RHO, parse_budget
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, configure
 
-__all__ = ["DEMO", "Plan", "PlannedScene", "plan_runs"]
-
 DEMO = "demo:"
 """The path of the synthetic room, which is made in the benchmark's folder on demand."""
 DEPTH = "depth"

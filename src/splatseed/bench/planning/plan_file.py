@@ -20,8 +20,6 @@ from splatseed.io.files import read_text
 from splatseed.literal import quoted
 from splatseed.train.settings import TrainSettings
 
-__all__ = ["plan_text", "read_plan"]
-
 SCENES = "scenes"
 PARAMETERS = "parameters"
 FILES = ("path", "depth", "cloud")

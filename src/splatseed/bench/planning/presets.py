@@ -17,8 +17,6 @@ from splatseed.bench.planning.records import SFM
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.train.settings import TrainSettings
 
-__all__ = ["PRESETS", "PresetName", "preset_plan"]
-
 PresetName = Literal["mipnerf360", "replica", "laptop", "quick"]
 PRESETS: tuple[PresetName, ...] = ("mipnerf360", "replica", "laptop", "quick")
 

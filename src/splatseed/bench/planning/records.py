@@ -18,20 +18,6 @@ from splatseed.train.seeds import most_seeds
 from splatseed.train.settings import StrategyName, TrainSettings
 from splatseed.upsample import Profile
 
-__all__ = [
-    "ANY_RATIO",
-    "SFM",
-    "SHARED",
-    "WITH_CLOUD",
-    "Arm",
-    "RunResult",
-    "RunRow",
-    "RunSpec",
-    "RunStatus",
-    "needs_cloud",
-    "plain",
-]
-
 SFM = "sfm"
 """The method that leaves the cloud of Structure-from-Motion as it is; its ratio is 1."""
 

@@ -22,8 +22,6 @@ from splatseed.scene import Scene
 from splatseed.splat.frame import stray_note, stray_views
 from splatseed.views.view import check_lens, poses_of
 
-__all__ = ["SceneFacts", "open_scene", "survey"]
-
 
 @dataclass(frozen=True)
 class SceneFacts:

@@ -19,8 +19,6 @@ from splatseed.errors import SceneFormatError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 
-__all__ = ["cloud_picture", "open_unchanged", "seed_specs"]
-
 MOST = 10
 """Clouds in a picture."""
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["COLORS", "MANY", "Plot", "legend_of", "method_color", "new_figure", "panels", "png"]
-
 COLORS = {
     "sfm": "#222222",
     "linear": "#0072B2",

@@ -28,8 +28,6 @@ from splatseed.preview.fonts import font_families, plain
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["arm_figure", "seconds_figure"]
-
 DASHES: Mapping[str, str] = {"default": "-", "mcmc": "--", "grow": "-.", "none": ":"}
 MARKS: Mapping[str, str] = {"default": "o", "mcmc": "s", "grow": "^", "none": "D"}
 POINTS = 60

@@ -35,9 +35,6 @@ from splatseed.train.settings import StrategyName
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Plot", "curve_figure", "ratio_figure", "scene_figure", "shown_variants",
-           "strategy_figure"]  # fmt: skip
-
 MARKERS = {2.0: "v", 4.0: "s", 8.0: "o", 16.0: "^", 32.0: "D"}
 """Marks by ratio; other ratios have a cross."""
 LATE = 0.15

@@ -16,18 +16,6 @@ from string import Template
 
 from splatseed.bench.analysis.tables import Cell, Table, cell_text
 
-__all__ = [
-    "JPEG",
-    "Section",
-    "data_uri",
-    "figure",
-    "page",
-    "paragraphs",
-    "preformatted",
-    "slider",
-    "table",
-]
-
 PNG, JPEG = "image/png", "image/jpeg"
 _WORDS = ' class="words"'
 

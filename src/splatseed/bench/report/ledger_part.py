@@ -12,8 +12,6 @@ from splatseed.bench.planning.records import RunRow
 from splatseed.bench.report.html import Section, paragraphs, preformatted, table
 from splatseed.literal import counted
 
-__all__ = ["counts", "ledger_sections"]
-
 SHOWN = 200
 """Runs listed in a table; of a large plan that has just begun, nearly all are missing."""
 

@@ -28,8 +28,6 @@ from splatseed.errors import SplatseedError
 from splatseed.io.files import read_file, read_text
 from splatseed.progress import Progress, silent
 
-__all__ = ["CLOUDS", "FIGURES", "KEPT_DESCRIPTORS", "Pictures", "safe_name", "scene_pictures"]
-
 FIGURES = "figures"
 CLOUDS = "clouds.json"
 KEPT_DESCRIPTORS = "descriptors.json"

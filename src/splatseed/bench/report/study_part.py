@@ -42,8 +42,6 @@ from splatseed.bench.report.figures import (
 )
 from splatseed.bench.report.html import Section, figure, paragraphs, table
 
-__all__ = ["StudyReport", "study_report"]
-
 NO_GAINS = "There is nothing to compare with yet: runs of sfm are missing, or all others."
 
 

@@ -23,8 +23,6 @@ from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.splat.pictures import GAP
 from splatseed.train.settings import StrategyName
 
-__all__ = ["ComparedView", "compared_views", "jpeg"]
-
 VIEWS = 2
 """Views shown per scene and strategy; one if there are several strategies."""
 SIDE = 960

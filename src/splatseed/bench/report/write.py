@@ -42,8 +42,6 @@ from splatseed.io.files import read_text
 from splatseed.io.output.staging import atomic_file, output_folder
 from splatseed.progress import Progress, silent
 
-__all__ = ["REPORT", "Report", "write_report"]
-
 REPORT = "report.html"
 TABLES = "tables"
 KIND = "bench report"

@@ -27,8 +27,6 @@ from splatseed.bench.running.job import JobOptions, Outcome, run_job
 from splatseed.process.interpreter import child_command, child_environment
 from splatseed.progress import Progress
 
-__all__ = ["Child", "Killed", "serve"]
-
 PROGRAM = "from splatseed.bench.running.child import serve; serve()"
 REPORT_SECONDS = 0.5
 """Seconds between progress messages."""

@@ -12,8 +12,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-__all__ = ["describe_environment", "package_version"]
-
 PACKAGES = ("splatseed", "torch", "gsplat", "torchmetrics", "numpy", "scipy", "numba", "ray")
 
 

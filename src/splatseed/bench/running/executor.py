@@ -18,8 +18,6 @@ from splatseed.bench.running.watcher import Watcher
 from splatseed.bench.running.worker import HEARTBEAT_SECONDS, worker_name
 from splatseed.errors import OutputError
 
-__all__ = ["Executor"]
-
 TRIES = 2
 """How often one call of the command starts a run whose process is killed."""
 

@@ -15,16 +15,8 @@ from splatseed.bench.planning.scenes import SceneFacts
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.errors import OutputError
 from splatseed.io.files import read_text
-from splatseed.io.output.staging import MANIFEST, atomic_file, check_output
-
-__all__ = [
-    "DEMO_FACTS",
-    "PLAN",
-    "TUNING",
-    "check_bench_folder",
-    "make_bench_folder",
-    "make_demo_scene",
-]
+from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.output.staging import atomic_file, check_output
 
 DEMO_FACTS = SceneFacts(
     "demo",

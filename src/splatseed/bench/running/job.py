@@ -45,8 +45,6 @@ if TYPE_CHECKING:  # PyTorch, which takes a while
     from splatseed.train.run import TrainingRun
     from splatseed.views.view import View
 
-__all__ = ["JobOptions", "Outcome", "run_job"]
-
 TRAIN = "train"
 COVISIBLE, DEPTHS = "covisible", "depths"
 """The folders of what is known of test views' pixels and of depth by stereo, beside the ledger."""

@@ -18,17 +18,6 @@ from splatseed.io.files import read_text
 from splatseed.io.output.staging import output_folder
 from splatseed.train.record.folder import RunFolder
 
-__all__ = [
-    "ERROR",
-    "RESULT",
-    "kept_files",
-    "kept_folder",
-    "read_result",
-    "result_bytes",
-    "work_folder",
-    "write_kept",
-]
-
 RESULT = "result.json"
 ERROR = "error.txt"
 PICTURES = 3

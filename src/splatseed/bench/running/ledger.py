@@ -22,8 +22,6 @@ from splatseed.bench.planning.records import RunResult, RunRow, RunSpec
 from splatseed.bench.running.worker import is_gone
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 
-__all__ = ["LEDGER", "Ledger"]
-
 LEDGER = "ledger.sqlite"
 """The ledger's name in the folder of a benchmark."""
 APPLICATION_ID = 0x73706C62

@@ -21,8 +21,6 @@ from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.watcher import Watcher
 from splatseed.process.interruption import Interruption, interruption
 
-__all__ = ["LocalExecutor"]
-
 POLL_SECONDS = 0.2
 
 

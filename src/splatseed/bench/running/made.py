@@ -20,8 +20,6 @@ from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.output.staging import atomic_file
 from splatseed.pointcloud import PointCloud
 
-__all__ = ["made_file", "read_made", "write_made"]
-
 SEEDS = "seeds"
 
 

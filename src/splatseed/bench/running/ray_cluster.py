@@ -25,13 +25,11 @@ from splatseed.bench.running.kept import kept_folder, read_result, work_folder, 
 from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.watcher import Watcher
 from splatseed.errors import OutputError, ParameterError, SceneNotFoundError, SplatseedError
-from splatseed.io.output.staging import MANIFEST
+from splatseed.io.output.manifest import MANIFEST
 from splatseed.process.interruption import interruption
 from splatseed.process.ray_tasks import LOSSES, Cluster, Flights, Landing, Share
 from splatseed.process.threads import slot_environment
 from splatseed.progress import silent
-
-__all__ = ["RayExecutor", "run_on_node"]
 
 
 @dataclass(frozen=True)

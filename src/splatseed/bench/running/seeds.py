@@ -27,8 +27,6 @@ from splatseed.seeding.thinning import thin_to
 from splatseed.seeding.upsampling import CELL, DEFAULT_METHOD, upsample
 from splatseed.upsample import Upsampler, chooses_number, configure
 
-__all__ = ["is_full", "make_seeds", "scene_of"]
-
 PLAIN = "linear"
 """The method used if no points are to be made; any would do."""
 

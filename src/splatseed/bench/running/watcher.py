@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from splatseed.bench.planning.records import RunResult, RunSpec
 
-__all__ = ["Watcher"]
-
 
 class Watcher:
     """Told about runs by their executor; may be called from several threads at once."""

@@ -12,8 +12,6 @@ import socket
 from functools import cache
 from pathlib import Path
 
-__all__ = ["HEARTBEAT_SECONDS", "STALE_SECONDS", "is_gone", "worker_name"]
-
 HEARTBEAT_SECONDS = 10.0
 STALE_SECONDS = 180.0
 """Many heartbeats: clocks of two machines differ, and a busy disk delays heartbeats."""

@@ -20,18 +20,6 @@ from splatseed.bench.analysis.statistics import Difference, over_views_and_repea
 from splatseed.bench.planning.records import SFM, Arm, RunResult
 from splatseed.errors import ParameterError
 
-__all__ = [
-    "BASELINE",
-    "LAST_REPEATS",
-    "Rung",
-    "Verdict",
-    "best_arms",
-    "check_time",
-    "is_baseline",
-    "plan_rungs",
-    "verdict",
-]
-
 BASELINE = (SFM, "default")
 """Method and strategy of the baseline."""
 KEPT = (1.0, 1 / 3, 1 / 6)

@@ -11,8 +11,6 @@ from itertools import count
 
 from splatseed.train.schedule import FULL_RUN, make_schedule
 
-__all__ = ["growth_within", "most_grown", "steps_to_grow"]
-
 
 def growth_within(steps: int) -> float:
     """The factor by which ``grow`` is sure to multiply its Gaussians in a run of so many steps."""

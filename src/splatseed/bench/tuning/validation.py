@@ -13,8 +13,6 @@ from splatseed.io import load_originals, write_scene
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS
 from splatseed.views.view import check_lens
 
-__all__ = ["LEAST_VIEWS", "make_validation_scene"]
-
 LEAST_VIEWS = 4
 """Fewest training views of a scene: some to train on, and at least one to validate on."""
 

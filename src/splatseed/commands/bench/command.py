@@ -27,8 +27,6 @@ from splatseed.io.output.staging import atomic_file
 from splatseed.literal import counted, did_you_mean, visible
 from splatseed.process.interruption import exit_code
 
-__all__ = ["run"]
-
 SOME_FAILED = 1
 REPORTING = {"report": "run_report", "compare": "run_compare"}
 

@@ -15,8 +15,6 @@ from splatseed.bench.running.watcher import Watcher
 from splatseed.console import ERR, OUT
 from splatseed.literal import visible
 
-__all__ = ["RunDisplay", "describe", "run_display", "spoken_time"]
-
 TRAIN = "train"
 MINUTE = 60.0
 

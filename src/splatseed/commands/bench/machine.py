@@ -24,8 +24,6 @@ from splatseed.train.settings import BYTES_EACH, Backend
 if TYPE_CHECKING:
     from splatseed.process.ray_tasks import Cluster
 
-__all__ = ["Machine", "check_machine", "open_machine"]
-
 Run: TypeAlias = Callable[[Ledger, Path, Collection[str], JobOptions, Watcher], bool]
 
 

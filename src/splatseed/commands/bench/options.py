@@ -24,8 +24,6 @@ from splatseed.errors import ParameterError
 from splatseed.train.settings import StrategyName, TrainSettings
 from splatseed.upsample import Profile
 
-__all__ = ["Asked", "Options", "parse_plan"]
-
 """The name of the plan in the folder of a benchmark."""
 DEFAULT = Plan()
 

@@ -17,8 +17,6 @@ from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.progress import Progress
 from splatseed.train.settings import Backend
 
-__all__ = ["Prepared", "prepare"]
-
 NO_RUNS = "Name other methods, or what these need."
 
 

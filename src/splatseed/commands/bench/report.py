@@ -33,8 +33,6 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.io.output.staging import check_output, output_folder
 from splatseed.literal import counted, quoted
 
-__all__ = ["run_compare", "run_report"]
-
 
 @dataclass(frozen=True)
 class ReportOptions:

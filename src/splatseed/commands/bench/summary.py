@@ -13,8 +13,6 @@ from splatseed.commands.bench.display import describe
 from splatseed.console import print_commands, print_note, print_pairs, print_table
 from splatseed.literal import counted, quoted
 
-__all__ = ["print_summary"]
-
 FAILURES_SHOWN = 5
 
 

@@ -23,16 +23,13 @@ from splatseed.commands.demo.methods import SHOWN
 from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import MissingDependencyError, OutputError, ParameterError
-from splatseed.io.output.manifest import MANIFEST, kind_of
-from splatseed.io.output.staging import add_files
+from splatseed.io.output.manifest import MANIFEST, add_files, kind_of
 from splatseed.literal import quoted
 from splatseed.requirements import require
 from splatseed.upsample import planned_size
 
 if TYPE_CHECKING:  # importing PyTorch takes a while, and it may be absent
     from splatseed.commands.demo.training import TrainedArm
-
-__all__ = ["Options", "run"]
 
 TRAINED_PICTURE = "preview_trained.png"
 

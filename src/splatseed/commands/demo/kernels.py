@@ -25,8 +25,6 @@ from splatseed.console import StageClock
 from splatseed.kernels.compilation import watched
 from splatseed.process.interpreter import child_command, child_environment
 
-__all__ = ["TRAINING", "KernelsAhead", "compile_parts", "kernels_ahead", "wait"]
-
 TRAINING = "training"
 PARTS = (SHOWN, "voronoi", "spline")
 """What the second process compiles, in this order; training as early as possible after the

@@ -6,8 +6,6 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.upsample import METHODS, chooses_number, configure, upsample
 
-__all__ = ["SHOWN", "TEST_EVERY", "upsample_by"]
-
 SHOWN = "auto"
 TEST_EVERY = 8
 """Photographs held out for testing: no method uses them."""

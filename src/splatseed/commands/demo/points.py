@@ -18,7 +18,8 @@ from splatseed.commands.demo.methods import SHOWN, upsample_by
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.diagnostics.geometry import GeometryScore, measure, spacing
 from splatseed.io import find_depths, load_scene, write_scene
-from splatseed.io.output.staging import add_files, atomic_file, output_folder
+from splatseed.io.output.manifest import add_files
+from splatseed.io.output.staging import atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
 from splatseed.scene import Scene
@@ -27,8 +28,6 @@ from splatseed.upsample import methods_for
 
 if TYPE_CHECKING:  # which imports this module
     from splatseed.commands.demo import Options
-
-__all__ = ["make_points"]
 
 SAMPLES = 20_000
 """Samples of the surfaces at which coverage is measured."""

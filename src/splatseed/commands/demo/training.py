@@ -25,17 +25,6 @@ from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
 
-__all__ = [
-    "POSES_ALONE",
-    "Arm",
-    "TrainedArm",
-    "psnr_after",
-    "seed_poses_alone",
-    "total_seconds",
-    "train_arm",
-    "write_comparison",
-]
-
 POSES_ALONE = {"random start": "random", f"{SHOWN}, poses alone": f"poses_{SHOWN}"}
 """Arms that know no points, and how their folders end."""
 

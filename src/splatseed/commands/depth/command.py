@@ -23,8 +23,6 @@ from splatseed.monocular import (
 from splatseed.scene import Scene
 from splatseed.train.schedule import FULL_RUN
 
-__all__ = ["run"]
-
 NAMES_SHOWN = 5
 MAX_SIZE = 1600
 PACKAGES = ("splatseed", "transformers", "torch", "onnxruntime", "numpy", "pillow")

@@ -9,9 +9,6 @@ from splatseed.lens import undistort_command
 from splatseed.literal import quoted
 from splatseed.scene import Scene
 
-__all__ = ["after_network", "after_stereo", "look", "number_for", "use"]
-
-
 RATIO = 16
 PER_POINT = 8
 """Pixels of known depth per new point. Beyond that, lifting runs out of pixels that are free and

@@ -17,8 +17,6 @@ from splatseed.errors import ParameterError
 from splatseed.monocular import DeviceName
 from splatseed.stereo.settings import LEAST_SIZE, MOST_GRID
 
-__all__ = ["Options", "check_together"]
-
 Channels = tuple[float, float, float]
 
 

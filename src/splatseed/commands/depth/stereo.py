@@ -34,8 +34,6 @@ from splatseed.train.schedule import FULL_RUN
 if TYPE_CHECKING:
     from splatseed.stereo import StereoMap
 
-__all__ = ["provenance", "run_stereo"]
-
 NAMES_SHOWN = 5
 PICTURE = "preview_maps.png"
 PACKAGES = ("splatseed", "numba", "numpy", "pillow", "scipy")

@@ -33,14 +33,6 @@ from splatseed.seeding.advice import (
 )
 from splatseed.train.schedule import FULL_RUN
 
-__all__ = [
-    "ADVICE_OPTIONS",
-    "advice_commands",
-    "advice_for",
-    "advice_rows",
-    "run_advice",
-]
-
 Budget = Annotated[
     str | None,
     tyro.conf.arg(

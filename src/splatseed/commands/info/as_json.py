@@ -21,8 +21,6 @@ from splatseed.scene import Scene
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth import Alignment
 
-__all__ = ["print_json"]
-
 
 def print_json(
     scene: Scene,

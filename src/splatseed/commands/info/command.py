@@ -42,8 +42,6 @@ from splatseed.train.schedule import FULL_RUN
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth import Alignment
 
-__all__ = ["Options", "run"]
-
 KINDS_SHOWN = 3
 """Kinds of cameras listed; collections of photographs from the web have one per photograph."""
 

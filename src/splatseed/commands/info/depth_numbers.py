@@ -16,8 +16,6 @@ from splatseed.depth import Alignment
 from splatseed.depthmap import DepthKind, DepthMap, DepthMaps
 from splatseed.scene import Scene
 
-__all__ = ["print_depth"]
-
 ROWS = 12
 """Images listed without --all."""
 

@@ -25,8 +25,6 @@ from splatseed.preview.photographs import photograph_or_blank
 from splatseed.scene import Image, Scene
 from splatseed.views.visibility import find_visibility
 
-__all__ = ["write_depth_picture"]
-
 SIDE = 480
 """The longer side of a tile, in pixels."""
 LIMIT = 0.1

@@ -13,8 +13,6 @@ from splatseed.seeding.photographs import has_points, photographed
 if TYPE_CHECKING:  # kernels load with its use
     from splatseed.seeding.poses_alone.pose_error import PoseError
 
-__all__ = ["Poses", "look_at_poses"]
-
 REFINE = "--refine-poses"
 """What problems that it can mend name."""
 

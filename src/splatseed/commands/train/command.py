@@ -58,8 +58,6 @@ from splatseed.views.view import poses_of
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
 
-__all__ = ["bar_columns", "run"]
-
 BAR_WIDTH = 12
 DEFAULT = TrainSettings()
 BEST: StrategyName = "auto"

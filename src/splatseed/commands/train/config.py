@@ -16,8 +16,6 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io.files import read_text
 from splatseed.literal import did_you_mean
 
-__all__ = ["with_config"]
-
 NOTES = {"splatseed", "points", "device", "versions"}
 """What config.json records besides settings."""
 RENAMED = {"seeding": "seeds"}

@@ -16,8 +16,6 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
     from splatseed.train.run import TrainingRun
     from splatseed.viewer.training import TrainingViewer
 
-__all__ = ["Watch", "view_port", "watched"]
-
 HOST = "127.0.0.1"
 
 

@@ -11,8 +11,6 @@ from splatseed.literal import quoted
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options
 
-__all__ = ["check_options"]
-
 FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
 """Suffixes by which somebody means a file of points."""
 COVERING = ("auto", "cover")

@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import ParameterError
-from splatseed.io.output.staging import add_files, atomic_file
+from splatseed.io.output.manifest import add_files
+from splatseed.io.output.staging import atomic_file
 from splatseed.io.recentring import check_precision, offset_of, recentred
 from splatseed.io.transform_file import read_cloud_transform
 from splatseed.literal import visible
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
     from splatseed.seeding.alignment.align import Alignment
     from splatseed.seeding.clouds.method import Cloud
     from splatseed.seeding.clouds.streaming import MemoryPlan
-
-__all__ = ["CLOUD", "Bringing", "Brought", "bring_clouds", "settle_cloud"]
 
 CLOUD = "cloud"
 RECENTER = "recenter.json"

@@ -73,8 +73,6 @@ from splatseed.upsample import (
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.method import Cloud, GivenClouds
 
-__all__ = ["HELP_ALL", "Options", "asks_what_to_do", "full_options", "parse", "run"]
-
 HELP_ALL = "--help-all"
 OUTPUT = Path("OUT")
 """Stands for an output where the help is shown."""

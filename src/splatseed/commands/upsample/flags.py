@@ -7,16 +7,6 @@ from typing import Any
 
 import tyro
 
-__all__ = [
-    "budget_flag",
-    "cover_flag",
-    "default_flag",
-    "depth_folder_flag",
-    "memory_flag",
-    "number_flag",
-    "output_flag",
-]
-
 
 def number_flag(kind: type, default: str) -> Any:
     """How an optional number appears in the help: as a number, with its default in words."""

@@ -20,8 +20,6 @@ from splatseed.seeding.upsampling import CELL
 from splatseed.upsample import Upsampler, chooses_number, methods_for, upsample
 from splatseed.upsample.registry import origin_name
 
-__all__ = ["PICTURES", "summarise", "write_methods_preview", "write_previews"]
-
 PAIR, ALL, ORIGINS, CELLS, MAPS = PICTURES = (
     "preview.png",
     "preview_methods.png",

@@ -9,8 +9,6 @@ from splatseed.scene import Scene
 from splatseed.seeding.photographs import Stereo, begins_from_points, has_points
 from splatseed.upsample import Profile, Upsampler, configure
 
-__all__ = ["found_how", "method_words", "number_words", "parameters_of"]
-
 TOLD_ELSEWHERE = {"files", "transform", "memory", "alone"}
 """Parameters of a cloud that other lines tell."""
 

@@ -14,8 +14,6 @@ from splatseed.train.settings import TrainSettings
 from splatseed.train.start import gaussians_of_scene
 from splatseed.upsample import Upsampler
 
-__all__ = ["check_start", "write_start"]
-
 
 def check_start(path: Path, output: Path, *, overwrite: bool) -> None:
     """Refuse an unusable name for the initial Gaussians before any work is done.

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from splatseed.process.tasks import Tasks
     from splatseed.tiles import Source, Tiled, TilePlan
 
-__all__ = ["Tiling", "find_source", "run_tiled"]
-
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz", ".glb")
 """Files of points that only ``open_cloud`` reads."""
 PROCESS, PER_POINT, PER_NEIGHBOR = 300 << 20, 120, 20

@@ -10,8 +10,6 @@ from splatseed.lens import undistort_command
 from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneFormat
 
-__all__ = ["tell_training", "training_commands"]
-
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
 PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})
 """Trainers that do not deal with lens distortion themselves, as far as we know."""

@@ -25,8 +25,6 @@ from splatseed.io.clouds.rows import COPY_AGAIN
 from splatseed.literal import told
 from splatseed.process.memory import check_memory
 
-__all__ = ["CONFIDENCES", "LEAST", "MASKS", "POSITIONS", "NpzCloud"]
-
 POSITIONS = ("world_points", "pts3d", "points3d", "points", "xyz", "point_map", "pointmap")
 COLORS = ("rgb", "colors", "colours", "color", "images", "imgs", "image", "rgb_img")
 MASKS = ("mask", "masks", "valid", "valid_mask")

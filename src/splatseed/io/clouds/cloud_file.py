@@ -16,8 +16,6 @@ from typing import Literal, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-__all__ = ["CHUNK", "CloudChunk", "CloudFile", "Colors"]
-
 CHUNK = 1 << 20
 """Rows read at once unless the caller says otherwise: 50 to 100 MB while they are read."""
 

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
-__all__ = ["SAMPLES", "SAMPLE_ROWS", "ColorRange", "GreyRange", "sample_starts"]
-
 SAMPLES, SAMPLE_ROWS = 16, 4096
 """Places in a file that are looked at to find ranges, and rows at each."""
 GREY = 128

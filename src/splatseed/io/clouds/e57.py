@@ -21,8 +21,6 @@ from splatseed.io.clouds.colors import SAMPLE_ROWS, SAMPLES, ColorRange, GreyRan
 from splatseed.io.clouds.rows import COPY_AGAIN
 from splatseed.requirements import require
 
-__all__ = ["E57Cloud"]
-
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _RGB = ("colorRed", "colorGreen", "colorBlue")

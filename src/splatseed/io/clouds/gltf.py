@@ -24,8 +24,6 @@ from splatseed.io.clouds.rows import COPY_AGAIN, check_size
 from splatseed.io.files import open_file
 from splatseed.literal import told
 
-__all__ = ["GlbCloud"]
-
 _MAGIC, _JSON = b"glTF", 0x4E4F534A
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"VEC3": 3, "VEC4": 4}

@@ -22,8 +22,6 @@ from splatseed.io.clouds.colors import SAMPLE_ROWS, ColorRange, GreyRange, sampl
 from splatseed.io.clouds.rows import COPY_AGAIN, check_size, positions
 from splatseed.requirements import require
 
-__all__ = ["LasCloud"]
-
 _RGB = ("red", "green", "blue")
 _WHERE_POINTS, _RECORD = 96, 54
 """Where a header has the offset of the points, followed by the number of variable length records;

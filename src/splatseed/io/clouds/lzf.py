@@ -13,8 +13,6 @@ import numpy as np
 
 from splatseed.kernels.jit import inline
 
-__all__ = ["decompress"]
-
 
 def decompress(packed: bytes, size: int) -> bytes | None:
     """The ``size`` bytes that a block holds; None if it does not hold exactly so many."""

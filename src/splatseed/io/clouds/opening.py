@@ -10,8 +10,6 @@ from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.clouds.cloud_file import CloudFile
 from splatseed.io.ply.foreign import refuse_foreign
 
-__all__ = ["SUFFIXES", "open_cloud"]
-
 _READERS = {
     ".las": "las:LasCloud",
     ".laz": "las:LasCloud",

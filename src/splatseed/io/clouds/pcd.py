@@ -31,8 +31,6 @@ from splatseed.io.clouds.tables import TextTable
 from splatseed.io.files import open_file
 from splatseed.process.memory import check_memory
 
-__all__ = ["PcdCloud"]
-
 _HEADER_BYTES = 1 << 16
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _PACKED = ("rgb", "rgba")

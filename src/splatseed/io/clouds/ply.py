@@ -32,8 +32,6 @@ from splatseed.io.ply.header import Element, Header, parse_header
 from splatseed.io.ply.points import read_ply
 from splatseed.pointcloud import PointCloud
 
-__all__ = ["PlyCloud"]
-
 _HEADER_BYTES = 1 << 20
 
 

@@ -19,8 +19,6 @@ from splatseed.io.clouds.cloud_file import CloudChunk, Colors
 from splatseed.io.clouds.colors import SAMPLE_ROWS, ColorRange, GreyRange, sample_starts
 from splatseed.io.files import open_file
 
-__all__ = ["COPY_AGAIN", "Columns", "Painter", "check_size", "read_rows"]
-
 COPY_AGAIN = "Copy the file again, or export it again."
 
 XYZ = ("x", "y", "z")

@@ -21,8 +21,6 @@ from splatseed.io.clouds.colors import SAMPLES
 from splatseed.io.clouds.rows import COPY_AGAIN, XYZ, Columns, Painter, chunk_of
 from splatseed.io.files import open_file
 
-__all__ = ["TextTable", "numbers"]
-
 BLOCK = 1 << 24
 """Bytes read at once."""
 SAMPLE_BYTES = 1 << 16

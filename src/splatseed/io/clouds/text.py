@@ -22,8 +22,6 @@ from splatseed.io.clouds.rows import RGB_NAMES, XYZ, Columns
 from splatseed.io.clouds.tables import Dialect, TextTable
 from splatseed.io.files import open_file
 
-__all__ = ["TextCloud"]
-
 _LOOKED_AT = 1 << 16
 """Bytes from which names and columns are recognised."""
 _NAMES = {

@@ -34,17 +34,6 @@ from splatseed.io.colmap.model import (
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Tracks
 
-__all__ = [
-    "point_rows",
-    "read_cameras",
-    "read_images",
-    "read_points3d",
-    "set_point_count",
-    "write_cameras",
-    "write_images",
-    "write_points3d",
-]
-
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<IiQQ")  # camera id, model id, width, height; then the parameters
 _POSE = struct.Struct("<I7dI")  # image id, wxyz quaternion, translation, camera id; then the name

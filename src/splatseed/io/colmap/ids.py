@@ -17,8 +17,6 @@ from jaxtyping import Bool, Int64
 from splatseed.errors import PointCloudError
 from splatseed.scene import NO_POINT, Image, Observations, Scene, Tracks
 
-__all__ = ["Renumbered", "renumber", "without_points"]
-
 
 @dataclass(frozen=True, eq=False)
 class Renumbered:

@@ -19,18 +19,6 @@ from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
-__all__ = [
-    "EXPORT_AGAIN",
-    "MAX_ID",
-    "UNKNOWN_ERROR",
-    "by_camera_id",
-    "check_unique",
-    "make_image",
-    "make_intrinsics",
-    "make_points",
-    "point_columns",
-]
-
 EXPORT_AGAIN = "Copy the file again, or export the model again with COLMAP."
 MAX_ID = 2**32 - 1
 """Camera ids, image ids and feature indices are 32-bit in COLMAP's binary form."""

@@ -21,15 +21,6 @@ from splatseed.io.ply.points import read_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource, Tracks
 
-__all__ = [
-    "empty_cloud",
-    "find_model",
-    "read_colmap_scene",
-    "read_model_cameras",
-    "read_model_points",
-    "scene_root",
-]
-
 _MODEL_FILES = ("cameras", "images", "points3D")
 _IMAGE_DIRS = ("images", "images_2", "images_4", "images_8", "image", "input")
 

@@ -31,12 +31,6 @@ from splatseed.io.files import read_bytes
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Tracks
 
-__all__ = [
-    "read_cameras",
-    "read_images",
-    "read_points3d",
-]
-
 
 def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
     """The camera records of a ``cameras.txt``, in file order.

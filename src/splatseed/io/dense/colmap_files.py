@@ -14,8 +14,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 
-__all__ = ["consistency_records", "write_consistency_graph", "write_map"]
-
 
 def write_map(path: Path, values: Float32[np.ndarray, "H W *C"]) -> None:
     """Write a depth map [H, W] or a normal map [H, W, 3]; NaN becomes 0, COLMAP's "unknown".

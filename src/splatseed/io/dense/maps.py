@@ -17,8 +17,6 @@ from splatseed.camera import Camera
 from splatseed.errors import ParameterError
 from splatseed.scene import Image
 
-__all__ = ["MAX_SOURCES", "DenseMap", "check_map", "depth_along", "scaled_K"]
-
 MAX_SOURCES = 8
 """``agreeing`` has one bit per source."""
 _MAX_CHANGE = 1.25

@@ -19,8 +19,6 @@ from splatseed.io.dense.maps import DenseMap
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Tracks
 
-__all__ = ["PER_MAP", "OverlapPoints"]
-
 PER_MAP = 200
 """Enough to tell which views overlap much and which little."""
 _GREY = 128

@@ -23,8 +23,6 @@ from splatseed.io.photograph import decode_photograph, open_photograph, photogra
 from splatseed.progress import Progress, in_threads
 from splatseed.scene import Image, Scene
 
-__all__ = ["Undistort", "bring_photographs", "check_image"]
-
 Undistort: TypeAlias = Callable[
     [UInt8[np.ndarray, "H W 3"], Intrinsics, Float64[np.ndarray, "3 3"]],
     tuple[UInt8[np.ndarray, "H W 3"], Bool[np.ndarray, "H W"]],

@@ -21,8 +21,6 @@ from splatseed.io.depth.folder import depth_folder, safe_parts
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 
-__all__ = ["write_dense_maps"]
-
 
 def write_dense_maps(
     scene: Scene,

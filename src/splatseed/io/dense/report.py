@@ -12,8 +12,6 @@ import numpy as np
 
 from splatseed.io.dense.maps import DenseMap
 
-__all__ = ["DenseCount", "DenseReport"]
-
 
 @dataclass(frozen=True)
 class DenseReport:

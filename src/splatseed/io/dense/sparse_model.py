@@ -24,8 +24,6 @@ from splatseed.lens import rays_through
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene
 
-__all__ = ["SparseModel", "photograph_model"]
-
 Size = tuple[int, int]
 """Width and height in pixels."""
 

@@ -23,12 +23,11 @@ from splatseed.io.dense.photographs import Undistort, bring_photographs, check_i
 from splatseed.io.dense.report import DenseCount, DenseReport
 from splatseed.io.dense.sparse_model import Size, SparseModel, photograph_model
 from splatseed.io.output.layouts import write_json
-from splatseed.io.output.staging import MANIFEST, output_folder
+from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.output.staging import output_folder
 from splatseed.io.photograph import photograph_folder
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-
-__all__ = ["check_dense_scene", "write_dense_workspace"]
 
 _KINDS = ("photometric", "geometric")
 """COLMAP's two passes; stereo_fusion reads the second unless told otherwise."""

@@ -23,18 +23,6 @@ from splatseed.io.archives import ARCHIVE_FAILURES, ARRAY_FAILURES
 from splatseed.io.files import read_bytes
 from splatseed.literal import beginning, told
 
-__all__ = [
-    "KINDS",
-    "MAX_PIXELS",
-    "StoredDepth",
-    "check_stored",
-    "read_colmap_depth",
-    "read_npy",
-    "read_npz",
-    "read_pfm",
-    "refuse",
-]
-
 KINDS: tuple[DepthKind, ...] = get_args(DepthKind)
 """NumPy kinds of real numbers."""
 MAX_PIXELS = 2**28

@@ -26,8 +26,6 @@ from splatseed.io.depth.arrays import (
 from splatseed.io.depth.lens import Undistortion
 from splatseed.io.depth.pictures import read_exr, read_picture
 
-__all__ = ["INTEGER_SCALE", "NOTHING_HIT", "SUFFIXES", "DepthFiles"]
-
 INTEGER_SCALE = 1000.0
 """Default scale of integer maps: millimetres in a scene in metres."""
 NOTHING_HIT = 1e9

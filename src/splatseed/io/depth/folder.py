@@ -23,20 +23,9 @@ from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io.depth.arrays import KINDS, check_stored
 from splatseed.io.files import read_bytes
 from splatseed.io.output.layouts import write_json
-from splatseed.io.output.staging import MANIFEST, output_folder
+from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.output.staging import output_folder
 from splatseed.literal import told
-
-__all__ = [
-    "CAMERA_FILE",
-    "DESCRIPTION",
-    "DepthDescription",
-    "DepthWriter",
-    "depth_folder",
-    "read_capture_scale",
-    "read_description",
-    "safe_parts",
-    "write_description",
-]
 
 CAMERA_FILE = "cam_params.json"
 """The camera of an RGB-D capture, and the scale of its maps, in its folder or the one above."""

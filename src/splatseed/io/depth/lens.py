@@ -17,8 +17,6 @@ from jaxtyping import Float32
 from splatseed.camera import Intrinsics
 from splatseed.lens import image_points
 
-__all__ = ["Undistortion"]
-
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:

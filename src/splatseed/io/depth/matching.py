@@ -25,8 +25,6 @@ from splatseed.io.depth.folder import (
 )
 from splatseed.scene import Scene
 
-__all__ = ["match_by_name"]
-
 _FOLDERS = ("", "stereo/depth_maps", "depth_maps", "results", "depths", "depth")
 """Subfolders searched for maps; the first with a map of any image is used."""
 _FRAME = re.compile(r"frame(\d+)", re.IGNORECASE)

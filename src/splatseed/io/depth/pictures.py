@@ -21,8 +21,6 @@ from splatseed.io.files import read_bytes
 from splatseed.literal import told
 from splatseed.requirements import require
 
-__all__ = ["read_exr", "read_picture"]
-
 _PILLOW_FAILURES = (
     *(OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, EOFError),
     *(OverflowError, AttributeError, struct.error, MemoryError),

@@ -16,8 +16,6 @@ from splatseed.io.nerfstudio.scene import find_points
 from splatseed.io.nerfstudio.transforms import Transforms, read_transforms
 from splatseed.scene import Image, Scene, SceneSource, Split
 
-__all__ = ["is_blender", "read_blender"]
-
 _FILES = ("transforms_train.json", "transforms_test.json")
 
 

@@ -20,14 +20,6 @@ from splatseed.errors import OutputError
 from splatseed.io.nerfstudio.transforms import OPENCV_FROM_OPENGL, Transforms
 from splatseed.scene import Image, Scene
 
-__all__ = [
-    "NERFSTUDIO_FROM_COLMAP",
-    "applied_transform",
-    "frame_paths",
-    "kept_json",
-    "transforms_json",
-]
-
 NERFSTUDIO_FROM_COLMAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """The ``applied_transform`` that nerfstudio gives a COLMAP model: (x, y, z) -> (x, z, -y)."""
 

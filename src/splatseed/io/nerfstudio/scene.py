@@ -28,8 +28,6 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.similarity import fit_similarity
 
-__all__ = ["find_points", "read_transforms_scene"]
-
 _POINT_FILES = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _LEGACY_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
 """What nerfstudio applied to a COLMAP model before it wrote ``applied_transform``."""

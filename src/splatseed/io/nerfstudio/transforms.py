@@ -29,8 +29,6 @@ from splatseed.io.files import open_file, read_bytes
 from splatseed.literal import told
 from splatseed.scene import Image
 
-__all__ = ["OPENCV_FROM_OPENGL", "Transforms", "apply_transform", "read_transforms"]
-
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Turns camera axes from OpenGL's to OpenCV's, and back."""
 

@@ -19,19 +19,10 @@ from jaxtyping import UInt8
 
 from splatseed.io.files import read_text
 from splatseed.io.output.layouts import write_json
+from splatseed.io.output.manifest import MANIFEST
 from splatseed.io.output.seeds_npz import SEEDS, read_seeds
-from splatseed.io.output.staging import MANIFEST
 from splatseed.pointcloud import GENERATED, ORIGINAL
 from splatseed.scene import Scene
-
-__all__ = [
-    "carry_seeds",
-    "number_of_originals",
-    "recall_seeds",
-    "saw_all_photographs",
-    "upsampling",
-    "was_upsampled",
-]
 
 UPSAMPLED = "upsampled"
 """Where the manifest of an undistorted scene holds that of the points."""

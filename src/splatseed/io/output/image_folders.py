@@ -17,8 +17,6 @@ from pathlib import Path, PurePath
 from splatseed.io.files import open_file
 from splatseed.scene import Scene
 
-__all__ = ["bring", "frame_folders", "image_folders"]
-
 _SIBLINGS = tuple(
     f"{kind}{scale}" for kind in ("images", "masks", "depths") for scale in ("", "_2", "_4", "_8")
 )

@@ -34,8 +34,6 @@ from splatseed.io.split import MODEL_LISTS, ROOT_LISTS, split_fields
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 
-__all__ = ["write_colmap", "write_json", "write_split", "write_transforms"]
-
 _ROOT_EXTRAS = ("poses_bounds.npy", "ext_metadata.json")  # gsplat's examples read them if present
 _MODEL_EXTRAS = ("depth_params.json",)  # graphdeco's trainer reads it if present
 _RIG_FILES = ("rigs", "frames")

@@ -15,8 +15,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["held", "remove_leftovers", "remove_tree"]
-
 _SETTLED = 5.0
 """Seconds after which a partial that nobody holds counts as a leftover: it is locked right after
 it is made."""

@@ -17,8 +17,6 @@ from typing import Any
 
 from splatseed.io.files import read_text
 
-__all__ = ["MANIFEST", "add_files", "kind_of", "seal", "unlisted_files", "why_kept"]
-
 MANIFEST = "splatseed.json"
 """The file that marks a folder as written by splatseed: only such a folder is ever replaced."""
 

@@ -20,8 +20,6 @@ from splatseed.io.output.seeds_npz import SEEDS, PositionDigest, write_origins
 from splatseed.io.ply.points import ply_header, ply_rows
 from splatseed.pointcloud import ORIGINAL, PointCloud
 
-__all__ = ["PointStream", "append_points"]
-
 Piece = tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]
 
 

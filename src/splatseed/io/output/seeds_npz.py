@@ -24,15 +24,6 @@ from splatseed.errors import PointCloudError
 from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
 
-__all__ = [
-    "SEEDS",
-    "KnownOfSeeds",
-    "PositionDigest",
-    "read_seeds",
-    "write_origins",
-    "write_seeds",
-]
-
 SEEDS = "seeds.npz"
 
 _STORED: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {

@@ -19,18 +19,7 @@ from pathlib import Path
 
 from splatseed.errors import OutputError
 from splatseed.io.output.leftovers import held, remove_leftovers, remove_tree
-from splatseed.io.output.manifest import MANIFEST, add_files, kind_of, seal, why_kept
-
-__all__ = [
-    "MANIFEST",
-    "add_files",
-    "atomic_file",
-    "check_apart",
-    "check_output",
-    "check_parents",
-    "kind_of",
-    "output_folder",
-]
+from splatseed.io.output.manifest import seal, why_kept
 
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT}
 _NO_PERMISSION = {errno.EACCES, errno.EPERM, errno.EROFS}

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from splatseed.errors import SceneFormatError
 
-__all__ = ["refuse_foreign", "refuse_packed"]
-
 _FORMATS = {
     ".spz": "Gaussians compressed by Niantic's spz",
     ".splat": "Gaussians in the .splat format of web viewers, 32 bytes each",

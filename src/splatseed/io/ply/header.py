@@ -16,8 +16,6 @@ from typing import NamedTuple
 from splatseed.errors import SceneFormatError
 from splatseed.literal import beginning
 
-__all__ = ["EXPORT_PLY_AGAIN", "Element", "Header", "Property", "parse_header"]
-
 EXPORT_PLY_AGAIN = "Copy the file again, or export it again as a binary little-endian PLY."
 
 _TYPES = {

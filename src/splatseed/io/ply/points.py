@@ -22,8 +22,6 @@ from splatseed.io.ply.foreign import refuse_packed
 from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, Header, parse_header
 from splatseed.pointcloud import PointCloud
 
-__all__ = ["ply_header", "ply_rows", "read_ply", "write_ply"]
-
 _XYZ = ("x", "y", "z")
 _RGB_NAMES = (
     ("red", "green", "blue"),

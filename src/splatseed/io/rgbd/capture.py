@@ -17,8 +17,6 @@ from splatseed.io.depth.folder import CAMERA_FILE
 from splatseed.io.files import open_file, read_file
 from splatseed.literal import told
 
-__all__ = ["check_size", "find_camera_file", "read_intrinsics", "read_text"]
-
 
 def find_camera_file(root: Path) -> Path | None:
     """The camera file of a capture, if there is one."""

@@ -32,8 +32,6 @@ from splatseed.literal import agreeing, counted
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 
-__all__ = ["load_rgbd"]
-
 _FRAME = re.compile(r"frame(\d+)\.(?:jpe?g|png)", re.IGNORECASE)
 _RIGID_TOLERANCE = 1e-3  # of rotation @ rotation.T against the identity
 

@@ -30,8 +30,6 @@ from splatseed.io.rgbd.tum_lists import TOLERANCE, nearest_in_time, poses_at, re
 from splatseed.literal import agreeing, counted
 from splatseed.scene import Image, Scene, SceneSource
 
-__all__ = ["find_tum_depths", "is_tum", "load_tum"]
-
 DEPTH_SCALE = 5000.0
 """Stored units per metre."""
 

@@ -18,8 +18,6 @@ from jaxtyping import Bool, Float64, Int64
 from splatseed.errors import SceneFormatError
 from splatseed.io.rgbd.capture import read_text
 
-__all__ = ["TOLERANCE", "Track", "nearest_in_time", "poses_at", "read_list", "read_track"]
-
 TOLERANCE = 0.02
 """Seconds by which an image, its depth and its pose may differ: the benchmark's own."""
 

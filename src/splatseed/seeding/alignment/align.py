@@ -30,8 +30,6 @@ from splatseed.seeding.alignment.polish import polish
 from splatseed.seeding.alignment.sampling import CloudSample, normals_of, sample_cloud
 from splatseed.similarity import Similarity
 
-__all__ = ["Alignment", "align"]
-
 ROUNDS = (
     (100, 250, 20, 0.3, 0.04, 0.04, 0.85),
     (16, 1500, 20, 0.2, 0.02, 0.02, 0.82),

@@ -26,8 +26,6 @@ from jaxtyping import Float64, Int64
 from splatseed.progress import Progress, silent
 from splatseed.similarity import Similarity
 
-__all__ = ["Unit", "even", "find_starts", "spread_rotations"]
-
 ROTATIONS = 1200
 """About 18 degrees from any orientation to the nearest."""
 BEST, AROUND = 12, (-9.0, 0.0, 9.0)

@@ -24,8 +24,6 @@ from splatseed.similarity import Similarity
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-__all__ = ["LEAST", "Fitted", "Surface", "design", "fit", "moved", "residuals_of"]
-
 STILL = 1e-7
 LEAST = 12
 """Marks within reach that a fit needs."""

@@ -21,8 +21,6 @@ from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Image, Scene, Tracks
 from splatseed.similarity import Similarity
 
-__all__ = ["LEAST_MARKS", "MOST_MARKS", "Marks", "find_marks", "pixel_noise", "triangulation"]
-
 LEAST_MARKS = 200
 MOST_MARKS = 6000
 LEAST_VIEWS = 3

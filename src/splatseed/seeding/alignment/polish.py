@@ -24,8 +24,6 @@ from splatseed.seeding.alignment.icp import LEAST, Fitted, Surface, design, move
 from splatseed.seeding.alignment.marks import Marks
 from splatseed.similarity import Similarity
 
-__all__ = ["Polished", "clustered_covariance", "polish"]
-
 NEIGHBORS = 20
 FLAT = 0.1
 """Greatest thickness of a patch, over its narrower extent; half of the patches always pass, so that

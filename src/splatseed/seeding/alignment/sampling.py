@@ -23,8 +23,6 @@ from splatseed.seeding.clouds.voxels import EvenVoxels
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-__all__ = ["CloudSample", "normals_of", "sample_cloud"]
-
 SAMPLE = 1 << 18
 CHUNK = 1 << 19
 NEIGHBORS = 12

@@ -26,8 +26,6 @@ from splatseed.seeding.coverage import cell_counts, cell_depths, grid_from_world
 from splatseed.views.projection import place
 from splatseed.views.view import View
 
-__all__ = ["Evidence", "FreeRays", "find_evidence", "find_surfaces", "surface_agreement"]
-
 CELLS = (4, 8, 16, 32)
 """Sides of cells to choose from, in pixels."""
 FILLED = 3

@@ -29,8 +29,6 @@ from splatseed.seeding.clouds.support import find_support
 from splatseed.seeding.clouds.voxels import Voxels
 from splatseed.views.view import View
 
-__all__ = ["Judged", "judge"]
-
 AGREES = 0.5
 """Least agreement of the photographs on a voxel's colour, where at least ``ASKED`` see it."""
 ASKED = 4

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from splatseed.seeding.clouds.streaming import MemoryPlan, Streamed
     from splatseed.views.view import View
 
-__all__ = ["Cloud", "GivenClouds"]
-
 FITS = 0.2
 """Below this share of the scene's own points at the cloud's depth it is another's: a cloud of
 another place has 0 to 0.1, one in the right place 0.36 (red kitchen, noisy) to 0.92 (room0)."""

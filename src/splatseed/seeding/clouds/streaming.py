@@ -21,8 +21,6 @@ from splatseed.seeding.clouds.voxels import BYTES_EACH, Voxels
 from splatseed.similarity import Similarity
 from splatseed.views.view import View
 
-__all__ = ["CHUNK", "MemoryPlan", "Streamed", "plan_memory", "stream"]
-
 CHUNK = 1 << 19
 """Points in memory at a time: 50 MB with all that is computed of them."""
 FEWEST, MOST = 1 << 16, 1 << 24

@@ -12,8 +12,6 @@ from jaxtyping import Float32, Int32, Int64
 from splatseed.kernels.hashing import FREE, scramble, slot_of
 from splatseed.kernels.jit import inline, kernel, parallel_range
 
-__all__ = ["find_support"]
-
 
 def find_support(
     xyz: Float32[np.ndarray, "N 3"], side: Float32[np.ndarray, " N"], count: Int32[np.ndarray, " N"]

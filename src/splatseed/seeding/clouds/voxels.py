@@ -21,8 +21,6 @@ from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.seeding.coverage import grid_from_world
 from splatseed.views.view import View
 
-__all__ = ["BYTES_EACH", "EvenVoxels", "Voxels"]
-
 BYTES_EACH = 320
 """Bytes per voxel, at most: 45 here, the others where voxels are looked at, thinned and written."""
 CHUNKS, BLOCK = 64, 512

@@ -28,8 +28,6 @@ from splatseed.stereo.without_points import any_depth
 from splatseed.views.pairs import choose_by_pose
 from splatseed.views.view import View, data_factor, load_views, poses_of
 
-__all__ = ["check_poses"]
-
 Poses = Float64[np.ndarray, "V 4 4"]
 
 SIDE, GRID, SWEEPS = 200, 4, 6

@@ -25,8 +25,6 @@ from splatseed.stereo.settings import StereoSettings
 from splatseed.views.pairs import choose_by_pose
 from splatseed.views.view import View, data_factor, load_views
 
-__all__ = ["PoseError", "pose_error"]
-
 Gray = Float64[np.ndarray, "H W"]
 
 SIDE = 400

@@ -14,8 +14,6 @@ from jaxtyping import Float64
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 
-__all__ = ["random_start"]
-
 
 def random_start(
     scene: Scene, rng: np.random.Generator, trainer: Literal["gsplat", "nerfstudio"] = "gsplat"

@@ -18,9 +18,6 @@ from splatseed.scene import Image
 from splatseed.sfm.features import Run
 from splatseed.sfm.photos import Photo, name_some
 
-__all__ = ["map_images", "posed_model", "rigid", "triangulate_points"]
-
-
 SIMPLE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL")
 """Camera models than which none is worth trying instead."""
 

@@ -17,8 +17,6 @@ from jaxtyping import Bool, Float64
 from splatseed.camera import quat_from_rotation
 from splatseed.scene import Image
 
-__all__ = ["Poses", "align", "poses_of", "shifts", "spread", "turns", "with_poses"]
-
 _ROUNDS = 5  # of fitting the similarity and the noise in turn
 _LEAST_NOISE = 1e-9  # of the spread, and in radians: equal poses have none
 _TYPICAL = 1.54  # median length of a 3-vector of standard normal numbers

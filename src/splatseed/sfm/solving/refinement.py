@@ -27,8 +27,6 @@ from splatseed.sfm.report import Refinement
 from splatseed.sfm.solving.mapping import posed_model, rigid
 from splatseed.sfm.solving.poses import Poses, align, poses_of, shifts, spread, turns, with_poses
 
-__all__ = ["refine"]
-
 COARSE = (6.0, 2.0)
 """Degrees by which an observation may miss its point in the first rounds."""
 FINE = (8.0, 4.0)

@@ -21,8 +21,6 @@ from splatseed.train.device import device_name
 from splatseed.train.seeds import seeds_digest
 from splatseed.train.settings import AS_IT_IS, Reading, TrainSettings
 
-__all__ = ["check_same_seeds", "make_config", "resumed_reading", "resumed_settings"]
-
 WHERE = {"backend"}
 """Settings that may change when a run is resumed."""
 OPTIONS = {"seeding": "seeds"}

@@ -16,8 +16,6 @@ from splatseed.io.output.staging import atomic_file
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["Record", "write_curve_csv", "write_curve_png"]
-
 
 class Record(NamedTuple):
     """The progress of a run."""

@@ -18,11 +18,9 @@ from typing import Any
 from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io import write_scene
 from splatseed.io.files import read_text
-from splatseed.io.output.staging import MANIFEST, add_files, atomic_file, check_apart, check_output
+from splatseed.io.output.manifest import MANIFEST, add_files
+from splatseed.io.output.staging import atomic_file, check_apart, check_output
 from splatseed.scene import Scene
-
-__all__ = ["RunFolder", "write_json"]
-
 
 KIND = "train"
 """The kind recorded in a run folder's manifest."""

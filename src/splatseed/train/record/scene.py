@@ -15,8 +15,6 @@ from splatseed.scene import Scene
 from splatseed.train.record.folder import RunFolder
 from splatseed.train.settings import Reading
 
-__all__ = ["scene_as_read"]
-
 
 def scene_as_read(
     scene: Scene,

@@ -7,8 +7,6 @@ from pathlib import Path
 from splatseed.requirements import require
 from splatseed.train.record.curve import Record
 
-__all__ = ["Board"]
-
 
 class Board:
     """A TensorBoard log.

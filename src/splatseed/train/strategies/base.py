@@ -12,8 +12,6 @@ from splatseed.train.device import Capacity
 from splatseed.train.parameters import Optimizers, Parameters
 from splatseed.views.view import View
 
-__all__ = ["Strategy"]
-
 
 class Strategy(ABC):
     """Changes the number of Gaussians.

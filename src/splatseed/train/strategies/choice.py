@@ -14,8 +14,6 @@ from splatseed.train.strategies.base import Strategy
 from splatseed.train.strategies.densification import Default, Fixed, Mcmc
 from splatseed.train.strategies.growing import NOWHERE, Growing
 
-__all__ = ["make_strategy"]
-
 
 def make_strategy(
     settings: TrainSettings,

@@ -16,8 +16,6 @@ from splatseed.splat.rendering import render_features
 from splatseed.train.parameters import Parameters
 from splatseed.views.view import View
 
-__all__ = ["contributions"]
-
 
 def contributions(
     params: Parameters, view: View, error: Float[Tensor, "H W"]

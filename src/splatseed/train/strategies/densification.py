@@ -27,8 +27,6 @@ from splatseed.train.schedule import LEARNING_RATES
 from splatseed.train.settings import TrainSettings
 from splatseed.train.strategies.base import Strategy
 
-__all__ = ["Capped", "Default", "Fixed", "Mcmc"]
-
 
 class Fixed(Strategy):
     """The seeds only: Gaussians are neither added nor removed."""

@@ -30,8 +30,6 @@ from splatseed.train.strategies.contributions import contributions
 from splatseed.train.strategies.placing import add_candidates, draw_candidates, join_candidates
 from splatseed.views.view import View
 
-__all__ = ["NOWHERE", "PLACED", "Growing"]
-
 LOOK_EVERY = 2
 """Steps between looks at contributions: a look costs half a step."""
 FAINT = 0.005

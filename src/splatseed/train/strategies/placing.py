@@ -20,8 +20,6 @@ from splatseed.splat.rendering import camera_of
 from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters
 from splatseed.views.view import View
 
-__all__ = ["Candidates", "add_candidates", "draw_candidates", "join_candidates"]
-
 Candidates = Mapping[str, Tensor]
 """``means`` [M, 3], ``colors`` [M, 3] from the photograph, 0 to 1, ``depths`` [M], and ``sizes``
 [M], standard deviations: training units; while they are collected also ``valid`` [M], bool."""

@@ -24,8 +24,6 @@ from splatseed.kernels.jit import inline
 from splatseed.progress import Progress
 from splatseed.upsample.neighbors import PreparedCloud
 
-__all__ = ["box_cells"]
-
 ENLARGE = 0.1
 """The paper's 10%."""
 FLAT = 1e-14

@@ -21,8 +21,6 @@ from jaxtyping import Bool, Float64, Int32
 
 from splatseed.kernels.jit import inline, kernel, parallel_range
 
-__all__ = ["Cells", "build_cells"]
-
 MAX_NEIGHBORS = 58
 """So that planes, with the cube's 6, are 64."""
 MAX_PLANES = 6 + MAX_NEIGHBORS

@@ -15,8 +15,6 @@ from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints
 from splatseed.upsample.neighbors import prepare_scene
 
-__all__ = ["BoundingBox", "in_box"]
-
 BLOCK = 1 << 18
 
 

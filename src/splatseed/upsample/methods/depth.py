@@ -19,8 +19,6 @@ from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 
-__all__ = ["Depth"]
-
 MAX_VIEWS = 255
 
 

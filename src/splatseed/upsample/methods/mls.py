@@ -19,8 +19,6 @@ from jaxtyping import Float32
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.surfaces.patches import Patches, PatchMethod
 
-__all__ = ["Mls"]
-
 TERMS = 6
 """1, u, v, u^2, uv, v^2."""
 RIDGE = 1e-6

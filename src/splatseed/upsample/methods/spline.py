@@ -29,8 +29,6 @@ from splatseed.upsample.surfaces.spline_basis import (
     penalty,
 )
 
-__all__ = ["Spline"]
-
 COEFFICIENTS = CONTROL * CONTROL
 BAND = 3 * CONTROL + 3
 """Bandwidth: two overlapping basis functions are at most this far apart in the flat order."""

@@ -18,8 +18,6 @@ from splatseed.upsample.method import NewPoints
 from splatseed.upsample.nearest import Draws, Known, NearestMethod, blended
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
-__all__ = ["Triangle"]
-
 
 @dataclass(frozen=True)
 class Triangle(NearestMethod):

@@ -28,8 +28,6 @@ from splatseed.upsample.nearest import Draws, Known, NearestMethod
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.surfaces.frames import local_frames
 
-__all__ = ["Voronoi"]
-
 BLOCK = 1 << 14
 
 

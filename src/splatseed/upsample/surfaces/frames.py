@@ -14,8 +14,6 @@ from jaxtyping import Bool, Float64, Int32
 
 from splatseed.kernels.jit import inline, kernel, parallel_range
 
-__all__ = ["coordinate", "local_frames", "world_frames"]
-
 COLLINEAR = 1e-9
 """Ratio of the two largest variances below which a neighbourhood counts as collinear."""
 

@@ -24,8 +24,6 @@ from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.surfaces.frames import coordinate, local_frames, world_frames
 from splatseed.upsample.surfaces.placement import place_in_box, place_in_triangle, place_on_disc
 
-__all__ = ["PatchMethod", "Patches", "lift"]
-
 BLOCK = 1 << 13
 """Base points that are fitted between two updates of the progress bar."""
 MIN_NEIGHBORS = 3

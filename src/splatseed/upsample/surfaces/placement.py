@@ -16,8 +16,6 @@ from splatseed.upsample.nearest import Draws
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 from splatseed.upsample.surfaces.frames import coordinate
 
-__all__ = ["place_in_box", "place_in_triangle", "place_on_disc"]
-
 TRIANGLE_NEIGHBORS = 8
 """Neighbours from which the other two corners are drawn."""
 

@@ -19,8 +19,6 @@ from jaxtyping import Float32, Float64, Int8
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.surfaces.patches import Patches
 
-__all__ = ["CONTROL", "PatchBasis", "evaluate", "patch_basis", "penalty"]
-
 CONTROL = 6
 """Control values a side: 3 uniform intervals and cubic degree."""
 HEIGHT_UNIT = 1.5

@@ -14,8 +14,6 @@ from jaxtyping import Float32
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.surfaces.patches import Patches
 
-__all__ = ["bicubic_heights"]
-
 DEGREE = 3
 TERMS = (DEGREE + 1) * (DEGREE + 1)
 

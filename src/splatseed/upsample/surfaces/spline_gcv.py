@@ -16,8 +16,6 @@ from jaxtyping import Float64
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.surfaces.spline_basis import CONTROL, PatchBasis, penalty
 
-__all__ = ["LAMBDAS", "cross_validate"]
-
 LAMBDAS = np.logspace(-3.0, 2.0, 11)
 """The candidates: from near interpolation to near a plane."""
 COEFFICIENTS = CONTROL * CONTROL

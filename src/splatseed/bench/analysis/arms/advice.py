@@ -17,8 +17,6 @@ from splatseed.bench.analysis.tables import Table, number, words
 from splatseed.seeding.advice import AS_IT_IS, ROOM, Measured, advise
 from splatseed.train.settings import StrategyName
 
-__all__ = ["CLOSE", "AdviceScore", "Advised", "advice_table", "score_advice"]
-
 CLOSE = 0.1
 """Advice within this many decibels of the best arm counts as right."""
 ROOMS = (1.0, 1.1, 1.3, 1.6, 2.0, 3.0, 5.0, 1e9)

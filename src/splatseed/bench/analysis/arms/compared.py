@@ -21,8 +21,6 @@ from splatseed.bench.analysis.study import BASELINE, Cell as Runs, Study, Varian
 from splatseed.bench.planning.records import RunResult
 from splatseed.train.settings import StrategyName
 
-__all__ = ["Arm", "Compared", "baseline_of", "compared_arms", "psnr_at"]
-
 Measure: TypeAlias = Callable[[RunResult], float | None]
 Pair: TypeAlias = tuple[RunResult, RunResult]
 

@@ -15,9 +15,6 @@ from splatseed.bench.analysis.study import BASELINE, Study
 from splatseed.bench.analysis.tables import Cell, Table, number, words
 from splatseed.bench.planning.records import RunResult
 
-__all__ = ["answer_at_equal_cost", "arm_table", "scene_arm_table", "seconds_table",
-           "unequal_numbers"]  # fmt: skip
-
 SHOWN = 0.005
 """The least gain in dB that does not read 0.00."""
 EQUAL = 0.01
