@@ -88,7 +88,7 @@ def cases(scenes: Path) -> Iterator[tuple[str, Callable[[], str]]]:
             )
         yield (
             f"points/{name}/auto-budget",
-            lambda s=scene: of_cloud(ss.upsample(s, budget="0.25rho", seed=0)),
+            lambda s=scene: of_cloud(ss.upsample(s, budget=8_000, seed=0)),
         )
         yield (
             f"points/{name}/mls-verify-cover",
@@ -96,12 +96,14 @@ def cases(scenes: Path) -> Iterator[tuple[str, Callable[[], str]]]:
                 ss.upsample(s, method="mls", ratio=4, seed=0, verify=True, cover=8)
             ),
         )
+    room = ss.load_scene(scenes / "replica" / "room0")
+    yield "points/room0/depth", lambda: of_cloud(ss.upsample(room, method="depth", seed=0))
     yield "stereo/fern", lambda: of_maps(fern)
     bare = without_points(fern)
     yield "stereo/fern-without-points", lambda: of_maps(bare)
     yield (
         "points/fern-without-points/auto",
-        lambda: of_cloud(ss.upsample(bare, budget="0.25rho", seed=0)),
+        lambda: of_cloud(ss.upsample(bare, budget=8_000, seed=0)),
     )
     for strategy in STRATEGIES:
         yield f"train/fern/{strategy}", lambda s=strategy: trained(scenes / "fern", s)
