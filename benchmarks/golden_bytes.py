@@ -23,6 +23,7 @@ import numpy as np
 
 import splatseed as ss
 from splatseed.cli import main
+from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.stereo import stereo_depths
@@ -96,8 +97,11 @@ def cases(scenes: Path) -> Iterator[tuple[str, Callable[[], str]]]:
                 ss.upsample(s, method="mls", ratio=4, seed=0, verify=True, cover=8)
             ),
         )
-    room = ss.load_scene(scenes / "replica" / "room0")
-    yield "points/room0/depth", lambda: of_cloud(ss.upsample(room, method="depth", seed=0))
+    room = load_scene(scenes / "replica" / "room0", require_points=False)
+    yield (
+        "points/room0/auto",
+        lambda: of_cloud(ss.upsample(room, budget=8_000, seed=0)),
+    )
     yield "stereo/fern", lambda: of_maps(fern)
     bare = without_points(fern)
     yield "stereo/fern-without-points", lambda: of_maps(bare)
