@@ -20,7 +20,7 @@ from torch import Tensor
 
 from splatseed import load_scene
 from splatseed.evaluate import evaluate_views
-from splatseed.evaluate.images import l1_and_ssim_by_convolution
+from splatseed.splat.metrics import l1_and_ssim_by_convolution
 from splatseed.train import TrainSettings
 from splatseed.train.device import peak_gpu_bytes, pick_device
 from splatseed.train.losses import _fused_ssim

@@ -31,8 +31,7 @@ from benchmarks.rendering.stopwatch import RENDER_STAGES, Place, Stopwatch, time
 
 from splatseed import load_scene
 from splatseed.errors import SplatseedError
-from splatseed.splat.frame import TrainingFrame, training_frame
-from splatseed.splat.gaussians import Gaussians, initial_gaussians
+from splatseed.splat.gaussians import Gaussians, TrainingFrame, initial_gaussians, training_frame
 from splatseed.splat.rendering import render_view
 from splatseed.train import losses
 from splatseed.train.near_depths import near_depths

@@ -23,7 +23,7 @@ from benchmarks.common.markdown import table
 from benchmarks.rendering.splats import make_workload
 from PIL import Image
 
-from splatseed.splat.frame import training_frame
+from splatseed.splat.gaussians import training_frame
 from splatseed.viewer.live import FrameLoop
 from splatseed.viewer.paths import smooth_path
 from splatseed.viewer.pictures import Entry

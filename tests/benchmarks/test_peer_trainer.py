@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
-from splatseed.evaluate.images import l1_and_ssim_by_convolution
+from splatseed.splat.metrics import l1_and_ssim_by_convolution
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.view import load_split
 

@@ -17,8 +17,8 @@ pytest.importorskip("torch")
 import torch
 
 from splatseed.errors import OutputError, SceneFormatError
-from splatseed.evaluate import load_lpips
 from splatseed.io.output.staging import atomic_file, output_folder
+from splatseed.splat.metrics import load_lpips
 from splatseed.train.schedule import Schedule
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import load_checkpoint

@@ -12,8 +12,14 @@ from splatseed.camera import rotation_from_quat
 from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.io.ply.points import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.splat.frame import stray_views, training_frame
-from splatseed.splat.gaussians import SH_C0, Gaussians, initial_gaussians, neighbor_distances
+from splatseed.splat.gaussians import (
+    SH_C0,
+    Gaussians,
+    initial_gaussians,
+    neighbor_distances,
+    stray_views,
+    training_frame,
+)
 from splatseed.splat.ply import read_gaussians, write_gaussians
 from splatseed.views.view import load_split
 

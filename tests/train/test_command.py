@@ -17,9 +17,9 @@ from splatseed import requirements
 from splatseed.commands.train import Options
 from splatseed.commands.train.command import _next_commands
 from splatseed.errors import MissingDependencyError
-from splatseed.evaluate.lpips import LPIPS_NETS
 from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
+from splatseed.splat.metrics import LPIPS_FILES
 from splatseed.train.record.config import resumed_settings
 
 from ..command_line import exit_code
@@ -149,9 +149,9 @@ def test_bad_words_end_in_one_line(room_path, tmp_path, capsys, words, said):
 
 def test_lpips_is_offered_only_where_its_weights_are(tmp_path, monkeypatch):
     monkeypatch.setattr("torch.hub.get_dir", lambda: str(tmp_path))
-    monkeypatch.setattr("splatseed.evaluate.lpips.require", lambda *_: None)
+    monkeypatch.setattr("splatseed.splat.metrics.require", lambda *_: None)
     assert _next_commands(Path("my run")) == [("look at it", "splatseed view 'my run'")]
-    weights = tmp_path / "checkpoints" / LPIPS_NETS["vgg"].file
+    weights = tmp_path / "checkpoints" / LPIPS_FILES["vgg"]
     weights.parent.mkdir()
     weights.touch()
     assert _next_commands(Path("r"))[1] == ("score again, with LPIPS", "splatseed evaluate r")

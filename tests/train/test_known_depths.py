@@ -13,7 +13,7 @@ from splatseed.camera import Intrinsics
 from splatseed.io import load_scene
 from splatseed.progress import silent
 from splatseed.scene import Image
-from splatseed.splat.frame import TrainingFrame
+from splatseed.splat.gaussians import TrainingFrame
 from splatseed.stereo.depths import find_stereo
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.known_depths import known_depths

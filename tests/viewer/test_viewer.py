@@ -17,7 +17,7 @@ pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 from splatseed.cli import main
 from splatseed.errors import ParameterError
 from splatseed.pointcloud import PointCloud
-from splatseed.splat.frame import TrainingFrame
+from splatseed.splat.gaussians import TrainingFrame
 from splatseed.viewer import pictures, session as session_module
 from splatseed.viewer.canvas import canvas_view, fitted_fov, laid_onto, stage_pose
 from splatseed.viewer.pictures import Entry

@@ -25,7 +25,8 @@ from splatseed.train.settings import Backend, TrainSettings
 from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.evaluate import EvalResult, Lpips
+    from splatseed.scores import EvalResult
+    from splatseed.splat.metrics import Lpips
 
 PathOrNone = Annotated[
     Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
@@ -154,7 +155,7 @@ def _check_outputs(options: Options, task: _Task) -> None:
 
 def _lpips(options: Options) -> tuple[Lpips | None, str]:
     """The metric, or why there is none; weights that the user names must exist."""
-    from splatseed.evaluate import load_lpips  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (imports PyTorch)
 
     try:
         return load_lpips(options.lpips_net, options.lpips_weights), ""
@@ -176,7 +177,7 @@ def _evaluate(
         load_model,
         write_renders,
     )
-    from splatseed.evaluate.covisible import (  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.splat.covisible import (  # noqa: PLC0415  (imports PyTorch)
         find_covisible,
         pixel_masks,
     )

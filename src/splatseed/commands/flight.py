@@ -200,9 +200,9 @@ def _views_of_file(
     path: Path, transform: str | None, shown: Shown, size: tuple[int, int], fps: float
 ) -> tuple[Sequence[View], float]:
     """The cameras of a path's file in the model's world, and the frame rate."""
-    from splatseed.evaluate.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
     from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415  (loads with its use)
     from splatseed.scene import Scene  # noqa: PLC0415  (loads with its use)
+    from splatseed.splat.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
     from splatseed.viewer.paths import check_path, path_of_file, views_from  # noqa: PLC0415  (loads with its use)
     from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 

@@ -21,7 +21,7 @@ from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.splat.frame import TrainingFrame
+from splatseed.splat.gaussians import TrainingFrame
 from splatseed.stereo.of_scene import stereo_depths
 from splatseed.stereo.result import Stereo
 from splatseed.train.settings import TrainSettings

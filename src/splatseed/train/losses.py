@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from splatseed.evaluate.images import l1_and_ssim_by_convolution
-from splatseed.evaluate.ssim import l1_and_ssim
+from splatseed.splat.metrics import l1_and_ssim_by_convolution
+from splatseed.splat.ssim import l1_and_ssim
 
 SSIM_WEIGHT = 0.2
 

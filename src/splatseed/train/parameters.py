@@ -17,8 +17,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from splatseed.splat.frame import SCENE_SCALE
-from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.gaussians import SCENE_SCALE, Gaussians
 from splatseed.train.schedule import Schedule
 
 Parameters = torch.nn.ParameterDict

@@ -19,15 +19,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseed.errors import OutputError, PointCloudError, SceneNotFoundError
-from splatseed.evaluate.ssim import WINDOW
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import CurvePoint, EvalResult, TrainingResult
-from splatseed.splat.frame import TrainingFrame, stray_note, stray_views, training_frame
+from splatseed.splat.gaussians import TrainingFrame, stray_note, stray_views, training_frame
 from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
+from splatseed.splat.ssim import WINDOW
 from splatseed.train.device import (
     check_fits,
     device_name,

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.pointcloud import PointCloud
-from splatseed.splat.frame import stray_views, training_frame
-from splatseed.splat.gaussians import Gaussians, initial_gaussians
+from splatseed.splat.gaussians import Gaussians, initial_gaussians, stray_views, training_frame
 from splatseed.train.near_depths import near_depths
 from splatseed.train.settings import TrainSettings
 from splatseed.views.view import View

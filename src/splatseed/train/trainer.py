@@ -17,11 +17,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseed.evaluate.images import psnr, ssim_of_all
 from splatseed.process.allocator import keep_freed_memory
 from splatseed.process.interruption import interruption
-from splatseed.splat.photographs import Photographs, photograph_of
-from splatseed.splat.rendering import render_view
+from splatseed.splat.metrics import psnr, ssim_of_all
+from splatseed.splat.rendering import Photographs, photograph_of, render_view
 from splatseed.train.averaging import add_to_mean, take_mean
 from splatseed.train.losses import photometric_loss
 from splatseed.train.parameters import optimize

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float64, UInt8
 
 from splatseed.camera import Camera, quat_from_rotation, rotation_from_quat
-from splatseed.splat.frame import TrainingFrame
+from splatseed.splat.gaussians import TrainingFrame
 from splatseed.views.view import View
 
 NO_PIXELS = np.empty((0, 0, 3), np.uint8)

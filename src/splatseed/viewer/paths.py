@@ -22,8 +22,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io.files import read_bytes
 from splatseed.literal import counted, told
 from splatseed.similarity import Similarity
-from splatseed.splat.frame import stray_views
-from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.gaussians import Gaussians, stray_views
 from splatseed.viewer.renderer import CORE, resized
 from splatseed.views.view import View
 from splatseed.views.viewpoint import look_at

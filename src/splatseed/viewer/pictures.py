@@ -24,8 +24,7 @@ from splatseed.preview.photographs import photograph_at
 from splatseed.preview.points import render_points
 from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import covered_cells
-from splatseed.splat.frame import TrainingFrame
-from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.gaussians import Gaussians, TrainingFrame
 from splatseed.splat.pictures import error_map
 from splatseed.viewer.canvas import laid_onto
 from splatseed.viewer.frames import as_bytes, depth_colors

@@ -17,8 +17,7 @@ from jaxtyping import Float32
 
 from splatseed.render.rasterize import rasterization
 from splatseed.scene import Scene
-from splatseed.splat.frame import TrainingFrame, training_frame
-from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.gaussians import Gaussians, TrainingFrame, training_frame
 from splatseed.views.view import View, poses_of
 
 CORE = 0.6

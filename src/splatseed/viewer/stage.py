@@ -15,7 +15,7 @@ from jaxtyping import Float32, UInt8
 from splatseed.pointcloud import PointCloud
 from splatseed.preview.origins import origin_colors
 from splatseed.scene import Image, Scene
-from splatseed.splat.frame import TrainingFrame
+from splatseed.splat.gaussians import TrainingFrame
 from splatseed.upsample.registry import origin_name
 from splatseed.viewer.canvas import stage_pose
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.scene import Image, Scene
-from splatseed.splat.frame import training_frame
+from splatseed.splat.gaussians import training_frame
 from splatseed.train.run import TrainingRun
 from splatseed.viewer.pictures import Drawn, Entry
 from splatseed.viewer.session import Session

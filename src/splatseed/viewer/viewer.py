@@ -19,7 +19,7 @@ import torch
 from splatseed.errors import ParameterError
 from splatseed.requirements import require
 from splatseed.scene import Scene
-from splatseed.splat.frame import TrainingFrame, training_frame
+from splatseed.splat.gaussians import TrainingFrame, training_frame
 from splatseed.viewer.canvas import fitted_fov, stage_pose
 from splatseed.viewer.paths import orbit
 from splatseed.viewer.pictures import Entry

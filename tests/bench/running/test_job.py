@@ -286,7 +286,7 @@ def test_pixels_that_two_training_views_see_are_found_once(specs, do, tmp_path):
     (kept,) = (tmp_path / "covisible").iterdir()
     assert 0.3 < result.scores.covisible_share <= 1
     assert all(view.covisible_psnr is not None for view in result.scores.per_image)
-    from splatseed.evaluate.covisible import read_covisible, write_covisible
+    from splatseed.splat.covisible import read_covisible, write_covisible
 
     grids = read_covisible(kept)
     assert set(grids) == {view.name for view in result.scores.per_image}

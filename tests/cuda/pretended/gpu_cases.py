@@ -27,10 +27,10 @@ import torch
 
 from splatseed.errors import MissingDependencyError, PointCloudError
 from splatseed.evaluate import evaluate_views
-from splatseed.evaluate.images import l1_and_ssim_by_convolution, ssim_of_all
+from splatseed.splat.metrics import l1_and_ssim_by_convolution, ssim_of_all
 from splatseed.io import load_scene
 from splatseed.process import gsplat_kernels
-from splatseed.splat import photographs
+from splatseed.splat import rendering
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import TrainSettings, losses, prepare_run, trainer
@@ -93,7 +93,7 @@ def test_a_run_on_cuda_takes_the_steps_of_the_cpu(room, tmp_path, strategy):
 def test_a_step_does_not_wait_for_the_gpu(room, tmp_path, monkeypatch, strategy, held):
     """Once each view was shown, but for rounds, which look at how many Gaussians they change."""
     if not held:
-        monkeypatch.setattr(photographs, "SHARE", 0.0)
+        monkeypatch.setattr(rendering, "SHARE", 0.0)
     waits = {}
 
     def count(step):

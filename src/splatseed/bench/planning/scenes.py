@@ -19,7 +19,7 @@ from splatseed.io.depth_search import search_depths
 from splatseed.io.photograph import open_photograph, photograph_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.splat.frame import stray_note, stray_views
+from splatseed.splat.gaussians import stray_note, stray_views
 from splatseed.views.view import check_lens, poses_of
 
 

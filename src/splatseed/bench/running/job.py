@@ -41,7 +41,8 @@ from splatseed.train.stereo_size import stereo_size
 from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
-    from splatseed.evaluate import Covisible, Lpips
+    from splatseed.evaluate import Covisible
+    from splatseed.splat.metrics import Lpips
     from splatseed.train.run import TrainingRun
     from splatseed.views.view import View
 
@@ -190,7 +191,7 @@ def _prepare(
 
 
 def _load_lpips() -> Lpips:
-    from splatseed.evaluate import load_lpips  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
 
     return load_lpips()
 
@@ -217,7 +218,7 @@ def _covisible(spec: RunSpec, target: Path, views: Sequence[View], progress: Pro
 
     The scene is reopened for it, so that an arm's depth maps make no difference.
     """
-    from splatseed.evaluate.covisible import (  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.covisible import (  # noqa: PLC0415  (PyTorch)
         find_covisible,
         pixel_masks,
         read_covisible,

@@ -99,7 +99,7 @@ def _job_options(plan: Plan) -> JobOptions:
 
     If LPIPS is requested, missing weights are reported now rather than in every run.
     """
-    from splatseed.evaluate.lpips import GIVE_PATH, load_lpips  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.metrics import GIVE_PATH, load_lpips  # noqa: PLC0415  (PyTorch)
 
     try:
         load_lpips()

@@ -332,7 +332,7 @@ def _summarise(options: Options, result: TrainingResult) -> None:
 
 def _next_commands(output: Path) -> list[tuple[str, str]]:
     """What to do with a finished run; LPIPS only where its weights are."""
-    from splatseed.evaluate.lpips import lpips_is_here  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.splat.metrics import lpips_is_here  # noqa: PLC0415  (imports PyTorch)
 
     commands = [("look at it", f"splatseed view {quoted(output)}")]
     if lpips_is_here():

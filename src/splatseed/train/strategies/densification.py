@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseed.render import MCMCStrategy
-from splatseed.splat.frame import SCENE_SCALE
+from splatseed.splat.gaussians import SCENE_SCALE
 from splatseed.train.device import Capacity
 from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters, yardsticks
 from splatseed.train.schedule import LEARNING_RATES

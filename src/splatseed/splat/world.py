@@ -89,7 +89,7 @@ def check_world(
         return ""
     ratios = [(word, apart(world)) for word, world in _candidates(path, scene)]
     closest = min(each for _, each in ratios)
-    if _fits(ratio, closest):
+    if ratio <= APART and ratio <= closest * CLOSER:
         return (
             f"Points of the scene are {ratio:.1f} times as far from the nearest Gaussian as "
             "Gaussians from each other: look at the renders before you trust the scores."
@@ -111,16 +111,8 @@ def check_world(
     )
 
 
-def _fits(ratio: float, closest: float) -> bool:
-    """Whether Gaussians so far apart are in the right world; those of another are ``closest``."""
-    return ratio <= DOUBTFUL or (ratio <= APART and ratio <= closest * CLOSER)
-
-
 def _measure(scene: Scene, gaussians: Gaussians) -> Callable[[Similarity | None], float] | None:
-    """A function from a transform to how far apart points and Gaussians are.
-
-    None without enough.
-    """
+    """A function from a transform to how far apart points and Gaussians are; None with too few."""
     from scipy.spatial import KDTree  # noqa: PLC0415  (slow to import)
 
     rng = np.random.default_rng(0)

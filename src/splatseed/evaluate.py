@@ -1,43 +1,151 @@
-"""A trained model and the test views of its scene, in the world of that scene.
+"""Scores of Gaussians: how close renders come to photographs that were not used for training.
 
-Notation: the training frame is that of the scene's training cameras (``splat.frame``). Promise: a
-model is rendered in that frame whoever trained it, so that the near plane is the same as in
-training and single precision suffices for a distant world; the background is black.
+``evaluate_views`` scores any function from a view to an image; ``load_model`` and
+``evaluate_model`` a file of Gaussians in the world of its scene, whoever trained it.
+
+Notation: a render and a photograph are [H, W, 3], sRGB values 0..1, not linearised. Promise:
+renders are clamped to [0, 1] and not rounded to 8 bits; each view is scored at its own size; SSIM
+has an 11 x 11 Gaussian window (sigma 1.5) and images mirrored at their edges, which is what
+torchmetrics and so gsplat's trainer report. A model is rendered in the frame of the scene's
+training cameras, so that the near plane is the same as in training and single precision suffices
+for a distant world; the background is black. Needs PyTorch (``pip install ".[train]"``).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
+from jaxtyping import Bool, Float
+
+from splatseed.requirements import require
+
+require("torch")  # before what loads it, for one clear error
+
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from splatseed.errors import SceneNotFoundError
-from splatseed.evaluate.lpips import Lpips
-from splatseed.evaluate.metrics import Covisible, Render, evaluate_views
-from splatseed.evaluate.ssim import WINDOW
-from splatseed.evaluate.world import (
-    NO_TRANSFORM,
-    check_world,
-    find_transform,
-    view_in,
-)
+from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.export import read_model
 from splatseed.io import load_scene
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.scores import NOT_ASKED, EvalResult
-from splatseed.splat.frame import TrainingFrame, training_frame
-from splatseed.splat.gaussians import Gaussians
+from splatseed.scores import NOT_ASKED, EvalResult, ViewScore
+from splatseed.splat.gaussians import Gaussians, TrainingFrame, training_frame
+from splatseed.splat.metrics import Lpips, psnr, ssim_of_all
 from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
-from splatseed.splat.rendering import render_view
+from splatseed.splat.rendering import photograph_of, render_view
+from splatseed.splat.ssim import WINDOW
+from splatseed.splat.world import NO_TRANSFORM, check_world, find_transform, view_in
 from splatseed.views.view import View, load_views, poses_of
+
+Covisible: TypeAlias = Mapping[str, Bool[np.ndarray, "H W"]]
+"""Which pixels of each test view at least two training views see, by the view's name."""
+Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
+
+
+@torch.no_grad()
+def evaluate_views(
+    render: Render,
+    views: Sequence[View],
+    *,
+    lpips: Lpips | None = None,
+    lpips_reason: str = NOT_ASKED,
+    covisible: Covisible | None = None,
+    progress: Progress = silent,
+) -> EvalResult:
+    """Score renders of views against their photographs.
+
+    The first view is rendered once more beforehand, untimed, because a first call may compile.
+
+    Args:
+        render: Renders a view as float [H, W, 3], values about 0..1, on any device.
+        views: The views; at least one.
+        lpips: The LPIPS metric; LPIPS is not measured when left out.
+        lpips_reason: Why it is left out, for the reader of the result.
+        covisible: The pixels over which PSNR is also computed, for the views it contains; see
+            ``splat.covisible``.
+        progress: Called with the stage and the fraction done.
+
+    Raises:
+        ParameterError: There are no views, or a render has another size or is not finite.
+
+    Example:
+        >>> import numpy as np, torch
+        >>> grey = np.full((16, 16, 3), 128, np.uint8)
+        >>> view = View("grey.png", grey, np.eye(3), 16, 16, np.eye(4))
+        >>> result = evaluate_views(lambda view: torch.zeros(16, 16, 3), [view])
+        >>> round(result.psnr, 2)
+        5.99
+    """
+    if not views:
+        raise ParameterError(
+            "views to score", found="none", fix="Hold out some images for testing (test_every)."
+        )
+    render(views[0])
+    scores = []
+    for view in views:
+        scores.append(_score(render, view, lpips, (covisible or {}).get(view.name)))
+        progress("score", len(scores) / len(views))
+    return EvalResult(
+        tuple(scores),
+        lpips_net=lpips.net if lpips else None,
+        lpips_reason="" if lpips else lpips_reason,
+    )
+
+
+def _score(
+    render: Render, view: View, lpips: Lpips | None, seen: Bool[np.ndarray, "H W"] | None
+) -> ViewScore:
+    start = _now()
+    image = render(view)
+    seconds = _now() - start
+    _check(image, view)
+    image, photograph = image.clamp(0.0, 1.0), photograph_of(view, image.device)
+    score = ViewScore(
+        view.name,
+        psnr=psnr(image, photograph),
+        ssim=ssim_of_all(image, photograph),
+        lpips=None if lpips is None else lpips(image, photograph),
+        seconds=seconds,
+    )
+    if seen is None:
+        return score
+    within = psnr(image, photograph, torch.from_numpy(seen).to(image.device))
+    return dataclasses.replace(
+        score,
+        covisible_psnr=within if seen.any() else None,
+        covisible_share=float(seen.mean()),
+    )
+
+
+def _now() -> float:
+    """The time, once the GPU, if one is in use, has finished its work."""
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
+def _check(image: Tensor, view: View) -> None:
+    expected = (view.height, view.width, 3)
+    if tuple(image.shape) != expected:
+        raise ParameterError(
+            f"a render of {view.name} of shape {list(expected)}",
+            found=f"{list(image.shape)}",
+            fix="Render views at their own width and height.",
+        )
+    if not bool(torch.isfinite(image).all()):
+        raise ParameterError(
+            f"a render of {view.name} of finite values",
+            found="NaN or infinity",
+            fix="The model has values that are not finite: train it again.",
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,17 +270,6 @@ def gaussian_renderer(
         return render_view(tensors, frame.view(view), sh_degree)[0]
 
     return render
-
-
-def frame_of_scene(scene: Scene, test_every: int = 8) -> TrainingFrame:
-    """The frame that a scene is trained in, from the poses alone.
-
-    Args:
-        scene: A scene with at least two images.
-        test_every: As used in training.
-    """
-    train, _ = scene.split(test_every)
-    return training_frame(poses_of(train))
 
 
 def write_renders(model: TrainedModel, folder: Path, progress: Progress = silent) -> None:

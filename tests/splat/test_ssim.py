@@ -11,8 +11,8 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 import torch
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from splatseed.evaluate.images import l1_and_ssim_by_convolution, psnr
-from splatseed.evaluate.ssim import l1_and_ssim
+from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr
+from splatseed.splat.ssim import l1_and_ssim
 from splatseed.train.losses import photometric_loss
 
 

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from splatseed.depthmap import DepthMap, DepthMaps
-from splatseed.errors import SceneFormatError
+from splatseed.depthmap import DepthMaps
 from splatseed.io.archives import ARCHIVE_FAILURES
 from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
@@ -29,17 +28,17 @@ from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world, grid_of
 from splatseed.views.view import View, data_factor, poses_of
 
-LEAST_VIEWS = 2
+_LEAST_VIEWS = 2
 """Training views that must see a pixel."""
-CELLS = 100
+_CELLS = 100
 """Along the longer side: 8 pixels of 800. The SfM points of a capture fill most of such cells."""
-LEAST_CELL = 2.0
+_LEAST_CELL = 2.0
 """Smallest side of a cell, in pixels."""
-MAX_SIZE = 800
+_MAX_SIZE = 800
 """Longer side in pixels of the frames that are divided into cells."""
-NEAREST = 4
+_NEAREST = 4
 """Covered cells over which an empty cell takes the median of inverse depth."""
-STAGE = "find co-visible pixels"
+_STAGE = "find co-visible pixels"
 
 Grids = Mapping[str, Bool[np.ndarray, "rows cols"]]
 
@@ -60,6 +59,8 @@ def find_covisible(
     Raises:
         SceneFormatError: A depth map is damaged.
     """
+    from scipy.ndimage import maximum_filter  # noqa: PLC0415  (slow to import)
+
     points = scene.points.references
     xyz = np.ascontiguousarray(points.xyz[points.finite], np.float32)
     maps = scene.depths if scene.source and scene.source.format == "rgbd" else None
@@ -72,14 +73,16 @@ def find_covisible(
         depths = []
         for grid in pool.map(lambda view: _depths(view, xyz, maps), views):
             depths.append(grid)
-            progress(STAGE, 0.5 * len(depths) / len(views))
-        seen = list(zip(train, map(_farthest, depths), strict=False))
+            progress(_STAGE, 0.5 * len(depths) / len(views))
+        # At an edge both surfaces count as seen: each cell's depth is its neighbours' largest.
+        farthest = (maximum_filter(grid, size=3, mode="nearest") for grid in depths)
+        seen = list(zip(train, farthest, strict=False))
         grids = pool.map(
             lambda view, grid: _covisible(view, grid, seen), test, depths[len(train) :]
         )
         for view, grid in zip(test, grids, strict=True):
             by_view[view.name] = grid
-            progress(STAGE, 0.5 + 0.5 * len(by_view) / len(test))
+            progress(_STAGE, 0.5 + 0.5 * len(by_view) / len(test))
     return by_view
 
 
@@ -90,25 +93,25 @@ def pixel_masks(grids: Grids, views: Sequence[View]) -> dict[str, Bool[np.ndarra
         grids: The result of ``find_covisible``.
         views: The test views.
     """
-    return {v.name: _pixels(grids[v.name], v) for v in views if v.name in grids}
+    return {v.name: _resized(grids[v.name], v.height, v.width) for v in views if v.name in grids}
 
 
-def _pixels(grid: Bool[np.ndarray, "rows cols"], view: View) -> Bool[np.ndarray, "H W"]:
-    rows, cols = grid.shape
-    i = (np.arange(view.height) + 0.5) * rows / view.height
-    j = (np.arange(view.width) + 0.5) * cols / view.width
-    return grid[np.ix_(i.astype(np.int64), j.astype(np.int64))]
+def _resized(values: np.ndarray[Any, Any], rows: int, cols: int) -> np.ndarray[Any, Any]:
+    """The nearest value at the centres of ``rows x cols`` cells of the same frame."""
+    i = (np.arange(rows) + 0.5) * values.shape[0] / rows
+    j = (np.arange(cols) + 0.5) * values.shape[1] / cols
+    return values[np.ix_(i.astype(np.int64), j.astype(np.int64))]
 
 
 def _cell(view: View) -> float:
     """Side of a view's cells in pixels."""
-    return max(max(view.width, view.height) / CELLS, LEAST_CELL)
+    return max(max(view.width, view.height) / _CELLS, _LEAST_CELL)
 
 
-def _frames(images: Sequence[Image], maps: DepthMaps | None) -> list[View]:
+def _frames(images: Sequence[Image], maps: DepthMaps | None) -> Sequence[View]:
     """The images' frames at the size that cells are stated for; with depth maps, those with one."""
     known = [image for image in images if maps is None or image.name in maps]
-    return list(poses_of(known, data_factor(known, MAX_SIZE))) if known else []
+    return poses_of(known, data_factor(known, _MAX_SIZE)) if known else ()
 
 
 def _depths(
@@ -118,27 +121,8 @@ def _depths(
     rows, cols = grid_of(view, _cell(view))
     if maps is None:
         return _filled(cell_depths(view, xyz, _cell(view)))
-    values = _planar(maps.read(view.name), view)
-    i = ((np.arange(rows) + 0.5) * values.shape[0] / rows).astype(np.int64)
-    j = ((np.arange(cols) + 0.5) * values.shape[1] / cols).astype(np.int64)
-    return _filled(np.nan_to_num(values[np.ix_(i, j)], nan=np.inf))
-
-
-def _planar(depth_map: DepthMap, view: View) -> Float32[np.ndarray, "H W"]:
-    """A depth map's planar depth."""
-    if depth_map.kind == "z":
-        return depth_map.values
-    if depth_map.kind != "ray":
-        raise SceneFormatError(
-            "depth maps of planar depth or of distance along the ray",
-            found=f"{depth_map.kind} for {view.name}",
-            fix="Convert them.",
-        )
-    height, width = depth_map.values.shape
-    K = np.diag([width / view.width, height / view.height, 1.0]) @ view.K
-    v, u = np.indices((height, width)) + 0.5
-    along = np.hypot(np.hypot((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]), 1.0)
-    return np.asarray(depth_map.values / along, np.float32)
+    values = _resized(maps.read(view.name).values, rows, cols)  # RGB-D captures have planar depth
+    return _filled(np.nan_to_num(values, nan=np.inf))
 
 
 def _filled(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
@@ -149,18 +133,11 @@ def _filled(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "ro
     if not known.any() or known.all():
         return depths
     inverse = 1.0 / depths[known]
-    k = min(NEAREST, len(inverse))
+    k = min(_NEAREST, len(inverse))
     _, near = cKDTree(np.argwhere(known)).query(np.argwhere(~known), k=k)
     filled = depths.copy()
     filled[~known] = 1.0 / np.median(inverse[near.reshape(-1, k)], axis=1)
     return filled
-
-
-def _farthest(depths: Float32[np.ndarray, "rows cols"]) -> Float32[np.ndarray, "rows cols"]:
-    """The largest depth of each cell and its neighbours: at an edge both surfaces count as seen."""
-    from scipy.ndimage import maximum_filter  # noqa: PLC0415  (slow to import)
-
-    return np.asarray(maximum_filter(depths, size=3, mode="nearest"))
 
 
 def _covisible(
@@ -168,20 +145,16 @@ def _covisible(
     depths: Float32[np.ndarray, "rows cols"],
     seen: Sequence[tuple[View, Float32[np.ndarray, "rows cols"]]],
 ) -> Bool[np.ndarray, "rows cols"]:
-    xyz1 = _in_world(view, np.where(np.isfinite(depths), depths, -1.0))
-    count = sum((_sees(other, known, xyz1) for other, known in seen), np.zeros(len(xyz1), np.int32))
-    enough = np.asarray(count).reshape(depths.shape) >= LEAST_VIEWS
-    return np.asarray(enough & np.isfinite(depths))
-
-
-def _in_world(view: View, depths: Float64[np.ndarray, "rows cols"]) -> Float64[np.ndarray, "C 4"]:
-    """The cells' centres at their depths, homogeneous."""
     rows, cols = depths.shape
+    known = np.isfinite(depths)
+    # The cells' centres at their depths, in the world, homogeneous.
     place = np.indices(depths.shape).reshape(2, -1)[::-1] + 0.5
     grid_from_pixels = np.diag([cols / view.width, rows / view.height, 1.0])
     rays = np.linalg.inv(grid_from_pixels @ view.K) @ np.vstack([place, np.ones(rows * cols)])
-    in_cam = np.vstack([rays * depths.ravel(), np.ones(rows * cols)])
-    return np.asarray((np.linalg.inv(view.cam_from_world) @ in_cam).T)
+    in_cam = np.vstack([rays * np.where(known, depths, -1.0).ravel(), np.ones(rows * cols)])
+    xyz1 = (np.linalg.inv(view.cam_from_world) @ in_cam).T
+    count = sum((_sees(other, grid, xyz1) for other, grid in seen), np.zeros(len(xyz1), np.int32))
+    return np.asarray((np.asarray(count).reshape(depths.shape) >= _LEAST_VIEWS) & known)
 
 
 def _sees(

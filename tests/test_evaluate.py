@@ -1,0 +1,157 @@
+"""Scores must be those of the papers: checked against torchmetrics and by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+# An import below imports PyTorch, so that it has to come after the question whether it is there.
+torch = pytest.importorskip("torch", reason="evaluation needs PyTorch")
+
+from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.evaluate import (
+    evaluate_model,
+    evaluate_views,
+    gaussian_renderer,
+    load_model,
+    write_renders,
+)
+from splatseed.io import load_scene
+from splatseed.scores import EvalResult, ViewScore
+from splatseed.splat.gaussians import initial_gaussians, training_frame
+from splatseed.splat.metrics import Lpips
+from splatseed.splat.ply import write_gaussians
+from splatseed.views.view import View, poses_of
+
+
+@pytest.fixture
+def truth(rng):
+    return rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def noisy(rng, truth):
+    noise = rng.normal(0, 0.1, truth.shape).astype(np.float32)
+    return torch.from_numpy(truth / np.float32(255) + noise)
+
+
+def _view(image, name="a.png"):
+    height, width = image.shape[:2]
+    return View(name, image, np.eye(3), width, height, np.eye(4))
+
+
+def test_scores_are_those_of_torchmetrics_on_clamped_renders(truth, noisy):
+    functional = pytest.importorskip("torchmetrics.functional.image")
+    result = evaluate_views(lambda _: noisy, [_view(truth)])
+
+    def planes(image):
+        return image.clamp(0, 1).permute(2, 0, 1)[None]
+
+    x, y = planes(noisy), planes(torch.from_numpy(truth / np.float32(255)))
+    psnr = functional.peak_signal_noise_ratio(x, y, data_range=1.0)
+    ssim = functional.structural_similarity_index_measure(x, y, sigma=1.5, data_range=1.0)
+    assert result.psnr == pytest.approx(float(psnr), abs=1e-3)
+    assert result.ssim == pytest.approx(float(ssim), abs=1e-5)
+
+
+def test_the_mean_psnr_is_that_of_the_images_not_of_the_mean_error():
+    image = np.zeros((16, 16, 3), np.uint8)
+    errors = {"a.png": 0.1, "b.png": 0.01}
+    views = [_view(image, name) for name in errors]
+    result = evaluate_views(lambda v: torch.full((16, 16, 3), errors[v.name]), views)
+    assert [s.psnr for s in result.per_image] == pytest.approx([20, 40], abs=1e-4)
+    assert result.psnr == pytest.approx(30, abs=1e-4)
+    assert [s.name for s in result.per_image] == ["a.png", "b.png"]
+
+
+def test_values_beyond_the_range_are_clamped():
+    white = _view(np.full((16, 16, 3), 255, np.uint8))
+    assert evaluate_views(lambda _: torch.full((16, 16, 3), 7.0), [white]).psnr == math.inf
+
+
+def test_lpips_is_in_the_result_or_why_not(truth, noisy):
+    without = evaluate_views(lambda _: noisy, [_view(truth)], lpips_reason="no weights").to_dict()
+    assert (without["lpips"], without["lpips_reason"]) == (None, "no weights")
+    metric = Lpips.__new__(Lpips)
+    metric.net = "alex"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Lpips, "__call__", lambda *_: 0.25)
+        result = evaluate_views(lambda _: noisy, [_view(truth)] * 2, lpips=metric)
+    assert (result.lpips, result.lpips_net, result.lpips_reason) == (0.25, "alex", "")
+
+
+def test_what_cannot_be_scored_is_refused(truth):
+    for image in (torch.zeros(64, 48, 3), torch.full((48, 64, 3), math.nan)):
+        with pytest.raises(ParameterError, match=r"a\.png"):
+            evaluate_views(lambda _, image=image: image, [_view(truth)])
+    with pytest.raises(ParameterError, match="views"):
+        evaluate_views(lambda _: torch.zeros(1), [])
+
+
+def test_json_is_valid_also_for_a_perfect_render():
+    scores = (ViewScore("a", math.inf, 1.0, 0.0, 0.1), ViewScore("b", 30.0, 0.9, 0.2, 0.3))
+    result = EvalResult(scores, lpips_net="vgg", lpips_reason="")
+    content = json.loads(result.to_json())
+    assert content["psnr"] is None
+    assert content["per_image"][0]["psnr"] is None
+    assert content["per_image"][1]["psnr"] == 30.0
+    assert content["ssim"] == pytest.approx(0.95)
+    assert content["lpips"] == pytest.approx(0.1)
+    assert content["render_seconds"] == pytest.approx(0.2)
+
+
+@pytest.fixture(scope="module")
+def room(larger_room_path):
+    return larger_room_path
+
+
+@pytest.fixture(scope="module")
+def model_path(room, tmp_path_factory):
+    """The seeds themselves as Gaussians of the world, with some colour by direction."""
+    gaussians = initial_gaussians(load_scene(room).points, opacity=0.9)
+    gaussians.shN[:, :3] = np.random.default_rng(0).normal(0, 0.1, (len(gaussians), 3, 3))
+    path = tmp_path_factory.mktemp("model") / "seeds.ply"
+    write_gaussians(path, gaussians)
+    return path
+
+
+def test_a_ply_of_the_world_is_scored_on_the_test_views(room, model_path):
+    model = load_model(model_path, room)
+    result = evaluate_model(model)
+    assert [s.name for s in result.per_image] == [i.name for i in load_scene(room).split()[1]]
+    assert result.num_gaussians == len(load_scene(room).points)
+    assert result.model_bytes == result.num_gaussians * 59 * 4
+    black = evaluate_views(lambda v: torch.zeros(v.height, v.width, 3), model.views)
+    assert result.psnr > black.psnr + 1
+
+
+def test_a_model_looks_the_same_in_whatever_frame_it_is_rendered(room, model_path):
+    model = load_model(model_path, room)
+    frame = training_frame(poses_of(load_scene(room).split()[0]))
+    other = dataclasses.replace(frame, origin=frame.origin + 0.5, scale=3 * frame.scale)
+    moved = gaussian_renderer(model.gaussians, other)
+    for view in model.views:
+        # The near plane is closer there: nothing of the room lies that near.
+        torch.testing.assert_close(moved(view), model.render(view), atol=2e-3, rtol=0)
+
+
+def test_pictures_show_the_photograph_the_render_and_the_error(room, model_path, tmp_path):
+    model = load_model(model_path, room, data_factor=2)
+    write_renders(model, tmp_path)
+    for view in model.views:
+        assert (view.width, view.height) == (60, 45)
+        with Image.open(tmp_path / view.name) as file:
+            pixels = np.asarray(file)
+        assert pixels.shape[0] == view.height
+        assert pixels.shape[1] > 3 * view.width
+        np.testing.assert_array_equal(pixels[:, : view.width], view.photograph)
+
+
+def test_a_bare_cloud_is_no_scene_to_score_on(room, model_path):
+    with pytest.raises(SceneNotFoundError, match="to have images"):
+        load_model(model_path, room / "sparse/0/points3D.ply")
