@@ -1,10 +1,8 @@
-"""Depth networks so small that a test can make them: of transformers' own classes, and in ONNX."""
+"""Depth networks so small that a test can make them, of transformers' own classes."""
 
 from __future__ import annotations
 
 from pathlib import Path
-
-import numpy as np
 
 IMAGENET = {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
 
@@ -138,40 +136,3 @@ def save_network(name: str, folder: Path) -> Path:
     network.save_pretrained(folder)
     processor.save_pretrained(folder)
     return folder
-
-
-def onnx_sum(
-    path: Path,
-    *,
-    shape: tuple[int | str, ...] = ("batch", 3, "height", "width"),
-    channel_axis: bool = False,
-    half: bool = False,
-    factor: int = 1,
-) -> Path:
-    """Write a network whose map is red + 2 green + 4 blue of its input, ``factor`` times
-    smaller."""
-    from onnx import TensorProto, checker, helper, numpy_helper, save
-
-    dtype, kind = (np.float16, TensorProto.FLOAT16) if half else (np.float32, TensorProto.FLOAT)
-    weights = np.zeros((1, 3, factor, factor), dtype)
-    weights[0, :, 0, 0] = [1, 2, 4]
-    conv = helper.make_node(
-        "Conv", ["image", "weights"], ["sum"], kernel_shape=[factor] * 2, strides=[factor] * 2
-    )
-    squeeze = helper.make_node("Squeeze", ["sum", "axes"], ["depth"])
-    output, last = ("sum", []) if channel_axis else ("depth", [squeeze])
-    free = ["b", 1, "h", "w"] if channel_axis else ["b", "h", "w"]
-    graph = helper.make_graph(
-        [conv, *last],
-        "sum",
-        [helper.make_tensor_value_info("image", kind, shape)],
-        [helper.make_tensor_value_info(output, kind, free)],
-        [
-            numpy_helper.from_array(weights, "weights"),
-            numpy_helper.from_array(np.array([1]), "axes"),
-        ],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    checker.check_model(model)
-    save(model, path)
-    return path

@@ -17,7 +17,6 @@ INSTALL = {
     "pycolmap": "pycolmap>=4.0",
     "tensorboard": "tensorboard>=2.14",
     "transformers": "transformers>=5.18",
-    "onnxruntime": "onnxruntime>=1.19",
     "OpenEXR": "OpenEXR>=3.3",
     "ray": "ray>=2.40",
     "imageio_ffmpeg": "imageio-ffmpeg>=0.6",
@@ -32,7 +31,7 @@ folder."""
 _TRAIN = ("torch", "gsplat", "torchmetrics")
 _EXTRA = {
     **dict.fromkeys(_TRAIN, "train"),
-    **dict.fromkeys(("transformers", "onnxruntime"), "depth"),
+    "transformers": "depth",
     **dict.fromkeys(("viser", "zstandard", "imageio_ffmpeg"), "view"),
     **dict.fromkeys(("laspy", "lazrs", "pye57"), "scan"),
     "pycolmap": "sfm",
@@ -44,8 +43,7 @@ _EXTRA = {
 _TOGETHER = {
     "torch": _TRAIN,
     "gsplat": _TRAIN,
-    "transformers": ("torch", "transformers", "onnxruntime"),
-    "onnxruntime": ("onnxruntime", "torch", "transformers"),
+    "transformers": ("torch", "transformers"),
     "viser": ("viser", "imageio_ffmpeg", "zstandard"),
     "pycolmap": ("pycolmap", "imageio_ffmpeg"),
 }

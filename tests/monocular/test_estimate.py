@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from PIL import Image as PilImage
 
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene
-from splatseed.monocular import Meaning, estimate_depths
+from splatseed.monocular import estimate_depths
 from splatseed.synthetic import make_capture, write_capture
 
 
@@ -20,8 +21,7 @@ from splatseed.synthetic import make_capture, write_capture
 class Brightness:
     """A network that takes bright for near, and remembers what it was asked."""
 
-    meaning: Meaning = Meaning("inverse", "made")  # noqa: RUF009  (frozen)
-    device: str = "this test"
+    meaning: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(kind="inverse"))
     asked: list = field(default_factory=list)
 
     def __call__(self, images):
@@ -104,8 +104,6 @@ def test_subfolders_and_foreign_suffixes_keep_their_names(own_path, network, tmp
     for image, name in ((first, "left/a.png"), (second, "right/a.png")):
         (scene.source.image_dir / name).parent.mkdir()
         shutil.move(scene.source.image_dir / image.name, scene.source.image_dir / name)
-    from dataclasses import replace
-
     renamed = (replace(first, name="left/a.png"), replace(second, name="right/a.png"))
     scene = scene.replace(images=renamed)
     estimate_depths(scene, network, tmp_path / "maps")
@@ -157,10 +155,10 @@ def test_a_failure_on_the_way_leaves_nothing(room_path, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["", "maps", "images/maps"])
-def test_the_scene_is_not_written_into(name, own_path, network):
-    with pytest.raises(OutputError, match="apart from the input"):
-        estimate_depths(load_scene(own_path), network, own_path / name)
+def test_the_scene_is_not_written_into(room_path, network):
+    for name in ("", "maps", "images/maps"):
+        with pytest.raises(OutputError):
+            estimate_depths(load_scene(room_path), network, room_path / name)
     assert not network.asked
 
 
@@ -173,15 +171,13 @@ def test_an_earlier_folder_is_replaced_only_when_asked(room_path, network, tmp_p
     estimate_depths(scene, network, tmp_path / "maps", overwrite=True)
 
 
-@pytest.mark.parametrize("number", [{"batch": 0}, {"max_size": -5}])
-def test_numbers_out_of_range_are_refused(number, room_path, network, tmp_path):
-    with pytest.raises(ParameterError, match="of 1 or more"):
-        estimate_depths(load_scene(room_path), network, tmp_path / "maps", **number)
-
-
-def test_a_scene_without_photographs_is_refused(own_path, network, tmp_path):
+def test_what_cannot_be_done_is_refused(own_path, network, tmp_path):
+    scene = load_scene(own_path)
+    for number in ({"batch": 0}, {"max_size": -5}):
+        with pytest.raises(ParameterError, match=next(iter(number)).replace("_", "-")):
+            estimate_depths(scene, network, tmp_path / "maps", **number)
+    with pytest.raises(SceneNotFoundError):
+        estimate_depths(scene.replace(images=()), network, tmp_path / "maps")
     shutil.rmtree(own_path / "images")
-    with pytest.raises(SceneNotFoundError, match="with photographs"):
+    with pytest.raises(SceneNotFoundError):
         estimate_depths(load_scene(own_path), network, tmp_path / "maps")
-    with pytest.raises(SceneNotFoundError, match="with photographs"):
-        estimate_depths(load_scene(own_path).replace(images=()), network, tmp_path / "maps")

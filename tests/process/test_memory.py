@@ -7,10 +7,10 @@ import os
 import numpy as np
 import pytest
 
+from splatseed import monocular
 from splatseed.commands.bench.machine import Machine, check_machine
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
-from splatseed.monocular import estimate
 from splatseed.pointcloud import PointCloud
 from splatseed.process import memory
 from splatseed.stereo import StereoSettings, stereo_depths
@@ -77,12 +77,10 @@ def test_what_stereo_holds_beside_photographs(free, scene):
 
 
 def test_a_batch_for_a_network(free):
-    free(2 * 1000 * estimate.BYTES_A_PIXEL)
-    sizes = dict.fromkeys("abc", (40, 25))
-    estimate._check_memory(sizes, 2)
+    free(2 * 1000 * monocular.BYTES_A_PIXEL)
+    monocular._check_memory((40, 25), 2)
     with pytest.raises(ParameterError, match="--batch 2"):
-        estimate._check_memory(sizes, 3)
-    estimate._check_memory({"a": (40, 25)}, 3)
+        monocular._check_memory((40, 25), 3)
 
 
 def test_the_runs_of_a_benchmark(free):

@@ -1,68 +1,167 @@
-"""Depth from single photographs, by pretrained networks.
+"""Depth maps of a scene's photographs by a pretrained network.
 
-``load_network`` takes a network that is on this machine, in transformers' format or in ONNX, and
-``estimate_depths`` runs it on a scene's photographs. Promise: nothing is downloaded; PyTorch and
-transformers are imported only for networks that need them.
+``splatseed.monocular.network.load_network`` takes a network that is on this machine, and
+``estimate_depths`` runs it on every photograph. Promise: nothing is downloaded; every photograph is
+read to its last byte before the network runs on the first; one batch is in memory at a time; the
+folder of maps appears whole or not at all.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from splatseed.depthmap import DepthKind
-from splatseed.errors import ParameterError
-from splatseed.monocular.estimate import DepthReport, estimate_depths
-from splatseed.monocular.network import DepthNetwork, DeviceName, Meaning
-from splatseed.monocular.preparation import Preparation
-from splatseed.requirements import require
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image as PilImage
 
-__all__ = [
-    "DepthNetwork",
-    "DepthReport",
-    "DeviceName",
-    "Meaning",
-    "Preparation",
-    "estimate_depths",
-    "load_network",
-]
+from splatseed.depthmap import ASPECT_SLACK
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io.depth.folder import depth_folder
+from splatseed.io.output.staging import check_output
+from splatseed.io.photograph import (
+    check_photograph,
+    decode_photograph,
+    photograph_bytes,
+    photograph_folder,
+)
+from splatseed.process.memory import check_memory
+from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
+
+if TYPE_CHECKING:  # PyTorch is imported only where a network is loaded
+    from splatseed.monocular.network import DepthNetwork
+
+__all__ = ["DepthReport", "estimate_depths"]
+
+BYTES_A_PIXEL = 3 + 4 * 3 + 4
+"""Bytes per pixel of a photograph in a network: its colours, these as floats, and its depth."""
+Size = tuple[int, int]
+"""Width and height in pixels."""
 
 
-def load_network(
-    model: str,
-    *,
-    kind: DepthKind | None = None,
-    device: DeviceName = "auto",
-    preparation: Preparation | None = None,
-) -> DepthNetwork:
-    """Load a depth network that is on this machine.
+@dataclass(frozen=True)
+class DepthReport:
+    """The result of prediction.
 
     Args:
-        model: An ``.onnx`` file; a folder in transformers' format; or the id of a model that
-            Hugging Face's cache holds.
-        kind: What it predicts; None: what its configuration says.
-        device: Where to run it; auto takes a usable GPU if there is one.
-        preparation: How the input of an ONNX network is made, where its file does not say.
+        path: The folder of maps.
+        num_images: How many there are.
+        sizes: Width and height of the smallest and the largest map.
+        flat: Images whose map is constant or has no finite value: the network failed there.
+        seconds: Wall time of the predictions.
+    """
+
+    path: Path
+    num_images: int
+    sizes: tuple[Size, Size]
+    flat: tuple[str, ...]
+    seconds: float
+
+
+def estimate_depths(
+    scene: Scene,
+    network: DepthNetwork,
+    output: Path,
+    *,
+    batch: int = 1,
+    max_size: int = 1600,
+    overwrite: bool = False,
+    provenance: Mapping[str, object] | None = None,
+    progress: Progress = silent,
+) -> DepthReport:
+    """Predict a depth map for every image of a scene; ``splatseed.io.find_depths`` reads them.
+
+    Args:
+        scene: A scene with photographs.
+        network: The network.
+        output: The folder to write, with one float32 ``.npy`` per image.
+        batch: Photographs per run of the network.
+        max_size: A photograph whose longer side has more pixels is reduced to this before the
+            network sees it, and its map has that size.
+        overwrite: Whether an earlier folder of maps may be replaced.
+        provenance: How the maps were made, for ``splatseed.json``.
+        progress: Called with the stage and the fraction done.
 
     Raises:
-        MissingDependencyError: A package that runs it is not installed.
-        SceneNotFoundError: It is not on this machine; says which command fetches it.
-        SceneFormatError: It is not a depth network, or is damaged.
-        ParameterError: There is no such device, nothing says what it predicts, or a preparation is
-            given for a network that brings its own.
+        ParameterError: A number is out of its range.
+        SceneNotFoundError: The scene has no images, or a photograph is missing.
+        SceneFormatError: A photograph cannot be decoded, or differs from its camera in aspect
+            ratio.
+        OutputError: The folder cannot be written.
     """
-    said = preparation or Preparation()
-    if Path(model).suffix.lower() == ".onnx":
-        require("onnxruntime")
-        from splatseed.monocular.onnx_file import load_onnx  # noqa: PLC0415  (an extra)
+    for name, number in (("batch", batch), ("max-size", max_size)):
+        if number < 1:
+            raise ParameterError(f"--{name} of 1 or more", found=f"{number}", fix="Raise it.")
+    folder = photograph_folder(scene)
+    protect = (folder,) if scene.source is None else scene.source.inputs
+    check_output(output, kind="depth", overwrite=overwrite, protect=protect)
+    sizes = _sizes(scene, folder, max_size, progress)
+    ordered = sorted(sizes.values(), key=lambda size: size[0] * size[1])
+    _check_memory(ordered[-1], min(batch, len(sizes)))
+    start, flat, done = time.perf_counter(), [], 0
+    with depth_folder(
+        output, network.meaning.kind, overwrite=overwrite, protect=protect, provenance=provenance
+    ) as writer:
+        progress("predict depth", 0.0)
+        for names, size in _batches(sizes, batch):
+            maps = network([_load(folder / name, size) for name in names])
+            for name, values in zip(names, maps, strict=True):
+                finite = np.isfinite(values)
+                writer.write(name, np.where(finite, values, np.float32(np.nan)))
+                if not finite.any() or np.ptp(values[finite]) == 0:
+                    flat.append(name)
+            done += len(names)
+            progress("predict depth", done / len(sizes))
+    seconds = time.perf_counter() - start
+    return DepthReport(output, done, (ordered[0], ordered[-1]), tuple(sorted(flat)), seconds)
 
-        return load_onnx(Path(model), kind=kind, device=device, preparation=said)
-    if said != Preparation():
-        raise ParameterError(
-            "--input-size, --input-multiple, --mean and --std for .onnx files only",
-            found=f"{model}, whose image processor has its own",
-            fix="Leave them out, or change its preprocessor_config.json.",
-        )
-    require("torch", "transformers")
-    from splatseed.monocular.hugging_face import load_hugging_face  # noqa: PLC0415  (an extra)
 
-    return load_hugging_face(model, kind=kind, device=device)
+def _sizes(scene: Scene, folder: Path, max_size: int, progress: Progress) -> dict[str, Size]:
+    """The size at which the network sees each photograph, by name, in order of names."""
+    lenses = {image.name: image.intrinsics for image in scene.images}
+    sizes = {}
+    with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
+        checked = pool.map(lambda name: check_photograph(folder / name), sorted(lenses))
+        for name, (width, height) in zip(sorted(lenses), checked, strict=True):
+            lens = lenses[name]
+            if abs(width / height / (lens.width / lens.height) - 1) > ASPECT_SLACK:
+                raise SceneFormatError(
+                    f"{folder / name} to have its camera's aspect ratio, "
+                    f"{lens.width} x {lens.height}",
+                    found=f"{width} x {height}",
+                    fix="Use the images that the model was made from, or a resized copy of them.",
+                )
+            factor = min(max_size / max(width, height), 1.0)
+            sizes[name] = max(round(width * factor), 1), max(round(height * factor), 1)
+            progress("check images", len(sizes) / len(lenses))
+    return sizes
+
+
+def _check_memory(largest: Size, batch: int) -> None:
+    """Refuse a batch that does not fit into memory, whatever the network itself needs."""
+    pixels = largest[0] * largest[1]
+    what = f"photographs of {pixels / 1e6:.1f} megapixels at a time"
+    fix = "Pass --batch {most}, or a smaller --max-size."
+    check_memory(batch, pixels * BYTES_A_PIXEL, what, fix=fix)
+
+
+def _batches(sizes: Mapping[str, Size], batch: int) -> Iterator[tuple[list[str], Size]]:
+    """Names that go through the network together, all of the same size."""
+    ordered = sorted(sizes, key=lambda name: (sizes[name], name))
+    for size, group in groupby(ordered, lambda name: sizes[name]):
+        names = list(group)
+        for start in range(0, len(names), batch):
+            yield names[start : start + batch], size
+
+
+def _load(path: Path, size: Size) -> UInt8[np.ndarray, "H W 3"]:
+    picture = decode_photograph(path, photograph_bytes(path))
+    if picture.size != size:
+        picture = picture.resize(size, PilImage.Resampling.BICUBIC)
+    return np.array(picture)

@@ -1,23 +1,50 @@
-"""The interface of depth networks, whatever runs them.
+"""Depth networks in Hugging Face's format, run by transformers and PyTorch.
 
-Notation: a *prediction* is float32 [H, W], one value for each pixel of a photograph. Promise: the
-meaning of its values is stated with the evidence for it; if there is none, the user is asked.
+Notation: a *prediction* is float32 [H, W], one value for each pixel of a photograph. A network sees
+a photograph within a *frame*: pixels [height, width] of the frame's [full_height, full_width], from
+(top, left) on; the rest is padding that the network asked for. Promise: nothing is downloaded and
+no code from a model's folder is run; a network whose weights are not all in its file is refused
+rather than run with random ones; transformers' logs stay silent; the meaning of a network's values
+is stated with the evidence for it, or the user is asked.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+import torch
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor
+from torch.nn.functional import interpolate, pad
 
 from splatseed.depthmap import DepthKind
-from splatseed.errors import ParameterError
+from splatseed.errors import (
+    MissingDependencyError,
+    ParameterError,
+    SceneFormatError,
+    SceneNotFoundError,
+    SplatseedError,
+)
+from splatseed.literal import quoted
+from splatseed.process.torch_device import DeviceName, pick_torch_device
+from splatseed.requirements import require
 
-DeviceName = Literal["auto", "cpu", "cuda"]
-
+_EXAMPLE = "depth-anything/Depth-Anything-V2-Small-hf"
+_ID = re.compile(r"\w[\w.-]*/\w[\w.-]*")
+_UNUSED = re.compile(r"fusion_stage\.layers\.0\.residual_layer1\.")
+"""Weights that DPT has but never uses; Intel's files omit them."""
+_ZOE_MARGIN = 3
+"""ZoeDepth pads a photograph by mirroring this times the square root of half a side's pixels."""
+_LOCAL = {"local_files_only": True, "trust_remote_code": False}
 _METRIC = {
     "depth_pro": "Depth Pro",
     "glpn": "GLPN",
@@ -40,75 +67,265 @@ class Meaning:
     reason: str
 
 
-class DepthNetwork(Protocol):
-    """A network with its weights, ready to run."""
+class _Frame(NamedTuple):
+    """Where the photograph lies within what the network sees."""
 
-    @property
-    def meaning(self) -> Meaning:
-        """What it predicts."""
-        ...
+    full_height: int
+    full_width: int
+    top: int
+    left: int
+    height: int
+    width: int
+
+
+class DepthNetwork:
+    """A network of transformers' auto class for depth, with its image processor.
+
+    Args:
+        processor: Makes the network's input.
+        network: A model whose output has ``predicted_depth``.
+        meaning: What it predicts.
+        device: Where to run it.
+    """
+
+    def __init__(
+        self, processor: Any, network: Any, meaning: Meaning, device: torch.device
+    ) -> None:
+        self.meaning = meaning
+        self._processor = processor
+        self._network = network.eval().to(device)
+        self._device = device
 
     @property
     def device(self) -> str:
         """Where it runs, in words."""
-        ...
+        if self._device.type == "cuda":
+            return torch.cuda.get_device_name(self._device)
+        return f"CPU, {torch.get_num_threads()} threads"
 
+    @torch.inference_mode()
     def __call__(
         self, images: Sequence[UInt8[np.ndarray, "H W 3"]]
     ) -> list[Float32[np.ndarray, "H W"]]:
         """Predict for photographs of one size (sRGB), at their size.
 
+        Predictions are resized to the photograph bilinearly, so that no value lies outside those
+        predicted, and without the padding that some networks ask for.
+
         Raises:
-            SplatseedError: The network cannot run on them.
+            ParameterError: The batch does not fit into memory.
+            SceneFormatError: The network does not run on such an image.
         """
-        ...
+        size = images[0].shape[:2]
+        values, frame = self._prepare(images)
+        try:
+            outputs = self._network(pixel_values=values.to(self._device))
+        except (RuntimeError, ValueError) as error:
+            raise _failed(error, values) from error
+        if getattr(outputs, "field_of_view", None) is not None:  # Depth Pro's scale depends on it
+            depths = self._processor.post_process_depth_estimation(
+                outputs, target_sizes=[size] * len(images)
+            )
+            return [each["predicted_depth"].float().cpu().numpy() for each in depths]
+        depth = outputs.predicted_depth[:, None].float()
+        if frame is not None:
+            rows = slice(frame.top, frame.top + frame.height)
+            columns = slice(frame.left, frame.left + frame.width)
+            depth = _scaled(depth, (frame.full_height, frame.full_width))[:, :, rows, columns]
+        return list(_scaled(depth, size)[:, 0].cpu().numpy())
+
+    def _prepare(
+        self, images: Sequence[UInt8[np.ndarray, "H W 3"]]
+    ) -> tuple[Float[Tensor, "B 3 h w"], _Frame | None]:
+        """The network's input, and where the photographs lie in it; None: they fill it."""
+        processor, height, width = self._processor, *images[0].shape[:2]
+        divisor = getattr(processor, "size_divisor", None)
+        pads = bool(getattr(processor, "do_pad", False))
+        if pads and divisor:  # done here: the processor does not report how much
+            return _padded(self._process(images, do_pad=False), divisor)
+        values = self._process(images)
+        if pads and self._network.config.model_type == "zoedepth":
+            top, left = (int(math.sqrt(side / 2) * _ZOE_MARGIN) for side in (height, width))
+            return values, _Frame(height + 2 * top, width + 2 * left, top, left, height, width)
+        return values, None
+
+    def _process(
+        self, images: Sequence[UInt8[np.ndarray, "H W 3"]], **options: bool
+    ) -> Float[Tensor, "B 3 h w"]:
+        made = self._processor(
+            images=list(images), return_tensors="pt", input_data_format="channels_last", **options
+        )
+        return torch.as_tensor(made["pixel_values"])
 
 
-def meaning_of(config: Mapping[str, Any], name: str, given: DepthKind | None) -> Meaning:
-    """What a network predicts, by its ``config.json`` as transformers writes it.
+def load_network(
+    model: str, *, kind: DepthKind | None = None, device: DeviceName = "auto"
+) -> DepthNetwork:
+    """Load a depth network that is on this machine.
 
     Args:
-        config: The file's content; empty if there is none.
-        name: The network's name, for the error.
-        given: What the user says, which takes precedence.
+        model: A folder with ``config.json``, ``preprocessor_config.json`` and weights, or the id of
+            a model that Hugging Face's cache holds.
+        kind: What it predicts; None: what its configuration says.
+        device: Where to run it; auto takes a GPU if PyTorch sees one.
 
     Raises:
-        ParameterError: Neither the user nor the file says.
+        MissingDependencyError: transformers, or torchvision where its image processor needs it, is
+            absent.
+        SceneNotFoundError: It is not on this machine; says which command fetches it.
+        SceneFormatError: It is not a depth network, or is damaged.
+        ParameterError: There is no such device, or nothing says what it predicts.
     """
+    require("transformers")
+    where = pick_torch_device(device, "--device")
+    path = Path(model)
+    if path.is_dir() and not (path / "config.json").is_file():
+        raise _misfit(model, "no config.json in it")
+    if path.is_file():
+        raise _misfit(model, "a file")
+    with _silent():
+        meaning = _meaning_of(_read_config(model).to_dict(), model, kind)
+        processor, network = _load(model)
+    return DepthNetwork(processor, network, meaning, where)
+
+
+def _meaning_of(config: Mapping[str, Any], name: str, given: DepthKind | None) -> Meaning:
+    """What a network predicts, by its ``config.json``, unless the user says."""
+    model_type = config["model_type"]
     if given is not None:
         return Meaning(given, "as --depth-kind says")
-    model_type = config.get("model_type")
     if model_type in _METRIC:
         return Meaning("z", f"{_METRIC[model_type]} predicts metres")
     if model_type == "depth_anything":
-        return _depth_anything(config)
-    if model_type == "dpt":
-        return _dpt(config)
+        if config.get("depth_estimation_type", "relative") == "metric":
+            return Meaning("z", "its config says depth_estimation_type metric")
+        return Meaning("inverse", "Depth Anything is relative unless its config says metric")
+    if model_type == "dpt":  # published by MiDaS, and with DINOv2
+        if (config.get("backbone_config") or {}).get("model_type") == "dinov2":
+            return Meaning("z", "DPT on DINOv2 predicts metres")
+        return Meaning("inverse", "DPT of MiDaS predicts inverse depth")
     raise ParameterError(
         f"--depth-kind, to say what {name} predicts",
-        found=f"a network of type {model_type!r}, which does not say"
-        if config
-        else "no config.json",
+        found=f"a network of type {model_type!r}, which does not say",
         fix="Pass --depth-kind inverse for networks that predict disparity (MiDaS, Depth Anything"
         " without 'Metric'), --depth-kind z for those that predict metres.",
     )
 
 
-def _depth_anything(config: Mapping[str, Any]) -> Meaning:
-    if config.get("depth_estimation_type", "relative") == "metric":
-        return Meaning("z", "its config says depth_estimation_type metric")
-    return Meaning("inverse", "Depth Anything is relative unless its config says metric")
+def _read_config(model: str) -> Any:
+    """The configuration of a network for depth, from its folder or from Hugging Face's cache."""
+    from transformers import MODEL_FOR_DEPTH_ESTIMATION_MAPPING, AutoConfig  # noqa: PLC0415  (loads with its use)
+
+    try:
+        config = AutoConfig.from_pretrained(model, **_LOCAL)
+    except Exception as error:  # transformers raises errors of many libraries
+        if Path(model).is_dir():
+            raise _misfit(model, _one_line(error)) from error
+        raise SceneNotFoundError(
+            f"the depth network {model} on this machine",
+            found="neither a folder of that name nor a copy in Hugging Face's cache",
+            fix="splatseed downloads nothing by itself. "
+            + _fetch(model if _ID.fullmatch(model) else _EXAMPLE),
+        ) from error
+    if type(config) not in MODEL_FOR_DEPTH_ESTIMATION_MAPPING:
+        raise _misfit(model, f"a network of type {config.model_type}, which is not for depth")
+    return config
 
 
-def _dpt(config: Mapping[str, Any]) -> Meaning:
-    """DPT was published by MiDaS, for inverse depth, and with DINOv2, for metres."""
-    backbone = config.get("backbone_config") or {}
-    if backbone.get("model_type") == "dinov2":
-        return Meaning("z", "DPT on DINOv2 predicts metres")
-    return Meaning("inverse", "DPT of MiDaS predicts inverse depth")
+def _load(model: str) -> tuple[Any, Any]:
+    """The image processor and the network, from local files only, with all weights."""
+    from transformers import (  # noqa: PLC0415  (seconds to import)
+        AutoImageProcessor,
+        AutoModelForDepthEstimation,
+    )
+
+    try:
+        # Pillow's resizing, with or without torchvision: the same maps on every machine.
+        processor = AutoImageProcessor.from_pretrained(model, backend="pil", **_LOCAL)
+        network, loading = AutoModelForDepthEstimation.from_pretrained(
+            model, dtype=torch.float32, output_loading_info=True, **_LOCAL
+        )
+    except MemoryError:
+        raise
+    except Exception as error:  # transformers raises errors of many libraries
+        if "torchvision" in str(error).lower() and find_spec("torchvision") is None:
+            pip = f"{quoted(sys.executable or 'python')} -m pip install torchvision"
+            raise MissingDependencyError(
+                f"torchvision, which the image processor of {model} needs",
+                found="none",
+                fix=f"Install it for your version of PyTorch: {pip}.",
+            ) from error
+        raise _misfit(model, _one_line(error)) from error
+    parameters = {name for name, _ in network.named_parameters()}
+    missing = sorted(n for n in loading["missing_keys"] & parameters if not _UNUSED.search(n))
+    if missing:
+        raise _misfit(model, f"no weights for {missing[0]} and {len(missing) - 1} more")
+    return processor, network
 
 
-def one_line(error: Exception) -> str:
+def _failed(error: Exception, values: Float[Tensor, "B 3 h w"]) -> SplatseedError:
+    """The error for a network that failed."""
+    batch, _, height, width = values.shape
+    # PyTorch's memory errors on the CPU contain "allocate".
+    if isinstance(error, torch.cuda.OutOfMemoryError) or "allocate" in str(error):
+        return ParameterError(
+            f"enough memory for {batch} images of {width} x {height} at once",
+            found=_one_line(error).partition(". ")[0],
+            fix="Pass a smaller --batch or --max-size, or another --device.",
+        )
+    return SceneFormatError(
+        f"a network that takes images of {width} x {height} pixels",
+        found=_one_line(error),
+        fix="Its preprocessor_config.json may belong to another network.",
+    )
+
+
+def _misfit(model: str, found: str) -> SceneFormatError:
+    return SceneFormatError(
+        f"{model} to be a depth network that transformers loads: a folder of config.json,"
+        " preprocessor_config.json and weights",
+        found=found,
+        fix=f"Networks in other formats (.pth, .pt, .onnx) are not read. {_fetch(_EXAMPLE)}",
+    )
+
+
+def _fetch(name: str) -> str:
+    folder = name.rpartition("/")[2]
+    return f"Run: hf download {name} --local-dir {folder} and pass --model {folder}."
+
+
+def _one_line(error: Exception) -> str:
     """The first line of another library's error."""
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0].rstrip('.')}" if lines else type(error).__name__
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep transformers' warnings and progress bars from the terminal."""
+    from transformers.utils import logging  # noqa: PLC0415  (loads with its use)
+
+    level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
+    logging.set_verbosity(logging.CRITICAL)
+    logging.disable_progress_bar()
+    try:
+        yield
+    finally:
+        logging.set_verbosity(level)
+        if bars:
+            logging.enable_progress_bar()
+
+
+def _padded(
+    values: Float[Tensor, "B 3 h w"], divisor: int
+) -> tuple[Float[Tensor, "B 3 H W"], _Frame]:
+    """Zero-padded on both sides to multiples of ``divisor``."""
+    height, width = values.shape[2:]
+    down, right = (-side % divisor for side in (height, width))
+    top, left = down // 2, right // 2
+    frame = _Frame(height + down, width + right, top, left, height, width)
+    return pad(values, (left, right - left, top, down - top)), frame
+
+
+def _scaled(depth: Float[Tensor, "B 1 h w"], size: Sequence[int]) -> Float[Tensor, "B 1 H W"]:
+    return interpolate(depth, size=tuple(size), mode="bilinear", align_corners=False)

@@ -6,7 +6,7 @@ imported only when a device is picked.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from splatseed.errors import ParameterError
 from splatseed.process.memory import free_memory
@@ -15,7 +15,10 @@ if TYPE_CHECKING:  # PyTorch may be absent, and takes a while to load
     import torch
 
 
-def pick_torch_device(choice: Literal["auto", "cpu", "cuda"], option: str) -> torch.device:
+DeviceName: TypeAlias = Literal["auto", "cpu", "cuda"]
+
+
+def pick_torch_device(choice: DeviceName, option: str) -> torch.device:
     """The device of a choice; ``auto`` takes a GPU if PyTorch sees one.
 
     Args:

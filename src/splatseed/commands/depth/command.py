@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from splatseed.commands.depth.next_steps import after_network
 from splatseed.commands.depth.options import Options, check_together
@@ -13,19 +14,17 @@ from splatseed.commands.planned import Planned
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.output.staging import check_output
-from splatseed.monocular import (
-    DepthNetwork,
-    DepthReport,
-    Preparation,
-    estimate_depths,
-    load_network,
-)
+from splatseed.monocular import DepthReport, estimate_depths
+from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.train.schedule import FULL_RUN
 
+if TYPE_CHECKING:
+    from splatseed.monocular.network import DepthNetwork
+
 NAMES_SHOWN = 5
 MAX_SIZE = 1600
-PACKAGES = ("splatseed", "transformers", "torch", "onnxruntime", "numpy", "pillow")
+PACKAGES = ("splatseed", "transformers", "torch", "numpy", "pillow")
 
 
 def run(arguments: list[str]) -> None:
@@ -48,7 +47,10 @@ def _run_network(options: Options) -> None:
             options.output, kind="depth", overwrite=options.overwrite, protect=[options.scene]
         )
         clock("load network", 0.0)
-        network = _network(options)
+        require("torch", "transformers")
+        from splatseed.monocular.network import load_network  # noqa: PLC0415  (imports PyTorch)
+
+        network = load_network(str(options.model), kind=options.depth_kind, device=options.device)
         report = estimate_depths(
             scene,
             network,
@@ -60,13 +62,6 @@ def _run_network(options: Options) -> None:
             progress=clock,
         )
     _summarise(options, scene, network, report)
-
-
-def _network(options: Options) -> DepthNetwork:
-    preparation = Preparation(options.input_size, options.input_multiple, options.mean, options.std)
-    return load_network(
-        str(options.model), kind=options.depth_kind, device=options.device, preparation=preparation
-    )
 
 
 def _said_by(network: DepthNetwork) -> dict[str, object]:

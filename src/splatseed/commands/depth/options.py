@@ -14,20 +14,13 @@ import tyro
 from splatseed.commands.options import check_least
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError
-from splatseed.monocular import DeviceName
+from splatseed.process.torch_device import DeviceName
 from splatseed.stereo.settings import LEAST_SIZE, MOST_GRID
-
-Channels = tuple[float, float, float]
 
 
 def _number(default: str) -> Any:
     """How an optional number appears in the help."""
     return tyro.conf.arg(constructor=int, metavar="INT", help_behavior_hint=f"(default: {default})")
-
-
-_BESIDE = tyro.conf.arg(
-    metavar="FLOAT FLOAT FLOAT", help_behavior_hint="(default: as beside the file, else ImageNet's)"
-)
 
 
 @dataclass(frozen=True)
@@ -44,7 +37,7 @@ class Options:
     model: Annotated[
         str | None, tyro.conf.arg(metavar="NAME|PATH", help_behavior_hint="(or --stereo)")
     ] = None
-    """A folder in transformers' format, an id that Hugging Face's cache holds, or an .onnx file."""
+    """A network: a folder in transformers' format, or an id that Hugging Face's cache holds."""
     stereo: bool = False
     """Match the photographs with each other instead: no network, on the CPU; normals and confidence
     too."""
@@ -70,22 +63,11 @@ class Options:
         ),
     ] = None
     """What the network predicts: planar depth, distance along the ray, or inverse depth."""
-    input_size: Annotated[int | None, _number("as beside the file, else 518")] = None
-    """For an .onnx file that leaves it open: size in pixels to which the sides are scaled."""
-    input_multiple: Annotated[int | None, _number("as beside the file, else 14")] = None
-    """For such a file: the sides are then rounded to a multiple of this."""
-    mean: Annotated[Channels | None, _BESIDE] = None
-    """For an .onnx file: subtracted from red, green and blue in 0..1."""
-    std: Annotated[Channels | None, _BESIDE] = None
-    """For an .onnx file: divides red, green and blue after that."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
 
 
-_OF_NETWORK = (
-    *("batch", "device", "depth_kind"),
-    *("input_size", "input_multiple", "mean", "std"),
-)
+_OF_NETWORK = ("batch", "device", "depth_kind")
 _OF_STEREO = ("colmap", "grid", "seed", "preview")
 
 
@@ -102,7 +84,7 @@ def check_together(options: Options) -> None:
             fix="Name a network with --model, or match the photographs themselves with --stereo.",
         )
     check_least(options, 0, "seed")
-    check_least(options, 1, "grid", "batch", "input_size", "input_multiple")
+    check_least(options, 1, "grid", "batch")
     check_least(options, LEAST_SIZE if options.stereo else 1, "max_size")
     if (options.grid or 1) > MOST_GRID:
         found = f"{options.grid}"

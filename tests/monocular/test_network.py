@@ -26,9 +26,7 @@ from splatseed.errors import (
     SceneFormatError,
     SceneNotFoundError,
 )
-from splatseed.monocular import Preparation, load_network
-from splatseed.monocular.hugging_face import HuggingFaceNetwork
-from splatseed.monocular.network import Meaning
+from splatseed.monocular.network import DepthNetwork, Meaning, load_network
 
 from ..networks import SAVED
 
@@ -48,13 +46,18 @@ def _scaled(depth, size):
 
 @pytest.mark.parametrize("name", SAVED)
 def test_what_a_network_predicts_is_read_from_its_config(name, saved):
-    meaning = load_network(str(saved(name)), device="cpu").meaning
-    assert meaning.kind == KINDS[name]
-    assert len(meaning.reason) > 10
+    assert load_network(str(saved(name)), device="cpu").meaning.kind == KINDS[name]
 
 
-def test_the_user_goes_before_the_config(saved):
+def test_the_user_says_where_the_config_does_not(saved, tmp_path):
     assert load_network(str(saved("dpt")), kind="ray", device="cpu").meaning.kind == "ray"
+    folder = _copy(saved, tmp_path)
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(
+        json.dumps({**config, "model_type": "prompt_depth_anything"})
+    )
+    with pytest.raises(ParameterError, match="--depth-kind"):
+        load_network(str(folder), device="cpu")
 
 
 @pytest.mark.parametrize("name", ["depth_anything", "depth_anything_metric", "dpt", "glpn"])
@@ -95,7 +98,7 @@ def test_a_map_lies_on_its_photograph(name, off, saved, ramp):
     """
     processor = transformers.AutoImageProcessor.from_pretrained(saved(name), backend="pil")
     config = transformers.AutoConfig.from_pretrained(saved(name))
-    network = HuggingFaceNetwork(
+    network = DepthNetwork(
         processor, _SeesItself(config, processor), Meaning("z", "made"), torch.device("cpu")
     )
     (depth,) = network([ramp])
@@ -112,7 +115,7 @@ def test_padding_is_what_the_processor_itself_would_add(saved, ramp):
     config = transformers.AutoConfig.from_pretrained(saved("dpt_on_dinov2"))
     network = _SeesItself(config, processor)
     network.register_forward_pre_hook(lambda _, __, given: seen.append(given), with_kwargs=True)
-    HuggingFaceNetwork(processor, network, Meaning("z", "made"), torch.device("cpu"))([ramp])
+    DepthNetwork(processor, network, Meaning("z", "made"), torch.device("cpu"))([ramp])
     expected = processor([ramp], return_tensors="pt")["pixel_values"]
     assert expected.shape[2:] == (84, 126)
     torch.testing.assert_close(seen[0]["pixel_values"], expected)
@@ -123,13 +126,6 @@ def test_a_batch_gives_what_its_images_give_alone(saved, photographs):
     together = network(photographs)
     for image, depth in zip(photographs, together, strict=True):
         np.testing.assert_allclose(network([image])[0], depth, atol=1e-5)
-
-
-def test_the_same_bytes_again(saved, photographs):
-    first, second = (
-        load_network(str(saved("depth_anything")), device="cpu")(photographs) for _ in range(2)
-    )
-    assert np.stack(first).tobytes() == np.stack(second).tobytes()
 
 
 def test_threads_change_no_more_than_rounding(saved, photographs):
@@ -162,7 +158,7 @@ def test_depth_pro_leaves_its_maps_to_its_processor():
             fov = torch.arange(len(pixel_values)) + 40
             return SimpleNamespace(predicted_depth=pixel_values[:, 0], field_of_view=fov)
 
-    network = HuggingFaceNetwork(Processor(), Network(), Meaning("z", "made"), torch.device("cpu"))
+    network = DepthNetwork(Processor(), Network(), Meaning("z", "made"), torch.device("cpu"))
     first, second = network([np.zeros((6, 9, 3), np.uint8)] * 2)
     assert first.shape == (6, 9)
     assert (first == 40).all()
@@ -174,27 +170,32 @@ def _copy(saved, tmp_path, name="depth_anything"):
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "said"),
+    ("file", "content"),
     [
-        ("config.json", b"{", "not a valid JSON"),
-        ("config.json", None, "no config.json"),
-        ("config.json", b'{"model_type": "bert"}', "type bert, which is not for depth"),
-        ("config.json", b'{"model_type": "unheard"}', "unheard"),
-        ("model.safetensors", None, "model.safetensors"),
-        ("model.safetensors", b"0123456789", "header"),
-        ("preprocessor_config.json", None, "image processor"),
-        ("preprocessor_config.json", b"[1", "not a valid JSON"),
+        ("config.json", b"{"),
+        ("config.json", None),
+        ("config.json", b'{"model_type": "bert"}'),
+        ("config.json", b'{"model_type": "unheard"}'),
+        ("model.safetensors", None),
+        ("model.safetensors", b"0123456789"),
+        ("preprocessor_config.json", None),
+        ("preprocessor_config.json", b"[1"),
     ],
 )
-def test_a_damaged_folder_is_one_error(file, content, said, saved, tmp_path):
+def test_a_damaged_folder_is_one_error(file, content, saved, tmp_path):
     folder = _copy(saved, tmp_path)
     (folder / file).unlink()
     if content is not None:
         (folder / file).write_bytes(content)
-    with pytest.raises(SceneFormatError, match=said) as caught:
+    with pytest.raises(SceneFormatError, match=str(folder)) as caught:
         load_network(str(folder), device="cpu")
-    assert str(folder) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_is_no_network(tmp_path):
+    (tmp_path / "weights.pth").write_bytes(b"x")
+    with pytest.raises(SceneFormatError, match=r"weights\.pth"):
+        load_network(str(tmp_path / "weights.pth"))
 
 
 def test_a_network_with_random_weights_is_refused(saved, tmp_path):
@@ -204,16 +205,11 @@ def test_a_network_with_random_weights_is_refused(saved, tmp_path):
         {k: v for k, v in weights.items() if not k.startswith("head.")},
         folder / "model.safetensors",
     )
-    with pytest.raises(SceneFormatError, match=r"no weights for head\.conv1\.bias and 5 more"):
+    with pytest.raises(SceneFormatError, match=r"head\.conv1\.bias"):
         load_network(str(folder), device="cpu")
-
-
-def test_weights_of_another_shape_are_refused(saved, tmp_path):
-    folder = _copy(saved, tmp_path)
-    weights = load_file(folder / "model.safetensors")
-    weights["head.conv1.weight"] = torch.zeros(7, 7, 3, 3)
+    weights["head.conv1.weight"] = torch.zeros(7, 7, 3, 3)  # another shape
     save_file(weights, folder / "model.safetensors")
-    with pytest.raises(SceneFormatError, match="depth network"):
+    with pytest.raises(SceneFormatError):
         load_network(str(folder), device="cpu")
 
 
@@ -240,21 +236,14 @@ def test_a_network_that_is_not_here_is_never_looked_for_elsewhere(model, monkeyp
     assert f"hf download {name} --local-dir {folder} and pass --model {folder}" in str(caught.value)
 
 
-def test_a_file_that_is_no_onnx_is_refused(tmp_path):
-    (tmp_path / "weights.pth").write_bytes(b"x")
-    with pytest.raises(SceneFormatError, match=r"not \.onnx.*\.pth, \.pt\) are not read"):
-        load_network(str(tmp_path / "weights.pth"))
-
-
 def test_an_id_is_found_in_the_cache(saved, tmp_path):
     """In a process of its own: where the cache is, is settled as Hugging Face's package loads."""
     entry = tmp_path / "hub" / "models--me--tiny"
     shutil.copytree(saved("dpt"), entry / "snapshots" / ("0" * 40))
     (entry / "refs").mkdir()
     (entry / "refs" / "main").write_text("0" * 40)
-    code = (
-        "from splatseed.monocular import load_network; print(load_network('me/tiny').meaning.kind)"
-    )
+    code = "from splatseed.monocular.network import load_network as load"
+    code += "; print(load('me/tiny').meaning.kind)"
     environment = {**os.environ, "HF_HOME": str(tmp_path), "HF_HUB_CACHE": str(tmp_path / "hub")}
     run = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, check=True, text=True, env=environment
@@ -271,15 +260,6 @@ def test_a_processor_that_needs_torchvision_says_so(saved, tmp_path):
     processor = {"image_processor_type": "DepthProImageProcessor"}
     (folder / "preprocessor_config.json").write_text(json.dumps(processor))
     with pytest.raises(MissingDependencyError, match="pip install torchvision"):
-        load_network(str(folder), device="cpu")
-
-
-def test_a_type_that_does_not_tell_is_asked_for(saved, tmp_path):
-    folder = _copy(saved, tmp_path)
-    config = json.loads((folder / "config.json").read_text())
-    config["model_type"] = "prompt_depth_anything"
-    (folder / "config.json").write_text(json.dumps(config))
-    with pytest.raises(ParameterError, match="--depth-kind inverse"):
         load_network(str(folder), device="cpu")
 
 
@@ -309,20 +289,9 @@ def test_too_little_memory_names_the_flags(error, saved, ramp):
             raise error
 
     processor = transformers.AutoImageProcessor.from_pretrained(saved("dpt"), backend="pil")
-    network = HuggingFaceNetwork(processor, Greedy(), Meaning("z", "made"), torch.device("cpu"))
+    network = DepthNetwork(processor, Greedy(), Meaning("z", "made"), torch.device("cpu"))
     with pytest.raises(ParameterError, match=r"for 2 images of 32 x 32.*smaller --batch"):
         network([ramp, ramp])
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_gpu_that_is_not_there_is_an_error(saved):
-    with pytest.raises(ParameterError, match="--device cpu"):
-        load_network(str(saved("dpt")), device="cuda")
-
-
-def test_how_to_prepare_images_is_the_processors_business(saved):
-    with pytest.raises(ParameterError, match=r"--input-size.*\.onnx files only"):
-        load_network(str(saved("dpt")), preparation=Preparation(input_size=56))
 
 
 def test_loading_and_predicting_say_nothing(saved, photographs, capfd):
