@@ -24,7 +24,7 @@ import torch
 
 from splatseed.errors import OutputError
 from splatseed.render import rasterization
-from splatseed.train.strategies.contributions import contributions
+from splatseed.train.growing import contributions
 from splatseed.views.view import View
 
 __all__ = ["ODD_ONES", "TOLERANCE", "compare"]

@@ -23,8 +23,8 @@ from splatseed.evaluate import evaluate_views
 from splatseed.splat.metrics import l1_and_ssim_by_convolution
 from splatseed.train import TrainSettings
 from splatseed.train.device import peak_gpu_bytes, pick_device
-from splatseed.train.losses import _fused_ssim
 from splatseed.train.seeds import usable_seeds
+from splatseed.train.trainer import _fused_ssim
 from splatseed.views.view import View, load_split
 
 __all__ = ["train"]

@@ -33,14 +33,11 @@ from splatseed import load_scene
 from splatseed.errors import SplatseedError
 from splatseed.splat.gaussians import Gaussians, TrainingFrame, initial_gaussians, training_frame
 from splatseed.splat.rendering import render_view
-from splatseed.train import losses
-from splatseed.train.near_depths import near_depths
 from splatseed.train.parameters import make_optimizers, make_parameters
-from splatseed.train.seeds import usable_seeds
+from splatseed.train.seeds import near_depths, usable_seeds
 from splatseed.train.settings import TrainSettings
-from splatseed.train.state import TrainState
-from splatseed.train.strategies import make_strategy
-from splatseed.train.trainer import Trainer
+from splatseed.train.state import TrainState, make_strategy
+from splatseed.train.trainer import Trainer, _Loss
 from splatseed.views.view import load_split
 
 __all__: list[str] = []
@@ -142,8 +139,8 @@ def _stages(trainer: Trainer) -> dict[str, Sequence[Place]]:
     optimizers, strategy = trainer.state.optimizers.values(), trainer.state.strategy
     return {
         **RENDER_STAGES,
-        "loss": [(losses._Loss, "forward")],  # noqa: SLF001  (there is no public way)
-        "loss backward": [(losses._Loss, "backward")],  # noqa: SLF001  (there is no public way)
+        "loss": [(_Loss, "forward")],
+        "loss backward": [(_Loss, "backward")],
         "photograph": [(trainer._photographs, "of")],  # noqa: SLF001  (likewise)
         "Adam": [(each, name) for each in optimizers for name in ("step", "zero_grad")],
         "strategy": [(strategy, "before"), (strategy, "after")],

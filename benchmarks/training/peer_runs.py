@@ -29,7 +29,7 @@ from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.device import Capacity
 from splatseed.train.schedule import FULL_RUN
 from splatseed.train.seeds import usable_seeds
-from splatseed.train.strategies.densification import Capped
+from splatseed.train.strategies import Capped
 from splatseed.views.view import View, load_split
 
 __all__ = ["Split", "read_scene", "train_ours", "train_peer"]

@@ -21,8 +21,7 @@ from splatseed.io.output.staging import atomic_file, output_folder
 from splatseed.splat.metrics import load_lpips
 from splatseed.train.schedule import Schedule
 from splatseed.train.settings import TrainSettings
-from splatseed.train.state import load_checkpoint
-from splatseed.train.strategies import make_strategy
+from splatseed.train.state import load_checkpoint, make_strategy
 
 CPU = torch.device("cpu")
 

@@ -8,7 +8,7 @@ import pytest
 
 from splatseed.bench.running.folder import make_bench_folder
 from splatseed.io.output.staging import MANIFEST
-from splatseed.train.record.folder import RunFolder
+from splatseed.train.folder import RunFolder
 
 
 def _run_folder(path):

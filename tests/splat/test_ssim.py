@@ -13,7 +13,7 @@ from torchmetrics.functional.image import structural_similarity_index_measure
 
 from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr
 from splatseed.splat.ssim import l1_and_ssim
-from splatseed.train.losses import photometric_loss
+from splatseed.train.trainer import photometric_loss
 
 
 def _pair(rng, height, width):

@@ -20,7 +20,7 @@ from splatseed.errors import MissingDependencyError
 from splatseed.io.ply.points import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.metrics import LPIPS_FILES
-from splatseed.train.record.config import resumed_settings
+from splatseed.train.record import resumed_settings
 
 from ..command_line import exit_code
 

@@ -10,12 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from splatseed.splat.gaussians import SH_C0, Gaussians
 from splatseed.splat.rendering import render_features
+from splatseed.train.growing import PLACED, contributions, draw_candidates, join_candidates
 from splatseed.train.parameters import make_optimizers, make_parameters
 from splatseed.train.settings import TrainSettings
-from splatseed.train.strategies import make_strategy
-from splatseed.train.strategies.contributions import contributions
-from splatseed.train.strategies.growing import PLACED
-from splatseed.train.strategies.placing import draw_candidates, join_candidates
+from splatseed.train.state import make_strategy
 from splatseed.views.view import View
 
 SIDE = 32

@@ -16,11 +16,10 @@ from splatseed.scene import Image
 from splatseed.splat.gaussians import TrainingFrame
 from splatseed.stereo.depths import find_stereo
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train.known_depths import known_depths
+from splatseed.train.depths import PER_RENDERED, known_depths, stereo_size
 from splatseed.train.run import prepare_run
 from splatseed.train.seeds import seeded
 from splatseed.train.settings import TrainSettings
-from splatseed.train.stereo_size import PER_RENDERED, stereo_size
 
 FRAME = TrainingFrame(np.array([1.0, 2.0, 3.0]), 0.25)
 GROW = TrainSettings(strategy="grow", max_steps=60)
@@ -39,7 +38,7 @@ def scene(capture, tmp_path_factory):
 
 def test_depths_are_those_of_the_surfaces_in_training_units(capture, scene):
     notes: list[str] = []
-    depths = known_depths(scene, FRAME, GROW, CPU, note=notes.append)
+    depths = known_depths(scene, FRAME.scale, GROW, "cpu", note=notes.append)[0]
     truths = {image.name: truth for image, truth in zip(scene.images, capture.depths, strict=True)}
     errors = []
     for name, depth in depths.items():
@@ -47,7 +46,7 @@ def test_depths_are_those_of_the_surfaces_in_training_units(capture, scene):
             (np.arange(n) * m // n + m // n // 2)
             for n, m in zip(depth.shape, truths[name].shape, strict=True)
         )
-        world = depth.numpy() / FRAME.scale
+        world = depth / FRAME.scale
         truth = truths[name][np.ix_(rows, columns)]
         errors.append((np.abs(world / truth - 1))[world > 0])
     errors = np.concatenate(errors)
@@ -58,7 +57,7 @@ def test_depths_are_those_of_the_surfaces_in_training_units(capture, scene):
 
 def test_test_views_are_not_looked_at(scene):
     train, test = scene.split(8)
-    names = known_depths(scene, FRAME, GROW, CPU).keys()
+    names = known_depths(scene, FRAME.scale, GROW, "cpu")[0].keys()
     assert names <= {image.name for image in train}
     assert not names & {image.name for image in test}
 
@@ -67,12 +66,12 @@ def test_test_views_are_not_looked_at(scene):
     "settings", [{"strategy": "default"}, {"strategy": "grow", "placing": "none"}]
 )
 def test_nobody_looks_where_there_is_no_use(scene, settings):
-    assert known_depths(scene, FRAME, TrainSettings(**settings), CPU) == {}
+    assert known_depths(scene, FRAME.scale, TrainSettings(**settings), "cpu")[0] == {}
 
 
 def test_a_single_photograph_has_no_depth(scene):
     one = scene.replace(images=scene.images[:2])  # the first is a test view
-    assert known_depths(one, FRAME, GROW, CPU) == {}
+    assert known_depths(one, FRAME.scale, GROW, "cpu")[0] == {}
 
 
 def test_photographs_are_compared_once_for_seeds_and_growth(scene, tmp_path, monkeypatch):
@@ -123,8 +122,8 @@ def test_comparing_takes_a_part_of_training_unless_it_is_at_the_trained_size(
 
 def test_a_short_run_of_many_photographs_compares_them_at_the_trained_size(scene):
     short = TrainSettings(strategy="grow", max_steps=1, data_factor=2)
-    full = known_depths(scene, FRAME, GROW, CPU)
-    half = known_depths(scene, FRAME, short, CPU)
+    full = known_depths(scene, FRAME.scale, GROW, "cpu")[0]
+    half = known_depths(scene, FRAME.scale, short, "cpu")[0]
     for name, depth in half.items():
         assert depth.shape == tuple(n // 2 for n in full[name].shape)
     assert half

@@ -10,9 +10,9 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 from splatseed.splat.gaussians import initial_gaussians
-from splatseed.train.near_depths import LEAST, MARGIN, near_depths
-from splatseed.train.parameters import make_optimizers, make_parameters, optimize, yardsticks
+from splatseed.train.parameters import length_units, make_optimizers, make_parameters, optimize
 from splatseed.train.schedule import make_schedule
+from splatseed.train.seeds import MARGIN, NEAREST, near_depths
 from splatseed.views.view import View, load_split
 
 CPU = torch.device("cpu")
@@ -24,7 +24,7 @@ def _literal(xyz, views):
     for i, point in enumerate(xyz):
         for view in views:
             x, y, z = (view.cam_from_world @ [*point, 1.0])[:3]
-            if z <= LEAST:
+            if z <= NEAREST:
                 continue
             u, v, _ = view.K @ [x / z, y / z, 1.0]
             across = -MARGIN * view.width <= u <= (1 + MARGIN) * view.width
@@ -61,7 +61,7 @@ def test_many_views_are_sampled_evenly(monkeypatch):
     views = [_view([0, 0, -0.01 * i]) for i in range(1000)]
     one = np.array([[0, 0, 1.0]])
     assert near_depths(one, views[::-1])[0] == pytest.approx(1.0)
-    monkeypatch.setattr("splatseed.train.near_depths.MOST_PROJECTIONS", 1)
+    monkeypatch.setattr("splatseed.train.seeds.MOST_PROJECTIONS", 1)
     assert near_depths(one, views)[0] == pytest.approx(1.0)  # the first is among those asked
     assert near_depths(one, views[1:] + views[:1])[0] == pytest.approx(1.0)  # and the last
 
@@ -96,7 +96,7 @@ def test_3dgs_conventions_have_one_yardstick_for_all(begin):
     run = begin(strategy="default-3dgs", max_steps=60, cap_max=3000)
     count = len(run.state.params["means"])
     run.train()
-    assert yardsticks(run.state.params).tolist() == pytest.approx([1.1])
+    assert length_units(run.state.params).tolist() == pytest.approx([1.1])
     assert len(run.state.params["means"]) > count
 
 

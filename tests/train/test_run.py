@@ -20,8 +20,7 @@ from splatseed.evaluate import evaluate_views
 from splatseed.scene import Split
 from splatseed.splat.ply import read_gaussians
 from splatseed.train import device, run as run_module, trainer
-from splatseed.train.averaging import add_to_mean
-from splatseed.train.parameters import gaussians_of
+from splatseed.train.parameters import add_to_mean, gaussians_of
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
 

@@ -13,7 +13,7 @@ from splatseed.render import rasterization
 from splatseed.train.parameters import as_parameters, make_optimizers
 from splatseed.train.schedule import LEARNING_RATES, make_schedule
 from splatseed.train.settings import TrainSettings
-from splatseed.train.strategies import make_strategy
+from splatseed.train.state import make_strategy
 
 
 @pytest.mark.parametrize("as_3dgs", [True, False])

@@ -23,7 +23,7 @@ from splatseed.export import (
 )
 from splatseed.io.output.staging import check_parents
 from splatseed.literal import quoted
-from splatseed.train.record.folder import RunFolder
+from splatseed.train.folder import RunFolder
 from splatseed.train.settings import TrainSettings
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from splatseed.errors import SceneNotFoundError
 from splatseed.io.files import odd_kind
 from splatseed.io.load import is_scene
 from splatseed.literal import quoted
-from splatseed.train.record.folder import RunFolder
+from splatseed.train.folder import RunFolder
 
 
 def model_file(path: Path) -> Path:

@@ -19,7 +19,7 @@ from splatseed.io.load import check_there
 from splatseed.literal import counted, visible
 from splatseed.process.interruption import Termination, exit_code
 from splatseed.requirements import require
-from splatseed.train.record.folder import RunFolder
+from splatseed.train.folder import RunFolder
 from splatseed.train.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it

@@ -1,9 +1,13 @@
-"""The trained parameters in PyTorch, and their optimisers.
+"""The trained parameters in PyTorch, their optimisers, and their mean over the end of a run.
 
 Notation: gsplat's parameter dict: ``means``, ``scales`` (logarithms), ``quats``, ``opacities``
 (logits), ``sh0``, ``shN``; one Adam each, as gsplat's strategies need them. In splatseed's
 conventions they are accompanied by ``near_depths`` [N], which are not learnt: whatever adds, moves
 or removes Gaussians treats them like the rest.
+
+Steps on single photographs keep the parameters oscillating about their best values, since only the
+learning rate of positions decays; the mean does not oscillate (Polyak and Juditsky, 1992). Promise:
+the mean restarts when the number of Gaussians changes, so that each value averages one Gaussian.
 """
 
 from __future__ import annotations
@@ -11,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,12 +40,12 @@ def make_parameters(
     device: torch.device,
     near_depths: Float32[np.ndarray, " N"] | None = None,
 ) -> Parameters:
-    """Trainable copies of the Gaussians' arrays on a device, with their yardsticks.
+    """Trainable copies of the Gaussians' arrays on a device.
 
     Args:
         gaussians: The initial ones.
         device: Where they are trained.
-        near_depths: Their near depths; when left out, the cameras' extent is the yardstick for all.
+        near_depths: Their length units; when left out, the cameras' extent is the unit for all.
     """
     arrays = gaussians.arrays()
     if near_depths is not None:
@@ -64,7 +69,7 @@ def gaussians_of(params: Parameters | Mapping[str, Tensor]) -> Gaussians:
     return Gaussians(**{name: params[name].detach().cpu().numpy() for name in names})
 
 
-def yardsticks(params: Parameters) -> Float[Tensor, "#N"]:
+def length_units(params: Parameters) -> Float[Tensor, "#N"]:
     """The unit of each Gaussian's size and learning rate; a single number if all share it."""
     if NEAR_DEPTHS in params:
         lengths: Tensor = params[NEAR_DEPTHS].detach()
@@ -88,15 +93,12 @@ class _Adam(torch.optim.Adam):
 
 def make_optimizers(params: Parameters, schedule: Schedule) -> Optimizers:
     """One Adam per parameter, with the schedule's learning rates."""
-    betas = (ADAM_BETA1, schedule.beta2)
+    rates = schedule.learning_rates
+    how: dict[str, Any] = {
+        "betas": (ADAM_BETA1, schedule.beta2), "eps": ADAM_EPSILON, "fused": True
+    }  # fmt: skip
     return {
-        name: _Adam(
-            [{"params": [value]}],
-            lr=schedule.learning_rates[name],
-            betas=betas,
-            eps=ADAM_EPSILON,
-            fused=True,
-        )
+        name: _Adam([{"params": [value]}], lr=rates[name], **how)
         for name, value in params.items()
         if value.requires_grad
     }
@@ -108,13 +110,12 @@ def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, flo
     Args:
         params: The parameters, with their gradients.
         optimizers: Their optimisers.
-        rates: Their learning rates; for positions in yardsticks.
+        rates: Their learning rates; for positions in length units.
     """
-    means, lengths = params["means"], yardsticks(params)
+    means, lengths = params["means"], length_units(params)
     positions = means.data
-    means.data = torch.zeros_like(
-        positions
-    )  # a step from 0 loses no digits, however distant the position
+    # A step from 0 loses no digits, however distant the position.
+    means.data = torch.zeros_like(positions)
     for name, optimizer in optimizers.items():
         optimizer.param_groups[0]["lr"] = rates[name]
         optimizer.step()
@@ -124,3 +125,32 @@ def optimize(params: Parameters, optimizers: Optimizers, rates: Mapping[str, flo
     for axis in range(3):
         positions[:, axis].addcmul_(means.data[:, axis], lengths)
     means.data = positions
+
+
+@torch.no_grad()
+def add_to_mean(mean: dict[str, Any], params: Parameters) -> None:
+    """Add the current parameters to the mean.
+
+    Args:
+        mean: The means by name, and ``count``, the number of steps; empty at first, changed in
+            place.
+        params: All learnt parameters are averaged.
+    """
+    if not mean or len(mean["means"]) != len(params["means"]):
+        mean.clear()
+        mean["count"] = 0
+    mean["count"] += 1
+    for name, value in params.items():
+        if name in mean:
+            # m_n = m_(n-1) + (x - m_(n-1)) / n
+            mean[name].lerp_(value, 1.0 / mean["count"])
+        elif value.requires_grad:
+            mean[name] = value.detach().clone()
+
+
+@torch.no_grad()
+def take_mean(params: Parameters, mean: dict[str, Any]) -> None:
+    """Set the parameters to their means, if there are any for these Gaussians."""
+    if mean and len(mean["means"]) == len(params["means"]):
+        for name in mean.keys() & params.keys():
+            params[name].copy_(mean[name])

@@ -7,12 +7,10 @@ where it stopped, with its original settings; results are in the scene's world.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import TypeAlias
 
 import torch
 from jaxtyping import Float
@@ -28,6 +26,7 @@ from splatseed.splat.gaussians import TrainingFrame, stray_note, stray_views, tr
 from splatseed.splat.pictures import beside_photograph, picture_name, write_picture
 from splatseed.splat.ply import write_gaussians
 from splatseed.splat.ssim import WINDOW
+from splatseed.train.depths import known_depths
 from splatseed.train.device import (
     check_fits,
     device_name,
@@ -35,29 +34,28 @@ from splatseed.train.device import (
     peak_gpu_bytes,
     pick_device,
 )
-from splatseed.train.known_depths import known_depths, seconds_of
+from splatseed.train.folder import RunFolder, write_json
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
-from splatseed.train.record.config import (
+from splatseed.train.record import (
+    Board,
+    Record,
     check_same_seeds,
     make_config,
     resumed_reading,
     resumed_settings,
+    scene_as_read,
+    write_curve_csv,
+    write_curve_png,
 )
-from splatseed.train.record.curve import Record, write_curve_csv, write_curve_png
-from splatseed.train.record.folder import RunFolder, write_json
-from splatseed.train.record.scene import scene_as_read
-from splatseed.train.record.tensorboard import Board
-from splatseed.train.seeds import seeded, usable_seeds
+from splatseed.train.seeds import first_gaussians, seeded, usable_seeds
 from splatseed.train.settings import AS_IT_IS, Reading, TrainSettings
-from splatseed.train.start import first_gaussians
-from splatseed.train.state import TrainState, load_checkpoint, save_checkpoint
-from splatseed.train.strategies import Strategy, make_strategy
+from splatseed.train.state import TrainState, load_checkpoint, make_strategy, save_checkpoint
+from splatseed.train.strategies import Strategy
 from splatseed.train.trainer import Trainer
 from splatseed.views.view import View, check_lens, load_split, poses_of
 
-KnownDepths: TypeAlias = Mapping[str, Float[Tensor, "h w"]]
-Render: TypeAlias = Callable[[View], Float[Tensor, "H W 3"]]
-Score: TypeAlias = Callable[[Render, Sequence[View]], EvalResult]
+Render = Callable[[View], Float[Tensor, "H W 3"]]
+Score = Callable[[Render, Sequence[View]], EvalResult]
 """Scores renders against views, as ``evaluate.evaluate_views`` does."""
 
 SAVE_EVERY = 60.0
@@ -119,10 +117,16 @@ def prepare_run(
     """
     options = options or RunOptions()
     _check_images(scene)
-    folder = _checked_folder(output, scene, options)
-    begun = folder.read_config() if options.resume and folder.is_run else None
-    settings = resumed_settings(begun, settings)
-    reading = resumed_reading(begun, options.reading)
+    if options.tensorboard:
+        require("tensorboard")
+    folder = RunFolder(Path(output))
+    protect = scene.source.inputs if scene.source else ()
+    folder.check(overwrite=options.overwrite, resume=options.resume, protect=protect)
+    begun, reading = None, options.reading
+    if options.resume and folder.is_run:
+        begun = folder.read_config()
+        settings = resumed_settings(begun, settings)
+        reading = resumed_reading(begun, reading)
     for image in scene.images:
         check_lens(image, scene.source.root if scene.source else None)
     device = pick_device(settings.backend, progress)
@@ -132,7 +136,7 @@ def prepare_run(
     trained = scene.split(settings.test_every)[0]
     seeds = usable_seeds(scene.points, settings, note, poses_of(trained, settings.data_factor))
     check_fits(len(seeds), device)
-    config = make_config(scene, seeds, settings, device, reading)
+    config = make_config(scene, seeds, settings, device_name(device), reading)
     if begun:
         check_same_seeds(folder.config, begun, config)
     views = load_split(
@@ -146,14 +150,14 @@ def prepare_run(
     frame, strays = training_frame(views[0]), stray_views(views[0])
     for name in strays:
         note(stray_note(name))
+    depths, seconds = known_depths(
+        scene, frame.scale, settings, device.type,
+        stereo=stereo, kept=options.depths, note=note, progress=progress,
+    )  # fmt: skip
+    maps = {name: torch.as_tensor(depth).to(device) for name, depth in depths.items()}
+    strategy = make_strategy(settings, device, maps)
     near = [frame.view(view) for view in views[0] if view.name not in strays]
-    depths, seconds = _timed_depths(
-        partial(known_depths, scene, frame, settings, device, stereo=stereo, note=note),
-        options,
-        progress,
-    )
-    strategy = make_strategy(settings, device, depths)
-    state = _state(earlier, seeds, frame, near, settings, strategy, device)
+    state = _state(earlier, frame.cloud_from_world(seeds), near, settings, strategy, device)
     if state.step:
         note(f"Resuming after step {state.step:,} of {settings.max_steps:,}.")
     run = TrainingRun(folder, settings, frame, state, views)
@@ -162,23 +166,40 @@ def prepare_run(
         run.trainer.warm_up()
     # What cannot render has failed by now, and leaves no folder.
     if not begun:
-        state.watch.seconds += seconds  # the cost of growth includes finding depth
+        if not options.seeding_knew:
+            state.watch.seconds += seconds  # the cost of growth includes finding depth
         folder.begin(config, posed if reading.refine_poses else None)
     if options.tensorboard:
         run.log_to_tensorboard()
     return run
 
 
-def _timed_depths(
-    find: Callable[..., KnownDepths], options: RunOptions, progress: Progress
-) -> tuple[KnownDepths, float]:
-    """The depth that growth needs, and the seconds that finding it counts for in this run."""
-    start = time.perf_counter()
-    depths = find(kept=options.depths, progress=progress)
-    seconds = time.perf_counter() - start
-    if depths:
-        seconds = 0.0 if options.seeding_knew else seconds_of(options.depths, seconds)
-    return depths, seconds
+def _check_images(scene: Scene) -> None:
+    """Called before the folder is looked at, which may be the cloud's own."""
+    if not scene.images:
+        raise SceneNotFoundError(
+            "a scene with photographs to train on",
+            found=f"points alone{f' ({scene.source.points_path})' if scene.source else ''}",
+            fix="Name a scene with cameras, images and photographs. To begin with the points of a "
+            "scan, add them to it: splatseed upsample SCENE --cloud FILE -o OUT.",
+        )
+
+
+def _state(
+    begun: RunFolder | None,
+    seeds: PointCloud,
+    views: Sequence[View],
+    settings: TrainSettings,
+    strategy: Strategy,
+    device: torch.device,
+) -> TrainState:
+    """The state of a run that left a checkpoint, else the first state."""
+    schedule = settings.schedule
+    if begun and begun.checkpoint.is_file():
+        return load_checkpoint(begun.checkpoint, strategy, schedule, device)
+    gaussians, lengths = first_gaussians(seeds, views, settings)
+    params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
+    return TrainState(params, make_optimizers(params, schedule), strategy)
 
 
 class TrainingRun:
@@ -242,25 +263,20 @@ class TrainingRun:
             OutputError: The checkpoint or the curve cannot be written.
             PointCloudError: The GPU's memory does not suffice; the checkpoint is of the last step.
         """
-        with self._told_of_checkpoint():
+        with self._checkpoint_told(), gpu_memory_told(self.count):
             if self._saved_step is None:
                 self._save()  # fail now rather than after hours if the disk is full
-            with gpu_memory_told(self.count):
-                done = self._run(on_step)
+            try:
+                done = self.trainer.run(on_step)
+            except torch.cuda.OutOfMemoryError:
+                if self.trainer.is_whole:  # else the checkpoint before is the last whole one
+                    self.trainer.clear_gradients()
+                    self._save()
+                raise
             if self._board:
                 self._board.close()
             self._save()  # for a finished run too: scoring and writing results may fail
         return done
-
-    def _run(self, on_step: Callable[[int], None]) -> bool:
-        """Train; if a GPU's memory ends, save the last whole step first."""
-        try:
-            return self.trainer.run(on_step)
-        except torch.cuda.OutOfMemoryError:
-            if self.trainer.is_whole:  # else the checkpoint before is the last whole one
-                self.trainer.clear_gradients()
-                self._save()
-            raise
 
     def finish(self, score: Score, progress: Progress = silent) -> TrainingResult:
         """Score the test views and write the results; the checkpoint, no longer needed, is removed.
@@ -276,28 +292,23 @@ class TrainingRun:
             OutputError: A result cannot be written.
             PointCloudError: The GPU's memory does not suffice.
         """
-        with self._told_of_checkpoint(), gpu_memory_told(self.count):
-            return self._finish(score, progress)
-
-    def _finish(self, score: Score, progress: Progress) -> TrainingResult:
-        progress("score", 0.0)
-        scores = score(self.trainer.render, self.trainer.test_views)
-        world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
-        result = self._result(
-            replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes)
-        )
-        with self.folder.results() as staged:
-            write_gaussians(staged.gaussians, world)
-            write_curve_csv(staged.curve_csv, self.state.records)
-            write_curve_png(staged.curve_png, self.state.records)
-            self._write_renders(staged, progress)
-            write_json(staged.metrics, result.to_dict())
-        self.folder.checkpoint.unlink(missing_ok=True)
+        with self._checkpoint_told(), gpu_memory_told(self.count):
+            progress("score", 0.0)
+            scores = score(self.trainer.render, self.trainer.test_views)
+            world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
+            scores = replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes)
+            result = self._result(scores)
+            with self.folder.results() as staged:
+                write_gaussians(staged.gaussians, world)
+                write_curve_csv(staged.curve_csv, self.state.records)
+                write_curve_png(staged.curve_png, self.state.records)
+                self._write_renders(staged, progress)
+                write_json(staged.metrics, result.to_dict())
+            self.folder.checkpoint.unlink(missing_ok=True)
         return result
 
     def _result(self, scores: EvalResult) -> TrainingResult:
-        state = self.state
-        capacity = state.strategy.capacity
+        state, capacity = self.state, self.state.strategy.capacity
         return TrainingResult(
             scores,
             tuple(
@@ -316,7 +327,7 @@ class TrainingRun:
             self._board.add(record)
         if record.test_psnr is None:
             return
-        self._write_curve()
+        write_curve_csv(self.folder.curve_csv, self.state.records)
         if self._saved_step is None or time.monotonic() - self._saved > SAVE_EVERY:
             self._save()
 
@@ -325,7 +336,7 @@ class TrainingRun:
         self._saved, self._saved_step = time.monotonic(), self.state.step
 
     @contextmanager
-    def _told_of_checkpoint(self) -> Iterator[None]:
+    def _checkpoint_told(self) -> Iterator[None]:
         """Say which step is saved, and how to resume, if the run is cut off."""
         try:
             yield
@@ -340,9 +351,6 @@ class TrainingRun:
                 error.expected, found=error.found, fix=f"{error.fix} {kept}"
             ) from error
 
-    def _write_curve(self) -> None:
-        write_curve_csv(self.folder.curve_csv, self.state.records)
-
     def _write_renders(self, staged: RunFolder, progress: Progress) -> None:
         views = self.trainer.test_views
         names = [picture_name(view.name) for view in views]
@@ -351,43 +359,3 @@ class TrainingRun:
             picture = beside_photograph(view.photograph, self.trainer.render(view).cpu().numpy())
             write_picture(staged.renders / name, picture)
             progress("write", (i + 1) / len(views))
-
-
-def _check_images(scene: Scene) -> None:
-    """Refuse a cloud alone before the folder is looked at: its mistake is the greater one."""
-    if not scene.images:
-        where = f" ({scene.source.points_path})" if scene.source else ""
-        raise SceneNotFoundError(
-            "a scene with photographs to train on",
-            found=f"points alone{where}",
-            fix="Name a scene with cameras, images and photographs. To begin with the points of a "
-            "scan, add them to it: splatseed upsample SCENE --cloud FILE -o OUT.",
-        )
-
-
-def _checked_folder(output: Path, scene: Scene, options: RunOptions) -> RunFolder:
-    """The folder, checked to be writable; and TensorBoard, checked if requested."""
-    if options.tensorboard:
-        require("tensorboard")
-    folder = RunFolder(Path(output))
-    protect = scene.source.inputs if scene.source else ()
-    folder.check(overwrite=options.overwrite, resume=options.resume, protect=protect)
-    return folder
-
-
-def _state(
-    begun: RunFolder | None,
-    seeds: PointCloud,
-    frame: TrainingFrame,
-    views: Sequence[View],
-    settings: TrainSettings,
-    strategy: Strategy,
-    device: torch.device,
-) -> TrainState:
-    """The state of a run that left a checkpoint, else the first state."""
-    schedule = settings.schedule
-    if begun and begun.checkpoint.is_file():
-        return load_checkpoint(begun.checkpoint, strategy, schedule, device)
-    gaussians, lengths = first_gaussians(frame.cloud_from_world(seeds), views, settings)
-    params = make_parameters(gaussians, device, lengths if schedule.near_depths else None)
-    return TrainState(params, make_optimizers(params, schedule), strategy)

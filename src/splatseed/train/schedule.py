@@ -1,11 +1,11 @@
 """The hyperparameters of a run and their timing: splatseed's own, and 3DGS's.
 
 Notation: a *full* run has 30,000 steps, for which all of 3DGS's numbers are stated; T is the number
-of steps of the run at hand. Lengths, and so the rates of positions, are in *yardsticks*: a
+of steps of the run at hand. Lengths, and so the rates of positions, are in *length units*: a
 Gaussian's near depth (``near_depths``) in splatseed's conventions, the cameras' extent in 3DGS's.
-Promise: a full run of splatseed's differs from 3DGS's in the yardstick, the bound on initial sizes
-and MCMC's start; these and each departure in short runs were chosen on held-out training views: see
-benchmarks/training/README.md.
+Promise: a full run of splatseed's differs from 3DGS's in the length unit, the bound on initial
+sizes and MCMC's start; these and each departure in short runs were chosen on held-out training
+views: see benchmarks/training/README.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Densification = Literal["default", "grow", "mcmc", "none"]
 FULL_RUN = 30_000
 LEARNING_RATES: Mapping[str, float] = MappingProxyType(
     {
-        "means": 1.6e-4,  # times the yardstick
+        "means": 1.6e-4,  # times the length unit
         "scales": 5e-3,
         "quats": 1e-3,
         "opacities": 5e-2,
@@ -70,8 +70,9 @@ class Schedule:
 
     Args:
         max_steps: T.
-        near_depths: Whether each Gaussian's near depth is its yardstick, else the cameras' extent.
-        learning_rates: Initial rate of each parameter; for positions in yardsticks.
+        near_depths: Whether each Gaussian's near depth is its length unit; the cameras' extent if
+            not.
+        learning_rates: Initial rate of each parameter; for positions in length units.
         decays: Final fraction of those rates that decay.
         beta2: Adam's: the fraction of the mean squared gradient kept at each step.
         sh_every: Steps between degrees of the spherical harmonics.
@@ -80,7 +81,7 @@ class Schedule:
         refine_every: Steps between densifications.
         reset_every: Steps between resets of the opacities, if enabled; also the step after which
             Gaussians that are too large are pruned.
-        prune_size: The size that is too large, in yardsticks.
+        prune_size: The size that is too large, in length units.
         growth: Factor by which MCMC grows the number of Gaussians at a time.
         noise: Factor on 3DGS's learning rate of positions, for MCMC's noise.
         penalty: Weight of mean opacity and of mean size in MCMC's loss.
@@ -117,7 +118,7 @@ class Schedule:
         return min(step // self.sh_every, highest)
 
     def rates(self, step: int) -> dict[str, float]:
-        """The learning rate of each parameter; positions' in yardsticks."""
+        """The learning rate of each parameter; positions' in length units."""
         return {name: rate * self.decay(name, step) for name, rate in self.learning_rates.items()}
 
     def decay(self, name: str, step: int) -> float:

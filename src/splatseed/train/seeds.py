@@ -1,7 +1,12 @@
-"""The points that a run starts from.
+"""The points that a run starts from, and its first Gaussians.
 
+Notation: N points; a *near depth* is the smallest depth at which a training view sees a point, the
+unit of its Gaussian's size and learning rate. A length divided by it is an angle, so a rate or size
+in near depths looks the same in the photographs wherever a Gaussian is: in front of closely spaced
+cameras, on a table between them, or far behind both. 3DGS uses the cameras' extent for all.
 Promise: points that are left out are reported; which ones are kept depends only on points and
-cameras; the points have the attributes that the run uses, and no others.
+cameras; the same bytes whatever the number of threads. No PyTorch, so that the same start can be
+written for other trainers: a run begins with exactly what is written.
 """
 
 from __future__ import annotations
@@ -13,13 +18,15 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Bool, Float, Float32
 
 from splatseed.io.output.earlier import saw_all_photographs, was_upsampled
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene
+from splatseed.splat.gaussians import Gaussians, initial_gaussians, stray_views, training_frame
+from splatseed.train.depths import stereo_size
 from splatseed.train.settings import AS_3DGS, TrainSettings
-from splatseed.train.stereo_size import stereo_size
 from splatseed.views.view import View
 
 if TYPE_CHECKING:
@@ -27,6 +34,15 @@ if TYPE_CHECKING:
 
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
 """Most seeds as a fraction of the cap, for strategies that add Gaussians; others may use it all."""
+MOST_PROJECTIONS = 20_000_000
+"""Limit on points times views: beyond it, an even subset of the views is used."""
+LEAST_VIEWS = 64
+"""But never fewer views than this."""
+MARGIN = 0.1
+"""A point outside the photograph by up to this fraction of its size counts as seen: a large
+Gaussian there reaches in."""
+NEAREST = 0.01
+"""The rasteriser's near plane: nothing nearer is drawn."""
 
 
 def most_seeds(settings: TrainSettings, cap: int) -> int:
@@ -82,7 +98,14 @@ def seeded(
         progress=progress,
         note=note,
     )
-    note(_made(scene, cloud, time.perf_counter() - start))
+    seconds, kept = time.perf_counter() - start, cloud.num_original
+    if len(scene.points):
+        made = (
+            f"{kept:,} points of the scene and {len(cloud) - kept:,} new ones, in {seconds:.0f} s"
+        )
+        note(f"Seeds by method auto: {made}. --seeds scene begins with the scene's points alone.")
+    else:
+        note(f"Seeds by method auto: {len(cloud):,} points, in {seconds:.0f} s.")
     return scene.replace(points=cloud), results[-1] if results else None
 
 
@@ -98,16 +121,6 @@ def why_not_seeded(scene: Scene, settings: TrainSettings) -> str:
     if was_upsampled(scene):
         return "splatseed upsample made the points, and training begins with them as they are"
     return ""
-
-
-def _made(scene: Scene, cloud: PointCloud, seconds: float) -> str:
-    if not len(scene.points):
-        return f"Seeds by method auto: {len(cloud):,} points, in {seconds:.0f} s."
-    kept = cloud.num_original
-    return (
-        f"Seeds by method auto: {kept:,} points of the scene and {len(cloud) - kept:,} new ones, "
-        f"in {seconds:.0f} s. --seeds scene begins with the scene's points as they are."
-    )
 
 
 def usable_seeds(
@@ -128,21 +141,25 @@ def usable_seeds(
         views: The training views, for their cameras and sizes; when left out, crowding is measured
             in space.
     """
-    finite = points.select(points.finite)
-    if len(finite) < len(points):
-        note(f"{len(points) - len(finite):,} points without finite coordinates were left out.")
-    return _without_unused(_within_cap(finite, settings, note, views), settings, note)
+    seeds = points.select(points.finite)
+    if len(seeds) < len(points):
+        note(f"{len(points) - len(seeds):,} points without finite coordinates were left out.")
+    if settings.cap is not None and len(seeds) > settings.cap:
+        seeds = _thinned(seeds, settings, settings.cap, note, views)
+    used = {"sizes": settings.seed_sizes, "normals": settings.seed_normals}
+    for name, asked in used.items():
+        if asked and np.isnan(seeds.attributes.get(name, np.nan)).all():
+            note(f"--seed-{name} has no effect: no seed has known {name}.")
+    return seeds.replace(**dict.fromkeys(n for n in seeds.attributes if not used.get(n)))
 
 
-def _within_cap(
+def _thinned(
     points: PointCloud,
     settings: TrainSettings,
+    cap: int,
     note: Callable[[str], None],
     views: Sequence[View],
 ) -> PointCloud:
-    cap = settings.cap
-    if cap is None or len(points) <= cap:
-        return points
     from splatseed.seeding.budget import thin  # noqa: PLC0415  (kernels load with use)
 
     # Thinning takes the earlier of equals: originals first.
@@ -158,17 +175,6 @@ def _within_cap(
     return seeds
 
 
-def _without_unused(
-    points: PointCloud, settings: TrainSettings, note: Callable[[str], None]
-) -> PointCloud:
-    """The points without the attributes that a run with these settings does not use."""
-    used = {"sizes": settings.seed_sizes, "normals": settings.seed_normals}
-    for name, asked in used.items():
-        if asked and np.isnan(points.attributes.get(name, np.nan)).all():
-            note(f"--seed-{name} has no effect: no seed has known {name}.")
-    return points.replace(**dict.fromkeys(n for n in points.attributes if not used.get(n)))
-
-
 def seeds_digest(seeds: PointCloud) -> str:
     """A fingerprint of positions, colours and attributes."""
     digest = hashlib.blake2b(seeds.xyz.tobytes(), digest_size=16)
@@ -176,3 +182,93 @@ def seeds_digest(seeds: PointCloud) -> str:
     for name, values in seeds.attributes.items():
         digest.update(name.encode() + values.tobytes())
     return digest.hexdigest()
+
+
+def first_gaussians(
+    seeds: PointCloud, views: Sequence[View], settings: TrainSettings
+) -> tuple[Gaussians, Float32[np.ndarray, " N"]]:
+    """One Gaussian per seed, and its near depth [N].
+
+    Args:
+        seeds: Finite points, in the training frame.
+        views: The training views, likewise.
+        settings: Their schedule gives sizes and opacities; they also say what is fitted.
+
+    Raises:
+        PointCloudError: Fewer than two distinct points.
+    """
+    lengths, schedule = near_depths(seeds.xyz, views), settings.schedule
+    harmonics = None
+    if settings.seed_colors:
+        from splatseed.splat.appearance import fit_harmonics  # noqa: PLC0415  (kernels load with use)
+
+        harmonics = fit_harmonics(seeds, views)
+    gaussians = initial_gaussians(
+        seeds,
+        sh_degree=settings.sh_degree,
+        opacity=schedule.opacity,
+        scale_factor=schedule.scale_factor,
+        largest=schedule.largest * lengths,
+        flatness=schedule.flatness,
+        harmonics=harmonics,
+    )
+    return gaussians, lengths
+
+
+def gaussians_of_scene(
+    cloud: PointCloud, views: Sequence[View], settings: TrainSettings
+) -> Gaussians:
+    """The initial Gaussians of training from a cloud, in the scene's world.
+
+    Args:
+        cloud: Seeds in the world; those without finite coordinates are left out.
+        views: Photographs with their cameras.
+        settings: As for ``first_gaussians``.
+
+    Raises:
+        PointCloudError: Fewer than two distinct finite points.
+    """
+    frame, strays = training_frame(views), stray_views(views)
+    near = [frame.view(view) for view in views if view.name not in strays]
+    seeds = frame.cloud_from_world(cloud.select(cloud.finite))
+    return frame.gaussians_to_world(first_gaussians(seeds, near, settings)[0])
+
+
+def near_depths(xyz: Float[np.ndarray, "N 3"], views: Sequence[View]) -> Float32[np.ndarray, " N"]:
+    """The smallest depth of each point among the views that see it; the median if none does.
+
+    Args:
+        xyz: Points.
+        views: The training views; see ``MOST_PROJECTIONS``.
+    """
+    nearest = np.full(len(xyz), np.inf)
+    columns = np.ascontiguousarray(xyz.T, np.float64)
+    # Evenly spaced views, the first and the last among them.
+    asked = max(LEAST_VIEWS, MOST_PROJECTIONS // max(1, len(xyz)))
+    for i in np.unique(np.linspace(0, len(views) - 1, min(asked, len(views))).round().astype(int)):
+        depths, seen = _seen_depths(columns, views[i])
+        np.minimum(nearest, np.where(seen, depths, np.inf), out=nearest)
+    known = np.isfinite(nearest)
+    # A point that no view sees gets no gradient; any positive length will do.
+    nearest[~known] = np.median(nearest[known]) if known.any() else 1.0
+    return np.asarray(np.maximum(nearest, NEAREST), np.float32)
+
+
+def _seen_depths(
+    columns: Float[np.ndarray, "3 N"], view: View
+) -> tuple[Float[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+    """Depths in a view, and whether points are in front of it and roughly within its frame."""
+    # Sums are written out: BLAS may add in another order when it has more threads.
+    x, y, depths = (
+        row[0] * columns[0] + row[1] * columns[1] + row[2] * columns[2] + row[3]
+        for row in view.cam_from_world[:3]
+    )
+    seen = depths > NEAREST
+    for across, focal, center, size in (
+        (x, view.K[0, 0], view.K[0, 2], view.width),
+        (y, view.K[1, 1], view.K[1, 2], view.height),
+    ):
+        # Multiplied by the depth, so that nothing is divided by zero.
+        seen &= focal * across >= (-MARGIN * size - center) * depths
+        seen &= focal * across <= ((1 + MARGIN) * size - center) * depths
+    return depths, seen

@@ -103,22 +103,19 @@ class TrainSettings:
     left alone."""
 
     def __post_init__(self) -> None:
-        choices = (
-            ("strategy", StrategyName),
-            ("backend", Backend),
-            ("placing", Placing),
-            ("seeding", Seeding),
-        )
-        for name, kind in choices:
+        choices = {
+            "strategy": StrategyName, "backend": Backend, "placing": Placing, "seeding": Seeding
+        }  # fmt: skip
+        for name, kind in choices.items():
             known = get_args(kind)
             self._require(name, getattr(self, name) in known, f"one of {', '.join(known)}")
-        for name, least in (("max_steps", 1), ("data_factor", 1), ("seed", 0), ("test_every", 2)):
-            self._require(name, getattr(self, name) >= least, f"{least} or more")
-        self._require(
-            "cap_max",
-            self.cap_max is None or self.cap_max >= LEAST_GAUSSIANS,
-            f"{LEAST_GAUSSIANS} or more",
-        )
+        bounds = {
+            "max_steps": 1, "data_factor": 1, "seed": 0, "test_every": 2,
+            "cap_max": LEAST_GAUSSIANS,
+        }  # fmt: skip
+        for name, least in bounds.items():
+            value = getattr(self, name)
+            self._require(name, value is None or value >= least, f"{least} or more")
         self._require("sh_degree", 0 <= self.sh_degree <= 3, "0 to 3")
 
     def _require(self, name: str, fits: bool, expected: str) -> None:

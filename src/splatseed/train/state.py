@@ -15,14 +15,18 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.output.staging import atomic_file
+from splatseed.train.device import Capacity
+from splatseed.train.growing import NOWHERE, Growing
 from splatseed.train.parameters import Optimizers, Parameters, as_parameters, make_optimizers
-from splatseed.train.record.curve import Record
+from splatseed.train.record import Record
 from splatseed.train.schedule import Schedule
-from splatseed.train.strategies import Strategy
+from splatseed.train.settings import TrainSettings
+from splatseed.train.strategies import Default, Mcmc, Strategy
 
 FORMAT = 4
 """Version of the checkpoint's content."""
@@ -58,7 +62,7 @@ class TrainState:
         records: The curve so far.
         watch: Time spent training.
         losses: Losses of the steps since the last record.
-        mean: Mean of the Gaussians over the end of the run; see ``averaging``.
+        mean: Mean of the Gaussians over the end of the run; see ``add_to_mean``.
     """
 
     params: Parameters
@@ -69,6 +73,30 @@ class TrainState:
     watch: Stopwatch = field(default_factory=Stopwatch)
     losses: list[Tensor] = field(default_factory=list)
     mean: dict[str, Any] = field(default_factory=dict)
+
+
+def make_strategy(
+    settings: TrainSettings,
+    device: torch.device | None = None,
+    depths: Mapping[str, Float[Tensor, "h w"]] = NOWHERE,
+) -> Strategy:
+    """The strategy named by the settings, on their schedule.
+
+    Args:
+        settings: How to train.
+        device: The device whose memory limits the number of Gaussians; the CPU by default.
+        depths: Known depths of the training views; see ``Growing``.
+    """
+    capacity = Capacity(settings.cap, device or torch.device("cpu"))
+    match settings.densification:
+        case "default":
+            return Default(settings, capacity)
+        case "mcmc":
+            return Mcmc(settings, capacity)
+        case "grow":
+            return Growing(settings, capacity, depths)
+        case "none":
+            return Strategy()
 
 
 def save_checkpoint(path: Path, state: TrainState) -> None:
@@ -107,11 +135,19 @@ def load_checkpoint(
     Raises:
         SceneFormatError: The file is no checkpoint of this version.
     """
-    content = _load(path, device)
+    found = "another kind or version of file"
     try:
-        return _state_of(content, strategy, schedule)
-    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise _misfit(path, f"parts that do not fit together ({type(error).__name__})") from None
+        with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
+            content = torch.load(path, map_location=device, weights_only=True)
+        if isinstance(content, dict) and content.get("format") == FORMAT:
+            return _state_of(content, strategy, schedule)
+    except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
+        found = f"a damaged file ({type(error).__name__})"
+    raise SceneFormatError(
+        f"{path} to be a checkpoint of this version of splatseed",
+        found=found,
+        fix="Start the run again with --overwrite.",
+    )
 
 
 def _state_of(content: Mapping[str, Any], strategy: Strategy, schedule: Schedule) -> TrainState:
@@ -126,22 +162,3 @@ def _state_of(content: Mapping[str, Any], strategy: Strategy, schedule: Schedule
     watch = Stopwatch(float(content["seconds"]))
     step, losses = int(content["step"]), list(content["losses"])
     return TrainState(params, optimizers, strategy, step, records, watch, losses, content["mean"])
-
-
-def _load(path: Path, device: torch.device) -> dict[str, Any]:
-    try:
-        with warnings.catch_warnings(action="ignore"):  # about what a foreign file might be
-            content = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:  # noqa: BLE001  (PyTorch raises anything for a damaged file)
-        raise _misfit(path, f"a file that cannot be read ({type(error).__name__})") from None
-    if isinstance(content, dict) and content.get("format") == FORMAT:
-        return content
-    raise _misfit(path, "another kind or version of file")
-
-
-def _misfit(path: Path, found: str) -> SceneFormatError:
-    return SceneFormatError(
-        f"{path} to be a checkpoint of this version of splatseed",
-        found=found,
-        fix="Start the run again with --overwrite.",
-    )

@@ -1,16 +1,18 @@
 """The training loop: render a view, compare it with its photograph, optimise, densify.
 
-Notation: a step shows one training view; all cameras are in the training frame. Promise: on the CPU
-equal settings and seeds give equal bytes, whatever the number of threads and however often the run
-was interrupted: the order of the photographs is drawn from (seed, epoch), and PyTorch's generator,
-which the strategies use, is set from (seed, step) before each step. On a GPU a step waits for it
-only where gsplat does.
+Notation: a step shows one training view; all cameras are in the training frame; images are
+[H, W, 3], values about 0..1. The loss is 3DGS's, (1 - s) L1 + s (1 - SSIM) with s = 0.2. Promise:
+on the CPU equal settings and seeds give equal bytes, whatever the number of threads and however
+often the run was interrupted: the order of the photographs is drawn from (seed, epoch), and
+PyTorch's generator, which the strategies use, is set from (seed, step) before each step. On a GPU a
+step waits for it only where gsplat does.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,12 +21,11 @@ from torch import Tensor
 
 from splatseed.process.allocator import keep_freed_memory
 from splatseed.process.interruption import interruption
-from splatseed.splat.metrics import psnr, ssim_of_all
+from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr, ssim_of_all
 from splatseed.splat.rendering import Photographs, photograph_of, render_view
-from splatseed.train.averaging import add_to_mean, take_mean
-from splatseed.train.losses import photometric_loss
-from splatseed.train.parameters import optimize
-from splatseed.train.record.curve import Record
+from splatseed.splat.ssim import l1_and_ssim
+from splatseed.train.parameters import add_to_mean, optimize, take_mean
+from splatseed.train.record import Record
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import TrainState
 from splatseed.views.view import View
@@ -33,6 +34,7 @@ RECORDS = 200
 """Number of records in the curve of a run."""
 TESTS = 20
 """Number of times the test views are rendered during a run."""
+SSIM_WEIGHT = 0.2
 
 
 class Trainer:
@@ -76,7 +78,8 @@ class Trainer:
             Whether the last step is done.
         """
         state = self.state
-        with interruption() as stop, torch.random.fork_rng(self._cuda_devices()):
+        gpus = [self.device] if self.device.type == "cuda" else []
+        with interruption() as stop, torch.random.fork_rng(gpus):
             state.watch.start()
             while state.step < self.settings.max_steps and not stop.requested:
                 render, photograph = self._advance(state.step)
@@ -109,8 +112,10 @@ class Trainer:
         """Take one step; returns the render and the photograph."""
         state, schedule = self.state, self.settings.schedule
         params, optimizers, strategy = state.params, state.optimizers, state.strategy
-        self._seed_generators(_step_seed(self.settings.seed, step))
-        view = self.train_views[self._view_index(step)]
+        self._seed_generators(step)
+        epoch, position = divmod(step, len(self.train_views))
+        order = _epoch_order(self.settings.seed, epoch, len(self.train_views))
+        view = self.train_views[order[position]]
         photograph = self._photographs.of(view)
         render, info = render_view(params, view, schedule.sh_degree(step, self.settings.sh_degree))
         # gsplat's strategies ask PyTorch to retain the gradient of the 2D means here.
@@ -124,23 +129,20 @@ class Trainer:
         optimize(params, optimizers, schedule.rates(step))
         strategy.observe(params, view, render, photograph, step)
         strategy.after(params, optimizers, step, info)
-        self._average(step + 1)
+        if schedule.mean_from is not None and step >= schedule.mean_from:
+            add_to_mean(state.mean, params)
+            if step + 1 == self.settings.max_steps:
+                take_mean(params, state.mean)
         self.is_whole = True
         return render.detach(), photograph
 
-    def _seed_generators(self, seed: int) -> None:
+    def _seed_generators(self, step: int) -> None:
         """As ``torch.manual_seed``, which also formats the stack for devices that are not used."""
+        words = np.random.SeedSequence([self.settings.seed, step]).generate_state(1, np.uint64)
+        seed = int(words[0] >> 1)  # 63 bits: PyTorch's seeds are signed
         torch.default_generator.manual_seed(seed)
         if self.device.type == "cuda":
             torch.cuda.manual_seed(seed)
-
-    def _average(self, steps_done: int) -> None:
-        """Average the Gaussians over the end of a run; the last step leaves their mean."""
-        begin, state = self.settings.schedule.mean_from, self.state
-        if begin is not None and steps_done > begin:
-            add_to_mean(state.mean, state.params)
-            if steps_done == self.settings.max_steps:
-                take_mean(state.params, state.mean)
 
     def _record(self, render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]) -> None:
         """Note how far the run is; the clock stands still meanwhile."""
@@ -172,18 +174,11 @@ class Trainer:
         # Evenly spread over the run, and always at its last step.
         return step * times // last > (step - 1) * times // last
 
-    def _view_index(self, step: int) -> int:
-        epoch, position = divmod(step, len(self.train_views))
-        return int(_epoch_order(self.settings.seed, epoch, len(self.train_views))[position])
-
     @property
     def device(self) -> torch.device:
         """Where the Gaussians are."""
         means: Tensor = self.state.params["means"]
         return means.device
-
-    def _cuda_devices(self) -> list[torch.device]:
-        return [self.device] if self.device.type == "cuda" else []
 
 
 @lru_cache(maxsize=2)
@@ -192,6 +187,59 @@ def _epoch_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " V"]:
     return np.random.default_rng([seed, epoch]).permutation(count)
 
 
-def _step_seed(seed: int, step: int) -> int:
-    # 63 bits: PyTorch's seeds are signed.
-    return int(np.random.SeedSequence([seed, step]).generate_state(1, np.uint64)[0] >> 1)
+def photometric_loss(
+    render: Float[Tensor, "H W 3"], photograph: Float[Tensor, "H W 3"]
+) -> Float[Tensor, ""]:
+    """0.8 L1 + 0.2 (1 - SSIM), differentiable in ``render`` (Kerbl et al. 2023, eq. 7).
+
+    On a GPU the fused kernel of the package ``fused-ssim`` serves where it is installed.
+
+    Args:
+        render: The rendered view, float32; at least 11 pixels a side.
+        photograph: The view as captured, likewise.
+    """
+    fused = _fused_ssim() if render.is_cuda else None
+    if fused is None:
+        loss: Tensor = _Loss.apply(render, photograph)
+        return loss
+    l1 = (render - photograph).abs().mean()
+    x, y = (image.permute(2, 0, 1)[None].contiguous() for image in (render, photograph))
+    return (1 - SSIM_WEIGHT) * l1 + SSIM_WEIGHT * (1 - fused(x, y, padding="valid"))
+
+
+@lru_cache
+def _fused_ssim() -> Callable[..., Tensor] | None:
+    """The function of the package fused-ssim, None without it."""
+    try:
+        from fused_ssim import fused_ssim  # noqa: PLC0415  (optional)
+    except ImportError:
+        return None
+    return fused_ssim  # type: ignore[no-any-return]  # it has no types
+
+
+class _Loss(torch.autograd.Function):
+    """The loss and the analytic gradient of both of its parts, which ends the graph.
+
+    On the CPU in one Numba pass, whose bytes do not depend on the number of threads; on a GPU by a
+    few convolutions without TF32.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, render: Tensor, photograph: Tensor) -> Tensor:
+        weights = 1 - SSIM_WEIGHT, SSIM_WEIGHT
+        if render.device.type == "cpu":
+            arrays = render.detach().contiguous().numpy(), photograph.contiguous().numpy()
+            l1, similarity, slopes = l1_and_ssim(*arrays, *weights)
+            ctx.save_for_backward(torch.from_numpy(slopes))
+            return torch.tensor(weights[0] * l1 + weights[1] * (1 - similarity))
+        of_l1, of_ssim, gradient = l1_and_ssim_by_convolution(render, photograph, *weights)
+        ctx.save_for_backward(gradient)
+        return weights[0] * of_l1 + weights[1] * (1 - of_ssim)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        # backward mostly starts at the loss, and multiplying by one takes a whole pass; on a GPU
+        # looking at the number would wait.
+        at_loss = gradient.device.type == "cpu" and float(upstream[0]) == 1.0
+        return gradient if at_loss else gradient * upstream[0], None

@@ -19,7 +19,7 @@ from splatseed.io import load_scene
 from splatseed.io.files import read_bytes
 from splatseed.scene import Scene
 from splatseed.splat.gaussians import Gaussians
-from splatseed.train.record.folder import RunFolder
+from splatseed.train.folder import RunFolder
 
 MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
 _HEADER = 1 << 16

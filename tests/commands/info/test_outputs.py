@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatseed.io import load_scene, write_scene
-from splatseed.train.record.folder import RunFolder
+from splatseed.train.folder import RunFolder
 from splatseed.upsample import upsample
 
 

@@ -33,7 +33,7 @@ from splatseed.process import gsplat_kernels
 from splatseed.splat import rendering
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.train import TrainSettings, losses, prepare_run, trainer
+from splatseed.train import TrainSettings, prepare_run, trainer
 from splatseed.train.run import RunOptions
 from splatseed.viewer import pictures
 from splatseed.viewer.renderer import model_frame
@@ -210,7 +210,7 @@ def _pair():
 
 def _loss(x, y):
     x = x.clone().requires_grad_()
-    value = losses.photometric_loss(x, y)
+    value = trainer.photometric_loss(x, y)
     value.backward()
     return float(value.detach()), x.grad.cpu()
 
@@ -245,7 +245,7 @@ def test_the_loss_takes_few_operators():
         _loss(x, y)  # the window is copied once
         pc.COUNTS.clear()
         x.requires_grad_()
-        losses.photometric_loss(x, y).backward()
+        trainer.photometric_loss(x, y).backward()
     assert pc.COUNTS["launch"] <= 80  # of them about half are views, which launch nothing
 
 
@@ -258,11 +258,11 @@ def test_fused_ssim_is_taken_where_it_is_installed(monkeypatch):
 
     module = types.SimpleNamespace(fused_ssim=fused_ssim)
     monkeypatch.setitem(sys.modules, "fused_ssim", module)
-    losses._fused_ssim.cache_clear()
+    trainer._fused_ssim.cache_clear()
     x, y = _pair()
     with pc.pretended_gpu():
         found, _ = _loss(x.to("cuda"), y.to("cuda"))
-    losses._fused_ssim.cache_clear()
+    trainer._fused_ssim.cache_clear()
     assert calls == [((1, 3, 40, 31), True, "valid")]
     expected = 0.8 * (x - y).abs().mean() + 0.2 * (1 - (x - y).mean())
     assert found == pytest.approx(float(expected), rel=1e-6)

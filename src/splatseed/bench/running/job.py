@@ -37,7 +37,7 @@ from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
 from splatseed.seeding.upsampling import DEFAULT_METHOD
-from splatseed.train.stereo_size import stereo_size
+from splatseed.train.depths import stereo_size
 from splatseed.views.photographs import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while

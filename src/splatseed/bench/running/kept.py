@@ -16,7 +16,7 @@ from pathlib import Path
 from splatseed.bench.planning.records import RunResult, RunSpec
 from splatseed.io.files import read_text
 from splatseed.io.output.staging import output_folder
-from splatseed.train.record.folder import RunFolder
+from splatseed.train.folder import RunFolder
 
 RESULT = "result.json"
 ERROR = "error.txt"

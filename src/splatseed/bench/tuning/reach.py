@@ -14,7 +14,7 @@ from splatseed.train.schedule import FULL_RUN, make_schedule
 
 def growth_within(steps: int) -> float:
     """The factor by which ``grow`` is sure to multiply its Gaussians in a run of so many steps."""
-    from splatseed.train.strategies.growing import FASTEST  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.train.growing import FASTEST  # noqa: PLC0415  (imports PyTorch)
 
     schedule = make_schedule("grow", steps, as_3dgs=False)
     rounds = schedule.refine_stop // schedule.refine_every

@@ -41,7 +41,7 @@ from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
 from splatseed.seeding.amounts import parse_budget
-from splatseed.train.record.folder import RunFolder
+from splatseed.train.folder import RunFolder
 from splatseed.train.seeds import why_not_seeded
 from splatseed.train.settings import (
     AS_IT_IS,

@@ -10,8 +10,8 @@ from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views
 from splatseed.splat.ply import write_gaussians
+from splatseed.train.seeds import gaussians_of_scene
 from splatseed.train.settings import TrainSettings
-from splatseed.train.start import gaussians_of_scene
 from splatseed.upsample import Upsampler
 
 

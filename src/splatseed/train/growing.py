@@ -1,33 +1,39 @@
 """Strategy ``grow``: a fixed budget, spent where renders are still wrong.
 
-Notation: for each Gaussian, over the views looked at since the last round: *pixels* c = sum w,
-*error* E = sum w e with e the absolute error of a pixel (see ``contributions``), and *most pixels*,
-c in the one view where it is largest. A quarter of the added Gaussians come from splitting those
-that contribute to wrong pixels; the others are new, on wrong pixels whose depth is known (see
-``placing``). Promise: the number of Gaussians never exceeds the budget; which ones grow depends
-only on the views and the seed. Growing by the error that a Gaussian contributes to follows S. Rota
-Bulo et al., "Revising Densification in Gaussian Splatting" (2024); what is removed, when, and the
-normalisation of the error were chosen on held-out training views (benchmarks/training/README.md).
+Notation: w_ip is the weight of Gaussian i in pixel p, its alpha times the transmittance in front of
+it, so that pixel p is sum_i w_ip c_i; e is the absolute error of a pixel, d its planar depth in
+training units. For each Gaussian, over the views looked at since the last round: *pixels*
+c = sum w, *error* E = sum w e, and *most pixels*, c in the one view where it is largest. A
+*candidate* is a pixel drawn as a place for a Gaussian.
+
+A quarter of the added Gaussians come from splitting those that contribute to wrong pixels; the
+others are new, on wrong pixels whose depth is known, where splitting, which adds beside existing
+Gaussians, does not reach: a leaf, a rod, a piece of wall without a seed. Promise: the number of
+Gaussians never exceeds the budget; which ones grow depends only on the views and PyTorch's
+generator; candidates lie on pixels with known depth and nonzero error. Growing by the error that a
+Gaussian contributes to follows S. Rota Bulo et al., "Revising Densification in Gaussian Splatting"
+(2024); what is removed, when, and the normalisation of the error were chosen on held-out training
+views (benchmarks/training/README.md).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
 import torch
-from gsplat.strategy.ops import remove, split
-from jaxtyping import Bool, Float
+from gsplat.strategy.ops import duplicate, remove, split
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from splatseed.splat.gaussians import SH_C0
+from splatseed.splat.rendering import camera_of, render_features
 from splatseed.train.device import Capacity
-from splatseed.train.parameters import Optimizers, Parameters, yardsticks
+from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters, length_units
 from splatseed.train.settings import TrainSettings
-from splatseed.train.strategies.base import Strategy
-from splatseed.train.strategies.contributions import contributions
-from splatseed.train.strategies.placing import add_candidates, draw_candidates, join_candidates
+from splatseed.train.strategies import Strategy
 from splatseed.views.view import View
 
 LOOK_EVERY = 2
@@ -52,7 +58,16 @@ PLACED = 0.75
 NOWHERE: Mapping[str, Tensor] = MappingProxyType({})
 """No view's depth is known."""
 LEAST_VIEWS = 2
-"""Looks that must have shown a Gaussian before it is removed for its contribution."""
+"""Minimum observations before a Gaussian is removed for its contribution."""
+
+Candidates = Mapping[str, Tensor]
+"""``means`` [M, 3], ``colors`` [M, 3] from the photograph, 0 to 1, ``depths`` [M], and ``sizes``
+[M], standard deviations: training units; while they are collected also ``valid`` [M], bool."""
+OPACITY = 0.6
+"""Opacity of a new Gaussian. It stands on a surface; a fainter one takes the rest of the run to
+show."""
+SIZE = 1.0
+"""Standard deviation of a new Gaussian, in pixels of its view."""
 
 
 class Growing(Strategy):
@@ -62,7 +77,7 @@ class Growing(Strategy):
         settings: How to train.
         capacity: The budget.
         depths: Of each training view, by its name, planar depth in training units, 0 where it is
-            unknown; see ``placing``. Without them growth only splits.
+            unknown. Without them growth only splits.
     """
 
     capacity: Capacity
@@ -143,7 +158,7 @@ class Growing(Strategy):
     def _needless(self, params: Parameters) -> Bool[Tensor, " N"]:
         """Which Gaussians are removed: faint, too large, or with the least contribution."""
         sums, count = self._sums(params), len(params["means"])
-        sizes = torch.exp(params["scales"].detach()).amax(dim=-1) / yardsticks(params)
+        sizes = torch.exp(params["scales"].detach()).amax(dim=-1) / length_units(params)
         shown = sums["views"] >= LEAST_VIEWS
         # Nearly transparent, ...
         needless = torch.sigmoid(params["opacities"].detach()) < FAINT
@@ -198,3 +213,127 @@ class Growing(Strategy):
 def _least(most_pixels: Float[Tensor, " M"]) -> float:
     """The fewest pixels that are worth a Gaussian, given those of the Gaussians shown."""
     return min(LEAST_PIXELS, LEAST_PART * float(most_pixels.mean())) if len(most_pixels) else 0.0
+
+
+def contributions(
+    params: Parameters, view: View, error: Float[Tensor, "H W"]
+) -> tuple[Float[Tensor, " N"], Float[Tensor, " N"]]:
+    """Each Gaussian's pixels, sum_p w_ip, and the error in them, sum_p w_ip e_p.
+
+    Any rasteriser gives sums of weights as a gradient: of sum_p f_p sum_i w_ip c_i with respect to
+    c_i. The Gaussians and their gradients are left unchanged.
+
+    Args:
+        params: The parameter dict, in the frame of the view's camera.
+        view: The view whose camera is used.
+        error: The error e of each pixel.
+
+    Returns:
+        Pixels and errors; 0 where the view does not see a Gaussian.
+    """
+    means = params["means"]
+    with torch.enable_grad():
+        # Two channels of ones: their gradients are sum_p w_ip, plain or weighted by e_p.
+        colors = means.new_ones((len(means), 2)).requires_grad_()
+        frozen = {name: value.detach() for name, value in params.items()}
+        plain, weighted = render_features(frozen, view, colors).unbind(-1)
+        (plain.sum() + (weighted * error).sum()).backward()
+    assert colors.grad is not None  # noqa: S101  (backward made it)
+    pixels, errors = colors.grad.unbind(-1)
+    return pixels, errors
+
+
+def draw_candidates(
+    view: View,
+    depth: Float[Tensor, "h w"],
+    error: Float[Tensor, "H W"],
+    photograph: Float[Tensor, "H W 3"],
+    count: int,
+) -> Candidates:
+    """Draw pixels of known depth with probability proportional to e^2.
+
+    There are always ``count``; those drawn twice or without depth are not ``valid``, and
+    ``join_candidates`` leaves them out: a number that the GPU had to tell would be waited for.
+
+    Args:
+        view: The view, in the training frame.
+        depth: d, 0 where unknown; of any size, covering the whole photograph.
+        error: The error e.
+        photograph: Colours of new Gaussians, 0 to 1.
+        count: The number of draws.
+    """
+    height, width = error.shape
+    # The map is coarser: each pixel takes the depth of the map's pixel that covers it.
+    rows = torch.arange(height, device=depth.device) * depth.shape[0] // height
+    columns = torch.arange(width, device=depth.device) * depth.shape[1] // width
+    d = depth[rows[:, None], columns].flatten()
+    # In float64, so that the sum over a large photograph still grows with its last pixels.
+    worth = torch.where(d > 0, error.flatten() ** 2, 0.0).double().cumsum(0)
+    # Inverse of the cumulative sum: pixel p is drawn with probability e_p^2 / sum e^2.
+    drawn = torch.rand(count, dtype=torch.float64, device=worth.device) * worth[-1]
+    pixels = torch.searchsorted(worth, drawn, right=True).sort().values
+    valid = (pixels < len(d)) & (worth[-1] > 0)
+    valid[1:] &= pixels[1:] != pixels[:-1]
+    pixels = pixels.clamp(max=len(d) - 1)
+    d = d[pixels]
+    return {
+        "valid": valid,
+        "means": _unproject(view, pixels, d),
+        "colors": photograph.reshape(-1, 3)[pixels],
+        "depths": d,
+        "sizes": SIZE * d / float(view.K[0, 0]),
+    }
+
+
+def _unproject(
+    view: View, pixels: Int[Tensor, " M"], d: Float[Tensor, " M"]
+) -> Float[Tensor, "M 3"]:
+    """The pixels' centres in the training frame: x = R^T (d K^-1 (u, v, 1) - t)."""
+    u = (pixels % view.width + 0.5 - float(view.K[0, 2])) / float(view.K[0, 0])
+    v = (pixels // view.width + 0.5 - float(view.K[1, 2])) / float(view.K[1, 1])
+    pose = camera_of(view, d.device).cam_from_world
+    in_camera = torch.stack([u * d, v * d, d], dim=1).double()
+    return ((in_camera - pose[:3, 3]) @ pose[:3, :3]).float()
+
+
+def join_candidates(draws: Sequence[Candidates]) -> Candidates:
+    """The valid candidates of all draws, in order."""
+    joined = {name: torch.cat([each[name] for each in draws]) for name in draws[0]}
+    valid = joined.pop("valid").nonzero().squeeze(1)  # a GPU is waited for once, not for each
+    return {name: values[valid] for name, values in joined.items()}
+
+
+@torch.no_grad()
+def add_candidates(
+    params: Parameters, optimizers: Optimizers, candidates: Candidates, count: int
+) -> int:
+    """Turn ``count`` candidates, drawn uniformly, into round Gaussians of one colour.
+
+    Returns:
+        How many were made: fewer if there are not enough candidates or Gaussians.
+    """
+    number = len(params["means"])
+    count = min(count, len(candidates["depths"]), number)
+    if count <= 0:
+        return 0
+    device = params["means"].device
+    some = torch.randperm(len(candidates["depths"]), device=device)[:count]
+    chosen = {name: values.to(device)[some] for name, values in candidates.items()}
+    # Copies of arbitrary ones have the right shapes and zero moments; then they get their own
+    # values.
+    copied = torch.zeros(number, dtype=torch.bool, device=device)
+    copied[:count] = True
+    duplicate(params, optimizers, {}, copied)
+    new = {
+        "means": chosen["means"],
+        "scales": torch.log(chosen["sizes"])[:, None].expand(-1, 3),
+        "quats": torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).expand(count, 4),
+        "opacities": torch.logit(torch.full((count,), OPACITY, device=device)),
+        # colour = 1/2 + C0 sh0
+        "sh0": ((chosen["colors"] - 0.5) / SH_C0)[:, None],
+        "shN": torch.zeros_like(params["shN"][:count]),
+        NEAR_DEPTHS: chosen["depths"],
+    }
+    for name, value in params.items():
+        value[number:] = new[name]
+    return count

@@ -1,16 +1,14 @@
-"""gsplat's strategies behind one small interface.
+"""The interface of strategies, and gsplat's behind it; splatseed's own is in ``growing``.
 
-Notation: ``info`` is the rasteriser's; ``before`` runs before the backward pass, ``after`` after
-the optimisers. Promise: both backends run subclasses of gsplat's strategies, which hold growth to a
-cap and to the memory, and MCMC's growth and noise to splatseed's conventions; ``state`` is all that
-a checkpoint must hold. gsplat 1.5.3 never resets opacities (it writes ``step % reset_every == 0 &
-step > 0``, which is always false), so resetting is an option here.
+Notation: ``info`` is the rasteriser's. Promise: both backends run subclasses of gsplat's
+strategies, which hold growth to a cap and to the memory, and MCMC's growth and noise to splatseed's
+conventions; ``state`` is all that a checkpoint must hold. gsplat 1.5.3 never resets opacities (it
+writes ``step % reset_every == 0 & step > 0``, which is always false): resetting is an option here.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -22,17 +20,43 @@ from torch import Tensor
 from splatseed.render import MCMCStrategy
 from splatseed.splat.gaussians import SCENE_SCALE
 from splatseed.train.device import Capacity
-from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters, yardsticks
-from splatseed.train.schedule import LEARNING_RATES
+from splatseed.train.parameters import NEAR_DEPTHS, Optimizers, Parameters, length_units
+from splatseed.train.schedule import LEARNING_RATES, Schedule
 from splatseed.train.settings import TrainSettings
-from splatseed.train.strategies.base import Strategy
+from splatseed.views.view import View
 
 
-class Fixed(Strategy):
-    """The seeds only: Gaussians are neither added nor removed."""
+class Strategy:
+    """Changes the number of Gaussians; this one, ``none``, does not.
+
+    Attributes:
+        state: What it remembers from step to step, for checkpoints.
+        capacity: How many Gaussians it may make; None if it makes none.
+    """
+
+    def __init__(self, capacity: Capacity | None = None) -> None:
+        self.state: dict[str, Any] = {}
+        self.capacity = capacity
+
+    def regularization(self, params: Parameters) -> Float[Tensor, ""] | None:  # noqa: ARG002  (the interface's name)
+        """A term to add to the loss."""
+        return None
+
+    def before(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
+        """Called before the backward pass."""
+
+    def observe(
+        self,
+        params: Parameters,
+        view: View,
+        render: Float[Tensor, "H W 3"],
+        photograph: Float[Tensor, "H W 3"],
+        step: int,
+    ) -> None:
+        """Called after the optimisers, with the result of the step."""
 
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
-        """Change nothing."""
+        """Called after ``observe``; may replace parameters and their moments."""
 
 
 class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
@@ -45,17 +69,20 @@ class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
     capacity: Capacity
     grow_grad2d: float
 
-    def _update_state(
-        self, params: Parameters, state: Any, info: Any, packed: bool = False
-    ) -> None:
-        if packed:
-            super()._update_state(params, state, info, packed)
-            return
+    def _update_state(self, params: Parameters, state: Any, info: Any, packed: bool) -> None:
+        assert not packed  # noqa: S101  (``info`` lists all Gaussians)
         means = params["means"]
         for name in ("grad2d", "count"):
             if state[name] is None:
                 state[name] = torch.zeros(len(means), device=means.device)
-        _add_gradients(state, info)
+        radii, half_cameras = info["radii"], info["n_cameras"] / 2.0
+        seen = (radii[..., 0] > 0) & (radii[..., 1] > 0)
+        x, y = info["means2d"].grad.unbind(-1)
+        # gsplat's units: gradients by normalised image coordinates, -1 to 1, whatever the size.
+        x, y = x * (info["width"] * half_cameras), y * (info["height"] * half_cameras)
+        for camera, lengths in enumerate(torch.hypot(x, y)):
+            state["grad2d"] += lengths
+            state["count"] += seen[camera]
 
     def _grow_gs(self, params: Parameters, optimizers: Any, state: Any, step: int) -> Any:
         wanted = self.grow_grad2d
@@ -78,18 +105,6 @@ class Capped(DefaultStrategy):  # type: ignore[misc]  # gsplat has no types
         return max(self.grow_grad2d, float(torch.topk(gradients, room + 1).values[-1]))
 
 
-def _add_gradients(state: Any, info: Any) -> None:
-    """Count each visible Gaussian, and add up the lengths of the gradients of its 2D mean."""
-    radii, half_cameras = info["radii"], info["n_cameras"] / 2.0
-    seen = (radii[..., 0] > 0) & (radii[..., 1] > 0)
-    x, y = info["means2d"].grad.unbind(-1)
-    # gsplat's units: gradients by normalised image coordinates, -1 to 1, whatever the size.
-    lengths = torch.hypot(x * (info["width"] * half_cameras), y * (info["height"] * half_cameras))
-    for camera in range(info["n_cameras"]):
-        state["grad2d"] += lengths[camera]
-        state["count"] += seen[camera]
-
-
 class Default(Strategy):
     """3DGS's densification: clone and split where the image gradient is large, prune the faint."""
 
@@ -105,7 +120,7 @@ class Default(Strategy):
             refine_every=schedule.refine_every,
             # gsplat also begins to prune by size after this many steps.
             reset_every=schedule.reset_every,
-            # Larger Gaussians, in yardsticks, are removed: 0.1.
+            # Larger Gaussians, in length units, are removed: 0.1.
             prune_scale3d=schedule.prune_size,
         )
         self.inner.capacity = capacity
@@ -119,18 +134,14 @@ class Default(Strategy):
     def after(self, params: Parameters, optimizers: Optimizers, step: int, info: Any) -> None:
         """Clone, split, prune, and reset opacities if enabled."""
         # gsplat takes one number here, or one per Gaussian like the rest of its state.
-        self.state["scene_scale"] = yardsticks(params) if NEAR_DEPTHS in params else SCENE_SCALE
+        self.state["scene_scale"] = length_units(params) if NEAR_DEPTHS in params else SCENE_SCALE
         self.inner.step_post_backward(params, optimizers, self.state, step, info)
-        if self._resets_at(step):
+        while_refining = self.resets and 0 < step < self.inner.refine_stop_iter
+        if while_refining and step % self.inner.reset_every == 0:
             # Twice the opacity at which Gaussians are pruned: those that matter recover, others go.
             reset_opa(params, optimizers, self.state, value=2 * self.inner.prune_opa)
 
-    def _resets_at(self, step: int) -> bool:
-        while_refining = self.resets and 0 < step < self.inner.refine_stop_iter
-        return while_refining and step % self.inner.reset_every == 0
 
-
-@dataclass
 class _Bounded(MCMCStrategy):
     """gsplat's strategy, but it may grow faster, and never beyond the memory.
 
@@ -139,20 +150,19 @@ class _Bounded(MCMCStrategy):
     photographs is then the same there wherever the Gaussian is.
     """
 
-    capacity: Capacity | None = None
-    growth: float = 1.0
-    noise: float = 0.0
+    capacity: Capacity
+    schedule: Schedule
 
     def set_noise(self, params: Parameters) -> None:
         """Called before each step, and whenever the number of Gaussians changes."""
         if NEAR_DEPTHS in params:
             # gsplat: noise = covariance x normal x lr x noise_lr
-            self.noise_lr = self.noise / yardsticks(params)[:, None]
+            self.noise_lr = self.schedule.noise / length_units(params)[:, None]
 
     def _add_new_gs(self, params: Parameters, optimizers: Any, binoms: Any) -> int:
-        assert self.capacity is not None  # noqa: S101  (given in ``Mcmc``)
         count = len(params["means"])
-        added = max(0, self.capacity.limit(count, int(self.growth * count)) - count)
+        # Gaussians grow by 5% a round, by more where rounds are fewer; up to the cap.
+        added = max(0, self.capacity.limit(count, int(self.schedule.growth * count)) - count)
         if added:
             sample_add(params, optimizers, {}, added, binoms, self.min_opacity)
         self.set_noise(params)
@@ -166,23 +176,20 @@ class Mcmc(Strategy):
         super().__init__(capacity)
         self.schedule = schedule = settings.schedule
         self.inner = _Bounded(
-            capacity=capacity,
-            # Gaussians grow by 5% a round, by more where rounds are fewer; up to the cap.
-            growth=schedule.growth,
             # 5e5 times the rate of positions: faint Gaussians wander, opaque ones stay.
-            noise=schedule.noise,
             noise_lr=schedule.noise,
             refine_start_iter=schedule.refine_start,
             refine_stop_iter=schedule.refine_stop,
             refine_every=schedule.refine_every,
         )
+        self.inner.capacity, self.inner.schedule = capacity, schedule
         self.state = self.inner.initialize_state()
 
     def regularization(self, params: Parameters) -> Float[Tensor, ""]:
         """Mean opacity and mean size, weighted."""
         opacities, sizes = torch.sigmoid(params["opacities"]), torch.exp(params["scales"])
         if NEAR_DEPTHS in params:
-            sizes = sizes / yardsticks(params)[:, None]
+            sizes = sizes / length_units(params)[:, None]
         # 0.01 (mean opacity + mean size): needless Gaussians fade, and are relocated.
         return self.schedule.penalty * (opacities.mean() + sizes.mean())
 

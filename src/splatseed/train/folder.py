@@ -11,7 +11,6 @@ import secrets
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,60 +25,33 @@ KIND = "train"
 """The kind recorded in a run folder's manifest."""
 
 
-@dataclass(frozen=True)
 class RunFolder:
     """A run's folder.
 
-    Args:
+    Attributes:
         path: Where it is, or will be.
+        config: The scene and the settings, as JSON.
+        checkpoint: The state from which an unfinished run is resumed.
+        metrics: The scores, as JSON; written once the run has finished.
+        gaussians: The trained Gaussians.
+        curve_csv: The curve as a table.
+        curve_png: The curve as a picture.
+        renders: Test views beside their photographs.
+        tensorboard: TensorBoard's log, if asked for.
+        scene: The scene at refined poses, if the run refined them.
     """
 
-    path: Path
-
-    @property
-    def config(self) -> Path:
-        """The scene and the settings, as JSON."""
-        return self.path / "config.json"
-
-    @property
-    def checkpoint(self) -> Path:
-        """The state from which an unfinished run is resumed."""
-        return self.path / "checkpoint.pt"
-
-    @property
-    def metrics(self) -> Path:
-        """The scores, as JSON; written once the run has finished."""
-        return self.path / "metrics.json"
-
-    @property
-    def gaussians(self) -> Path:
-        """The trained Gaussians."""
-        return self.path / "point_cloud.ply"
-
-    @property
-    def curve_csv(self) -> Path:
-        """The curve as a table."""
-        return self.path / "curve.csv"
-
-    @property
-    def curve_png(self) -> Path:
-        """The curve as a picture."""
-        return self.path / "curve.png"
-
-    @property
-    def renders(self) -> Path:
-        """Test views beside their photographs."""
-        return self.path / "renders"
-
-    @property
-    def tensorboard(self) -> Path:
-        """TensorBoard's log, if asked for."""
-        return self.path / "tensorboard"
-
-    @property
-    def scene(self) -> Path:
-        """The scene at refined poses, if the run refined them."""
-        return self.path / "scene"
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config = path / "config.json"
+        self.checkpoint = path / "checkpoint.pt"
+        self.metrics = path / "metrics.json"
+        self.gaussians = path / "point_cloud.ply"
+        self.curve_csv = path / "curve.csv"
+        self.curve_png = path / "curve.png"
+        self.renders = path / "renders"
+        self.tensorboard = path / "tensorboard"
+        self.scene = path / "scene"
 
     @property
     def is_run(self) -> bool:
