@@ -46,8 +46,6 @@ ORDER = (
     "upsample",
     "tiles",
     "seeding",
-    "diagnostics",
-    "preview",
     "synthetic",
     "sfm",
     "monocular",
@@ -56,7 +54,7 @@ ORDER = (
     "export",
     "evaluate",
     "train",
-    "viewer",
+    "view",
     "bench",
     "console",
     "commands",
@@ -341,13 +339,13 @@ def test_dependencies_are_those_that_are_imported():
         needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
         needed -= {"fused_ssim"} if path.name == "trainer.py" else set()  # taken where it is there
         part = path.relative_to(SOURCE).parts[0]
-        trains = part in {"render", "splat", "evaluate.py", "train", "viewer", "commands"}
+        trains = part in {"render", "splat", "evaluate.py", "train", "view", "commands"}
         # These load torch, and gsplat's kernels, for those rooms.
         trains = trains or path.name in {"torch_device.py", "gsplat_kernels.py"}
         allowed = base | more if trains else base
         allowed = base | names["depth"] if part == "monocular" else allowed
         allowed = base | names["cluster"] if path.name == "ray_tasks.py" else allowed
-        if part in {"export", "viewer", "commands", "sfm"}:
+        if part in {"export", "view", "commands", "sfm"}:
             allowed = allowed | names["view"]
         if path.parent.name == "clouds":
             allowed = allowed | names["scan"]

@@ -14,7 +14,6 @@ import os
 import threading
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import tyro
@@ -24,10 +23,10 @@ from benchmarks.rendering.splats import make_workload
 from PIL import Image
 
 from splatseed.splat.gaussians import training_frame
-from splatseed.viewer.live import FrameLoop
-from splatseed.viewer.paths import smooth_path
-from splatseed.viewer.pictures import Entry
-from splatseed.viewer.shown import Shown
+from splatseed.view.flights import smooth_path
+from splatseed.view.models import Shown
+from splatseed.view.pictures import Entry
+from splatseed.view.session import FrameLoop
 from splatseed.views.view import View
 
 QUALITY = 70
@@ -101,7 +100,7 @@ def main(options: Options) -> None:
     """Print the tables."""
     warn_if_busy()
     workload = make_workload(options.gaussians, *options.size)
-    shown = Shown("room", Path("room"), None, workload.gaussians)
+    shown = Shown("room", None, workload.gaussians)
     entry = Entry(shown, training_frame(workload.views))
     path = smooth_path(workload.views, 600, options.size)
     for quick in (True, False):  # compiles, and prepares what is kept

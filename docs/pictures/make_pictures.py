@@ -23,17 +23,17 @@ from PIL import Image as PillowImage, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
 import splatseed as ss
-from splatseed.commands.info.depth_picture import write_depth_picture
 from splatseed.depth import align
-from splatseed.diagnostics.geometry import spacing
 from splatseed.io import find_depths
 from splatseed.io.depth.folder import depth_folder
 from splatseed.io.output.staging import atomic_file
-from splatseed.preview import choose_camera, render_points
 from splatseed.scene import Image
+from splatseed.seeding.diagnostics import spacing
 from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.upsample import methods_for
-from splatseed.views.viewpoint import choose_image, look_at
+from splatseed.view.maps import preview_depth
+from splatseed.view.points import render_points
+from splatseed.views.viewpoint import choose_camera, choose_image, look_at
 from splatseed.views.visibility import find_visibility
 
 HERE = Path(__file__).parent
@@ -102,7 +102,7 @@ def draw_depth() -> None:
             for name in depths:
                 writer.write(name, as_predicted(depths.read(name).values, rng))
         scene = scene.replace(depths=find_depths(scene, maps))
-        write_depth_picture(scene, align(scene), HERE / "depth_check.png")
+        preview_depth(scene, align(scene), HERE / "depth_check.png")
     with PillowImage.open(HERE / "depth_check.png") as picture:
         smaller = picture.convert("RGB").reduce(2).quantize(200)
     smaller.save(HERE / "depth_check.png", optimize=True)

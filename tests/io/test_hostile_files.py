@@ -18,7 +18,6 @@ import pytest
 import splatseed
 from splatseed.bench.planning.plan_file import read_plan
 from splatseed.commands.train.config import with_config
-from splatseed.diagnostics.trainable import untrainable
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import files, load_originals, load_scene, write_scene
 from splatseed.io.colmap import binary as colmap_binary
@@ -26,6 +25,7 @@ from splatseed.io.depth.arrays import read_npz
 from splatseed.io.files import open_file, read_file
 from splatseed.io.output.manifest import kind_of
 from splatseed.io.photograph import photograph_bytes
+from splatseed.seeding.diagnostics import untrainable
 
 
 @pytest.fixture

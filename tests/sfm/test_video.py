@@ -11,7 +11,7 @@ from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import is_video
 from splatseed.sfm.video import choose, pick_frames, shift
-from splatseed.viewer.video import write_video
+from splatseed.view.flights import write_video
 
 HEIGHT, WIDTH = 120, 160
 STILL = 12

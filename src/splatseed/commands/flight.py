@@ -13,21 +13,20 @@ from splatseed.commands.models import model_file
 from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_note, print_pairs, stage_display
 from splatseed.errors import OutputError, ParameterError
-from splatseed.export import check_opacity, keep_gaussians, parse_crop
 from splatseed.io.output.staging import check_parents
 from splatseed.requirements import require
 from splatseed.train.settings import Backend
-from splatseed.viewer.video import check_video_name, even_size, write_video
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.viewer.renderer import ModelRenderer
-    from splatseed.viewer.shown import Shown
+    from splatseed.view.models import ModelRenderer, Shown
     from splatseed.views.view import View
 
 MOST_SIDE = 1280
 LEAST_SIDE = 16
 MOST_FRAMES = 20_000
 WITHOUT_CAMERAS = (960, 720)
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov")
+"""All hold H.264."""
 
 PathOrNone = Annotated[
     Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
@@ -74,13 +73,6 @@ class Options:
         ),
     ] = None
     """Size of the video in pixels; odd numbers become even, as H.264 requires."""
-    crop: Annotated[
-        TextOrNone, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1", help_behavior_hint="")
-    ] = None
-    """Show only the Gaussians whose centres lie in this box; write --crop=-1,... if the first
-    number is negative."""
-    min_opacity: float = 0.0
-    """Leave out Gaussians whose opacity is lower, 0 to 1."""
     backend: Backend = "auto"
     """Where to render; auto takes a GPU if PyTorch sees one."""
     overwrite: bool = False
@@ -92,7 +84,7 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "flight", arguments)
     _check(options)
     require("torch", "imageio_ffmpeg")
-    from splatseed.viewer.frames import flight_frames  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.view.flights import flight_frames, write_video  # noqa: PLC0415  (imports PyTorch)
 
     with stage_display() as clock:
         clock("read", 0.0)
@@ -112,8 +104,13 @@ def run(arguments: list[str]) -> None:
 
 def _check(options: Options) -> None:
     """Check what can be checked before any work starts."""
-    check_video_name(options.output)
-    check_opacity(options.min_opacity)
+    suffix = options.output.suffix
+    if suffix.lower() not in VIDEO_SUFFIXES:
+        raise ParameterError(
+            f"the name of a video: {', '.join(VIDEO_SUFFIXES)}",
+            found=suffix or "no suffix",
+            fix="Name it flight.mp4.",
+        )
     check_parents(options.output)
     if options.output.exists() and not options.overwrite:
         fix = "Pass --overwrite to replace it, or choose another name."
@@ -135,7 +132,7 @@ def _check(options: Options) -> None:
 
 
 def _open(options: Options, path: Path) -> Shown:
-    from splatseed.viewer.shown import open_shown  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.models import open_shown  # noqa: PLC0415  (loads with its use)
 
     shown = open_shown(path, options.scene)
     if shown.gaussians is None:
@@ -149,7 +146,7 @@ def _open(options: Options, path: Path) -> Shown:
 
 def _compared(options: Options, path: Path, first: Shown) -> Shown:
     """The model beside the first, which the same cameras see."""
-    from splatseed.viewer.shown import share_a_world  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.models import share_a_world  # noqa: PLC0415  (loads with its use)
 
     shown = _open(options, path)
     if not share_a_world(first, shown):
@@ -163,6 +160,7 @@ def _compared(options: Options, path: Path, first: Shown) -> Shown:
 
 def _size(options: Options, shown: Shown) -> tuple[int, int]:
     """Width and height of the video."""
+    from splatseed.view.flights import even_size  # noqa: PLC0415  (loads with its use)
     from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     if options.size is not None:
@@ -182,14 +180,12 @@ def _size(options: Options, shown: Shown) -> tuple[int, int]:
 
 def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Sequence[View], float]:
     """The cameras, one per frame, and the frame rate."""
-    from splatseed.viewer.paths import orbit, smooth_path  # noqa: PLC0415  (loads with its use)
-    from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.flights import orbit, smooth_path  # noqa: PLC0415  (loads with its use)
 
     if options.path is not None:
         return _views_of_file(options.path, options.transform, shown, size, options.fps)
     frames = max(1, round(options.seconds * options.fps))
-    images = shown.scene.split(shown.test_every)[0] if shown.scene else ()
-    cameras = poses_of(images, shown.data_factor)
+    cameras = shown.train_views
     assert shown.gaussians is not None  # noqa: S101  (see _open)
     if options.orbit or len(cameras) < 2:
         return orbit(cameras, shown.gaussians, frames, size), options.fps
@@ -203,36 +199,30 @@ def _views_of_file(
     from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415  (loads with its use)
     from splatseed.scene import Scene  # noqa: PLC0415  (loads with its use)
     from splatseed.splat.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.viewer.paths import check_path, path_of_file, views_from  # noqa: PLC0415  (loads with its use)
-    from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.flights import check_path, path_of_file  # noqa: PLC0415  (loads with its use)
 
-    views, named = path_of_file(path, size)
+    world = None
     if transform is not None:
         world = find_transform(transform, shown.scene or Scene(empty_cloud()))
-        views = views if world is None else views_from(world, views)
+    views, named = path_of_file(path, size, world)
     assert shown.gaussians is not None  # noqa: S101  (see _open)
     if transform != NO_TRANSFORM:
-        cameras = poses_of(shown.scene.images) if shown.scene else ()
-        check_path(path, views, shown.gaussians, cameras)
+        check_path(path, views, shown.gaussians, shown.train_views)
     return views, named or fps
 
 
 def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> list[ModelRenderer]:
-    """The renderers of the models, cropped and cleaned, all in the first one's frame."""
+    """The renderers of the models, all on the first one's stage."""
     from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.viewer.renderer import ModelRenderer, model_frame  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.models import ModelRenderer, stage_frame  # noqa: PLC0415  (loads with its use)
 
     clock("prepare", 0.0)
-    crop = None if options.crop is None else parse_crop(options.crop)
-    device = pick_device(options.backend, clock)
-    frame = None
-    renderers = []
-    for shown in models:
-        assert shown.gaussians is not None  # noqa: S101  (see _open)
-        kept = keep_gaussians(shown.gaussians, crop, options.min_opacity)
-        frame = frame or model_frame(kept, shown.scene, shown.test_every)
-        renderers.append(ModelRenderer(kept, frame, device))
-    return renderers
+    device, frame = pick_device(options.backend, clock), stage_frame(models[0])
+    return [
+        ModelRenderer(each.gaussians, frame, device)
+        for each in models
+        if each.gaussians is not None
+    ]
 
 
 def _summarise(

@@ -10,12 +10,12 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
-from splatseed.diagnostics.trainable import is_distorted
 from splatseed.io import load_scene
 from splatseed.io.image_checks import warnings_but_lens
 from splatseed.io.output.earlier import was_upsampled
 from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted
+from splatseed.seeding.diagnostics import is_distorted
 from splatseed.sfm import undistort
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import sys
 import time
-import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,7 +13,7 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
-from splatseed.errors import ParameterError, SceneNotFoundError, SplatseedError
+from splatseed.errors import SceneNotFoundError, SplatseedError
 from splatseed.io.load import check_there
 from splatseed.literal import counted, visible
 from splatseed.process.interruption import Termination, exit_code
@@ -23,7 +22,7 @@ from splatseed.train.folder import RunFolder
 from splatseed.train.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.viewer.shown import Shown
+    from splatseed.view.models import Shown
 
 MOST_OPENED = 12
 LOCAL = {"127.0.0.1", "localhost", "::1"}
@@ -48,10 +47,6 @@ class Options:
     """The address to listen on: this machine alone, or 0.0.0.0 for all that can reach it."""
     port: int = 8080
     """The port to listen on; 0 for any free one."""
-    max_points: int = 5_000_000
-    """The most points that the browser gets to draw; one without a GPU gets 300,000."""
-    browser: bool = False
-    """Open this machine's browser."""
     backend: Backend = "auto"
     """Where to render; auto takes a GPU if PyTorch sees one."""
 
@@ -61,24 +56,22 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "view", arguments)
     require("torch", "viser")
     from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.viewer.viewer import Viewer, free_port  # noqa: PLC0415  (likewise)
+    from splatseed.view.models import stage_frame  # noqa: PLC0415  (likewise)
+    from splatseed.view.pictures import Entry  # noqa: PLC0415  (likewise)
+    from splatseed.view.server import Viewer, free_port  # noqa: PLC0415  (likewise)
 
-    if options.max_points < 1:
-        raise ParameterError(
-            "--max-points of 1 or more", found=f"{options.max_points}", fix="Try 1000000."
-        )
     for path in filter(None, (options.what, options.compare)):
         check_there(path)  # a slip in a path is told before a port that is taken
     port = free_port(options.host, options.port)
     with stage_display() as clock:
         clock("read", 0.0)
         opened, beside = _opened(options)
-        device = pick_device(options.backend, clock)
-        viewer = Viewer(
-            opened, options.host, port, device, most_points=options.max_points, beside=beside
-        )
+        device, frame = pick_device(options.backend, clock), stage_frame(opened[0])
+        entries = [Entry(shown, frame, device) for shown in opened]
+        second = None if beside is None else entries[beside]
+        viewer = Viewer(entries, options.host, port, second)
         clock("prepare", 0.0)
-        viewer.entries[0].warm_up()
+        entries[0].warm_up()
     _announce(options, port, opened, beside)
     try:
         while True:
@@ -95,7 +88,7 @@ def _opened(options: Options) -> tuple[list[Shown], int | None]:
     """What to show, under names that tell them apart; and which is compared with the first."""
     from dataclasses import replace  # noqa: PLC0415  (loads with its use)
 
-    from splatseed.viewer.shown import open_shown  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.models import open_shown  # noqa: PLC0415  (loads with its use)
 
     paths = _within(options.what)
     beside = None if options.compare is None else len(paths)
@@ -164,8 +157,6 @@ def _announce(options: Options, port: int, opened: list[Shown], beside: int | No
         )
     print_commands("next", [*commands, ("stop", "Ctrl-C")])
     OUT.file.flush()
-    if options.browser and not webbrowser.open(url):
-        print_note("No browser was found here: open the address yourself.")
 
 
 def _contents(shown: Shown) -> str:

@@ -15,7 +15,7 @@ pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.commands.train import live
-from splatseed.viewer.shown import open_shown
+from splatseed.view.models import open_shown
 
 SHORT = ("--max-steps", "3", "--data-factor", "2")
 ENDED = ("metrics.json", "point_cloud.ply")
@@ -171,7 +171,7 @@ def test_those_who_watch_see_the_refined_cameras(
         def close(self):
             pass
 
-    monkeypatch.setattr("splatseed.viewer.training.TrainingViewer", Viewer)
+    monkeypatch.setattr("splatseed.view.server.TrainingViewer", Viewer)
     monkeypatch.setattr(live, "view_port", lambda port: port)
     words = (*SHORT, "--refine-poses", "--view", "-o", tmp_path / "run")
     assert splatseed("train", bare, *words).code == 0

@@ -151,7 +151,7 @@ def test_the_files_of_an_alignment_are_listed(splatseed, room, tmp_path, monkeyp
         "splatseed.commands.upsample.command.bring_clouds",
         lambda *given: Brought(given[1], given[2], found),
     )
-    monkeypatch.setattr("splatseed.preview.preview_alignment", lambda *given: given[-1].touch())
+    monkeypatch.setattr("splatseed.view.clouds.preview_alignment", lambda *given: given[-1].touch())
     out = tmp_path / "out"
     run = splatseed("upsample", room, "--method", "linear", "--ratio", 1.1, "-o", out)
     assert run.code == 0, run.err

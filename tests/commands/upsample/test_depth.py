@@ -155,11 +155,9 @@ def test_flags_of_depth_do_nothing_for_other_methods(room, tmp_path, splatseed):
 
 
 def test_previews_show_depth_where_there_is_some(room, tmp_path, splatseed, monkeypatch):
-    import splatseed.preview as preview  # noqa: PLR0402  (its function is replaced)
-
     shown = []
     monkeypatch.setattr(
-        preview, "preview_methods", lambda _s, clouds, _p: shown.append(set(clouds))
+        "splatseed.view.clouds.preview_methods", lambda _s, clouds, _p: shown.append(set(clouds))
     )
     splatseed("upsample", room, "-o", tmp_path / "a", "--preview-methods")
     upsample(splatseed, room, tmp_path / "b", "--depth", room, "--preview-methods")

@@ -35,9 +35,8 @@ from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train import TrainSettings, prepare_run, trainer
 from splatseed.train.run import RunOptions
-from splatseed.viewer import pictures
-from splatseed.viewer.renderer import model_frame
-from splatseed.viewer.shown import Shown
+from splatseed.view import pictures
+from splatseed.view.models import Shown, stage_frame
 from splatseed.views.view import load_split
 
 STEPS = 16
@@ -270,8 +269,8 @@ def test_fused_ssim_is_taken_where_it_is_installed(monkeypatch):
 
 def test_the_viewer_renders_all_gaussians_while_the_camera_moves(room, monkeypatch):
     gaussians = initial_gaussians(room.points)
-    shown = Shown("room", Path("room"), room, gaussians)
-    frame = model_frame(gaussians, room)
+    shown = Shown("room", room, gaussians)
+    frame = stage_frame(shown)
     monkeypatch.setattr(pictures, "MOST_MOVING", len(gaussians) // 2)
     view = load_split(room)[0][0]
     with pc.pretended_gpu():

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from splatseed.diagnostics.scene import empty_regions
 from splatseed.errors import PointCloudError, SplatseedError
 from splatseed.io.files import read_text
 from splatseed.io.output.staging import atomic_file
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
+from splatseed.seeding.diagnostics import empty_regions
 
 if TYPE_CHECKING:  # SciPy and Numba
     from splatseed.upsample.neighbors import PreparedCloud

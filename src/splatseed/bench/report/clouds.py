@@ -76,7 +76,7 @@ def cloud_picture(
     Raises:
         SplatseedError: As ``splatseed.upsample``.
     """
-    from splatseed.preview import preview_methods  # noqa: PLC0415  (Numba and Pillow)
+    from splatseed.view.clouds import preview_methods  # noqa: PLC0415  (Numba and Pillow)
 
     clouds = {
         variant.label: make_seeds(scene, spec, progress, bench)[0]

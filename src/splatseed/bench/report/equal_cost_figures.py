@@ -23,7 +23,6 @@ from splatseed.bench.report.drawing import (
     panels,
     png,
 )
-from splatseed.preview.fonts import font_families, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,7 +81,7 @@ def _draw_scene(axes: Axes, study: Study, scene: str, arms: Sequence[Arm], base:
     axes.axvline(end, color="#bbbbbb", linewidth=0.8)
     if low < high:
         axes.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
-    axes.set_title(plain(scene), family=font_families())
+    axes.set_title(scene.replace("$", r"\$"))
     axes.set_xlabel("seconds, seeding included")
     axes.set_ylabel("PSNR, dB")
     axes.grid(visible=True, alpha=0.25)
@@ -132,8 +131,8 @@ def arm_figure(study: Study) -> Plot | None:
         mark = MARKS.get(each.arm.strategy, "P")
         axes.errorbar(each.gain.mean, row, xerr=error, color=color, marker=mark, linestyle="none")
     axes.axvline(0.0, color="#222222", linewidth=1)
-    names = [plain(each.arm.label) for each in others]
-    axes.set_yticks(range(len(others)), names, family=font_families())
+    names = [each.arm.label.replace("$", r"\$") for each in others]
+    axes.set_yticks(range(len(others)), names)
     axes.set_ylim(len(others) - 0.5, -0.5)
     axes.set_xlabel(f"gain over {base.label}, dB")
     axes.grid(visible=True, axis="x", alpha=0.25)

@@ -28,7 +28,6 @@ from splatseed.bench.report.drawing import (
     panels,
     png,
 )
-from splatseed.preview.fonts import font_families, plain
 from splatseed.scores import CurvePoint
 from splatseed.train.settings import StrategyName
 
@@ -73,7 +72,7 @@ def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
     figure, parts = panels(len(scenes))
     for scene, axes in zip(scenes, parts, strict=True):
         _draw_curves(axes, study, strategy, scene, arms, by)
-        axes.set_title(plain(scene), family=font_families())
+        axes.set_title(scene.replace("$", r"\$"))
         axes.set_xlabel(by if by == "steps" else "seconds, upsampling included")
         axes.set_ylabel("PSNR, dB")
     legend_of(figure, [(each.label, _marked(each)) for each in arms])
@@ -153,8 +152,8 @@ def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
                 _dot(axes, gain, place, variant, across=True)
     axes.axvline(0.0, color=COLORS["sfm"], linewidth=1)
     axes.axhline(len(gained.scenes) - 0.5, color="#bbbbbb", linewidth=0.8)
-    labels = [plain(name) for name in names]
-    axes.set_yticks(range(len(names)), labels, family=font_families())
+    labels = [name.replace("$", r"\$") for name in names]
+    axes.set_yticks(range(len(names)), labels)
     axes.set_ylim(len(names) - 0.5, -0.5)
     axes.set_xlabel("gain over sfm, dB")
     axes.grid(visible=True, axis="x", alpha=0.25)

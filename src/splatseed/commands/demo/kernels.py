@@ -128,7 +128,7 @@ def compile_parts(folder: str, *parts: str) -> None:
 
 def _compile(part: str, path: Path) -> None:
     from splatseed.io import find_depths, load_scene, write_scene  # noqa: PLC0415  (loads with its use)
-    from splatseed.preview import preview_pair  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.clouds import preview_pair  # noqa: PLC0415  (loads with its use)
 
     if part == TRAINING:
         _train(path)

@@ -16,15 +16,16 @@ import numpy as np
 from splatseed.commands.demo.kernels import KernelsAhead, wait
 from splatseed.commands.demo.methods import SHOWN, upsample_by
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
-from splatseed.diagnostics.geometry import GeometryScore, measure, spacing
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.output.manifest import add_files
 from splatseed.io.output.staging import atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
-from splatseed.preview import choose_camera, preview_errors, preview_methods, preview_pair
 from splatseed.scene import Scene
+from splatseed.seeding.diagnostics import GeometryScore, measure, spacing
 from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.upsample import methods_for
+from splatseed.view.clouds import preview_errors, preview_methods, preview_pair
+from splatseed.views.viewpoint import choose_camera
 
 if TYPE_CHECKING:  # which imports this module
     from splatseed.commands.demo import Options

@@ -18,12 +18,12 @@ from splatseed.console import StageClock
 from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
-from splatseed.preview import Tile, write_grid
 from splatseed.scores import TrainingResult
 from splatseed.seeding.poses_alone.random_start import random_start
 from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
+from splatseed.view.page import Tile, write_grid
 
 POSES_ALONE = {"random start": "random", f"{SHOWN}, poses alone": f"poses_{SHOWN}"}
 """Arms that know no points, and how their folders end."""

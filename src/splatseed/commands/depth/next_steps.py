@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatseed.diagnostics.trainable import is_distorted
 from splatseed.lens import undistort_command
 from splatseed.literal import quoted
 from splatseed.scene import Scene
+from splatseed.seeding.diagnostics import is_distorted
 
 RATIO = 16
 PER_POINT = 8

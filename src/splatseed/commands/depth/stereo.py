@@ -17,7 +17,6 @@ from splatseed.commands.depth.next_steps import after_stereo, look
 from splatseed.commands.depth.options import Options
 from splatseed.commands.planned import Planned
 from splatseed.console import OUT, StageClock, print_commands, print_note, stage_display
-from splatseed.diagnostics.trainable import is_distorted
 from splatseed.io import load_scene
 from splatseed.io.dense import (
     DenseReport,
@@ -29,6 +28,7 @@ from splatseed.io.image_checks import warnings_but_lens
 from splatseed.io.output.staging import check_output
 from splatseed.literal import quoted, visible
 from splatseed.scene import Scene
+from splatseed.seeding.diagnostics import is_distorted
 from splatseed.train.schedule import FULL_RUN
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _write(
 
 
 def _draw(options: Options, scene: Scene, maps: Sequence[StereoMap], clock: StageClock) -> None:
-    from splatseed.preview import preview_maps  # noqa: PLC0415  (Pillow)
+    from splatseed.view.maps import preview_maps  # noqa: PLC0415  (Pillow)
 
     clock("preview", 0.0)
     preview_maps(scene, maps, options.output / PICTURE)

@@ -14,8 +14,6 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.commands.planned import Planned
 from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
-from splatseed.diagnostics.scene import empty_regions
-from splatseed.diagnostics.trainable import is_distorted, untrainable
 from splatseed.io import load_scene
 from splatseed.io.output.earlier import was_upsampled
 from splatseed.lens import undistort_command, undistorted
@@ -31,6 +29,7 @@ from splatseed.seeding.advice import (
     measure,
     stereo_agreement,
 )
+from splatseed.seeding.diagnostics import empty_regions, is_distorted, untrainable
 from splatseed.train.schedule import FULL_RUN
 
 Budget = Annotated[

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from splatseed.commands.info.poses import Poses
 from splatseed.console import OUT
-from splatseed.diagnostics.scene import CloudStatistics, EmptyRegions, TrackStatistics
 from splatseed.scene import Scene
+from splatseed.seeding.diagnostics import CloudStatistics, EmptyRegions, TrackStatistics
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth import Alignment

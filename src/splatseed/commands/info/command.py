@@ -20,7 +20,13 @@ from splatseed.commands.options import parse_options
 from splatseed.commands.planned import Planned
 from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
 from splatseed.depthmap import DepthKind
-from splatseed.diagnostics.scene import (
+from splatseed.errors import ParameterError
+from splatseed.io import find_depths, load_scene
+from splatseed.io.output.earlier import was_upsampled
+from splatseed.io.output.staging import check_parents
+from splatseed.literal import quoted, visible
+from splatseed.scene import Scene
+from splatseed.seeding.diagnostics import (
     EMPTY_CELLS,
     CloudStatistics,
     EmptyRegions,
@@ -28,15 +34,9 @@ from splatseed.diagnostics.scene import (
     cloud_statistics,
     empty_regions,
     find_problems,
+    is_distorted,
     track_statistics,
 )
-from splatseed.diagnostics.trainable import is_distorted
-from splatseed.errors import ParameterError
-from splatseed.io import find_depths, load_scene
-from splatseed.io.output.earlier import was_upsampled
-from splatseed.io.output.staging import check_parents
-from splatseed.literal import quoted, visible
-from splatseed.scene import Scene
 from splatseed.train.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
@@ -159,10 +159,10 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
 
     alignments = align(scene, progress=clock)
     if options.picture is not None:
-        from splatseed.commands.info.depth_picture import write_depth_picture  # noqa: PLC0415  (loads with its use)
+        from splatseed.view.maps import preview_depth  # noqa: PLC0415  (loads with its use)
 
         clock("draw picture", 0.0)
-        write_depth_picture(scene, alignments, options.picture)
+        preview_depth(scene, alignments, options.picture)
     return alignments
 
 

@@ -14,7 +14,7 @@ from splatseed.requirements import require
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
-    from splatseed.viewer.training import TrainingViewer
+    from splatseed.view.server import TrainingViewer
 
 HOST = "127.0.0.1"
 
@@ -51,7 +51,7 @@ def view_port(port: int) -> int:
         ParameterError: The port is taken.
     """
     require("viser")
-    from splatseed.viewer.viewer import free_port  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.view.server import free_port  # noqa: PLC0415  (imports PyTorch)
 
     return free_port(HOST, port, "--view-port", "address")
 
@@ -62,7 +62,7 @@ def watched(training: TrainingRun, scene: Path, port: int | None) -> Iterator[Wa
     if port is None:
         yield Watch()
         return
-    from splatseed.viewer.training import TrainingViewer  # noqa: PLC0415  (imports PyTorch)
+    from splatseed.view.server import TrainingViewer  # noqa: PLC0415  (imports PyTorch)
 
     posed = training.folder.scene  # there is one if poses were refined
     loaded = load_scene(posed if posed.is_dir() else scene, require_points=False)

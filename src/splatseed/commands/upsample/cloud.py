@@ -147,7 +147,7 @@ class Brought(NamedTuple):
             }
             _write_json(folder / RECENTER, told)
         if self.alignment is not None:
-            from splatseed.preview import preview_alignment  # noqa: PLC0415  (Pillow)
+            from splatseed.view.clouds import preview_alignment  # noqa: PLC0415  (Pillow)
 
             alignment = self.alignment
             report, picture = (folder / name for name in ALIGNMENT)

@@ -46,7 +46,6 @@ from splatseed.console import (
     stage_display,
 )
 from splatseed.depthmap import DepthKind
-from splatseed.diagnostics.geometry import far_share
 from splatseed.errors import ParameterError
 from splatseed.io import WriteReport, find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
@@ -56,6 +55,7 @@ from splatseed.literal import counted, visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.process.memory import bytes_of
 from splatseed.scene import Scene
+from splatseed.seeding.diagnostics import far_share
 from splatseed.seeding.photographs import photographed
 from splatseed.seeding.thinning import points_within
 from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample

@@ -51,11 +51,8 @@ def write_previews(
         folder: Where the pictures go.
         clock: Told the stages.
     """
-    from splatseed.preview import (  # noqa: PLC0415  (Pillow)
-        preview_maps,
-        preview_origins,
-        preview_pair,
-    )
+    from splatseed.view.clouds import preview_origins, preview_pair  # noqa: PLC0415  (Pillow)
+    from splatseed.view.maps import preview_maps  # noqa: PLC0415  (Pillow)
 
     clock("preview", 0.0)
     preview_pair(scene, seeds, folder / PAIR, title=name)
@@ -96,7 +93,7 @@ def write_methods_preview(
         folder: Where the picture goes.
         clock: Told the stages.
     """
-    from splatseed.preview import preview_methods  # noqa: PLC0415  (Pillow)
+    from splatseed.view.clouds import preview_methods  # noqa: PLC0415  (Pillow)
 
     clouds = {}
     for name in dict.fromkeys((*methods_for(scene), method)):
@@ -116,8 +113,8 @@ def write_methods_preview(
 
 def _draw_cells(scene: Scene, seeds: PointCloud, path: Path) -> None:
     """Which cells of some photographs hold a point, before and after."""
-    from splatseed.preview import CoveredView, preview_cells  # noqa: PLC0415  (Pillow)
     from splatseed.seeding.coverage import covered_cells  # noqa: PLC0415  (kernels load with use)
+    from splatseed.view.clouds import CoveredView, preview_cells  # noqa: PLC0415  (Pillow)
 
     images = photographed(scene)
     views = read_views(scene, [images[i] for i in _some_of(images)], MAX_SIZE, silent)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatseed.console import print_commands, print_note
-from splatseed.diagnostics.trainable import is_distorted, untrainable
 from splatseed.lens import undistort_command
 from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneFormat
+from splatseed.seeding.diagnostics import is_distorted, untrainable
 
 COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
 PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from splatseed.camera import Intrinsics
-from splatseed.diagnostics.scene import (
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Scene, Tracks
+from splatseed.seeding.diagnostics import (
     CloudStatistics,
     EmptyRegions,
     cloud_statistics,
@@ -14,8 +16,6 @@ from splatseed.diagnostics.scene import (
     find_problems,
     track_statistics,
 )
-from splatseed.pointcloud import PointCloud
-from splatseed.scene import Image, Scene, Tracks
 
 SHARES = [5, 25, 50, 75, 95]
 

@@ -1,6 +1,9 @@
 """One connected browser: its controls, its camera, and the pictures sent to it.
 
-Promise: two browsers share nothing but what is shown; when a browser disconnects, its thread ends.
+Notation: a *frame* is one picture sent; the scale of a frame is its size divided by the canvas's.
+Promise: the newest camera is drawn, never a queue of old ones, coarsely while it moves and in full
+when it is still; two browsers share nothing but what is shown; when a browser disconnects, only its
+own thread ends.
 """
 
 from __future__ import annotations
@@ -9,21 +12,38 @@ import io
 import logging
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from PIL import Image as PillowImage
 
-from splatseed.errors import SplatseedError
 from splatseed.literal import visible
-from splatseed.preview.photographs import photograph_at
 from splatseed.scene import Image, Scene
-from splatseed.viewer.canvas import canvas_view, fitted_fov, stage_pose
-from splatseed.viewer.frames import split_picture
-from splatseed.viewer.live import FrameLoop
-from splatseed.viewer.pictures import NOTHING, Drawn, Entry
-from splatseed.viewer.stage import add_cameras, add_clouds, clouds_of, point_size
+from splatseed.view.models import split_picture
+from splatseed.view.page import fitted, photograph_at
+from splatseed.view.pictures import (
+    Drawn,
+    Entry,
+    add_cameras,
+    canvas_view,
+    clouds_of,
+    fitted_fov,
+    point_size,
+    stage_pose,
+)
 from splatseed.views.view import View
 
+MOVING_SECONDS = 0.12
+"""Seconds a frame may take while the camera moves."""
+STILL_AFTER = 0.2
+"""Seconds without movement after which the full picture is drawn."""
+LEAST_SCALE, FIRST_SCALE = 0.12, 0.3
+"""Coarsest scale of a frame, and the scale before any frame has been timed."""
+CLOSE_SECONDS = 2.0
+"""Seconds to wait for the frame being drawn."""
+MEMORY = 0.5
+"""Weight of the latest frame in the running estimate of the cost per pixel."""
 MOST_PIXELS = 1_600_000
 """The most pixels of a full picture; on larger canvases it is stretched."""
 THUMBNAIL = 96
@@ -35,12 +55,72 @@ PATIENCE, MOST_PATIENCE = 0.3, 30.0
 """Seconds that the points of a picture may take (without a GPU a million take some seconds), and
 the longest wait for an answer."""
 FLIGHT_SECONDS, FLIGHT_STEPS = 0.5, 15
-_LOG = logging.getLogger(__name__)
 ARRIVED = 1e-3
-NO_SECOND = "nothing"
+NOTHING, NO_SECOND = "points only", "nothing"
 CLEAR_OF_CONTROLS = 0.38
 """Where the border between two pictures begins: the controls cover the right of the window."""
 JPEG_MOVING, JPEG_STILL = 70, 92
+_LOG = logging.getLogger(__name__)
+
+
+class FrameLoop:
+    """Draws a frame after each call of ``change``.
+
+    Args:
+        draw: Draws and sends a picture at a scale; returns the number of pixels drawn, 0 for none.
+    """
+
+    def __init__(self, draw: Callable[[float], int]) -> None:
+        self._draw = draw
+        self._changed = threading.Event()
+        self._closed = False
+        self._pixel_seconds: float | None = None
+        self._full_pixels = 1.0
+        self.frames = 0
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def change(self) -> None:
+        """The camera moved, or something else is shown."""
+        self._changed.set()
+
+    def close(self) -> None:
+        """End the loop once the current frame is finished."""
+        self._closed = True
+        self._changed.set()
+        self._thread.join(CLOSE_SECONDS)
+
+    def _run(self) -> None:
+        while True:
+            self._changed.wait()
+            if self._closed:
+                return
+            self._changed.clear()
+            scale = self._scale()
+            self._frame(scale)
+            if scale < 1 and not self._changed.wait(STILL_AFTER):
+                self._frame(1.0, learn=False)
+
+    def _scale(self) -> float:
+        """The scale at which a frame just meets its time budget."""
+        if self._pixel_seconds is None:
+            return FIRST_SCALE
+        affordable = MOVING_SECONDS / self._pixel_seconds / self._full_pixels
+        # Pixels go with the square of the scale.
+        return float(np.clip(np.sqrt(affordable), LEAST_SCALE, 1.0))
+
+    def _frame(self, scale: float, *, learn: bool = True) -> None:
+        began = time.perf_counter()
+        pixels = self._draw(scale)
+        if not pixels:
+            return
+        self.frames += 1
+        self._full_pixels = pixels / scale**2
+        if not learn:  # a full frame draws all Gaussians, a coarse one only the most visible
+            return
+        took = (time.perf_counter() - began) / pixels
+        before = took if self._pixel_seconds is None else self._pixel_seconds
+        self._pixel_seconds = MEMORY * took + (1 - MEMORY) * before
 
 
 class Session:
@@ -49,18 +129,10 @@ class Session:
     Args:
         client: viser's handle of the browser.
         entries: What was opened; at least one.
-        most_points: The most points that the browser draws.
         beside: The entry whose model is shown beside that of the first, from the beginning.
     """
 
-    def __init__(
-        self,
-        client: Any,
-        entries: list[Entry],
-        most_points: int = MOST_POINTS,
-        beside: Entry | None = None,
-    ) -> None:
-        self._most_points = most_points
+    def __init__(self, client: Any, entries: list[Entry], beside: Entry | None = None) -> None:
         self._beside = beside
         self._client = client
         self._entries = {entry.name: entry for entry in entries}
@@ -95,15 +167,23 @@ class Session:
         gui, names = self._client.gui, list(self._entries)
         first = self._entries[names[0]]
         self._what = gui.add_dropdown("Show", names, visible=len(names) > 1)
-        kinds = self._kinds(first)
+        kinds = (NOTHING, *first.kinds)
         self._kind = gui.add_dropdown(
             "Picture", kinds, initial_value=kinds[1 if first.has_model else 0]
         )
-        seconds = self._second_choices()
-        second = self._second_at_first()
-        self._second = gui.add_dropdown("Beside it", seconds, initial_value=second)
-        border = 0.5 if second == NO_SECOND else CLEAR_OF_CONTROLS
+        pairs = [(entry, kind) for entry in self._entries.values() for kind in entry.kinds]
+        self._seconds = {
+            f"{entry.name}: {kind}" if len(names) > 1 else kind: (entry, kind)
+            for entry, kind in pairs
+        }
+        second = NO_SECOND
+        if self._beside is not None and self._beside.has_model:
+            second = f"{self._beside.name}: {self._beside.kinds[0]}"
+        self._second = gui.add_dropdown(
+            "Beside it", (NO_SECOND, *self._seconds), initial_value=second
+        )
         shown = second != NO_SECOND
+        border = CLEAR_OF_CONTROLS if shown else 0.5
         self._split = gui.add_slider("Border at", 0.05, 0.95, 0.01, border, visible=shown)
         self._note = gui.add_markdown("", visible=False)
         shot = gui.add_button("Screenshot")
@@ -125,33 +205,13 @@ class Session:
         self._go.on_update(lambda _: self._go_to(self._go.value))
         shot.on_click(lambda _: self._screenshot())
 
-    @staticmethod
-    def _kinds(entry: Entry) -> tuple[str, ...]:
-        return (NOTHING, *entry.kinds)
-
-    def _second_choices(self) -> tuple[str, ...]:
-        """Every picture of every entry, prefixed with the entry's name if there are several."""
-        several = len(self._entries) > 1
-        pairs = [(entry, kind) for entry in self._entries.values() for kind in entry.kinds]
-        self._seconds = {
-            f"{entry.name}: {kind}" if several else kind: (entry, kind) for entry, kind in pairs
-        }
-        return (NO_SECOND, *self._seconds)
-
-    def _second_at_first(self) -> str:
-        """The picture of the entry that was asked for beside the first."""
-        if self._beside is None or not self._beside.has_model:
-            return NO_SECOND
-        pictures = (self._beside, self._beside.kinds[0])
-        return next(name for name, pair in self._seconds.items() if pair == pictures)
-
     @property
     def _entry(self) -> Entry:
         return self._entries[self._what.value]
 
     def _switched(self) -> None:
         """Another entry was chosen: replace pictures, points and cameras by its own."""
-        kinds = self._kinds(self._entry)
+        kinds = (NOTHING, *self._entry.kinds)
         self._kind.options = kinds
         if self._kind.value not in kinds:
             self._kind.value = kinds[-1] if not self._entry.has_model else kinds[1]
@@ -166,19 +226,17 @@ class Session:
     # The stage ----------------------------------------------------------------------------------
 
     def _fill_stage(self) -> None:
-        scene, frame = self._entry.shown.scene, self._entry.frame
-        for handle in (*self._nodes.values(), *(h for _, h in self._cameras)):
+        shown, frame = self._entry.shown, self._entry.frame
+        cameras = (handle for _, handle in self._cameras)
+        for handle in (*self._nodes.values(), *cameras, *self._origins.values()):
             handle.remove()
-        for box in self._origins.values():
-            box.remove()
         self._nodes, self._cameras, self._origins = {}, [], {}
-        if scene is None:
+        if shown.scene is None:
             return
-        if scene.images:
-            every = self._entry.shown.test_every
-            self._cameras = add_cameras(self._client.scene, scene, frame, self._fly, every)
+        if shown.scene.images:
+            self._cameras = add_cameras(self._client.scene, shown, frame, self._fly)
             self._go.options = ("-", *(image.name for image, _ in self._cameras))
-        self._send_points(scene, min(self._most_points, FIRST_POINTS))
+        self._send_points(shown.scene, FIRST_POINTS)
         with self._origin_folder:
             for name in self._nodes:
                 self._origins[name] = self._client.gui.add_checkbox(name, initial_value=True)
@@ -192,16 +250,27 @@ class Session:
         if clouds:
             self._clouds = {cloud.name: cloud for cloud in clouds}
             self._base_size = point_size(clouds, scene.images, self._entry.frame)
-            self._nodes = add_clouds(self._client.scene, clouds, self._base_size)
+            self._nodes = {
+                cloud.name: self._client.scene.add_point_cloud(
+                    f"/points/{cloud.name}",
+                    cloud.xyz,
+                    cloud.rgb,
+                    point_size=self._base_size,
+                    point_shape="circle",
+                    point_shading="flat",
+                    precision="float32",
+                )
+                for cloud in clouds
+            }
 
     def _fill_in(self) -> None:
         """Send what can wait: photographs, and as many more points as the browser draws quickly."""
         self._add_thumbnails()
         scene, nodes = self._entry.shown.scene, self._nodes
-        if scene is None or min(self._most_points, len(scene.points)) <= FIRST_POINTS:
+        if scene is None or len(scene.points) <= FIRST_POINTS:
             return
         try:
-            wanted = min(self._most_points, self._affordable_points())
+            wanted = min(MOST_POINTS, self._affordable_points())
         except Exception:  # noqa: BLE001  (the browser went away, or hides its page)
             return
         if wanted > ENOUGH_MORE * FIRST_POINTS and nodes is self._nodes and not self._closed:
@@ -209,23 +278,19 @@ class Session:
             self._restyle()
 
     def _affordable_points(self) -> int:
-        """How many points the browser can draw in reasonable time, measured on its first points."""
+        """How many points the browser draws in reasonable time, measured on its first points."""
+        seconds = {}
         try:
-            without, with_points = (self._seconds_of_a_picture(points=on) for on in (False, True))
+            for shown in (False, True):
+                for node in self._nodes.values():
+                    node.visible = shown
+                for _ in range(2):  # the first may still show the points as they were
+                    start = time.perf_counter()
+                    self._client.get_render(48, 64, transport_format="jpeg", timeout=MOST_PATIENCE)
+                    seconds[shown] = time.perf_counter() - start
         finally:  # it may not have answered
             self._restyle()
-        return round(FIRST_POINTS * PATIENCE / max(with_points - without, 1e-3))
-
-    def _seconds_of_a_picture(self, *, points: bool) -> float:
-        """How long the browser takes to draw a small picture and to send it."""
-        for node in self._nodes.values():
-            node.visible = points
-        seconds = 0.0
-        for _ in range(2):  # the first may still show the points as they were
-            start = time.perf_counter()
-            self._client.get_render(48, 64, transport_format="jpeg", timeout=MOST_PATIENCE)
-            seconds = time.perf_counter() - start
-        return seconds
+        return round(FIRST_POINTS * PATIENCE / max(seconds[True] - seconds[False], 1e-3))
 
     def _restyle(self) -> None:
         """Style points and cameras as the switches say."""
@@ -239,7 +304,7 @@ class Session:
             if not np.array_equal(node.colors[:1], colors[:1]) or self._by_origin.value:
                 node.colors = colors
         self._show_cameras()
-        self._legend.content = self._legend_html() if self._nodes else ""
+        self._legend.content = self._legend_html()
 
     def _show_cameras(self) -> None:
         """Hide the camera at which the browser stands: its photograph would block the view."""
@@ -264,8 +329,7 @@ class Session:
             if self._closed or scene is None or cameras != self._cameras:
                 return
             camera = image.camera
-            scale = THUMBNAIL / max(camera.width, camera.height)
-            size = (max(1, round(scale * camera.width)), max(1, round(scale * camera.height)))
+            size = fitted(camera.width, camera.height, THUMBNAIL)
             thumbnail = photograph_at(scene, image, size)
             if thumbnail is not None:
                 handle.image = thumbnail
@@ -315,8 +379,6 @@ class Session:
         """Draw what is asked for and send it; returns the number of pixels drawn."""
         try:
             return self._drawn(scale)
-        except SplatseedError as error:
-            self._say(str(error))
         except Exception as error:  # noqa: BLE001  (the thread must live on)
             if self._closed:  # the browser has disconnected meanwhile
                 return 0
@@ -331,8 +393,7 @@ class Session:
             self._show(None, 0)
             self._say("")
             return 0
-        canvas = self._canvas(scale)
-        at = self.at
+        canvas, at = self._canvas(scale), self.at
         drawn: list[Drawn] = [(None, "")]
         if kind != NOTHING:
             drawn = [self._entry.draw(kind, canvas, at, quick=scale < 1)]
@@ -374,8 +435,6 @@ class Session:
 
     def _screenshot(self) -> None:
         """Send what the browser shows, points over picture, as a PNG to save."""
-        from PIL import Image as PillowImage  # noqa: PLC0415  (slow to import)
-
         camera = self._client.camera
         size = (camera.image_width, camera.image_height)
         over = PillowImage.fromarray(

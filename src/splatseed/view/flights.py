@@ -1,29 +1,42 @@
-"""Camera paths: smooth ones through a scene's cameras, orbits, and nerfstudio's files.
+"""Flights through a model: camera paths, their frames, and the video of these.
 
 Notation: a path is a sequence of views without pixels, one per frame, in world coordinates with
 OpenCV axes; a *stop* is a camera that a path is made from. Promise: equal input gives equal paths;
-cameras far from all others are left out.
+cameras far from all others are left out; a video appears whole or not at all.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 from scipy.ndimage import gaussian_filter1d
 
-from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_bytes
+from splatseed.io.output.staging import atomic_file
 from splatseed.literal import counted, told
+from splatseed.progress import Progress, silent
+from splatseed.requirements import require
 from splatseed.similarity import Similarity
 from splatseed.splat.gaussians import Gaussians, stray_views
-from splatseed.viewer.renderer import CORE, resized
+from splatseed.view.models import (
+    CORE,
+    ModelRenderer,
+    as_bytes,
+    depth_colors,
+    depth_range,
+    pinhole_view,
+    split_picture,
+    with_size,
+)
 from splatseed.views.view import View
 from splatseed.views.viewpoint import look_at
 
@@ -37,11 +50,17 @@ MOST_FRAMES = 100_000
 MADE_UP_SIZE = (960, 720)
 LOOKS, LOOKED_AT = 60, 5000
 """Views and Gaussians sampled to decide whether a path misses the model."""
-LEAST_SEEN, HALF = 0.002, 0.5
+LEAST_SEEN = 0.002
 """A view that sees a smaller share of the Gaussians misses them; more than half must not."""
 FAR_AWAY = 10.0
 """A path is far away beyond this many times the cameras' extent."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+DEPTH_SAMPLES = 7
+"""How many frames of a path are rendered to find its depth range."""
+QUALITY = 8
+"""imageio-ffmpeg's quality, 0 to 10."""
+
+# Paths --------------------------------------------------------------------------------------------
 
 
 def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> list[View]:
@@ -73,8 +92,10 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
     fine = gaussian_filter1d(fine, SMOOTHING * len(places), axis=0, mode="nearest")
     moved = np.linalg.norm(np.diff(fine[:, :3], axis=0), axis=1)
     even = _interpolated(fine, moved + 1e-9 * reach, np.linspace(0, 1, frames))
-    model = resized(_median_camera(views), *size)
-    return [_view_of_vector(model, pose, i) for i, pose in enumerate(even)]
+    lens = with_size(_median_camera(views), *size)
+    return [
+        _posed(lens, i, pose[:3], pose[:3] + pose[3:6], pose[6:]) for i, pose in enumerate(even)
+    ]
 
 
 def orbit(
@@ -91,12 +112,13 @@ def orbit(
     if len(views) > 1:
         centers = _centers(views)
         up = -np.mean([view.cam_from_world[1, :3] for view in views], axis=0)
-        focus, model = focus_of(views), _median_camera(views)
+        focus, lens = focus_of(views), _median_camera(views)
     else:
         focus = np.median(gaussians.means.astype(np.float64), axis=0)
         reach = np.quantile(np.linalg.norm(gaussians.means - focus, axis=1), CORE)
         up = np.array([0.0, -1.0, 0.0])  # as in the world of most captures
-        centers, model = (focus + reach * np.array([2.0, -0.7, 0.0]))[None], _made_up()
+        centers = (focus + reach * np.array([2.0, -0.7, 0.0]))[None]
+        lens = pinhole_view(MADE_UP_SIZE, 2 * np.arctan(0.5), np.eye(4))
     up = up / np.linalg.norm(up)
     offsets = centers - focus
     # Distances from the focus along up, and around it.
@@ -104,15 +126,12 @@ def orbit(
     radius = np.median(np.linalg.norm(offsets - heights[:, None] * up, axis=1))
     first = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
     first /= np.linalg.norm(first)
-    side, model = np.cross(up, first), resized(model, *size)
+    side, lens = np.cross(up, first), with_size(lens, *size)
     eyes = [
         focus + np.median(heights) * up + radius * (np.cos(angle) * first + np.sin(angle) * side)
         for angle in 2 * np.pi * np.arange(frames) / frames
     ]
-    return [
-        dataclasses.replace(model, name=f"{i}", cam_from_world=look_at(eye, focus, up))
-        for i, eye in enumerate(eyes)
-    ]
+    return [_posed(lens, i, eye, focus, up) for i, eye in enumerate(eyes)]
 
 
 def focus_of(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
@@ -131,12 +150,15 @@ def focus_of(views: Sequence[View]) -> Float64[np.ndarray, " 3"]:
     )
 
 
-def path_of_file(path: Path, size: tuple[int, int]) -> tuple[list[View], float | None]:
+def path_of_file(
+    path: Path, size: tuple[int, int], world: Similarity | None = None
+) -> tuple[list[View], float | None]:
     """The views of a camera path in nerfstudio's JSON, and its frame rate if the file gives one.
 
     Args:
-        path: The file; its cameras are assumed to be in the model's world.
+        path: The file.
         size: Width and height of the views; fields of view are vertical, in degrees.
+        world: From the model's world to the file's; None if they are one.
 
     Raises:
         SceneNotFoundError: There is no such file.
@@ -144,29 +166,38 @@ def path_of_file(path: Path, size: tuple[int, int]) -> tuple[list[View], float |
     """
     try:
         content = json.loads(read_bytes(path))
-        frames = content["camera_path"]
-        views = [_view_of_frame(frame, size, i) for i, frame in enumerate(frames)]
+        views = [_view_of_frame(frame, size, i) for i, frame in enumerate(content["camera_path"])]
         fps = float(content["fps"]) if content.get("fps") else None
+        found = "" if 0 < len(views) <= MOST_FRAMES else counted(len(views), "camera")
     except SceneNotFoundError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise _no_path(path, told(error)) from None
-    if not 0 < len(views) <= MOST_FRAMES:
-        raise _no_path(path, counted(len(views), "camera"))
+        found = told(error)
+    if found:
+        raise SceneFormatError(
+            f"{path} to be a camera path as nerfstudio's viewer writes it: "
+            "camera_path, with camera_to_world and fov",
+            found=found[:120],
+            fix="Export the path again.",
+        )
+    if world is not None:
+        back = world.inverse
+        views = [
+            dataclasses.replace(view, cam_from_world=back.camera(view.cam_from_world))
+            for view in views
+        ]
     return views, fps
 
 
-def views_from(world: Similarity, views: Sequence[View]) -> list[View]:
-    """Views of another world, transformed into the model's.
-
-    Args:
-        world: From the model's world to the views' world.
-        views: The views in that world.
-    """
-    back = world.inverse
-    return [
-        dataclasses.replace(view, cam_from_world=back.camera(view.cam_from_world)) for view in views
-    ]
+def _view_of_frame(frame: dict[str, Any], size: tuple[int, int], i: int) -> View:
+    world_from_gl = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
+    fov = np.radians(float(frame.get("fov", 50)))
+    rotation = world_from_gl[:3, :3]
+    if not np.isfinite(world_from_gl).all() or not 0 < fov < np.pi:
+        raise ValueError(f"camera {i} with a field of view of {frame.get('fov')}")
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
+        raise ValueError(f"camera {i}, whose matrix is no rotation")
+    return pinhole_view(size, fov, np.linalg.inv(world_from_gl @ OPENCV_FROM_OPENGL))
 
 
 def check_path(
@@ -185,20 +216,15 @@ def check_path(
     """
     some = [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), LOOKS)).astype(int)]
     xyz = gaussians.means[:: max(1, len(gaussians) // LOOKED_AT)].astype(np.float64)
-    seen = np.array([_share_seen(view, xyz) for view in some])
-    found = ""
-    if np.mean(seen < LEAST_SEEN) > HALF:
-        found = "next to none of them in most of its pictures"
-    elif len(cameras) > 1:
-        known, asked = _centers(cameras), _centers(some)
-        middle = np.median(known, axis=0)
-        reach = np.linalg.norm(known - middle, axis=1).max()
-        if np.median(np.linalg.norm(asked - middle, axis=1)) > FAR_AWAY * reach > 0:
-            found = "cameras far from all that the model was trained from"
-    if found:
+    lost = np.mean([_share_seen(view, xyz) < LEAST_SEEN for view in some]) > 0.5
+    if len(cameras) > 1:
+        middle = np.median(_centers(cameras), axis=0)
+        reach, away = (np.linalg.norm(_centers(v) - middle, axis=1) for v in (cameras, some))
+        lost = lost or np.median(away) > FAR_AWAY * reach.max() > 0
+    if lost:
         raise SceneFormatError(
-            f"{path} to show the Gaussians",
-            found=f"{found}: a path through another world",
+            f"{path} to lead past the model",
+            found="a path through another world, far away or with next to no Gaussians in sight",
             fix="nerfstudio's paths are in a world of its own: name the dataparser_transforms.json "
             "of its run with --transform; to follow the path as it is, pass --transform none.",
         )
@@ -212,34 +238,6 @@ def _share_seen(view: View, xyz: Float64[np.ndarray, "N 3"]) -> float:
     return float(inside.mean())
 
 
-def _centers(views: Sequence[View]) -> Float64[np.ndarray, "N 3"]:
-    return np.array([_pose_vector(view)[:3] for view in views])
-
-
-def _no_path(path: Path, found: str) -> SceneFormatError:
-    return SceneFormatError(
-        f"{path} to be a camera path as nerfstudio's viewer writes it: "
-        "camera_path, with camera_to_world and fov",
-        found=found[:120],
-        fix="Export the path again.",
-    )
-
-
-def _view_of_frame(frame: dict[str, Any], size: tuple[int, int], i: int) -> View:
-    world_from_gl = np.array(frame["camera_to_world"], np.float64).reshape(4, 4)
-    fov = np.radians(float(frame.get("fov", 50)))
-    rotation = world_from_gl[:3, :3]
-    if not np.isfinite(world_from_gl).all() or not 0 < fov < np.pi:
-        raise ValueError(f"camera {i} with a field of view of {frame.get('fov')}")
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        raise ValueError(f"camera {i}, whose matrix is no rotation")
-    cam_from_world = np.linalg.inv(world_from_gl @ OPENCV_FROM_OPENGL)
-    width, height = size
-    focal = height / 2 / np.tan(fov / 2)
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    return View(f"{i}", np.empty((0, 0, 3), np.uint8), K, width, height, cam_from_world)
-
-
 def _in_order(views: Sequence[View]) -> list[View]:
     """Views sorted by name, as in a walk or video; by nearest neighbour if names give no order."""
     by_name = sorted(views, key=lambda view: view.name)
@@ -248,12 +246,10 @@ def _in_order(views: Sequence[View]) -> list[View]:
     centers = _centers(by_name)
     gaps = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     np.fill_diagonal(gaps, np.inf)
-    at, tour = 0, [0]
-    left = set(range(1, len(views)))
+    tour, left = [0], set(range(1, len(views)))
     while left:
-        at = min(left, key=lambda each: gaps[tour[-1], each])
-        tour.append(at)
-        left.remove(at)
+        tour.append(min(left, key=lambda each: gaps[tour[-1], each]))
+        left.remove(tour[-1])
     walked = sum(gaps[a, b] for a, b in pairwise(tour))
     named = sum(gaps[a, b] for a, b in pairwise(range(len(views))))
     return [by_name[i] for i in tour] if named > DETOUR * walked else by_name
@@ -265,9 +261,18 @@ def _pose_vector(view: View) -> Float64[np.ndarray, " 9"]:
     return np.concatenate([-rotation.T @ translation, rotation[2], -rotation[1]])
 
 
-def _view_of_vector(model: View, pose: Float64[np.ndarray, " 9"], i: int) -> View:
-    eye, forward, up = pose[:3], pose[3:6], pose[6:]
-    return dataclasses.replace(model, name=f"{i}", cam_from_world=look_at(eye, eye + forward, up))
+def _centers(views: Sequence[View]) -> Float64[np.ndarray, "N 3"]:
+    return np.array([_pose_vector(view)[:3] for view in views])
+
+
+def _posed(
+    lens: View,
+    i: int,
+    eye: Float64[np.ndarray, " 3"],
+    target: Float64[np.ndarray, " 3"],
+    up: Float64[np.ndarray, " 3"],
+) -> View:
+    return dataclasses.replace(lens, name=f"{i}", cam_from_world=look_at(eye, target, up))
 
 
 def _interpolated(
@@ -287,7 +292,88 @@ def _median_camera(views: Sequence[View]) -> View:
     return views[int(np.argsort(focals)[len(focals) // 2])]
 
 
-def _made_up() -> View:
-    width, height = MADE_UP_SIZE
-    K = np.array([[height, 0, width / 2], [0, height, height / 2], [0, 0, 1.0]])
-    return View("made up", np.empty((0, 0, 3), np.uint8), K, width, height, np.eye(4))
+# Frames and videos --------------------------------------------------------------------------------
+
+
+def flight_frames(
+    renderers: Sequence[ModelRenderer],
+    names: Sequence[str],
+    path: Sequence[View],
+    *,
+    depth: bool = False,
+    progress: Progress = silent,
+) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    """The frames of a path: of one model, or of two side by side.
+
+    Args:
+        renderers: One model, or two.
+        names: The models' names, shown when there are two.
+        path: The cameras.
+        depth: Show depth, not colour.
+        progress: Called with the stage and the fraction done.
+    """
+    limits = (0.0, 1.0)
+    if depth:
+        some = path[:: max(1, len(path) // DEPTH_SAMPLES)]
+        limits = depth_range(np.stack([renderers[0].depth(view) for view in some]))
+    for i, view in enumerate(path):
+        pictures = [
+            depth_colors(each.depth(view), limits) if depth else as_bytes(each.color(view))
+            for each in renderers
+        ]
+        yield pictures[0] if len(pictures) == 1 else split_picture(pictures[0], pictures[1], *names)
+        progress("render", (i + 1) / len(path))
+
+
+def even_size(width: int, height: int, most: int | None = None) -> tuple[int, int]:
+    """The nearest size that H.264 allows, both sides even.
+
+    Args:
+        width: Pixels.
+        height: Pixels.
+        most: Limit of the longer side; unlimited when left out.
+    """
+    scale = min(1.0, most / max(width, height)) if most else 1.0
+    width, height = (max(2, 2 * round(scale * side / 2)) for side in (width, height))
+    return width, height
+
+
+def write_video(
+    path: Path, frames: Iterable[UInt8[np.ndarray, "H W 3"]], size: tuple[int, int], fps: float
+) -> None:
+    """Write frames as H.264 by imageio-ffmpeg's ffmpeg, replacing a file at ``path``.
+
+    Args:
+        path: Its suffix is .mp4, .mkv or .mov.
+        frames: One after the other, all of one size.
+        size: Their width and height, both even.
+        fps: Frames per second.
+
+    Raises:
+        MissingDependencyError: imageio-ffmpeg is absent.
+        OutputError: The video cannot be written.
+    """
+    require("imageio_ffmpeg")
+    import imageio_ffmpeg  # noqa: PLC0415  (of the extra view)
+
+    with atomic_file(path) as partial:
+        writer = imageio_ffmpeg.write_frames(
+            str(partial),
+            size,
+            fps=fps,
+            quality=QUALITY,
+            macro_block_size=2,
+            ffmpeg_log_level="error",
+            output_params=["-movflags", "+faststart"],
+        )
+        try:
+            with closing(writer):  # also when stopped: ffmpeg must end before its file is removed
+                writer.send(None)
+                for frame in frames:
+                    writer.send(np.ascontiguousarray(frame))
+        except (OSError, RuntimeError) as error:  # ffmpeg ended early
+            raise OutputError(
+                f"{path} to be written",
+                found=" ".join(str(error).split())[-160:] or type(error).__name__,
+                fix="Check the disk and try again. Nothing half-written was left behind.",
+            ) from None

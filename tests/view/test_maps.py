@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 from PIL import Image as PillowImage
 
 from splatseed.camera import Camera, Intrinsics
 from splatseed.pointcloud import PointCloud
-from splatseed.preview import map_tiles, preview_maps
-from splatseed.preview.colors import UNKNOWN
-from splatseed.preview.maps import depth_picture, normal_picture
 from splatseed.scene import Image, Scene, SceneSource
+from splatseed.stereo import StereoMap
+from splatseed.view.maps import depth_picture, map_tiles, normal_picture, preview_maps
+from splatseed.view.page import UNKNOWN
 
 WIDTH, HEIGHT = 20, 12
 K = np.array([[20.0, 0, 10], [0, 20.0, 6], [0, 0, 1]])
-
-
-@dataclass
-class Maps:
-    """Stands in for what stereo makes."""
-
-    name: str
-    camera: Camera
-    depth: np.ndarray
-    normal: np.ndarray
-    confidence: np.ndarray
 
 
 @pytest.fixture
@@ -37,7 +24,7 @@ def maps():
     normal = np.tile(np.array([0, 0, -1], np.float32), (HEIGHT, WIDTH, 1))
     depth[:, : WIDTH // 2] = normal[:, : WIDTH // 2] = np.nan
     camera = Camera(K, WIDTH, HEIGHT, np.eye(4))
-    return Maps("a.png", camera, depth, normal, np.nan_to_num(depth / 8))
+    return StereoMap("a.png", camera, depth, normal, np.nan_to_num(depth / 8), (), np.empty(0))
 
 
 def test_unknown_is_grey_and_near_is_brighter_than_far(maps):

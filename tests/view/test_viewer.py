@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 import shutil
 import socket
+from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -15,15 +15,21 @@ torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
 pytest.importorskip("viser", reason="the viewer needs viser (extra view)")
 
 from splatseed.cli import main
+from splatseed.commands import view as verb
 from splatseed.errors import ParameterError
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.gaussians import TrainingFrame
-from splatseed.viewer import pictures, session as session_module
-from splatseed.viewer.canvas import canvas_view, fitted_fov, laid_onto, stage_pose
-from splatseed.viewer.pictures import Entry
-from splatseed.viewer.shown import open_shown
-from splatseed.viewer.stage import clouds_of
-from splatseed.viewer.viewer import Viewer, free_port, stage_frame
+from splatseed.view import pictures, session as session_module
+from splatseed.view.models import open_shown, stage_frame
+from splatseed.view.pictures import (
+    Entry,
+    canvas_view,
+    clouds_of,
+    fitted_fov,
+    laid_onto,
+    stage_pose,
+)
+from splatseed.view.server import Viewer, free_port
 
 from .page import (
     CHROMIUM,
@@ -42,14 +48,29 @@ BLANK = 15
 """A picture whose values deviate by less shows nothing."""
 
 
-@pytest.fixture
-def viewer(run_folder):
-    """A run, served."""
+def _entry(shown):
+    return Entry(shown, stage_frame(shown))
+
+
+@contextmanager
+def _served(*entries, **more):
     port = free_port("127.0.0.1", 0)
-    served = Viewer([open_shown(run_folder)], "127.0.0.1", port)
-    served.url = f"http://127.0.0.1:{port}"
-    yield served
-    served.stop()
+    viewer = Viewer(list(entries), "127.0.0.1", port, **more)
+    viewer.url = f"http://127.0.0.1:{port}"
+    yield viewer
+    viewer.stop()
+
+
+@pytest.fixture
+def viewer(entry):
+    """A run, served."""
+    with _served(entry) as served:
+        yield served
+
+
+@pytest.fixture
+def entry(run_folder):
+    return _entry(open_shown(run_folder))
 
 
 def _session(viewer):
@@ -105,10 +126,8 @@ def test_a_run_is_seen_offline_and_a_click_flies(viewer, run_folder, tmp_path):
 
 @needs_browser
 def test_a_click_of_the_mouse_on_a_camera_flies_there(room, tmp_path):
-    port = free_port("127.0.0.1", 0)
-    served = Viewer([open_shown(room)], "127.0.0.1", port)
-    with served_page(tmp_path, f"http://127.0.0.1:{port}") as page:
-        session = _session(served)
+    with _served(_entry(open_shown(room))) as viewer, served_page(tmp_path, viewer.url) as page:
+        session = _session(viewer)
         assert waits_for(lambda: "Show cameras" in text(page))
         assert waits_for(lambda: _camera_in_sight(session))
         begin = session._client.camera.position, session._client.camera.wxyz
@@ -133,7 +152,6 @@ def test_a_click_of_the_mouse_on_a_camera_flies_there(room, tmp_path):
         assert waits_for(lambda: not handle.visible)  # it does not stand in its own way
         session._client.camera.position = np.asarray(session._client.camera.position) + 0.1
         assert waits_for(lambda: handle.visible)
-    served.stop()
 
 
 def _camera_in_sight(session):
@@ -151,40 +169,32 @@ def _camera_in_sight(session):
 @needs_browser
 def test_a_browser_gets_as_many_points_as_it_draws_quickly(room, tmp_path, monkeypatch):
     monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
-    monkeypatch.setattr(
-        session_module.Session, "_seconds_of_a_picture", lambda _, points: points / 1e6
-    )
-    port = free_port("127.0.0.1", 0)
-    served = Viewer([open_shown(room)], "127.0.0.1", port)
-    total = len(served.entries[0].shown.scene.points)
-    with served_page(tmp_path, f"http://127.0.0.1:{port}") as page:
-        session = _session(served)
+    monkeypatch.setattr(session_module.Session, "_affordable_points", lambda _: 10**6)
+    entry = _entry(open_shown(room))
+    total = len(entry.shown.scene.points)
+    with _served(entry) as viewer, served_page(tmp_path, viewer.url) as page:
+        session = _session(viewer)
         assert waits_for(lambda: len(session._clouds["original"].xyz) == total)
         assert waits_for(lambda: f"original: {total:,}" in text(page))
-        monkeypatch.setattr(session, "_seconds_of_a_picture", lambda points: 100.0 * points)
-        session._fill_stage()  # as when another entry is chosen
-        assert waits_for(lambda: f"original: {total:,} (" in text(page))
-        assert len(session._clouds["original"].xyz) <= 100
+        monkeypatch.undo()
+        monkeypatch.setattr(session_module, "FIRST_POINTS", 100)
+        assert session._affordable_points() > 0
         # One that does not answer is left with the points that it has, shown.
-        session._seconds_of_a_picture = partial(_unanswered, session)
+        monkeypatch.setattr(session_module, "MOST_PATIENCE", 0.0)
         with pytest.raises(TimeoutError):
             session._affordable_points()
+        session._points_on.value = True
+        session._restyle()
         assert all(node.visible for node in session._nodes.values())
-    served.stop()
-
-
-def _unanswered(session, points):
-    for node in session._nodes.values():
-        node.visible = points
-    raise TimeoutError
 
 
 @needs_browser
-def test_switches_of_the_page_act_and_what_is_compared_is_there(run_folder, tmp_path):
-    port = free_port("127.0.0.1", 0)
-    one = open_shown(run_folder)
-    viewer = Viewer([one, replace(one, name="other")], "127.0.0.1", port, beside=1)
-    with served_page(tmp_path, f"http://127.0.0.1:{port}") as page:
+def test_switches_of_the_page_act_and_what_is_compared_is_there(entry, tmp_path):
+    other = _entry(replace(entry.shown, name="other"))
+    with (
+        _served(entry, other, beside=other) as viewer,
+        served_page(tmp_path, viewer.url) as page,
+    ):
         session = _session(viewer)
         assert session._second.value == "other: Gaussians"
         assert session._split.visible
@@ -197,7 +207,6 @@ def test_switches_of_the_page_act_and_what_is_compared_is_there(run_folder, tmp_
         click_text(page, "Screenshot", "button")
         assert waits_for(lambda: shots)
         assert shots[0][1].startswith(b"\x89PNG")
-    viewer.stop()
 
 
 @needs_browser
@@ -224,12 +233,6 @@ def test_two_browsers_have_switches_of_their_own_and_may_go(viewer, tmp_path):
 
 
 # What is drawn -----------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def entry(run_folder):
-    shown = open_shown(run_folder)
-    return Entry(shown, stage_frame(shown))
 
 
 def _canvas_at(entry, image, size):
@@ -295,7 +298,7 @@ def test_what_needs_a_camera_says_so(entry):
 def test_a_folder_that_vanishes_is_told_not_fatal(room, run_folder, tmp_path):
     own = shutil.copytree(room, tmp_path / "own")
     shown = open_shown(run_folder, own)
-    entry = Entry(shown, stage_frame(shown))
+    entry = _entry(shown)
     shutil.rmtree(own)
     image = shown.scene.images[0]
     picture, why = entry.draw("photograph", _canvas_at(entry, image, (64, 48)), image)
@@ -352,3 +355,14 @@ def test_bad_input_is_one_line(words, said, room, tmp_path, monkeypatch, capsys)
     assert stop.value.code == 2
     assert said in heard.err
     assert heard.err.count("\n") == 1
+
+
+def test_a_folder_that_holds_many_says_which_are_shown(room, tmp_path, monkeypatch, capsys):
+    for name in "abc":
+        (tmp_path / name).symlink_to(room)
+    assert [path.name for path in verb._within(tmp_path)] == ["a", "b", "c"]
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(verb, "MOST_OPENED", 2)
+    assert [path.name for path in verb._within(tmp_path)] == ["a", "b"]
+    said = capsys.readouterr()
+    assert "holds 3; shown are the first 2 by name" in " ".join((said.out + said.err).split())

@@ -16,9 +16,8 @@ from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene
 from splatseed.train.run import prepare_run
 from splatseed.train.settings import TrainSettings
-from splatseed.viewer.canvas import canvas_view, fitted_fov, stage_pose
-from splatseed.viewer.training import TrainingViewer
-from splatseed.viewer.viewer import free_port
+from splatseed.view.pictures import canvas_view, fitted_fov, stage_pose
+from splatseed.view.server import TrainingViewer, free_port
 
 STEPS = 40
 
@@ -45,8 +44,9 @@ def watched(room, tmp_path):
 
 
 def _canvas(viewer, image):
-    wxyz, position = stage_pose(image.camera, viewer.frame)
-    return canvas_view(wxyz, position, fitted_fov(image.camera, 4 / 3), (80, 60), viewer.frame)
+    frame = viewer.entries[0].frame
+    wxyz, position = stage_pose(image.camera, frame)
+    return canvas_view(wxyz, position, fitted_fov(image.camera, 4 / 3), (80, 60), frame)
 
 
 def test_renders_come_between_steps_and_change_nothing(watched, room, tmp_path):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.diagnostics.geometry import far_share, local_spacing, measure, spacing
 from splatseed.errors import PointCloudError
+from splatseed.seeding.diagnostics import far_share, local_spacing, measure, spacing
 from splatseed.synthetic import SHAPES
 
 

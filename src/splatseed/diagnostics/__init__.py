@@ -1,1 +1,0 @@
-"""Statistics of scenes and clouds: what is wrong with a scene, how far points are from surfaces."""

@@ -1,0 +1,1 @@
+"""Looking at scenes and models: pictures, the viewer in the browser, flights."""

@@ -1,0 +1,257 @@
+"""Pages of clouds, as one of the scene's own cameras sees them if it has any.
+
+Notation: cell (i, j) of a ``covered`` grid [rows, columns] starts at pixel (``cell i``, ``cell j``)
+and has ``cell`` px a side; the last row and column may reach beyond the photograph. Promise: files
+appear whole or not at all; cells are coloured exactly, without bleeding into each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from splatseed.camera import Camera
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Scene
+from splatseed.upsample.registry import origin_name
+from splatseed.view.page import (
+    GRID_SIDE,
+    Tile,
+    color_bar,
+    fitted,
+    legend,
+    map_colors,
+    photograph_at,
+    resized,
+    write_grid,
+)
+from splatseed.view.points import origin_colors, origin_picture, picture_size, render_points
+from splatseed.views.viewpoint import choose_camera, choose_image
+
+PAIR_SIDE = 800
+GREY = 150
+NEAR, FAR = np.array([0, 114, 178]), np.array([213, 94, 0])
+"""Colours of points on an aligned cloud and of those off it."""
+EMPTY = np.array([214.0, 20.0, 190.0])
+"""Colour of cells without a seed: magenta, the rarest colour in photographs."""
+BLEND = 0.6
+"""Opacity of that colour."""
+DIM = 0.75
+"""Factor on the brightness of the photograph under cells."""
+
+
+class CoveredView(NamedTuple):
+    """Which cells of one view are covered.
+
+    Args:
+        name: The image's name.
+        photograph: Its pixels, uint8 [H, W, 3].
+        cell: Side of a cell in pixels.
+        before: Whether each cell holds an original, bool [rows, columns].
+        after: Whether it holds a seed.
+    """
+
+    name: str
+    photograph: UInt8[np.ndarray, "H W 3"]
+    cell: int
+    before: Bool[np.ndarray, "rows columns"]
+    after: Bool[np.ndarray, "rows columns"]
+
+
+def preview_pair(
+    scene: Scene, upsampled: PointCloud, path: Path | str, *, title: str = "upsampled"
+) -> Path:
+    """Write a picture of the scene's points beside the upsampled ones, from one camera.
+
+    Args:
+        scene: The scene as read.
+        upsampled: The points made from it.
+        path: The PNG to write.
+        title: Describes the upsampled points, such as ``"mls, 8x"``.
+
+    Raises:
+        OutputError: The file cannot be written.
+        PointCloudError: The scene has no finite points.
+    """
+    clouds = {"original": scene.points, title: upsampled}
+    return write_grid(_cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE), path, columns=2)
+
+
+def preview_methods(scene: Scene, clouds: Mapping[str, PointCloud], path: Path | str) -> Path:
+    """Write a grid: the photograph if there is one, the scene's points, and each cloud.
+
+    Args:
+        scene: The scene as read.
+        clouds: Upsampled points by label, drawn in this order.
+        path: The PNG to write.
+
+    Raises:
+        OutputError: The file cannot be written.
+        PointCloudError: The scene has no finite points.
+    """
+    clouds = {"original": scene.points, **clouds}
+    return write_grid(
+        [
+            *_photograph(scene, GRID_SIDE, "photograph"),
+            *_cloud_tiles(clouds, choose_camera(scene), GRID_SIDE),
+        ],
+        path,
+    )
+
+
+def preview_errors(
+    clouds: Mapping[str, PointCloud],
+    distances: Mapping[str, Float64[np.ndarray, " N"]],
+    camera: Camera,
+    path: Path | str,
+) -> Path:
+    """Write a grid of clouds whose points are coloured by their distance to the true surface.
+
+    Args:
+        clouds: Points by label; usually only the new ones.
+        distances: For each label the distance of every point, in spacings h of the originals; from
+            1 on points have the last colour.
+        camera: The camera to look from.
+        path: The PNG to write.
+
+    Raises:
+        OutputError: The file cannot be written.
+        PointCloudError: Distances and points differ in number.
+    """
+    colored = {
+        f"{label}   {len(cloud):,} points: mean error {distances[label].mean():.2f} spacings": (
+            cloud.replace(rgb=map_colors(distances[label], 0.0, 1.0, "plasma"))
+        )
+        for label, cloud in clouds.items()
+    }
+    bar = color_bar("0 spacings", "1 spacings or more from the surface")
+    return write_grid(_cloud_tiles(colored, camera, GRID_SIDE, counted=False), path, footer=bar)
+
+
+def preview_origins(scene: Scene, points: PointCloud, path: Path | str) -> Path:
+    """Write a page: the seeds in their own colours, and by origin over the photograph.
+
+    Args:
+        scene: The scene as read; one of its cameras is chosen.
+        points: The seeds.
+        path: The PNG to write.
+
+    Raises:
+        OutputError: The file cannot be written.
+        PointCloudError: The scene has no finite points.
+    """
+    camera = choose_camera(scene)
+    scale = PAIR_SIDE / max(camera.width, camera.height)
+    size = picture_size(camera, scale)
+    photograph = photograph_at(scene, choose_image(scene), size)
+    tiles = [
+        Tile(f"{len(points):,} seeds", render_points(points, camera, scale=scale)),
+        Tile("by origin", origin_picture(points, camera, photograph, scale=scale)),
+    ]
+    codes, counts = np.unique(points.source, return_counts=True)
+    colors = origin_colors(codes.astype(np.uint8)).tolist()
+    entries = [
+        (f"{origin_name(code)} {count:,}", tuple(color))
+        for code, count, color in zip(codes.tolist(), counts.tolist(), colors, strict=True)
+    ]
+    return write_grid(tiles, path, columns=2, footer=legend(entries, 2 * size[0]))
+
+
+def preview_alignment(
+    scene: Scene,
+    cloud: Float64[np.ndarray, "N 3"],
+    rgb: UInt8[np.ndarray, "N 3"] | None,
+    marks: Float64[np.ndarray, "M 3"],
+    share: Float64[np.ndarray, " M"],
+    path: Path | str,
+) -> Path:
+    """Write a page of photograph, aligned cloud and residuals, side by side.
+
+    Args:
+        scene: One of its cameras is chosen.
+        cloud: A sample of the cloud in the scene's frame.
+        rgb: Its colours; grey without.
+        marks: The scene's points that it was aligned with.
+        share: For each, 0 on the cloud to 1 where it does not count.
+        path: The PNG to write.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    blend = np.clip(share, 0, 1)[:, None]
+    shades = np.rint((1 - blend) * NEAR + blend * FAR).astype(np.uint8)
+    clouds = {
+        "the cloud from its camera, as aligned": PointCloud(
+            cloud, np.full(cloud.shape, GREY, np.uint8) if rgb is None else rgb
+        ),
+        "the scene's points: blue on the cloud, orange off it": PointCloud(marks, shades),
+    }
+    drawn = _cloud_tiles(clouds, choose_camera(scene), PAIR_SIDE, counted=False)
+    tiles = [*_photograph(scene, PAIR_SIDE, "a photograph"), *drawn]
+    return write_grid(tiles, path, columns=len(tiles))
+
+
+def preview_cells(views: Sequence[CoveredView], path: Path | str) -> Path:
+    """Write a page: for each view, the cells covered by the originals, and by all seeds.
+
+    Args:
+        views: At least one.
+        path: The PNG to write.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    tiles = []
+    for view in views:
+        labels = (
+            f"{view.name[-28:]}: {view.before.mean():.1%} covered",
+            (f"with new points: {view.after.mean():.1%}"),
+        )
+        for label, covered in zip(labels, (view.before, view.after), strict=True):
+            picture = cell_picture(view.photograph, covered, view.cell)
+            size = fitted(picture.shape[1], picture.shape[0])
+            tiles.append(Tile(label, resized(picture, size)))
+    return write_grid(tiles, path, columns=2 if len(views) == 1 else 4)
+
+
+def cell_picture(
+    photograph: UInt8[np.ndarray, "H W 3"], covered: Bool[np.ndarray, "rows columns"], cell: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The dimmed photograph, with cells without a seed in magenta.
+
+    Args:
+        photograph: The photograph at the size at which cells were counted.
+        covered: Whether each cell holds a seed.
+        cell: Side of a cell in pixels.
+    """
+    height, width = photograph.shape[:2]
+    empty = ~np.repeat(np.repeat(covered, cell, axis=0), cell, axis=1)[:height, :width, None]
+    dimmed = DIM * photograph.astype(np.float64)
+    grey = dimmed.mean(axis=2, keepdims=True)
+    picture = np.where(empty, (1 - BLEND) * grey + BLEND * EMPTY, dimmed)
+    return np.asarray(np.round(picture), np.uint8)
+
+
+def _photograph(scene: Scene, side: int, label: str) -> list[Tile]:
+    """The photograph of the camera that ``choose_camera`` takes, if it can be read."""
+    camera = choose_camera(scene)
+    size = picture_size(camera, side / max(camera.width, camera.height))
+    photograph = photograph_at(scene, choose_image(scene), size)
+    return [] if photograph is None else [Tile(label, photograph)]
+
+
+def _cloud_tiles(
+    clouds: Mapping[str, PointCloud], camera: Camera, side: int, *, counted: bool = True
+) -> list[Tile]:
+    scale = side / max(camera.width, camera.height)
+    return [
+        Tile(
+            f"{label}   {len(cloud):,} points" if counted else label,
+            render_points(cloud, camera, scale=scale),
+        )
+        for label, cloud in clouds.items()
+    ]

@@ -1,0 +1,299 @@
+"""What a user names to look at: a scene, a run, or a file of Gaussians; and renders of the latter.
+
+Notation: the *stage* is the world moved and scaled so that near planes and single precision work:
+the training frame if the scene is known, else one fitted to what is shown; depth is planar z in
+world units, 0 where there is none. Promise: a file's content decides what it is; a model knows its
+scene if the run or the user names it; no gradients are computed, and renders are not cached.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, UInt8
+from PIL import Image as PillowImage, ImageDraw
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.export import detect_format, read_model
+from splatseed.io import load_scene
+from splatseed.io.files import read_bytes
+from splatseed.render.rasterize import rasterization
+from splatseed.scene import Scene
+from splatseed.splat.gaussians import Gaussians, TrainingFrame, training_frame
+from splatseed.train.folder import RunFolder
+from splatseed.view.page import font, latin, map_colors
+from splatseed.views.view import View, poses_of
+
+MODEL_SUFFIXES = (".spz", ".splat", ".sog", ".ksplat", ".glb")
+_HEADER = 1 << 16
+CORE = 0.6
+"""Share of the points, nearest to their median, that the stage is fitted to without cameras."""
+LEAST_ALPHA = 0.05
+"""Alpha below which a pixel has no depth."""
+LINE, WHITE = 2, 255
+"""Width and colour of the border between two pictures."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What a viewer shows: a scene, a model, or a model with its scene.
+
+    Args:
+        name: What to call it.
+        scene: Points, cameras and photographs; None for a lone model.
+        gaussians: The model, in the scene's world; None for a lone scene.
+        data_factor: The factor by which the run downsampled its photographs; 1 if unknown.
+        test_every: Every ``test_every``-th image, sorted by name, is a test view.
+    """
+
+    name: str
+    scene: Scene | None = None
+    gaussians: Gaussians | None = None
+    data_factor: int = 1
+    test_every: int = 8
+
+    @property
+    def train_views(self) -> tuple[View, ...]:
+        """The training cameras, as large as the run's photographs; none without a scene."""
+        images = self.scene.split(self.test_every)[0] if self.scene else ()
+        return poses_of(images, self.data_factor)
+
+
+def open_shown(path: Path, scene_path: Path | None = None) -> Shown:
+    """Read what a user names.
+
+    Args:
+        path: A scene, a run folder, or a file of Gaussians or points.
+        scene_path: The scene that a model belongs to; by default the one named by its run, if that
+            exists.
+
+    Raises:
+        SceneNotFoundError: ``path``, or the scene that the user names, does not exist.
+        SceneFormatError: It is damaged, or cannot be shown.
+    """
+    folder = RunFolder(path)
+    if path.is_dir() and folder.is_run:
+        return _open_run(folder, scene_path)
+    if path.is_file() and _is_model(path):
+        scene = None if scene_path is None else load_scene(scene_path, require_points=False)
+        return Shown(path.name, scene, read_model(path))
+    return Shown(path.name, load_scene(path, require_points=False))
+
+
+def _open_run(folder: RunFolder, scene_path: Path | None) -> Shown:
+    if not folder.gaussians.is_file():
+        raise SceneNotFoundError(
+            f"{folder.path} to be a finished run of splatseed train",
+            found="a run that has not finished",
+            fix=f"Continue it: splatseed train SCENE -o {folder.path} --resume.",
+        )
+    config, scene = folder.read_config(), None
+    named = scene_path or folder.scene_of(config)
+    if named is not None:
+        try:
+            scene = load_scene(Path(named), require_points=False)
+        except (SceneNotFoundError, SceneFormatError):
+            if scene_path is not None:
+                raise
+    return Shown(
+        folder.path.name,
+        scene,
+        read_model(folder.gaussians),
+        int(config.get("data_factor", 1)),
+        int(config.get("test_every", 8)),
+    )
+
+
+def _is_model(path: Path) -> bool:
+    """Whether a file holds Gaussians: a .ply of points is a scene."""
+    if path.suffix.lower() in MODEL_SUFFIXES:
+        return True
+    data = read_bytes(path)
+    if path.suffix.lower() == ".json" and b'"means"' not in data[:_HEADER]:
+        return False
+    try:
+        kind = detect_format(path, data)
+    except SceneFormatError:
+        return False
+    return kind != "ply" or b" rot_0\n" in data[:_HEADER].replace(b"\r", b"")
+
+
+def share_a_world(first: Shown, second: Shown) -> bool:
+    """Whether the cameras of one also see the other: a photograph has the same pose in both.
+
+    Also where the scene of one is unknown, as nothing speaks against it.
+    """
+    if not (first.scene and first.scene.images and second.scene):
+        return True
+    poses = {image.name: image.camera.world_from_cam for image in first.scene.images}
+    return any(
+        np.allclose(poses[image.name], image.camera.world_from_cam, rtol=1e-4, atol=1e-4)
+        for image in second.scene.images
+        if image.name in poses
+    )
+
+
+def stage_frame(shown: Shown) -> TrainingFrame:
+    """The training frame or, with fewer than two cameras, one fitted to the model or the points."""
+    scene = shown.scene
+    if scene is not None and len(scene.images) > 1:
+        return training_frame(poses_of(scene.split(shown.test_every)[0]))
+    if shown.gaussians is not None:
+        xyz = shown.gaussians.means.astype(np.float64)
+    else:
+        assert scene is not None  # noqa: S101  (there is a model or a scene)
+        xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
+    if not len(xyz):
+        return TrainingFrame(np.zeros(3), 1.0)
+    origin = np.median(xyz, axis=0)
+    reach = float(np.quantile(np.linalg.norm(xyz - origin, axis=1), CORE))
+    return TrainingFrame(origin, 1 / reach if reach > 0 else 1.0)
+
+
+def pinhole_view(
+    size: tuple[int, int], fov: float, cam_from_world: Float64[np.ndarray, "4 4"]
+) -> View:
+    """A view without pixels.
+
+    Args:
+        size: Its width and height.
+        fov: Its vertical field of view, radians.
+        cam_from_world: Its pose.
+    """
+    width, height = size
+    focal = height / 2 / np.tan(fov / 2)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return View("", np.empty((0, 0, 3), np.uint8), K, width, height, cam_from_world)
+
+
+def with_size(view: View, width: int, height: int) -> View:
+    """A camera with another picture size and the same vertical field of view."""
+    scale = height / view.height
+    K = np.diag([scale, scale, 1.0]) @ view.K
+    K[0, 2] += (width - scale * view.width) / 2
+    return dataclasses.replace(view, K=K, width=width, height=height)
+
+
+class ModelRenderer:
+    """Renders Gaussians given in world coordinates.
+
+    Args:
+        gaussians: In world coordinates.
+        frame: The stage to render on.
+        device: Where to render; the CPU when left out.
+    """
+
+    def __init__(
+        self, gaussians: Gaussians, frame: TrainingFrame, device: torch.device | None = None
+    ) -> None:
+        self.frame = frame
+        self.count = len(gaussians)
+        self._degree = math.isqrt(1 + gaussians.shN.shape[1]) - 1
+        tensors = {name: torch.tensor(a, device=device) for name, a in gaussians.arrays().items()}
+        self._means = torch.tensor(frame.points_from_world(gaussians.means), device=device)
+        self._shapes: dict[str, Any] = {
+            "quats": tensors["quats"],
+            "scales": torch.exp(tensors["scales"] + math.log(frame.scale)),
+            "opacities": torch.sigmoid(tensors["opacities"]),
+        }
+        colors = (tensors["sh0"], tensors["shN"]) if self._degree else tensors["sh0"]
+        if isinstance(colors, tuple) and self._means.is_cuda:
+            # gsplat takes them joined, our own rasteriser in two: joined once, not for every frame.
+            colors = torch.cat(colors, dim=1)
+        self._colors = colors
+
+    @torch.no_grad()
+    def color(self, view: View) -> Float32[np.ndarray, "H W 3"]:
+        """The rendered view, in [0, 1]; the background is black."""
+        return np.asarray(self._images(view, "RGB")[0].clamp_(0, 1).cpu().numpy())
+
+    @torch.no_grad()
+    def depth(self, view: View) -> Float32[np.ndarray, "H W"]:
+        """Expected planar depth in world units; 0 where there is none."""
+        images, alphas = self._images(view, "ED")
+        depth = torch.where(alphas > LEAST_ALPHA, images, 0)[..., 0] / self.frame.scale
+        return np.asarray(depth.cpu().numpy())
+
+    def _images(self, view: View, mode: Literal["RGB", "ED"]) -> tuple[torch.Tensor, torch.Tensor]:
+        posed, device = self.frame.view(view), self._means.device
+        images, alphas, _ = rasterization(
+            means=self._means,
+            **self._shapes,
+            colors=self._colors,
+            sh_degree=self._degree,
+            viewmats=torch.tensor(posed.cam_from_world[None], dtype=torch.float32, device=device),
+            Ks=torch.tensor(posed.K[None], dtype=torch.float32, device=device),
+            width=posed.width,
+            height=posed.height,
+            render_mode=mode,
+        )
+        return images[0], alphas[0]
+
+
+def as_bytes(image: Float32[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Colours in [0, 1] as 8-bit integers."""
+    return np.asarray(np.rint(np.clip(image, 0, 1) * 255), np.uint8)
+
+
+def depth_range(depth: Float32[np.ndarray, "*S"]) -> tuple[float, float]:
+    """Near and far: the 2nd and 98th percentiles of what is known, in world units."""
+    seen = depth[depth > 0]
+    if not seen.size:
+        return 0.0, 1.0
+    near, far = (float(value) for value in np.percentile(seen, [2, 98]))
+    return near, max(far, near * 1.001)
+
+
+def depth_colors(
+    depth: Float32[np.ndarray, "H W"], limits: tuple[float, float]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Depth as colours, spaced evenly in 1 / depth; near is bright, and black means no depth."""
+    near, far = (1 / max(limit, 1e-12) for limit in limits)
+    with np.errstate(divide="ignore"):
+        colors = map_colors(1 / depth, far, near, "turbo")
+    return np.where(depth[..., None] > 0, colors, 0).astype(np.uint8)
+
+
+def split_picture(
+    left: UInt8[np.ndarray, "H W 3"],
+    right: UInt8[np.ndarray, "H W 3"],
+    left_name: str = "",
+    right_name: str = "",
+    *,
+    at: float = 0.5,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The left of one picture and the right of another, labelled, with a white line between."""
+    column = round(at * left.shape[1])
+    named = (
+        _labelled(left, left_name, 0)[:, :column],
+        _labelled(right, right_name, column)[:, column:],
+    )
+    picture = np.concatenate(named, axis=1)
+    picture[:, max(column - LINE // 2, 0) : column + LINE // 2] = WHITE
+    return picture
+
+
+def _labelled(
+    picture: UInt8[np.ndarray, "H W 3"], name: str, column: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture with a name at its lower edge, starting at a given column."""
+    if not name:
+        return picture
+    size = max(10, min(picture.shape[0] // 28, 28))
+    image = PillowImage.fromarray(picture)
+    ImageDraw.Draw(image).text(
+        (column + size // 2, picture.shape[0] - size // 2),
+        latin(name),
+        fill="white",
+        font=font(size),
+        anchor="ld",
+        stroke_width=2,
+        stroke_fill="black",
+    )
+    return np.array(image)

@@ -1,0 +1,189 @@
+"""Pages of labelled pictures, colours for numbers, and the photographs beside them.
+
+Notation: a picture is uint8 [H, W, 3]; a tile is a picture with its label; a page is tiles in rows.
+Promise: the same input gives the same bytes; files appear whole or not at all; unknown values are
+grey; an unreadable photograph is no error, as a scene without photographs still has much to show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image as PillowImage, ImageDraw, ImageFont
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io.output.staging import atomic_file
+from splatseed.io.photograph import decode_photograph, photograph_bytes
+from splatseed.scene import Image, Scene
+
+GRID_SIDE = 600
+"""Longer side of a picture in a grid, in pixels."""
+LABEL_SIZES = (20, 11)
+"""Usual and smallest size of letters."""
+GAP, LABEL_HEIGHT, STRIP_HEIGHT = 12, 34, 44
+PAPER, INK = (255, 255, 255), (20, 20, 20)
+BLANK = (230, 230, 230)
+"""Stands in for a photograph."""
+UNKNOWN = (150, 150, 150)
+RANGE = (2, 98)
+"""Percentiles of a map's values between which its colours vary."""
+
+
+class Tile(NamedTuple):
+    """A picture and its label."""
+
+    label: str
+    picture: UInt8[np.ndarray, "H W 3"]
+
+
+def fitted(width: int, height: int, side: int = GRID_SIDE) -> tuple[int, int]:
+    """Width and height that keep the aspect ratio and whose longer side is ``side``."""
+    factor = side / max(width, height)
+    return max(round(width * factor), 1), max(round(height * factor), 1)
+
+
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The font of labels, which has the letters of Latin-1."""
+    return ImageFont.load_default(size=size)
+
+
+def latin(text: str) -> str:
+    r"""The text as ``font`` can show it, other characters as \u...."""
+    return text.encode("latin-1", "backslashreplace").decode("latin-1")
+
+
+def write_grid(
+    tiles: Sequence[Tile],
+    path: Path | str,
+    *,
+    columns: int | None = None,
+    footer: UInt8[np.ndarray, "H W 3"] | None = None,
+) -> Path:
+    """Arrange pictures in rows, each with its label above, and write the PNG.
+
+    Args:
+        tiles: At least one, placed row by row; smaller pictures are centred.
+        path: The PNG to write.
+        columns: Tiles per row; three or four when left out, whichever leaves fewer gaps.
+        footer: A strip below all, no wider than the page.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    if columns is None:
+        columns = min(len(tiles), min((3, 4), key=lambda count: -len(tiles) % count))
+    height, width = np.max([tile.picture.shape[:2] for tile in tiles], axis=0).tolist()
+    rows = -(-len(tiles) // columns)
+    foot = 0 if footer is None else len(footer)
+    page_height = rows * (height + LABEL_HEIGHT) + GAP + foot
+    page = PillowImage.new("RGB", (columns * (width + GAP) + GAP, page_height), PAPER)
+    draw = ImageDraw.Draw(page)
+    for i, (label, picture) in enumerate(tiles):
+        x = GAP + (i % columns) * (width + GAP)
+        y = (i // columns) * (height + LABEL_HEIGHT)
+        words = latin(label)
+        letters = _letters(words, width)
+        draw.text((x, y + LABEL_HEIGHT / 2), words, fill=INK, font=letters, anchor="lm")
+        left, top = (width - picture.shape[1]) // 2, (height - len(picture)) // 2
+        page.paste(PillowImage.fromarray(picture), (x + left, y + LABEL_HEIGHT + top))
+    if footer is not None:
+        page.paste(PillowImage.fromarray(footer), (GAP, page_height - foot))
+    with atomic_file(Path(path)) as partial:
+        page.save(partial, format="PNG")
+    return Path(path)
+
+
+def _letters(label: str, width: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """The largest font, down to a legible size, in which a label is no wider than its tile."""
+    size, least = LABEL_SIZES
+    needed = font(size).getlength(label)
+    return font(max(min(size, int(size * width / max(needed, 1.0))), least))
+
+
+def resized(
+    picture: UInt8[np.ndarray, "h w 3"], size: tuple[int, int], *, smooth: bool = True
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A picture at a width and height; where pixels must not blend, pass ``smooth=False``."""
+    how = PillowImage.Resampling.LANCZOS if smooth else PillowImage.Resampling.NEAREST
+    return np.asarray(PillowImage.fromarray(picture).resize(size, how))
+
+
+# Colours ------------------------------------------------------------------------------------------
+
+
+def map_colors(
+    values: Float[np.ndarray, "*S"], low: float, high: float, colormap: str = "viridis"
+) -> UInt8[np.ndarray, "*S 3"]:
+    """Colours of values from ``low`` to ``high``; grey where they are not finite.
+
+    The maps viridis (dark is low) and plasma (blue is low) remain distinct in grey print.
+    """
+    from matplotlib import colormaps  # noqa: PLC0415  (slow to import, needed here alone)
+
+    known = np.isfinite(values)
+    share = (np.where(known, values, low) - low) / max(high - low, 1e-12)
+    colors = colormaps[colormap](np.clip(share, 0.0, 1.0), bytes=True)[..., :3]
+    return np.asarray(np.where(known[..., None], colors, np.array(UNKNOWN, np.uint8)))
+
+
+def usual_range(values: Float[np.ndarray, "*S"]) -> tuple[float, float]:
+    """The range of the finite values without their extremes; 0 to 0 if there are none."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0, 0.0
+    low, high = np.percentile(finite, RANGE)
+    return float(low), float(high)
+
+
+def color_bar(low: str, high: str, colormap: str = "plasma") -> UInt8[np.ndarray, "H W 3"]:
+    """A strip of colours with labels at its ends."""
+    strip = map_colors(np.tile(np.linspace(0.0, 1.0, 240), (20, 1)), 0.0, 1.0, colormap)
+    bar = PillowImage.new("RGB", (GRID_SIDE, STRIP_HEIGHT), PAPER)
+    bar.paste(PillowImage.fromarray(strip), (70, 12))
+    draw = ImageDraw.Draw(bar)
+    draw.text((58, 22), low, fill=INK, font=font(18), anchor="rm")
+    draw.text((322, 22), high, fill=INK, font=font(18), anchor="lm")
+    return np.asarray(bar)
+
+
+def legend(
+    entries: Sequence[tuple[str, tuple[int, ...]]], width: int
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A strip of words, each after a dot of its colour."""
+    strip = PillowImage.new("RGB", (width, STRIP_HEIGHT), PAPER)
+    draw, letters, x = ImageDraw.Draw(strip), font(18), 8.0
+    for words, color in entries:
+        draw.ellipse((x, 14, x + 16, 30), fill=color)
+        draw.text((x + 24, 22), words, fill=INK, font=letters, anchor="lm")
+        x += 24 + letters.getlength(words) + 28
+    return np.asarray(strip)
+
+
+# Photographs --------------------------------------------------------------------------------------
+
+
+def photograph_at(
+    scene: Scene, image: Image | None, size: tuple[int, int]
+) -> UInt8[np.ndarray, "H W 3"] | None:
+    """An image's photograph, scaled to width and height; None if it cannot be read."""
+    folder = scene.source.image_dir if scene.source else None
+    if folder is None or image is None:
+        return None
+    path = folder / image.name
+    try:
+        picture = decode_photograph(path, photograph_bytes(path))
+    except (SceneNotFoundError, SceneFormatError):
+        return None
+    return np.array(picture.resize(size, PillowImage.Resampling.LANCZOS))
+
+
+def photograph_or_blank(
+    scene: Scene, image: Image | None, size: tuple[int, int]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The photograph, or plain light grey if it cannot be read."""
+    photograph = photograph_at(scene, image, size)
+    return np.full((size[1], size[0], 3), BLANK, np.uint8) if photograph is None else photograph

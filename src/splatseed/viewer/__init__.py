@@ -1,1 +1,0 @@
-"""Looking at scenes and models: camera paths, videos, and the viewer in the browser."""

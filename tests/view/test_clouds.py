@@ -1,0 +1,237 @@
+"""Drawn points are where, in front of and as many as they should be; pages show what they say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra import numpy as hnp
+from PIL import Image as PillowImage
+
+from splatseed.camera import Camera, Intrinsics
+from splatseed.errors import OutputError
+from splatseed.io import load_scene
+from splatseed.pointcloud import PointCloud
+from splatseed.scene import Image, Scene, SceneSource
+from splatseed.upsample.registry import SOURCE_CODES
+from splatseed.view.clouds import (
+    CoveredView,
+    cell_picture,
+    preview_cells,
+    preview_errors,
+    preview_methods,
+    preview_origins,
+    preview_pair,
+)
+from splatseed.view.page import Tile, write_grid
+from splatseed.view.points import COLORS, origin_colors, origin_picture, render_points
+
+K = np.array([[50.0, 0, 20], [0, 50.0, 15], [0, 0, 1]])
+CAMERA = Camera(K, 40, 30, np.eye(4))
+RED, GREEN = [255, 0, 0], [0, 255, 0]
+
+
+def _cloud(xyz, rgb):
+    return PointCloud(np.array(xyz, float).reshape(-1, 3), np.array(rgb, np.uint8).reshape(-1, 3))
+
+
+def _at(column, row, depth):
+    """The world point in the middle of a pixel."""
+    return CAMERA.unproject(np.array([[column + 0.5, row + 0.5]]), np.array([depth]))[0]
+
+
+# Points -------------------------------------------------------------------------------------------
+
+
+def test_a_point_in_the_middle_of_a_pixel_colours_that_pixel_alone():
+    for size in (1, 0.01):  # however small its disc
+        picture = render_points(_cloud(_at(7, 22, 3.0), RED), CAMERA, point_size=size)
+        assert picture.shape == (30, 40, 3)
+        assert (picture[..., 1] < 255).sum() == 1
+        assert (picture[22, 7] != 255).any()
+
+
+@pytest.mark.parametrize("swap", [False, True])
+def test_the_nearer_point_hides_the_farther(swap):
+    xyz, rgb = [_at(20, 15, 5.0), _at(20, 15, 2.0)], [RED, GREEN]
+    cloud = _cloud(xyz[::-1] if swap else xyz, rgb[::-1] if swap else rgb)
+    assert render_points(cloud, CAMERA, point_size=2)[15, 20].tolist() == GREEN
+
+
+def test_points_behind_beside_and_nowhere_are_left_out():
+    xyz = [[0, 0, -2.0], [0, 0, 0], [900.0, 0, 1], [np.nan, 0, 2], [0, np.inf, 2], [0, -1e30, 1]]
+    for cloud in (_cloud(xyz, [RED] * 6), _cloud([], [])):
+        assert (render_points(cloud, CAMERA, background=(9, 8, 7)) == [9, 8, 7]).all()
+
+
+def test_near_points_are_larger_up_to_a_limit():
+    def ink(depth):
+        others = [_at(2, 2, 4.0), _at(37, 2, 4.0), _at(2, 27, 4.0)]
+        cloud = _cloud([*others, _at(20, 15, depth)], [RED] * 3 + [GREEN])
+        picture = render_points(cloud, CAMERA, point_size=4).astype(int)
+        return (picture[..., 0] < 128).sum()
+
+    assert ink(4.0) < ink(2.5) < ink(1.0) == ink(0.3)
+
+
+def test_scale_changes_the_size_and_keeps_the_place():
+    picture = render_points(_cloud(_at(10, 20, 2.0), RED), CAMERA, point_size=2, scale=2.5)
+    assert picture.shape == (75, 100, 3)
+    row, column = np.argwhere((picture != 255).any(axis=2)).mean(axis=0) + 0.5
+    assert row == pytest.approx(20.5 * 2.5, abs=0.5)
+    assert column == pytest.approx(10.5 * 2.5, abs=0.5)
+
+
+def test_drawing_matches_a_loop_over_points(rng):
+    xyz = CAMERA.unproject(rng.uniform([-2, -2], [42, 32], (200, 2)), rng.uniform(1, 9, 200))
+    rgb = rng.integers(0, 255, (200, 3))
+    size = 5.0
+    uv, depth = CAMERA.project(xyz.astype(np.float32))
+    shown = (np.abs(uv / [40, 30] - 0.5) < 0.5 + 2 * size / np.array([40, 30])).all(axis=1)
+    radius = size * np.clip(np.median(depth[shown]) / depth, 0.75, 2.0)
+    expected = np.full((60, 80, 3), 255.0)
+    v, u = np.mgrid[:60, :80] + 0.5
+    for i in np.argsort(-depth):
+        expected[np.hypot(u - 2 * uv[i, 0], v - 2 * uv[i, 1]) <= radius[i]] = rgb[i]
+    expected = expected.reshape(30, 2, 40, 2, 3).mean(axis=(1, 3))
+    picture = render_points(_cloud(xyz, rgb), CAMERA, point_size=size)
+    np.testing.assert_allclose(picture, expected, atol=0.51)
+
+
+# Origins ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def seeds():
+    """An original, a stereo and a cover seed in the middle of three pixels, all of one colour."""
+    xyz = np.array([_at(5, 5, 2.0), _at(20, 15, 2.0), _at(35, 25, 2.0)])
+    source = np.array([0, SOURCE_CODES["stereo"], SOURCE_CODES["cover"]], np.uint8)
+    return PointCloud(xyz, np.full((3, 3), 90, np.uint8), source)
+
+
+def test_every_origin_has_a_colour_of_its_own(seeds):
+    codes = np.array([0, *SOURCE_CODES.values(), 255], np.uint8)
+    assert len(np.unique(origin_colors(codes), axis=0)) == len(codes)
+    assert origin_colors(np.array([77], np.uint8)).tolist() == [list(COLORS[255])]
+    picture = origin_picture(seeds, CAMERA)
+    for (row, column), code in zip([(5, 5), (15, 20), (25, 35)], (0, 8, 9), strict=True):
+        assert picture[row, column].tolist() == list(COLORS[code])
+    assert picture[15, 5].tolist() == [255, 255, 255]
+
+
+def test_the_photograph_behind_is_grey_and_pale(seeds):
+    photograph = np.zeros((60, 80, 3), np.uint8)
+    photograph[:, :40] = [250, 10, 10]
+    picture = origin_picture(seeds, CAMERA, photograph, scale=2.0).astype(int)
+    assert picture.shape == (60, 80, 3)
+    left, right = picture[50, 5], picture[10, 70]
+    assert len(set(left)) == len(set(right)) == 1
+    assert 170 < right[0] < left[0] < 255
+
+
+def test_a_page_of_origins_has_both_pictures_and_names_what_is_there(seeds, tmp_path):
+    picture = _read(preview_origins(Scene(seeds), seeds, tmp_path / "origins.png"))
+    left, right = np.array_split(picture[40:-44], 2, axis=1)
+    stereo = COLORS[SOURCE_CODES["stereo"]]
+    assert not (left == stereo).all(axis=2).any()
+    assert (right == stereo).all(axis=2).any()
+    for code, color in COLORS.items():  # letters have greys
+        dot = (picture[-44:] == color).all(axis=2).sum()
+        assert (dot > 100) == (code in {0, 8, 9})
+
+
+# Pages --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def scene(tmp_path, rng):
+    folder = tmp_path / "images"
+    folder.mkdir()
+    PillowImage.new("RGB", (40, 30), (10, 200, 30)).save(folder / "a.png")
+    intrinsics = Intrinsics(1, "PINHOLE", 40, 30, (50.0, 50.0, 20.0, 15.0))
+    image = Image("a.png", 1, intrinsics, np.array([1.0, 0, 0, 0]), np.zeros(3))
+    xyz = CAMERA.unproject(rng.uniform([0, 0], [40, 30], (150, 2)), rng.uniform(2, 4, 150))
+    points = _cloud(xyz, np.full((150, 3), 60))
+    source = SceneSource("colmap", tmp_path, tmp_path / "points3D.bin", image_dir=folder)
+    return Scene(points, (image,), (intrinsics,), source=source)
+
+
+def _read(path):
+    with PillowImage.open(path) as file:
+        assert file.format == "PNG"
+        return np.asarray(file.convert("RGB")).astype(int)
+
+
+def test_a_pair_shows_both_clouds(scene, tmp_path):
+    dense = PointCloud.concatenate(
+        scene.points, scene.points.replace(xyz=scene.points.xyz + np.float32(0.03))
+    )
+    path = preview_pair(scene, dense, tmp_path / "out" / "pair.png", title="twice")
+    picture = _read(path)
+    left, right = np.array_split(picture[60:], 2, axis=1)
+    assert picture.shape[1] > 2 * picture.shape[0] > 600
+    assert 0 < (left < 100).mean() < (right < 100).mean()
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["pair.png"]
+    again = preview_pair(scene, dense, tmp_path / "again.png", title="twice")
+    assert path.read_bytes() == again.read_bytes()
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError):
+        preview_pair(scene, dense, tmp_path / "file" / "pair.png")
+
+
+def test_the_grid_starts_with_the_photograph_where_there_is_one(scene, tmp_path):
+    clouds = {"one": scene.points, "two": scene.points}
+    with_photo = _read(preview_methods(scene, clouds, tmp_path / "with.png"))
+    green = (with_photo == [10, 200, 30]).all(axis=2)
+    assert green.sum() == 600 * 450
+    assert not green[:, 615:].any()
+    bare = _read(preview_methods(scene.replace(source=None), clouds, tmp_path / "without.png"))
+    assert not (bare == [10, 200, 30]).all(axis=2).any()
+
+
+def test_errors_are_coloured_by_distance(scene, tmp_path):
+    def picture(value):
+        errors = {"new": np.full(len(scene.points), value)}
+        path = preview_errors({"new": scene.points}, errors, CAMERA, tmp_path / "errors.png")
+        return _read(path)[40:480, 12:600]
+
+    good, bad, worse = picture(0.0), picture(1.0), picture(70.0)
+    inked = (good.min(axis=2) < 250) & (bad.min(axis=2) < 250)
+    assert good[inked][:, 2].mean() > good[inked][:, 1].mean() + 50  # blue
+    assert bad[inked][:, 0].mean() > bad[inked][:, 2].mean() + 100  # yellow
+    np.testing.assert_array_equal(bad, worse)
+
+
+@settings(deadline=None)
+@given(data=st.data(), height=st.integers(1, 20), width=st.integers(1, 20), cell=st.integers(1, 9))
+def test_a_pixel_is_dimmed_or_tinted_as_its_cell_is(data, height, width, cell):
+    covered = data.draw(hnp.arrays(bool, (-(-height // cell), -(-width // cell))))
+    picture = cell_picture(np.full((height, width, 3), 200, np.uint8), covered, cell).astype(int)
+    seeded = np.kron(covered, np.ones((cell, cell), bool))[:height, :width]
+    assert (picture[seeded] == 150).all()
+    assert (picture[~seeded][:, [0, 2]] > picture[~seeded][:, [1]] + 50).all()
+
+
+@pytest.mark.parametrize("num_views", [1, 3])
+def test_a_page_shows_the_cells_before_and_after(tmp_path, num_views):
+    before, after = np.zeros((3, 4), bool), np.ones((3, 4), bool)
+    view = CoveredView("a.png", np.full((24, 32, 3), 200, np.uint8), 8, before, after)
+    picture = _read(preview_cells([view] * num_views, tmp_path / "cells.png"))
+    tinted = (picture[..., 0] - picture[..., 1] > 50) & (picture[..., 2] - picture[..., 1] > 50)
+    assert tinted.sum() == num_views * 600 * 450
+    dimmed = (picture == 150).all(axis=2).sum()  # labels have a few grey pixels too
+    assert 0 <= dimmed - num_views * 600 * 450 < 200
+
+
+def test_a_label_in_any_script_is_drawn(tmp_path):
+    for name in ("日本語の部屋", "방 $a_1$", r"\frac $", "\U0001f3e0", "x" * 400):
+        write_grid([Tile(name, np.zeros((50, 300, 3), np.uint8))], tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("name", ["fern", "mipnerf360_sfm/stump"])
+def test_real_scenes_fill_a_good_part_of_the_picture(scenes, tmp_path, name):
+    real = load_scene(scenes / name)
+    picture = _read(preview_pair(real, real.points, tmp_path / "real.png"))
+    left, right = np.array_split(picture[40:] < 200, 2, axis=1)
+    assert left.mean() > 0.01
+    assert right.mean() == pytest.approx(left.mean(), rel=0.05)

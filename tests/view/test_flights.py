@@ -1,0 +1,304 @@
+"""Flights: smooth, upright paths past the cameras, and readable videos."""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="rendering needs PyTorch")
+ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra view)")
+
+from splatseed.errors import ParameterError, SceneFormatError
+from splatseed.io import load_scene, write_scene
+from splatseed.similarity import Similarity
+from splatseed.splat.gaussians import Gaussians
+from splatseed.splat.ply import read_gaussians
+from splatseed.view.flights import (
+    even_size,
+    focus_of,
+    orbit,
+    path_of_file,
+    smooth_path,
+    write_video,
+)
+from splatseed.view.models import (
+    ModelRenderer,
+    Shown,
+    depth_colors,
+    open_shown,
+    pinhole_view,
+    split_picture,
+    stage_frame,
+)
+from splatseed.views.view import View, poses_of
+from splatseed.views.viewpoint import look_at
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def _ring(count=24, radius=3.0, height=1.0):
+    """Cameras in a ring that look at the origin."""
+    views = []
+    for i, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
+        eye = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+        K = np.array([[100.0, 0, 60], [0, 100.0, 45], [0, 0, 1]])
+        pose = look_at(eye, np.zeros(3), UP)
+        views.append(View(f"{i:03}", np.empty((0, 0, 3), np.uint8), K, 120, 90, pose))
+    return views
+
+
+def _centers(views):
+    return np.array([-v.cam_from_world[:3, :3].T @ v.cam_from_world[:3, 3] for v in views])
+
+
+# Paths --------------------------------------------------------------------------------------------
+
+
+def test_a_path_follows_the_cameras_evenly(rng):
+    cameras = _ring()
+    path = smooth_path(cameras, 90, (160, 90))
+    centers = _centers(path)
+    assert len(path) == 90
+    np.testing.assert_allclose(np.linalg.norm(centers[:, :2], axis=1), 3, atol=0.15)
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    assert steps.max() < 1.2 * steps.min()
+    for view in path:
+        rotation = view.cam_from_world[:3, :3]
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+        assert (-rotation[1] @ UP) > 0.9
+    assert (path[0].width, path[0].height) == (160, 90)
+    np.testing.assert_allclose(path[0].K[:2, 2], [80, 45])
+    # Names in no order: it goes from neighbour to neighbour.
+    names = rng.permutation(24)
+    shuffled = [dataclasses.replace(v, name=f"{i}") for i, v in zip(names, cameras, strict=True)]
+    again = _centers(smooth_path(shuffled, 90, (160, 90)))
+    assert np.linalg.norm(np.diff(again, axis=0), axis=1).max() < 2 * steps.max()
+    with pytest.raises(ParameterError, match="two places"):
+        smooth_path(cameras[:1], 10, (64, 48))
+
+
+def test_an_orbit_goes_around_what_the_cameras_look_at(run_folder):
+    cameras = _ring()
+    np.testing.assert_allclose(focus_of(cameras), 0, atol=0.1)
+    gaussians = read_gaussians(run_folder / "point_cloud.ply")
+    centers = _centers(orbit(cameras, gaussians, 60, (160, 90)))
+    np.testing.assert_allclose(np.linalg.norm(centers[:, :2], axis=1), 3, atol=0.2)
+    np.testing.assert_allclose(centers[:, 2], 1, atol=0.1)
+    assert len(orbit([], gaussians, 7, (64, 48))) == 7  # a model alone has a way around it too
+
+
+def test_nerfstudios_paths_are_opengl_cameras(tmp_path):
+    world_from_gl = np.eye(4)
+    world_from_gl[:3, 3] = (1, 2, 3)
+    frame = {"camera_to_world": world_from_gl.reshape(-1).tolist(), "fov": 90.0, "aspect": 1.5}
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"camera_path": [frame, frame], "fps": 24}))
+    (view, _), fps = path_of_file(path, (150, 100))
+    assert (fps, view.width, view.height) == (24, 150, 100)
+    np.testing.assert_allclose(view.K, [[50, 0, 75], [0, 50, 50], [0, 0, 1]], atol=1e-9)
+    # OpenGL looks along -z: what lies there is in front.
+    np.testing.assert_allclose(view.cam_from_world @ [1, 2, -7, 1], [0, 0, 10, 1], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[]",
+        '{"camera_path": []}',
+        '{"camera_path": [{"camera_to_world": [1, 2]}]}',
+        '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,5,0,0,0,0,1]}]}',
+        '{"camera_path": [{"camera_to_world": [1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1], "fov": 200}]}',
+    ],
+)
+def test_what_is_no_path_is_refused(content, tmp_path):
+    (tmp_path / "path.json").write_text(content)
+    with pytest.raises(SceneFormatError, match="camera path"):
+        path_of_file(tmp_path / "path.json", (64, 48))
+
+
+# Renders ------------------------------------------------------------------------------------------
+
+
+def test_depth_is_that_of_a_wall():
+    """A wall of Gaussians 4 units ahead, in a world 100 units large."""
+    xy = np.stack(np.meshgrid(*2 * [np.linspace(-4, 4, 41)]), axis=-1).reshape(-1, 2)
+    count = len(xy)
+    wall = Gaussians(
+        means=np.column_stack([xy, np.full(count, 4.0)]).astype(np.float32) + np.float32(100),
+        scales=np.full((count, 3), np.log(0.15), np.float32) + np.array([0, 0, -3], np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        opacities=np.full(count, 4, np.float32),
+        sh0=np.zeros((count, 1, 3), np.float32),
+        shN=np.zeros((count, 0, 3), np.float32),
+    )
+    pose = np.eye(4)
+    pose[:3, 3] = -100
+    view = pinhole_view((64, 48), 2 * np.arctan(24 / 50), pose)
+    renderer = ModelRenderer(wall, stage_frame(Shown("wall", None, wall)))
+    np.testing.assert_allclose(renderer.depth(view), 4, atol=0.02)
+    np.testing.assert_allclose(renderer.color(view), 0.5, atol=0.03)
+
+
+def test_sizes_are_even_and_pictures_split_where_asked():
+    assert even_size(271, 481) == (272, 480)
+    assert even_size(4000, 3000, 1280) == (1280, 960)
+    red, blue = np.zeros((20, 40, 3), np.uint8), np.zeros((20, 40, 3), np.uint8)
+    red[..., 0], blue[..., 2] = 255, 255
+    split = split_picture(red, blue, at=0.25)
+    assert (split[:, :9, 0] == 255).all()
+    assert (split[:, 12:, 2] == 255).all()
+    colors = depth_colors(np.array([[0.0, 1.0, 2.0]], np.float32), (1.0, 2.0))
+    assert colors[0, 0].sum() == 0 < colors[0, 1].sum()
+
+
+def test_what_is_shown_is_what_the_file_holds(room, run_folder):
+    assert open_shown(room).gaussians is None
+    run = open_shown(run_folder)
+    assert len(run.scene.images) == 12
+    assert len(run.gaussians) == len(load_scene(room).points)
+    assert open_shown(room / "sparse/0/points3D.ply").gaussians is None
+    model = open_shown(run_folder / "point_cloud.ply")
+    assert (model.scene, len(model.gaussians)) == (None, len(run.gaussians))
+
+
+# The command --------------------------------------------------------------------------------------
+
+
+def _frames(path):
+    """A video's frames, [F, H, W, 3], and its frames per second."""
+    reader = ffmpeg.read_frames(str(path))
+    facts = next(reader)
+    width, height = facts["size"]
+    frames = [np.frombuffer(each, np.uint8).reshape(height, width, 3) for each in reader]
+    return np.stack(frames), facts["fps"]
+
+
+def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, splatseed):
+    out = tmp_path / "deep/flight.mp4"
+    said = splatseed("flight", run_folder, "-o", out, "--seconds", 0.2)
+    assert (said.code, said.err) == (0, "")
+    frames, fps = _frames(out)
+    assert (frames.shape, fps) == ((6, 90, 120, 3), 30)
+    assert frames.mean() > 20
+    assert np.abs(np.diff(frames.astype(int), axis=0)).mean() > 0.5  # it moves
+
+
+def test_two_models_are_split_and_odd_sizes_become_even(run_folder, tmp_path, splatseed):
+    out = tmp_path / "flight.mp4"
+    words = ("--orbit", "--seconds", 0.1, "--size", "101x75")
+    ply = run_folder / "point_cloud.ply"
+    said = splatseed("flight", run_folder, "-o", out, "--compare", ply, *words)
+    assert said.code == 0, said.err
+    frames, _ = _frames(out)
+    assert frames.shape == (3, 76, 100, 3)
+    assert (frames[:, 10:60, 49:51].mean(axis=(0, 2, 3)) > 150).all()  # the line between them
+
+
+def test_without_cameras_the_video_circles_and_says_so(run_folder, tmp_path, splatseed):
+    ply = shutil.copy(run_folder / "point_cloud.ply", tmp_path / "model.ply")
+    words = ("flight", ply, "--seconds", 0.05, "--size", "48x32", "-o")
+    said = splatseed(*words, tmp_path / "a.mp4")
+    assert said.code == 0, said.err
+    assert "circles" in said.out
+    asked = splatseed(*words, tmp_path / "b.mp4", "--orbit")
+    assert "circles" not in asked.out
+    assert (_frames(tmp_path / "a.mp4")[0] == _frames(tmp_path / "b.mp4")[0]).all()
+
+
+def test_a_path_of_nerfstudios_is_followed_in_depth(run_folder, tmp_path, splatseed):
+    frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 60}
+    (tmp_path / "p.json").write_text(json.dumps({"camera_path": 4 * [frame], "fps": 8}))
+    out = tmp_path / "flight.mkv"
+    words = ("--path", tmp_path / "p.json", "--transform", "none", "--depth")
+    said = splatseed("flight", run_folder, "-o", out, *words)
+    assert said.code == 0, said.err
+    frames, fps = _frames(out)
+    assert (len(frames), fps) == (4, 8)
+
+
+def test_a_path_through_nerfstudios_world_needs_its_transform(
+    room, run_folder, tmp_path, splatseed
+):
+    """Turned, moved and scaled: as it is, it leads past the model; with the transform it does
+    not."""
+    turn = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    world = Similarity(0.01, turn, np.array([0.2, 40.0, 0.1]))
+    content = {
+        "transform": np.column_stack([turn, world.translation / 0.01]).tolist(),
+        "scale": 0.01,
+    }
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(content))
+    camera = load_scene(room).images[3].camera
+    pose = np.linalg.inv(world.camera(camera.cam_from_world)) @ np.diag([1.0, -1, -1, 1])
+    fov = np.degrees(2 * np.arctan(camera.height / 2 / camera.K[1, 1]))
+    frames = 2 * [{"camera_to_world": pose.reshape(-1).tolist(), "fov": fov}]
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"camera_path": frames, "fps": 8}))
+    words = ("flight", run_folder, "-o", tmp_path / "flight.mp4", "--path", path)
+    said = splatseed(*words)
+    assert said.code == 2
+    assert "--transform" in said.err
+    said = splatseed(*words, "--transform", tmp_path / "dataparser_transforms.json")
+    assert said.code == 0, said.err
+    gaussians = read_gaussians(run_folder / "point_cloud.ply")
+    renderer = ModelRenderer(gaussians, stage_frame(Shown("", None, gaussians)))
+    wanted = renderer.color(poses_of([load_scene(room).images[3]])[0])
+    shown = _frames(tmp_path / "flight.mp4")[0][0] / 255
+    assert np.abs(shown - wanted).mean() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("-o", "a.avi"), ".mp4"),
+        (("-o", "a.mp4", "--size", "0x9"), "--size"),
+        (("-o", "a.mp4", "--seconds", "0"), "--seconds"),
+        (("-o", "a.mp4", "--path", "none.json"), "none.json"),
+        (("-o", "a.mp4", "--transform", "gsplat"), "--path"),
+        (("-o", "a.mp4", "--compare", "nowhere"), "nowhere"),
+        (("-o", "x" * 300 + ".mp4", "--seconds", "0.1"), "name too long"),
+    ],
+)
+def test_bad_input_is_one_line(words, said, run_folder, tmp_path, monkeypatch, splatseed):
+    monkeypatch.chdir(tmp_path)
+    heard = splatseed("flight", run_folder, *words)
+    assert (heard.code, heard.err.count("\n")) == (2, 1)
+    assert said in heard.err
+    assert not list(tmp_path.glob("*.mp4"))
+
+
+def test_scenes_and_models_of_other_places_are_refused(run_folder, room, tmp_path, splatseed):
+    heard = splatseed("flight", room, "-o", tmp_path / "a.mp4")
+    assert (heard.code, "found a scene" in heard.err) == (2, True)
+    scene = load_scene(room)
+    moved = [dataclasses.replace(im, translation=im.translation + 1) for im in scene.images]
+    write_scene(scene.replace(images=tuple(moved)), tmp_path / "elsewhere")
+    other = shutil.copytree(run_folder, tmp_path / "other")
+    config = json.loads((other / "config.json").read_text())
+    config["scene"] = str(tmp_path / "elsewhere")
+    (other / "config.json").write_text(json.dumps(config))
+    words = ("flight", run_folder, "--compare", other, "--seconds", 0.05)
+    heard = splatseed(*words, "-o", tmp_path / "a.mp4")
+    assert (heard.code, heard.err.count("\n")) == (2, 1)
+    assert "--compare" in heard.err
+    heard = splatseed(*words, "-o", tmp_path / "a.mp4", "--scene", room)
+    assert heard.code == 0, heard.err
+
+
+def test_a_stopped_video_leaves_nothing_and_ffmpeg_says_nothing(tmp_path, capfd):
+    def stopped():
+        yield np.zeros((32, 48, 3), np.uint8)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        write_video(tmp_path / "a.mp4", stopped(), (48, 32), 30.0)
+    del caught  # and with it the frames that keep ffmpeg's pipe open
+    gc.collect()
+    assert capfd.readouterr().err == ""
+    assert not list(tmp_path.iterdir())
