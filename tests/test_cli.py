@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from splatseed.cli import VERBS, main
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 
 COMMAND = (sys.executable, "-c", "from splatseed.cli import main; main()")

@@ -29,7 +29,7 @@ from benchmarks.common.machine import describe, warn_if_busy
 from benchmarks.common.markdown import table
 from benchmarks.common.memory import FamilyWatch
 
-from splatseed.io.ply.points import ply_header, ply_rows
+from splatseed.io.ply import ply_header, ply_rows
 from splatseed.process.interpreter import child_command, child_environment
 
 __all__: list[str] = []

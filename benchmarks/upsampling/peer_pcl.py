@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 from splatseed import PointCloud
 from splatseed.errors import MissingDependencyError
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 
 __all__ = ["MODES", "PeerTime", "build", "run"]
 

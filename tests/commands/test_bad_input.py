@@ -14,7 +14,7 @@ import pytest
 from splatseed.commands import info
 from splatseed.io import load_scene
 from splatseed.io.colmap import binary as colmap_binary
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 
 

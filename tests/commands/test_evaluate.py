@@ -12,7 +12,7 @@ pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
 from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.splat.ply import write_gaussians
 from splatseed.train.run import prepare_run

@@ -6,7 +6,7 @@ import pycolmap
 import pytest
 
 from splatseed.io import load_scene, write_scene
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 
 RUNS = [
     ("bonsai", "mls"),

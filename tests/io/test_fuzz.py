@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from splatseed.camera import Intrinsics
 from splatseed.errors import SplatseedError
 from splatseed.io.colmap import binary as colmap_binary, text as colmap_text
-from splatseed.io.ply.points import read_ply, write_ply
+from splatseed.io.ply import read_ply, write_ply
 
 from .fuzzing import assert_only_our_errors
 

@@ -15,7 +15,7 @@ from PIL import Image as PilImage
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
 from splatseed.io.colmap import binary as colmap_binary
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut
 

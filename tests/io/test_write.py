@@ -16,7 +16,7 @@ from splatseed.errors import OutputError, PointCloudError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.io.output import layouts
-from splatseed.io.ply.points import read_ply, write_ply
+from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Observations, Scene, Tracks
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import PointCloudError, SceneFormatError
-from splatseed.io.ply.points import read_ply, write_ply
+from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.gaussians import (
     SH_C0,

@@ -17,7 +17,7 @@ from splatseed import requirements
 from splatseed.commands.train import Options
 from splatseed.commands.train.command import _next_commands
 from splatseed.errors import MissingDependencyError
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.splat.metrics import LPIPS_FILES
 from splatseed.train.record import resumed_settings

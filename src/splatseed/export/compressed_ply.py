@@ -21,8 +21,8 @@ from splatseed.export.packing import (
     opacity_logits,
     smallest_three,
 )
-from splatseed.io.binary import ByteReader
-from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, parse_header
+from splatseed.io.files import ByteReader
+from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, parse_header
 from splatseed.splat.gaussians import SH_C0, Gaussians
 
 CHUNK = 256

@@ -28,8 +28,7 @@ from splatseed.export.packing import (
     opacity_logits,
     smallest_three,
 )
-from splatseed.io.archives import ARCHIVE_FAILURES
-from splatseed.io.files import read_bytes
+from splatseed.io.files import ARCHIVE_FAILURES, read_bytes
 from splatseed.literal import told
 from splatseed.progress import Progress, silent
 from splatseed.splat.gaussians import Gaussians

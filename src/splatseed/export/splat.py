@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from splatseed.export.packing import opacity_bytes, opacity_logits, unit_quats
-from splatseed.io.binary import ByteReader
+from splatseed.io.files import ByteReader
 from splatseed.splat.gaussians import SH_C0, Gaussians
 
 RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])

@@ -1,22 +1,48 @@
-"""Opening files that a scene names, which may be anything.
+"""Opening files that a scene names, which may be anything, and walking binary ones.
 
 Promise: only regular files are opened, so that nothing blocks or reads forever (a pipe,
-``/dev/zero``), and none larger than the free memory. What is refused raises an ``OSError`` whose
-``strerror`` says why, just as the system's refusals do; ``read_bytes`` turns these into our errors.
+``/dev/zero``), and none larger than the free memory is read whole; a count in a file is checked
+against the bytes that are left before anything is allocated for it. ``open_file``, ``read_file``
+and ``read_text`` raise an ``OSError`` whose ``strerror`` says what was refused; all else raises one
+of our errors, which names the file.
 """
 
 from __future__ import annotations
 
 import errno
+import json
+import lzma
 import os
 import stat
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.literal import beginning
 from splatseed.process.memory import free_memory
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
+COPY_AGAIN = "Copy the file again, or export it again."
+ARRAY_FAILURES = (
+    *(ValueError, TypeError, KeyError, IndexError, OverflowError, MemoryError, SyntaxError),
+    *(EOFError, RecursionError),
+    tokenize.TokenError,  # of headers that look like Python 2's
+)
+"""What NumPy raises for a damaged ``.npy``: it parses the header as Python."""
+ARCHIVE_FAILURES = (
+    *ARRAY_FAILURES,
+    *(OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error),
+    RuntimeError,  # encrypted, or compressed in a way that zipfile does not know
+)
+"""What a damaged ``.zip`` or ``.npz`` can raise besides."""
 
 _KINDS = (
     (stat.S_ISDIR, errno.EISDIR, "a folder"),
@@ -25,6 +51,7 @@ _KINDS = (
     (lambda _: True, errno.EINVAL, "a device, not a file"),
 )
 _WAIT_NOT = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+_COUNT = struct.Struct("<Q")
 
 
 def is_video(path: Path) -> bool:
@@ -73,15 +100,23 @@ def read_file(path: Path) -> bytes:
     """The whole content of a regular file.
 
     Raises:
-        OSError: There is none, it cannot be read, is of another kind, or larger than the free
-            memory.
+        OSError: As for ``open_file``, or it is larger than the free memory.
     """
     with open_file(path) as file:
-        size, free = os.fstat(file.fileno()).st_size, free_memory()
-        if free is not None and size > free:
-            told = f"{size / 1e9:,.1f} GB, more than the {free / 1e9:,.1f} GB of free memory"
-            raise OSError(errno.EFBIG, told, str(path))
+        check_room(path, os.fstat(file.fileno()).st_size)
         return file.read()
+
+
+def check_room(path: Path, size: int) -> None:
+    """Refuse a file whose content takes more bytes than are free.
+
+    Raises:
+        OSError: It does.
+    """
+    free = free_memory()
+    if free is not None and size > free:
+        told = f"{size / 1e9:,.1f} GB, more than the {free / 1e9:,.1f} GB of free memory"
+        raise OSError(errno.EFBIG, told, str(path))
 
 
 def read_text(path: Path) -> str:
@@ -94,26 +129,22 @@ def read_text(path: Path) -> str:
     return read_file(path).decode("utf-8")
 
 
-def _check(path: Path, status: os.stat_result) -> None:
-    if stat.S_ISREG(status.st_mode):
-        return
-    raise OSError(*_kind(status), str(path))
-
-
-def _kind(status: os.stat_result) -> tuple[int, str]:
-    """The error and the name of what is no regular file."""
-    return next((number, kind) for is_, number, kind in _KINDS if is_(status.st_mode))
-
-
 def read_bytes(path: Path) -> bytes:
-    """The whole file.
+    """The whole content of a regular file.
 
     Raises:
         SceneNotFoundError: There is no such file.
         SceneFormatError: It cannot be read (a folder, no permission, a failing disk).
     """
-    try:
+    with readable(path):
         return read_file(path)
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Turn an ``OSError`` from reading a file into one of our errors, as for ``read_bytes``."""
+    try:
+        yield
     except (FileNotFoundError, NotADirectoryError):
         raise SceneNotFoundError(f"a file at {path}", found="none", fix="Check the path.") from None
     except OSError as error:
@@ -122,3 +153,132 @@ def read_bytes(path: Path) -> bytes:
             found=error.strerror or type(error).__name__,
             fix="Check that it is a file and that you may read it.",
         ) from None
+
+
+def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> Any:
+    """The content of a JSON file.
+
+    Args:
+        path: The file.
+        expected: What errors say that it should be.
+        fix: What errors advise.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is no JSON.
+    """
+    try:
+        return json.loads(read_bytes(path))
+    except json.JSONDecodeError as error:
+        rest = error.doc[error.pos :].strip().splitlines()
+        there = repr(rest[0][:40]) if rest else "its end"
+        found = f"{there} at line {error.lineno}, column {error.colno}"
+        found = found if error.doc.strip() else "an empty file"
+    except UnicodeDecodeError:
+        found = "bytes that are no text"
+    except (ValueError, RecursionError) as error:
+        found = str(error)
+    raise SceneFormatError(f"{path} to be {expected}", found=found, fix=fix)
+
+
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write readable JSON; paths and other foreign values become text, NumPy scalars numbers."""
+
+    def plain(value: Any) -> object:
+        return value.item() if isinstance(value, np.generic) else str(value)
+
+    path.write_text(json.dumps(content, indent=2, default=plain) + "\n", encoding="utf-8")
+
+
+class ByteReader:
+    """Reads a little-endian binary file from front to back.
+
+    Args:
+        path: The file; it is read whole.
+        fix: What errors advise.
+
+    Attributes:
+        data: Its bytes.
+        offset: The next byte to read.
+        record: What is being read, for errors ("header", "record 3").
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It cannot be read; or, from any method, it ends early.
+    """
+
+    def __init__(self, path: Path, fix: str = COPY_AGAIN) -> None:
+        self.path = path
+        self.fix = fix
+        self.data = read_bytes(path)
+        self.offset = 0
+        self.record = "header"
+
+    @property
+    def remaining(self) -> int:
+        """Bytes not read yet."""
+        return len(self.data) - self.offset
+
+    def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
+        """The values of a fixed layout."""
+        self._require(layout.size)
+        values = layout.unpack_from(self.data, self.offset)
+        self.offset += layout.size
+        return values
+
+    def count(self, least_bytes: int, what: str) -> int:
+        """A u64 count of items that take at least ``least_bytes`` each, checked to fit."""
+        (count,) = self.unpack(_COUNT)
+        room = self.remaining // least_bytes
+        if count > room:
+            raise self.error(f"at most {room} {what} in the bytes that follow", f"{count} promised")
+        return int(count)
+
+    def array(self, dtype: np.dtype[Any], count: int) -> np.ndarray:
+        """The next ``count`` items, a read-only view of the file's bytes."""
+        self._require(count * dtype.itemsize)
+        items = np.frombuffer(self.data, dtype, count, self.offset)
+        self.offset += count * dtype.itemsize
+        return items
+
+    def text(self) -> str:
+        """A NUL-terminated UTF-8 string."""
+        end = self.data.find(b"\0", self.offset)
+        if end < 0:
+            raise self.error("a name ended by a zero byte", "the end of the file")
+        raw = self.data[self.offset : end]
+        try:
+            text = raw.decode("utf-8")
+        except UnicodeDecodeError:
+            raise self.error("a name in UTF-8", beginning(raw, 80)) from None
+        self.offset = end + 1
+        return text
+
+    def finish(self) -> None:
+        """Check that no bytes are left."""
+        if self.remaining:
+            self.record = "end"
+            raise self.error("the end of the file", f"{self.remaining} more bytes")
+
+    @property
+    def where(self) -> str:
+        """The current place, for errors."""
+        return f"{self.path}, {self.record}, byte {self.offset}"
+
+    def error(self, expected: str, found: str) -> SceneFormatError:
+        """An error at the current place."""
+        return SceneFormatError(f"{expected} in {self.where}", found=found, fix=self.fix)
+
+    def _require(self, size: int) -> None:
+        if size > self.remaining:
+            raise self.error(f"{size} more bytes", f"{self.remaining} before the end of the file")
+
+
+def _check(path: Path, status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(*_kind(status), str(path))
+
+
+def _kind(status: os.stat_result) -> tuple[int, str]:
+    """The error and the name of what is no regular file."""
+    return next((number, kind) for is_, number, kind in _KINDS if is_(status.st_mode))

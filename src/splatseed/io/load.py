@@ -19,8 +19,7 @@ from splatseed.io.nerfstudio.blender import is_blender, read_blender
 from splatseed.io.nerfstudio.scene import read_transforms_scene
 from splatseed.io.output.earlier import recall_seeds
 from splatseed.io.output.manifest import MANIFEST, kind_of
-from splatseed.io.ply.foreign import refuse_foreign
-from splatseed.io.ply.points import read_ply
+from splatseed.io.ply import read_ply, refuse_model
 from splatseed.io.rgbd.tum import is_tum, load_tum
 from splatseed.io.split import follow_lists
 from splatseed.literal import quoted
@@ -148,7 +147,7 @@ def _read_file(path: Path) -> Scene:
         ".ply": _read_bare_ply,
         ".json": read_transforms_scene,
     }
-    refuse_foreign(path)
+    refuse_model(path)
     _refuse_of_output(path)
     reader = readers.get(path.suffix.lower())
     if reader is None:

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from splatseed.depthmap import DepthMaps
-from splatseed.io.archives import ARCHIVE_FAILURES
+from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene

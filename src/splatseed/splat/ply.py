@@ -9,26 +9,23 @@ ones do not matter; a file appears whole or not at all.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.binary import ByteReader
+from splatseed.io.files import ByteReader
 from splatseed.io.output.staging import atomic_file
-from splatseed.io.ply.foreign import refuse_packed
-from splatseed.io.ply.header import EXPORT_PLY_AGAIN, Element, parse_header
+from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, parse_header, refuse_packed
 from splatseed.splat.gaussians import Gaussians
 
-XYZ = ("x", "y", "z")
-NORMAL = ("nx", "ny", "nz")
-DC = ("f_dc_0", "f_dc_1", "f_dc_2")
-OPACITY = ("opacity",)
-SCALE = ("scale_0", "scale_1", "scale_2")
-ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
-REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3}
-"""Number of f_rest at each degree of spherical harmonics, 3 ((degree + 1)^2 - 1)."""
+_MEANS = ("x", "y", "z")
+_NORMALS = ("nx", "ny", "nz")
+_SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
+_OPACITY = ("opacity",)
+_SCALES = ("scale_0", "scale_1", "scale_2")
+_QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+_REST_COUNTS = (0, 9, 24, 45)
+"""Number of f_rest by the degree of spherical harmonics, 3 ((degree + 1)^2 - 1)."""
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
@@ -38,7 +35,7 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
         OutputError: The file cannot be written.
     """
     count, rest = len(gaussians), 3 * gaussians.shN.shape[1]
-    names = (*XYZ, *NORMAL, *DC, *_rest_names(rest), *OPACITY, *SCALE, *ROTATION)
+    names = (*_MEANS, *_NORMALS, *_SH0, *_rest_names(rest), *_OPACITY, *_SCALES, *_QUATS)
     table = np.concatenate(
         [
             gaussians.means,
@@ -60,77 +57,61 @@ def write_gaussians(path: Path, gaussians: Gaussians) -> None:
 
 
 def read_gaussians(path: Path) -> Gaussians:
-    """Read Gaussians that any 3DGS trainer wrote, binary little-endian.
+    """Read Gaussians that any 3DGS trainer wrote, binary.
 
     Raises:
         SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no PLY, is cut short, or does not hold Gaussians.
+        SceneFormatError: It is no PLY, is cut short, or does not hold Gaussians at finite places.
     """
     reader = ByteReader(path, EXPORT_PLY_AGAIN)
     header = parse_header(path, reader.data)
     for element in header.elements:
         refuse_packed(path, [prop.name for prop in element.properties])
     vertex = header.elements[0] if header.elements else Element("none", 0, ())
-    _check(path, header.byte_order, vertex)
-    reader.offset, reader.record = header.size, "element vertex"
-    dtype = np.dtype([(p.name, header.byte_order + p.dtype) for p in vertex.properties])
-    rows = reader.array(dtype, vertex.num_rows)
-    count, rest = len(rows), _num_rest(vertex)
-    channel_major = _columns(rows, _rest_names(rest)).reshape(count, 3, rest // 3)
-    gaussians = Gaussians(
-        means=_columns(rows, XYZ),
-        scales=_columns(rows, SCALE),
-        quats=_columns(rows, ROTATION),
-        opacities=_columns(rows, OPACITY)[:, 0],
-        sh0=_columns(rows, DC)[:, None],
-        shN=np.ascontiguousarray(channel_major.transpose(0, 2, 1)),
-    )
-    _check_finite(path, gaussians)
-    return gaussians
-
-
-def _rest_names(count: int) -> tuple[str, ...]:
-    return tuple(f"f_rest_{i}" for i in range(count))
-
-
-def _num_rest(vertex: Element) -> int:
-    return sum(prop.name.startswith("f_rest_") for prop in vertex.properties)
-
-
-def _columns(rows: np.ndarray[Any, Any], names: tuple[str, ...]) -> Float32[np.ndarray, "N C"]:
-    table = np.empty((len(rows), len(names)), np.float32)
-    for i, name in enumerate(names):
-        table[:, i] = rows[name]
-    return table
-
-
-def _check(path: Path, byte_order: str, vertex: Element) -> None:
-    present = {prop.name for prop in vertex.properties if prop.length_dtype is None}
-    rest = _num_rest(vertex)
-    wanted = (*XYZ, *DC, *OPACITY, *SCALE, *ROTATION, *_rest_names(rest))
-    missing = [name for name in wanted if name not in present]
-    if vertex.name != "vertex" or missing:
-        there = f"no {', '.join(missing[:5])}"
-    elif not byte_order:
-        there = "an ascii file"
-    elif rest not in REST_COUNTS or vertex.num_rows == 0:
-        there = f"{rest} f_rest properties and {vertex.num_rows} vertices"
-    elif any(prop.length_dtype is not None for prop in vertex.properties):
-        there = "lists among the properties"
+    names = {prop.name for prop in vertex.properties}
+    rest = sum(name.startswith("f_rest_") for name in names)
+    wanted = (*_MEANS, *_SH0, *_OPACITY, *_SCALES, *_QUATS, *_rest_names(rest))
+    missing = [name for name in wanted if name not in names]
+    if missing or not header.byte_order or vertex.has_lists:
+        found = f"no {', '.join(missing[:5])}" if missing else "an ascii file, or lists"
+    elif rest not in _REST_COUNTS or not vertex.num_rows:
+        found = f"{rest} f_rest properties and {vertex.num_rows} vertices"
     else:
-        return
-    raise SceneFormatError(
-        f"{path} to hold trained Gaussians in 3DGS's layout, binary", found=there,
-        fix="Name the point_cloud.ply of a training run, not the seeds or a mesh.",
-    )  # fmt: skip
+        found = ""
+    if found:
+        raise SceneFormatError(
+            f"{path} to hold trained Gaussians in 3DGS's layout, binary",
+            found=found,
+            fix="Name the point_cloud.ply of a training run, not the seeds or a mesh.",
+        )
+    reader.offset, reader.record = header.size, "element vertex"
+    rows = reader.array(header.dtype(vertex), vertex.num_rows)
 
+    def columns(names: tuple[str, ...]) -> np.ndarray:
+        table = np.empty((len(rows), len(names)), np.float32)
+        for i, name in enumerate(names):
+            table[:, i] = rows[name]
+        return table
 
-def _check_finite(path: Path, gaussians: Gaussians) -> None:
+    channel_major = columns(_rest_names(rest)).reshape(len(rows), 3, rest // 3)
+    means = columns(_MEANS)
     # Some trainers write opacity +inf for opaque Gaussians; positions must be finite.
-    bad = ~np.isfinite(gaussians.means).all(axis=1)
+    bad = ~np.isfinite(means).all(axis=1)
     if bad.any():
         raise SceneFormatError(
             f"{path} to have finite positions",
             found=f"{np.count_nonzero(bad)} that are not, the first in vertex {np.argmax(bad)}",
             fix="Train again, or remove those Gaussians.",
         )
+    return Gaussians(
+        means=means,
+        scales=columns(_SCALES),
+        quats=columns(_QUATS),
+        opacities=columns(_OPACITY)[:, 0],
+        sh0=columns(_SH0)[:, None],
+        shN=np.ascontiguousarray(channel_major.transpose(0, 2, 1)),
+    )
+
+
+def _rest_names(count: int) -> tuple[str, ...]:
+    return tuple(f"f_rest_{i}" for i in range(count))

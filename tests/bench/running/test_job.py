@@ -129,7 +129,7 @@ def test_seeds_are_those_that_the_command_writes(specs, own_room, tmp_path, meth
     xyz[3], xyz[5] = np.nan, xyz[6]
     spoilt = tmp_path / "spoilt"
     write_scene(scene, spoilt)
-    from splatseed.io.ply.points import write_ply
+    from splatseed.io.ply import write_ply
 
     for path in (spoilt / "sparse" / "0").glob("points3D.*"):
         path.unlink()

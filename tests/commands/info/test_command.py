@@ -14,7 +14,7 @@ from PIL import Image as PilImage
 
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap.binary import write_cameras, write_points3d
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 
 

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.io import load_scene, write_scene
-from splatseed.io.ply.points import read_ply, write_ply
+from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.upsample import METHODS, chooses_number, configure
 

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from splatseed.io.ply.points import read_ply, write_ply
+from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.process import tasks, threads
 from splatseed.process.memory import bytes_of

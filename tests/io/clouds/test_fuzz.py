@@ -103,7 +103,7 @@ def damages(draw, data):
 
 @pytest.mark.parametrize("name", NAMES)
 @settings(
-    max_examples=150,
+    max_examples=100,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
@@ -114,45 +114,36 @@ def test_damage_is_told_or_harmless(name, tmp_path, little_memory, data, valid):
     assert_only_our_errors(drain, tmp_path / name, damaged, partial(little_memory, 64 << 20))
 
 
-def refused(path, data, match):
-    path.write_bytes(data)
-    with pytest.raises(SceneFormatError, match=match):
-        drain(path)
-
-
-@pytest.mark.parametrize("name", ["a.laz", "new.laz"])
-def test_a_number_of_chunks_is_not_believed(name, valid, tmp_path):
-    data = bytearray(valid[name])
+def too_many_chunks(data):
     (points,) = struct.unpack_from("<I", data, 96)
     (table,) = struct.unpack_from("<q", data, points)
     struct.pack_into("<I", data, table + 4, 2**32 - 1)
-    refused(tmp_path / name, data, "found 4,294,967,295 chunks in")
 
 
-def test_a_number_of_records_is_not_believed(valid, tmp_path):
-    data = bytearray(valid["a.las"])
-    struct.pack_into("<I", data, 100, 2**32 - 1)
-    refused(tmp_path / "a.las", data, "found 4,294,967,295 records in")
-
-
-def test_points_begin_within_the_file(valid, tmp_path):
-    data = bytearray(valid["a.las"])
-    struct.pack_into("<I", data, 96, 2**32 - 1)
-    refused(tmp_path / "a.las", data, "found points that begin at byte 4,294,967,295 of ")
-
-
-def test_points_of_another_size_than_the_header_says(valid, tmp_path):
+def a_longer_point(data):
     """Else lazrs makes room for what its own record says."""
-    data = bytearray(valid["a.laz"])
     at = data.index(b"laszip encoded") + 16 + 2 + 2 + 32 + 34
     assert struct.unpack_from("<HH", data, at) == (6, 20)  # the first item: POINT10, 20 bytes
     struct.pack_into("<H", data, at + 2, 2**16 - 1)
-    refused(tmp_path / "a.laz", data, "found points of ")
 
 
-def test_positions_of_several_values_are_refused(valid, tmp_path):
-    data = valid["a.pcd"].replace(b"COUNT 1 1 1 1", b"COUNT 2 1 1 1")
-    refused(tmp_path / "a.pcd", data, "found another COUNT of x")
+@pytest.mark.parametrize(
+    ("name", "lie"),
+    [
+        ("a.laz", too_many_chunks),
+        ("new.laz", too_many_chunks),
+        ("a.laz", a_longer_point),
+        ("a.las", lambda data: struct.pack_into("<I", data, 100, 2**32 - 1)),  # records
+        ("a.las", lambda data: struct.pack_into("<I", data, 96, 2**32 - 1)),  # points begin there
+        ("a.pcd", lambda data: data.__setitem__(slice(None), data.replace(b"T 1 1", b"T 2 1"))),
+    ],
+)
+def test_a_header_is_not_believed(name, lie, valid, tmp_path):
+    data = bytearray(valid[name])
+    lie(data)
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(SceneFormatError, match=name):
+        drain(tmp_path / name)
 
 
 def test_a_panic_of_lazrs_is_an_error_of_ours(valid, tmp_path, monkeypatch):

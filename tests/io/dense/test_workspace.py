@@ -21,7 +21,7 @@ from splatseed.errors import (
 )
 from splatseed.io import find_depths, load_scene
 from splatseed.io.dense import write_dense_maps, write_dense_workspace
-from splatseed.io.ply.points import read_ply
+from splatseed.io.ply import read_ply
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.undistortion import undistort
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.io import load_scene, write_scene
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 
 COUNTS = {"train": 5, "val": 2, "test": 3}

@@ -16,7 +16,7 @@ from splatseed.camera import Camera, Intrinsics, rotation_from_quat
 from splatseed.errors import OutputError, SceneFormatError, SplatseedError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.nerfstudio.transforms import read_transforms
-from splatseed.io.ply.points import read_ply, write_ply
+from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.similarity import Similarity
 

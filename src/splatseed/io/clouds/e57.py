@@ -7,47 +7,62 @@ scan is read in parts, never whole.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.errors import SceneFormatError
-from splatseed.io.clouds.cloud_file import CHUNK, CloudChunk, CloudFile
-from splatseed.io.clouds.colors import SAMPLE_ROWS, SAMPLES, ColorRange, GreyRange
-from splatseed.io.clouds.rows import COPY_AGAIN
+from splatseed.io.cloud_file import (
+    CHUNK,
+    SAMPLE_ROWS,
+    SAMPLES,
+    CloudChunk,
+    CloudFile,
+    Columns,
+    Painter,
+    guarded,
+    positions,
+)
 from splatseed.requirements import require
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _RGB = ("colorRed", "colorGreen", "colorBlue")
 _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
-_OPTIONAL = (*_RGB, "intensity", *_INVALID)
 
 
 @dataclass(frozen=True, eq=False)
 class _Scan:
-    """One scan of a file.
-
-    Args:
-        count: Its points.
-        fields: The fields that are read.
-        rotation: World from scan, float64 [3, 3].
-        translation: The scanner's place, float64 [3].
-    """
+    """One scan of a file: its points, the fields that are read, and world from scan."""
 
     count: int
     fields: tuple[str, ...]
     rotation: Float64[np.ndarray, "3 3"]
     translation: Float64[np.ndarray, " 3"]
 
+    @classmethod
+    def of(cls, header: Any) -> _Scan:
+        """The scan that pye57's header describes."""
+        known = set(header.point_fields)
+        place = next((each for each in (_CARTESIAN, _SPHERICAL) if set(each) <= known), None)
+        if place is None:
+            raise ValueError(f"neither cartesian nor spherical coordinates: {sorted(known)}")
+        optional = (*_RGB, "intensity", *_INVALID)
+        fields = (*place, *(name for name in optional if name in known))
+        if not header.has_pose():
+            return cls(int(header.point_count), fields, np.eye(3), np.zeros(3))
+        rotation = np.asarray(header.rotation_matrix, np.float64)
+        translation = np.asarray(header.translation, np.float64)
+        return cls(int(header.point_count), fields, rotation, translation)
+
     def positions(self, data: Mapping[str, np.ndarray]) -> Float64[np.ndarray, "n 3"]:
         """Points in the file's common frame."""
         if _CARTESIAN[0] in data:
-            xyz = np.stack([data[name] for name in _CARTESIAN], axis=1)
+            xyz = positions(data.__getitem__, _CARTESIAN)
         else:
             distance, azimuth, elevation = (data[name] for name in _SPHERICAL)
             flat = distance * np.cos(elevation)
@@ -67,104 +82,70 @@ class E57Cloud(CloudFile):
     def __init__(self, path: Path) -> None:
         require("pye57")
         self.path = path
-        with _Opened(path) as file:
-            self._scans = tuple(_describe(path, header) for header in file.headers)
-        self.count = sum(scan.count for scan in self._scans)
-        if not self._scans:
-            raise SceneFormatError(f"{path} to hold scans", found="none", fix=COPY_AGAIN)
-        colored = all(set(_RGB) <= set(scan.fields) for scan in self._scans)
-        bright = all("intensity" in scan.fields for scan in self._scans)
-        self.colors = "rgb" if colored else "intensity" if bright else "none"
-        self._color, self._grey = self._ranges()
-
-    def _ranges(self) -> tuple[ColorRange, GreyRange]:
-        """Ranges of colour and intensity, from the beginning of each scan."""
-        if self.colors == "none":
-            return ColorRange(), GreyRange()
-        heads = [data for i in range(len(self._scans)) for data in self._head(i)]
-        if self.colors == "rgb":
-            sample = [np.stack([data[name] for name in _RGB], axis=1) for data in heads]
-            return ColorRange.of(np.concatenate(sample)), GreyRange()
-        return ColorRange(), GreyRange.of(np.concatenate([data["intensity"] for data in heads]))
-
-    def _head(self, index: int) -> Iterator[dict[str, np.ndarray]]:
-        with _Opened(self.path) as file:
-            for data in _read(self.path, file, index, self._scans[index], SAMPLES * SAMPLE_ROWS):
-                yield data
-                return
+        with _opened(path) as (image, headers):
+            self._scans = tuple(map(_Scan.of, headers))
+            self.count = sum(scan.count for scan in self._scans)
+            if not self._scans:
+                raise ValueError("no scans")
+            columns = Columns()
+            if all(set(_RGB) <= set(scan.fields) for scan in self._scans):
+                columns = Columns(_RGB)
+            elif all("intensity" in scan.fields for scan in self._scans):
+                columns = Columns((), "intensity")
+            self.colors = columns.colors
+            most = SAMPLES * SAMPLE_ROWS
+            heads = [
+                next(_read(image, header, scan, most), {name: np.empty(0) for name in scan.fields})
+                for header, scan in zip(headers, self._scans, strict=True)
+            ]
+        # Ranges are those of the beginning of each scan.
+        known = {
+            name: np.concatenate([each[name] for each in heads if name in each])
+            for name in (*_RGB, "intensity")
+            if any(name in each for each in heads)
+        }
+        self._painter = Painter(columns, lambda: known.__getitem__)
 
     def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
         """See ``CloudFile.chunks``."""
-        with _Opened(self.path) as file:
-            for index, scan in enumerate(self._scans):
-                for data in _read(self.path, file, index, scan, size):
-                    chunk = CloudChunk(scan.positions(data), self._paint(data))
-                    if len(chunk):
+        with _opened(self.path) as (image, headers):
+            for header, scan in zip(headers, self._scans, strict=True):
+                for data in _read(image, header, scan, size):
+                    rgb = self._painter.paint(data.__getitem__)
+                    if len(chunk := CloudChunk(scan.positions(data), rgb)):
                         yield chunk
 
-    def _paint(self, data: Mapping[str, np.ndarray]) -> np.ndarray | None:
-        if self.colors == "rgb":
-            return self._color.to_bytes(np.stack([data[name] for name in _RGB], axis=1))
-        return self._grey.to_bytes(data["intensity"]) if self.colors == "intensity" else None
 
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, list[Any]]]:
+    """An open file and the headers of its scans; failures become one of our errors."""
+    from pye57 import ScanHeader, libe57  # noqa: PLC0415  (an optional package)
 
-class _Opened:
-    """An open E57 file and the headers of its scans."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> Self:
-        from pye57 import ScanHeader, libe57  # noqa: PLC0415  (an optional package)
-
-        # not pye57.E57, which removes files that it fails to open
-        self.image = _guarded(self.path, lambda: libe57.ImageFile(str(self.path), "r"))
+    with guarded(path, "a complete E57 file"):
+        image = libe57.ImageFile(str(path), "r")  # pye57.E57 removes files that it fails to open
         try:
-            scans = _guarded(self.path, lambda: self.image.root()["data3D"])
-            self.headers = [ScanHeader(scans[i]) for i in range(len(scans))]
-        except BaseException:
-            self.image.close()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.image.close()
+            scans = image.root()["data3D"]
+            yield image, [ScanHeader(scans[i]) for i in range(len(scans))]
+        finally:
+            image.close()
 
 
-def _describe(path: Path, header: Any) -> _Scan:
-    known = set(header.point_fields)
-    place = next((each for each in (_CARTESIAN, _SPHERICAL) if set(each) <= known), None)
-    if place is None:
-        raise SceneFormatError(
-            f"{path} to hold cartesian or spherical coordinates",
-            found=", ".join(sorted(known))[:160],
-            fix=COPY_AGAIN,
-        )
-    fields = (*place, *(name for name in _OPTIONAL if name in known))
-    if not header.has_pose():
-        return _Scan(int(header.point_count), fields, np.eye(3), np.zeros(3))
-    return _Scan(
-        int(header.point_count),
-        fields,
-        np.asarray(header.rotation_matrix, np.float64),
-        np.asarray(header.translation, np.float64),
-    )
-
-
-def _read(
-    path: Path, file: _Opened, index: int, scan: _Scan, size: int
-) -> Iterator[dict[str, np.ndarray]]:
+def _read(image: Any, header: Any, scan: _Scan, size: int) -> Iterator[dict[str, np.ndarray]]:
     """The fields of the valid points of a scan, at most ``size`` at a time."""
     from pye57 import libe57  # noqa: PLC0415  (an optional package)
 
     room = min(size, max(scan.count, 1))
-    arrays: dict[str, np.ndarray] = {name: np.empty(room, _dtype(name)) for name in scan.fields}
+    arrays: dict[str, np.ndarray] = {
+        # Colours may be bytes, 16-bit or 0 to 1: the values tell.
+        name: np.empty(room, np.int8 if name in _INVALID else np.float64)
+        for name in scan.fields
+    }
     buffers = libe57.VectorSourceDestBuffer()
     for name, array in arrays.items():
-        buffers.append(libe57.SourceDestBuffer(file.image, name, array, room, True, True))
-    reader = _guarded(path, lambda: file.headers[index].points.reader(buffers))
+        buffers.append(libe57.SourceDestBuffer(image, name, array, room, True, True))
+    reader = header.points.reader(buffers)
     given = 0
-    while count := _guarded(path, reader.read):
+    while count := reader.read():
         given += count
         valid = np.ones(count, bool)
         for name in _INVALID:
@@ -173,24 +154,4 @@ def _read(
         yield {name: array[:count][valid] for name, array in arrays.items()}
     reader.close()
     if given < scan.count:
-        raise _damaged(path, f"{given:,} of {scan.count:,} points of scan {index}")
-
-
-def _dtype(name: str) -> type:
-    if name in _RGB:
-        return np.float64  # bytes, 16-bit or 0 to 1: the values tell
-    return np.int8 if name in _INVALID else np.float64
-
-
-def _guarded(path: Path, read: Callable[[], Any]) -> Any:
-    """What ``read`` gives; whatever the package raises on a bad file as our error."""
-    try:
-        return read()
-    except MemoryError:
-        raise
-    except Exception as error:  # noqa: BLE001  (libE57Format raises errors of many kinds)
-        raise _damaged(path, " ".join(str(error).split())[:160]) from None
-
-
-def _damaged(path: Path, found: str) -> SceneFormatError:
-    return SceneFormatError(f"{path} to be a complete E57 file", found=found, fix=COPY_AGAIN)
+        raise ValueError(f"{given:,} of {scan.count:,} points of a scan")

@@ -10,16 +10,25 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from splatseed.errors import SceneFormatError, SplatseedError
-from splatseed.io.clouds.cloud_file import CHUNK, CloudChunk, CloudFile
-from splatseed.io.clouds.colors import SAMPLE_ROWS, ColorRange, GreyRange, sample_starts
-from splatseed.io.clouds.rows import COPY_AGAIN, check_size, positions
+from splatseed.io.cloud_file import (
+    CHUNK,
+    SAMPLE_ROWS,
+    CloudChunk,
+    CloudFile,
+    Column,
+    Columns,
+    Painter,
+    check_size,
+    guarded,
+    sample_starts,
+)
 from splatseed.requirements import require
 
 _RGB = ("red", "green", "blue")
@@ -41,80 +50,59 @@ class LasCloud(CloudFile):
     def __init__(self, path: Path) -> None:
         require("laspy", "lazrs")
         self.path = path
-        with _Opened(path) as file:
-            header = file.header
-            self.count = int(header.point_count)
-            self.bounds = np.array([header.mins, header.maxs], np.float64)
-            names = set(header.point_format.dimension_names)
-            sample = _sample(file, path, self.count)
-        self._names = names
-        self._color = ColorRange()
-        self._grey: GreyRange | None = None
-        if names >= set(_RGB) and (sample.size == 0 or sample[:, :3].any()):
-            self.colors = "rgb"
-            self._color = ColorRange.of(sample[:, :3])
-        elif sample.size and np.ptp(sample[:, 3]) > 0:
-            self.colors = "intensity"
-            self._grey = GreyRange.of(sample[:, 3])
+        with _opened(path) as file:
+            self.count = int(file.header.point_count)
+            self.bounds = np.array([file.header.mins, file.header.maxs], np.float64)
+            names = set(file.header.point_format.dimension_names)
+            there = [name for name in (*_RGB, "intensity") if name in names]
+            sample = {name: [np.empty(0, np.uint16)] for name in there}
+            for start in sample_starts(self.count):
+                file.seek(start)
+                points = file.read_points(SAMPLE_ROWS)
+                for name in there:
+                    sample[name].append(np.asarray(points[name], np.uint16))
+        columns = Columns()
+        known = {name: np.concatenate(parts) for name, parts in sample.items()}
+        if set(_RGB) <= names and (not self.count or any(known[name].any() for name in _RGB)):
+            columns = Columns(_RGB)
+        elif len(known.get("intensity", ())) and np.ptp(known["intensity"]) > 0:
+            columns = Columns((), "intensity")
+        self.colors = columns.colors
+        self._painter = Painter(columns, lambda: known.__getitem__)
+        self._marks_withheld = "withheld" in names
 
     def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
         """See ``CloudFile.chunks``."""
-        given = 0
-        with _Opened(self.path) as file:
-            while given < (self.count or 0):
-                points = _guarded(self.path, lambda: file.read_points(size))
+        given, count = 0, self.count or 0
+        with _opened(self.path) as file:
+            while given < count:
+                points = file.read_points(size)
                 if not len(points):
-                    raise _cut_short(self.path, f"{given:,} of {self.count:,} points")
+                    raise ValueError(f"{given:,} of {count:,} points")
                 given += len(points)
-                if len(chunk := self._chunk(points)):
+                column: Column = points.__getitem__
+                chunk = self._painter.chunk(lambda name, of=column: np.asarray(of(name)))  # type: ignore[misc]  # bound at once
+                if self._marks_withheld:
+                    chunk = chunk.select(~np.asarray(points["withheld"], bool))
+                if len(chunk):
                     yield chunk
 
-    def _chunk(self, points: Any) -> CloudChunk:
-        xyz = positions(points.__getitem__)
-        rgb = None
-        if self.colors == "rgb":
-            rgb = self._color.to_bytes(np.stack([np.asarray(points[n]) for n in _RGB], axis=1))
-        elif self._grey is not None:
-            rgb = self._grey.to_bytes(np.asarray(points["intensity"]))
-        chunk = CloudChunk(xyz, rgb)
-        if "withheld" not in self._names:
-            return chunk
-        withheld = np.asarray(points["withheld"], bool)
-        return chunk.select(~withheld) if withheld.any() else chunk
 
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A laspy reader; what it raises becomes one of our errors."""
+    import laspy  # noqa: PLC0415  (an optional package)
 
-class _Opened:
-    """A laspy reader whose failures are ours."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> Any:
-        import laspy  # noqa: PLC0415  (an optional package)
-
-        _guarded(self.path, lambda: _check_records(self.path))
-        self.reader = _guarded(self.path, lambda: laspy.open(self.path, read_evlrs=False))
-        check = _check_chunks if self.reader.header.are_points_compressed else _check_room
-        _guarded(self.path, lambda: check(self.path, self.reader.header))
-        return self.reader
-
-    def __exit__(self, *_: object) -> None:
-        self.reader.close()
-
-
-def _sample(file: Any, path: Path, count: int) -> np.ndarray:
-    """Red, green, blue and intensity of points spread over the file, [n, 4]; 0 where absent."""
-    parts = []
-    names = set(file.header.point_format.dimension_names)
-    for start in sample_starts(count):
-        _guarded(path, lambda at=start: file.seek(at))  # type: ignore[misc]  # bound at once
-        points = _guarded(path, lambda: file.read_points(SAMPLE_ROWS))
-        table = np.zeros((len(points), 4), np.uint16)
-        for i, name in enumerate((*_RGB, "intensity")):
-            if name in names:
-                table[:, i] = points[name]
-        parts.append(table)
-    return np.concatenate(parts) if parts else np.empty((0, 4), np.uint16)
+    with guarded(path, "a complete LAS or LAZ file"):
+        _check_records(path)
+        with laspy.open(path, read_evlrs=False) as reader:
+            header = reader.header
+            if header.are_points_compressed:
+                _check_chunks(path, header)
+            else:
+                bodies = header.point_count * header.point_format.size
+                check_size(path, header.offset_to_point_data + bodies)
+            yield reader
 
 
 def _check_records(path: Path) -> None:
@@ -126,16 +114,8 @@ def _check_records(path: Path) -> None:
     with path.open("rb") as file:
         file.seek(_WHERE_POINTS)
         start, number = struct.unpack("<II", file.read(8))
-    if start > size:
-        raise _cut_short(path, f"points that begin at byte {start:,} of {size:,}")
-    if number * _RECORD > size:
-        raise _cut_short(path, f"{number:,} records in {size:,} bytes")
-
-
-def _check_room(path: Path, header: Any) -> None:
-    """Refuse a LAS file with fewer bytes than its points take."""
-    needed = header.offset_to_point_data + header.point_count * header.point_format.size
-    check_size(path, needed)
+    if start > size or number * _RECORD > size:
+        raise ValueError(f"{number:,} records and points from byte {start:,} in {size:,} bytes")
 
 
 def _check_chunks(path: Path, header: Any) -> None:
@@ -150,20 +130,22 @@ def _check_chunks(path: Path, header: Any) -> None:
     size, bytes_each = path.stat().st_size, header.point_format.size
     vlr = lazrs.LazVlr(header.vlrs[header.vlrs.index("LasZipVlr")].record_data)
     if vlr.item_size() != bytes_each:
-        raise _cut_short(path, f"points of {vlr.item_size():,} bytes, not {bytes_each:,}")
+        raise ValueError(f"points of {vlr.item_size():,} bytes, not {bytes_each:,}")
     with path.open("rb") as file:
         number = _number_of_chunks(file, header.offset_to_point_data)
         # A chunk begins with a point as it is.
         if number * bytes_each > size:
-            raise _cut_short(path, f"{number:,} chunks in {size:,} bytes")
+            raise ValueError(f"{number:,} chunks in {size:,} bytes")
         file.seek(header.offset_to_point_data)
         chunks = np.array(lazrs.read_chunk_table(file, vlr), np.float64).reshape(number, 2)
     points, packed = chunks.sum(axis=0)
-    if packed > size or points < header.point_count:
+    if (
+        packed > size
+        or points < header.point_count
+        or chunks[:, 0].max() * bytes_each > _MOST_BYTES
+    ):
         found = f"chunks of {points:,.0f} points in {packed:,.0f} bytes"
-        raise _cut_short(path, f"{found}, for {header.point_count:,} points in {size:,} bytes")
-    if chunks[:, 0].max() * bytes_each > _MOST_BYTES:
-        raise _cut_short(path, f"a chunk of {chunks[:, 0].max():,.0f} points")
+        raise ValueError(f"{found}, for {header.point_count:,} points in {size:,} bytes")
 
 
 def _number_of_chunks(file: IO[bytes], start: int) -> int:
@@ -176,21 +158,3 @@ def _number_of_chunks(file: IO[bytes], start: int) -> int:
     file.seek(offset)
     _, number = struct.unpack("<II", file.read(8))
     return int(number)
-
-
-def _guarded(path: Path, read: Callable[[], Any]) -> Any:
-    """What ``read`` gives; whatever the package raises on a bad file as our error."""
-    try:
-        return read()
-    except (MemoryError, SplatseedError):
-        raise
-    except BaseException as error:  # laspy and lazrs raise errors of many kinds
-        # A panic of Rust is no Exception.
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
-            raise
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
-        raise _cut_short(path, f"one that is cut short or damaged ({reason})") from None
-
-
-def _cut_short(path: Path, found: str) -> SceneFormatError:
-    return SceneFormatError(f"{path} to be a complete LAS or LAZ file", found=found, fix=COPY_AGAIN)

@@ -17,13 +17,20 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.clouds.cloud_file import CHUNK, CloudChunk, CloudFile
-from splatseed.io.clouds.rows import RGB_NAMES, XYZ, Columns
-from splatseed.io.clouds.tables import Dialect, TextTable
+from splatseed.io.cloud_file import (
+    CHUNK,
+    RGB_NAMES,
+    SAMPLE_BYTES,
+    XYZ,
+    CloudChunk,
+    CloudFile,
+    Columns,
+    Dialect,
+    Painter,
+    TextTable,
+)
 from splatseed.io.files import open_file
 
-_LOOKED_AT = 1 << 16
-"""Bytes from which names and columns are recognised."""
 _NAMES = {
     "easting": "x",
     "northing": "y",
@@ -55,31 +62,40 @@ class TextCloud(CloudFile):
     def __init__(self, path: Path) -> None:
         self.path = path
         with open_file(path) as file:
-            head = file.read(_LOOKED_AT).decode("latin-1")
-            whole = len(head) < _LOOKED_AT
-        lines = head.split("\n") if whole else head.split("\n")[:-1]
+            head = file.read(SAMPLE_BYTES).decode("latin-1")
+        lines = head.split("\n")[: None if len(head) < SAMPLE_BYTES else -1]
         first, dialect = _first_line(path, lines)
         rows = [line.strip() for line in lines[first:] if line.strip()]
-        sample = _parse(path, rows, dialect)
-        names = _named(lines[:first], dialect, sample.shape[1])
+        num = len(_words(rows[0], dialect))
+        try:  # rows of another length than the first are left to the reader
+            even = [row for row in rows if len(_words(row, dialect)) == num]
+            sample = dialect.parse(even, range(num))
+        except ValueError as error:
+            raise SceneFormatError(
+                f"numbers in every row of {path}", found=str(error)[:120], fix="Export it again."
+            ) from None
+        names = _named(lines[:first], dialect, num)
         if names is None:
             names = _guessed(sample, path.suffix.lower() == ".pts")
-            self.warnings = (_told(path, names),)
+            self.warnings = (_describe_guess(path, names),)
         columns = Columns.among(names)
         self.colors = columns.colors
+        used = (*XYZ, *columns.rgb, *([columns.intensity] if columns.intensity else []))
         offset = sum(len(line) + 1 for line in lines[:first])  # latin-1: a byte per character
-        self._table = TextTable(path, names, columns, offset, dialect=dialect)
+        self._table = TextTable(path, names, used, offset, dialect=dialect)
+        self._painter = Painter(columns, self._table.sample)
 
     def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
         """See ``CloudFile.chunks``."""
-        yield from self._table.chunks(size)
+        yield from map(self._painter.chunk, self._table.columns(size))
 
 
 def _first_line(path: Path, lines: Sequence[str]) -> tuple[int, Dialect]:
     """The first line of at least three numbers, and how it is written."""
     for i, line in enumerate(lines):
         for dialect in _dialects(line):
-            if line.strip() and len(_words(line, dialect)) >= 3 and _is_numeric(line, dialect):
+            words = _words(line, dialect)
+            if line.strip() and len(words) >= 3 and all(map(_is_number, words)):
                 return i, dialect
     found = next((repr(line.strip()[:60]) for line in lines if line.strip()), "an empty file")
     raise SceneFormatError(
@@ -104,24 +120,12 @@ def _words(line: str, dialect: Dialect) -> list[str]:
     return [word.strip().strip('"') for word in text.split(dialect.delimiter)]
 
 
-def _is_numeric(line: str, dialect: Dialect) -> bool:
+def _is_number(word: str) -> bool:
     try:
-        [float(word) for word in _words(line, dialect)]
+        float(word)
     except ValueError:
         return False
     return True
-
-
-def _parse(path: Path, rows: Sequence[str], dialect: Dialect) -> Float64[np.ndarray, "N C"]:
-    """The sample's numbers; rows of another length than the first are left to the reader."""
-    count = len(_words(rows[0], dialect))
-    even = [row for row in rows if len(_words(row, dialect)) == count]
-    try:
-        return dialect.parse(even, range(count))
-    except ValueError as error:
-        raise SceneFormatError(
-            f"numbers in every row of {path}", found=str(error)[:120], fix="Export it again."
-        ) from None
 
 
 def _named(lines: Sequence[str], dialect: Dialect, count: int) -> list[str] | None:
@@ -140,9 +144,7 @@ def _guessed(sample: Float64[np.ndarray, "N C"], is_pts: bool) -> list[str]:
     """Names for columns that have none, from their values."""
     count = sample.shape[1]
     names = [*XYZ, *(f"column {i + 1}" for i in range(3, count))]
-    starts = range(3, count - 2)
-    if is_pts and count == 7:
-        starts = range(4, 5)
+    starts = range(4, 5) if is_pts and count == 7 else range(3, count - 2)
     start = next((i for i in starts if _like_colors(sample[:, i : i + 3])), None)
     if start is not None:
         names[start : start + 3] = _RGB
@@ -160,11 +162,11 @@ def _like_colors(values: Float64[np.ndarray, "N 3"]) -> bool:
     return bool(known.max() <= 65535 and (known == np.rint(known)).all())
 
 
-def _told(path: Path, names: Sequence[str]) -> str:
-    what = f"columns 1 to 3 of {path.name} are taken as x, y, z"
+def _describe_guess(path: Path, names: Sequence[str]) -> str:
+    what = "none as colours"
     if _RGB[0] in names:
         at = names.index(_RGB[0]) + 1
-        return f"It has no line of names: {what}, {at} to {at + 2} as red, green, blue."
-    if "intensity" in names:
-        return f"It has no line of names: {what}, 4 as intensity."
-    return f"It has no line of names: {what}, none as colours."
+        what = f"{at} to {at + 2} as red, green, blue"
+    elif "intensity" in names:
+        what = "4 as intensity"
+    return f"It has no line of names: columns 1 to 3 of {path.name} are taken as x, y, z, {what}."

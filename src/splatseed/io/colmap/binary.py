@@ -19,7 +19,6 @@ from jaxtyping import Float32, Int64, UInt8
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
-from splatseed.io.binary import ByteReader
 from splatseed.io.colmap.model import (
     EXPORT_AGAIN,
     UNKNOWN_ERROR,
@@ -31,6 +30,7 @@ from splatseed.io.colmap.model import (
     make_points,
     point_columns,
 )
+from splatseed.io.files import ByteReader
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Tracks
 

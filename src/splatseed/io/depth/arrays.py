@@ -19,8 +19,7 @@ from numpy.lib import format as npy_format
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import SceneFormatError
-from splatseed.io.archives import ARCHIVE_FAILURES, ARRAY_FAILURES
-from splatseed.io.files import read_bytes
+from splatseed.io.files import ARCHIVE_FAILURES, ARRAY_FAILURES, read_bytes
 from splatseed.literal import beginning, told
 
 KINDS: tuple[DepthKind, ...] = get_args(DepthKind)

@@ -23,7 +23,7 @@ from splatseed.io.colmap.scene import (
 from splatseed.io.files import odd_kind
 from splatseed.io.image_checks import image_warnings, lens_warnings
 from splatseed.io.nerfstudio.transforms import Transforms, apply_transform, read_transforms
-from splatseed.io.ply.points import read_ply
+from splatseed.io.ply import read_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.similarity import fit_similarity

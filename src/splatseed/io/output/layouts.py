@@ -29,7 +29,7 @@ from splatseed.io.nerfstudio.content import (
 from splatseed.io.nerfstudio.transforms import apply_transform, read_transforms
 from splatseed.io.output.image_folders import frame_folders, image_folders
 from splatseed.io.output.seeds_npz import write_seeds
-from splatseed.io.ply.points import write_ply
+from splatseed.io.ply import write_ply
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS, split_fields
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene

@@ -17,7 +17,7 @@ from jaxtyping import Float32, UInt8
 
 from splatseed.io.colmap.binary import point_rows, set_point_count
 from splatseed.io.output.seeds_npz import SEEDS, PositionDigest, write_origins
-from splatseed.io.ply.points import ply_header, ply_rows
+from splatseed.io.ply import ply_header, ply_rows
 from splatseed.pointcloud import ORIGINAL, PointCloud
 
 Piece = tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]

@@ -21,7 +21,7 @@ from jaxtyping import Float32, UInt8
 from numpy.lib import format as npy_format
 
 from splatseed.errors import PointCloudError
-from splatseed.io.archives import ARCHIVE_FAILURES
+from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.pointcloud import ATTRIBUTES, GENERATED, ORIGINAL, PointCloud
 
 SEEDS = "seeds.npz"

@@ -1,14 +1,13 @@
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.ply.points import read_ply, write_ply
+from splatseed.io import load_scene
+from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 
 KINDS = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort", "i4": "int"}
@@ -137,16 +136,6 @@ def test_colours_come_in_several_types(tmp_path, form, kind, values, expected):
 
 
 @forms
-@pytest.mark.parametrize(
-    ("kind", "values"), [("f4", (0, 0.5, 256)), ("f4", (-0.5, 0, 1)), ("i4", (0, -1, 5))]
-)
-def test_colours_out_of_range_are_refused(tmp_path, form, kind, values):
-    fields = [*XYZ, *((name, kind) for name, _ in RGB)]
-    with pytest.raises(SceneFormatError, match=r"colours from 0 to .*properties red, green, blue"):
-        read_ply(_write(tmp_path, form, fields, [(0, 0, 0, *values)]))
-
-
-@forms
 def test_missing_colours_are_mid_grey(tmp_path, form):
     assert read_ply(_write(tmp_path, form, XYZ, [(1, 2, 3)])).rgb.tolist() == [[128, 128, 128]]
 
@@ -159,81 +148,6 @@ def test_trained_gaussians_give_the_colour_of_their_first_harmonic(tmp_path, for
     rows = [(0, 0, 0, *harmonic, 9), (1, 1, 1, -50, 0, 50, 9)]
     rgb = read_ply(_write(tmp_path, form, fields, rows)).rgb
     assert rgb.tolist() == [[0, 51, 255], [0, 128, 255]]
-
-
-@forms
-@pytest.mark.parametrize("faces", [[(0, 1, 2), (1, 2, 3)], [(0, 1, 2), (0, 1, 2, 3)], [(), (1,)]])
-@pytest.mark.parametrize("first", [True, False])
-def test_elements_with_lists_may_stand_beside_the_vertices(tmp_path, form, faces, first):
-    fields, path = (*XYZ, *RGB), tmp_path / "mesh.ply"
-    parts = [
-        (FACE, _faces(form, *faces)),
-        (_vertex(fields, len(ROWS)), _body(form, fields, ROWS)),
-    ]
-    if form == "ascii" and () in faces:
-        parts[0] = (FACE, b"0\n1 1\n")
-    elements, bodies = zip(*parts if first else reversed(parts), strict=True)
-    path.write_bytes(_header(form, *elements).encode() + b"".join(bodies))
-    _assert_read(path)
-
-
-@forms
-def test_scalar_elements_may_come_first(tmp_path, form):
-    camera = [("fx", "f8"), ("width", "i4")]
-    fields, path = (*XYZ, *RGB), tmp_path / "points.ply"
-    element = "element camera 1\nproperty double fx\nproperty int width\n"
-    header = _header(form, element, "element nothing 5\n", _vertex(fields, len(ROWS)))
-    bodies = _body(form, camera, [(500.5, 640)]) + _body(form, fields, ROWS)
-    path.write_bytes(header.encode() + bodies)
-    _assert_read(path)
-
-
-def _with_vertex_lists(form, lengths):
-    vertex = (
-        _vertex(XYZ[:1], 2)
-        + "property list uchar int seen_by\n"
-        + "".join(f"property {KINDS[kind]} {name}\n" for name, kind in (*XYZ[1:], *RGB))
-    )
-    rows = (
-        _body(form, XYZ[:1], [row[:1]])
-        + _faces(form, range(length))
-        + _body(form, (*XYZ[1:], *RGB), [row[1:]])
-        for row, length in zip(ROWS, lengths, strict=True)
-    )
-    joined = b"".join(rows)
-    if form == "ascii":  # a row is one line
-        fields = iter(joined.split(b"\n"))
-        joined = b"".join(b" ".join(itertools.islice(fields, 3)) + b"\n" for _ in ROWS)
-    return _header(form, vertex).encode() + joined
-
-
-@forms
-def test_vertex_lists_of_one_length_are_passed_over(tmp_path, form):
-    path = tmp_path / "points.ply"
-    path.write_bytes(_with_vertex_lists(form, (2, 2)))
-    _assert_read(path)
-
-
-@forms
-def test_vertex_lists_of_several_lengths_are_refused(tmp_path, form):
-    path = tmp_path / "points.ply"
-    path.write_bytes(_with_vertex_lists(form, (1, 2)))
-    with pytest.raises(SceneFormatError, match="vertex lists of one length"):
-        read_ply(path)
-
-
-@pytest.mark.parametrize("length", ["", "x", "-1", "9" * 5000])
-def test_list_lengths_that_are_none_are_refused(tmp_path, length):
-    path = tmp_path / "points.ply"
-    header = "element vertex 1\nproperty list char int seen_by\n" + _vertex(XYZ, 1).removeprefix(
-        "element vertex 1\n"
-    )
-    path.write_text(_header("ascii", header) + f"{length}\n" * 2)
-    with pytest.raises(SceneFormatError, match=r"the length of list seen_by|1 lines of vertices"):
-        read_ply(path)
-    path.write_bytes(_header("binary_little_endian", header).encode() + b"\xff" * 20)
-    with pytest.raises(SceneFormatError, match="a list length of 0 or more"):
-        read_ply(path)
 
 
 @forms
@@ -257,55 +171,45 @@ def test_dos_line_ends_and_non_finite_positions_pass(tmp_path, form):
 POINT_HEADER = _header("binary_little_endian", _vertex(XYZ, 1))
 
 
+@forms
+def test_faces_after_the_vertices_are_not_read(tmp_path, form):
+    fields, path = (*XYZ, *RGB), tmp_path / "mesh.ply"
+    header = _header(form, _vertex(fields, len(ROWS)), FACE)
+    path.write_bytes(header.encode() + _body(form, fields, ROWS) + _faces(form, (0, 1, 2), (0, 1)))
+    _assert_read(path)
+
+
 @pytest.mark.parametrize(
-    ("data", "message"),
+    "data",
     [
-        ("", "to be a PLY file: .*found an empty file"),
-        ("plyx\n" + POINT_HEADER[4:], "to be a PLY file"),
-        (POINT_HEADER[:-11], "to be a PLY file"),
-        ("ply\nend_header\n", r"format ascii.*line 2"),
-        (POINT_HEADER.replace("1.0", "2.0"), r"line 2; found 'format binary_little_endian 2.0'"),
-        (POINT_HEADER.replace("_little_endian", ""), "line 2"),
-        (POINT_HEADER.replace("element vertex 1", ""), "an element before any property"),
-        (POINT_HEADER.replace("vertex 1", "vertex -1"), r"line 4; found 'element vertex -1'"),
-        (POINT_HEADER.replace("vertex 1", "vertex many"), "element NAME COUNT"),
-        (POINT_HEADER.replace("float z", "real z"), "line 7; found 'property real z'"),
-        (POINT_HEADER.replace("float z", "list float int z"), "line 7"),
-        (POINT_HEADER.replace("float z", "float x"), "differ in name in .*line 4"),
-        (POINT_HEADER.replace("float z", "float w"), "scalar x, y, z; found properties x, y, w"),
-        (POINT_HEADER.replace("float z", "list uchar int z"), "scalar x, y, z"),
-        (POINT_HEADER.replace("vertex", "point"), "found no element vertex"),
-        (POINT_HEADER.replace("end_header", "texture a.png\nend_header"), "line 8"),
-        (POINT_HEADER + 11 * "x", "4 more bytes in .*element vertex, byte [0-9]+; found 3"),
-        (
-            POINT_HEADER.replace("vertex 1", "vertex 2") + 23 * "x",
-            "24 more bytes in .*element vertex, byte [0-9]+; found 23",
-        ),
-        (POINT_HEADER.replace("vertex 1", f"vertex {2**60}") + 24 * "x", "more bytes"),
-        (POINT_HEADER.replace("vertex 1", "vertex " + 5000 * "9"), "element NAME COUNT"),
+        "",
+        "plyx\n" + POINT_HEADER[4:],
+        POINT_HEADER[:-11],
+        "ply\nend_header\n",
+        POINT_HEADER.replace("1.0", "2.0"),
+        POINT_HEADER.replace("_little_endian", ""),
+        POINT_HEADER.replace("element vertex 1", ""),
+        POINT_HEADER.replace("vertex 1", "vertex -1"),
+        POINT_HEADER.replace("vertex 1", "vertex " + 5000 * "9"),
+        POINT_HEADER.replace("float z", "real z"),
+        POINT_HEADER.replace("float z", "float x"),
+        POINT_HEADER.replace("float z", "float w"),
+        POINT_HEADER.replace("float z", "list uchar int z"),
+        POINT_HEADER.replace("vertex", "point"),
+        POINT_HEADER.replace("element vertex", "element chunk 1\nelement vertex"),
+        POINT_HEADER.replace("end_header", "texture a.png\nend_header"),
+        POINT_HEADER + 11 * "x",
+        POINT_HEADER.replace("vertex 1", f"vertex {2**60}") + 24 * "x",
+        POINT_HEADER.replace("end_header", "property uint packed_position\nend_header") + 99 * "x",
+        _header("ascii", _vertex(XYZ, 2)) + "1 2 3\n",
+        _header("ascii", _vertex(XYZ, 2)) + "1 2 3\n1 2\n",
+        _header("ascii", _vertex(XYZ, 2)) + "1 2 3\n1 2 x\n",
     ],
 )
-def test_malformed_files_name_the_place(tmp_path, little_memory, data, message):
+def test_malformed_files_are_named(tmp_path, little_memory, data):
     path = tmp_path / "points.ply"
     path.write_bytes(data.encode())
-    with little_memory(), pytest.raises(SceneFormatError, match=message):
-        read_ply(path)
-
-
-@pytest.mark.parametrize(
-    ("kinds", "body", "message"),
-    [
-        ("fff", "1 2 3\n", "2 lines of vertices in .*ascii body.*found 1"),
-        ("fff", "1 2 3\n1 2\n", "a number for each vertex property .*row 2"),
-        ("fff", "1 2 3\n1 2 x\n", "a number .*row 1"),
-        ("ffi", "1 2 3\n1 2 3.5\n", "z as integers .*3.5 in row 2"),
-    ],
-)
-def test_malformed_ascii_bodies_name_the_row(tmp_path, kinds, body, message):
-    fields = [(name, {"f": "f4", "i": "i4"}[kind]) for name, kind in zip("xyz", kinds, strict=True)]
-    path = tmp_path / "points.ply"
-    path.write_text(_header("ascii", _vertex(fields, 2)) + body)
-    with pytest.raises(SceneFormatError, match=message):
+    with little_memory(), pytest.raises(SceneFormatError, match=r"points\.ply"):
         read_ply(path)
 
 
@@ -314,3 +218,11 @@ def test_missing_files_are_our_errors(tmp_path):
         read_ply(tmp_path / "points.ply")
     with pytest.raises(SceneFormatError, match="readable"):
         read_ply(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".splat", ".ksplat", ".sog", ".SPZ"])
+def test_a_model_that_is_no_scene_is_named(suffix, tmp_path):
+    path = tmp_path / f"model{suffix}"
+    path.write_bytes(b"\x1f\x8b")
+    with pytest.raises(SceneFormatError, match=r"a trained model"):
+        load_scene(path)

@@ -1,0 +1,302 @@
+"""PLY files: reading points of any writer, and the form of them that every 3DGS loader takes.
+
+Notation: an *element* is a table of rows; a *property* is a column, a scalar or a list with its
+length in front. Properties may stand in any order and beside any others. Colours are
+red/green/blue, diffuse_* or r/g/b: bytes, 16-bit integers, or floats from 0 to 1 or to 255; else
+the ``f_dc`` of trained Gaussians. Promise: ascii and both binary forms give the same cloud; counts
+are checked against the file before anything is allocated; what follows the vertices is not read.
+Files with lists in their vertices, or another element before them, are refused: nobody writes them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from splatseed.errors import SceneFormatError
+from splatseed.io.cloud_file import (
+    CHUNK,
+    XYZ,
+    CloudChunk,
+    CloudFile,
+    Columns,
+    Painter,
+    RowTable,
+    TextTable,
+    positions,
+)
+from splatseed.io.files import check_room, open_file, readable
+from splatseed.literal import beginning
+from splatseed.pointcloud import PointCloud
+
+EXPORT_PLY_AGAIN = "Copy the file again, or export it again as a binary little-endian PLY."
+
+_TYPES = {
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_END = re.compile(rb"^end_header[ \t]*(\r?\n|\Z)", re.MULTILINE)
+_MAX_HEADER = 1 << 20  # a longer search would only crawl through a body
+_GREY = 128
+_DROP_IN = np.dtype(
+    [(name, "<f4") for name in (*XYZ, "nx", "ny", "nz")]
+    + [(name, "u1") for name in ("red", "green", "blue")]
+)
+_MODELS = {
+    ".spz": "Gaussians compressed by Niantic's spz",
+    ".splat": "Gaussians in the .splat format of web viewers, 32 bytes each",
+    ".ksplat": "Gaussians in the .ksplat format of GaussianSplats3D",
+    ".sog": "Gaussians compressed as PlayCanvas's SOG",
+}
+
+
+class Property(NamedTuple):
+    """One column of an element: its name, NumPy's code of its type, and whether it is a list."""
+
+    name: str
+    dtype: str
+    is_list: bool
+
+
+class Element(NamedTuple):
+    """One table of a file."""
+
+    name: str
+    num_rows: int
+    properties: tuple[Property, ...]
+
+    @property
+    def has_lists(self) -> bool:
+        """Whether its rows may differ in length."""
+        return any(each.is_list for each in self.properties)
+
+
+class Header(NamedTuple):
+    """What a PLY file promises to hold.
+
+    Args:
+        byte_order: NumPy's character for it; empty for an ascii body.
+        elements: The tables, in order.
+        size: Length of the header in bytes: the offset of the body.
+    """
+
+    byte_order: str
+    elements: tuple[Element, ...]
+    size: int
+
+    def dtype(self, element: Element) -> np.dtype[Any]:
+        """The layout of a row of scalars."""
+        return np.dtype([(each.name, self.byte_order + each.dtype) for each in element.properties])
+
+
+def parse_header(path: Path, data: bytes) -> Header:
+    """The header at the start of a PLY file: known types, unique names, counts of zero or more.
+
+    Args:
+        path: The file, for errors.
+        data: Its bytes, or its first ones.
+
+    Raises:
+        SceneFormatError: It is not a PLY header, or one of its lines makes no sense.
+    """
+    end = _END.search(data, 0, _MAX_HEADER)
+    if not re.match(rb"ply[ \t]*\r?\n", data) or end is None:
+        raise SceneFormatError(
+            f"{path} to be a PLY file: a line 'ply', a header, a line 'end_header'",
+            found=beginning(data, 20),
+            fix=EXPORT_PLY_AGAIN,
+        )
+    byte_order: str | None = None
+    elements: list[Element] = []
+    # Comments may be in any encoding.
+    for number, line in enumerate(data[: end.start()].decode("latin-1").split("\n")[1:], start=2):
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", form, "1.0"] if form in _BYTE_ORDERS and byte_order is None:
+                byte_order = _BYTE_ORDERS[form]
+                continue
+            case ["element", name, count] if re.fullmatch("[0-9]{1,19}", count) and (
+                byte_order is not None
+            ):
+                elements.append(Element(name, int(count), ()))
+                continue
+            case ["property", *kind, name] if elements and (found := _property(name, kind)):
+                last = elements[-1]
+                if name not in {each.name for each in last.properties}:
+                    elements[-1] = last._replace(properties=(*last.properties, found))
+                    continue
+        raise SceneFormatError(
+            f"a format, an element or one of its properties in the header of {path}, line {number}",
+            found=repr(line.strip()[:80]),
+            fix=EXPORT_PLY_AGAIN,
+        )
+    if byte_order is None:
+        raise SceneFormatError(f"a format in {path}", found="none", fix=EXPORT_PLY_AGAIN)
+    return Header(byte_order, tuple(elements), end.end())
+
+
+def _property(name: str, kind: list[str]) -> Property | None:
+    match kind:
+        case ["list", length, of] if of in _TYPES and _TYPES.get(length, "f")[0] in "iu":
+            return Property(name, _TYPES[of], is_list=True)
+        case [of] if of in _TYPES:
+            return Property(name, _TYPES[of], is_list=False)
+    return None
+
+
+class PlyCloud(CloudFile):
+    """A PLY file of points, of any size.
+
+    Raises:
+        SceneFormatError: It is not a PLY, has no vertices with x, y, z, or is cut short.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with open_file(path) as file:
+            header = parse_header(path, file.read(_MAX_HEADER))
+        vertex = _vertex_of(path, header)
+        names = [each.name for each in vertex.properties]
+        self._columns = Columns.among(names)
+        self.count, self.colors = vertex.num_rows, self._columns.colors
+        self._table: RowTable | TextTable
+        if header.byte_order:
+            self._table = RowTable(path, header.dtype(vertex), header.size, self.count)
+        else:
+            intensity = self._columns.intensity
+            used = (*XYZ, *self._columns.rgb, *([intensity] if intensity else []))
+            whole = frozenset(each.name for each in vertex.properties if each.dtype[0] in "iu")
+            self._table = TextTable(
+                path, names, used, header.size, self.count, integers=whole - {*XYZ}
+            )
+        self._painter: Painter | None = None
+
+    def chunks(self, size: int = CHUNK) -> Iterator[CloudChunk]:
+        """See ``CloudFile.chunks``."""
+        if self._painter is None:
+            self._painter = Painter(self._columns, self._table.sample)
+        yield from map(self._painter.chunk, self._table.columns(size))
+
+    def whole(self) -> PointCloud:
+        """All points; grey without colours."""
+        count = self.count or 0
+        column = next(self._table.columns(max(count, 1)), np.empty(0, _DROP_IN).__getitem__)
+        with np.errstate(over="ignore"):  # beyond float32 is infinite, to be seen and dropped
+            xyz = positions(column).astype(np.float32)
+        rgb = None
+        if count and self._columns.rgb:
+            rgb = Painter(self._columns, lambda: column).paint(column)
+        return PointCloud(xyz, np.full((count, 3), _GREY, np.uint8) if rgb is None else rgb)
+
+
+def read_ply(path: Path) -> PointCloud:
+    """The vertices of a PLY file as a cloud.
+
+    Coordinates may be NaN or infinite; nothing is repaired. Colours that are not a number are mid
+    grey, and so are all without colours.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is unreadable, malformed or shorter than its header promises, larger
+            than the free memory, or has no vertices with x, y, z.
+    """
+    with readable(path):
+        cloud = PlyCloud(path)
+        check_room(path, path.stat().st_size)
+        return cloud.whole()
+
+
+def write_ply(path: Path, points: PointCloud) -> None:
+    """Write the PLY that every 3DGS loader takes.
+
+    Binary little-endian; float32 x, y, z and zero normals, uchar red, green, blue; nothing else.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    with path.open("wb") as file:
+        file.write(ply_header(len(points)))
+        file.write(ply_rows(points.xyz, points.rgb))
+
+
+def ply_header(count: int) -> bytes:
+    """The header of a PLY as ``write_ply`` writes it, of ``count`` points."""
+    kinds = {"f": "float", "u": "uchar"}
+    properties = "".join(
+        f"property {kinds[_DROP_IN[name].kind]} {name}\n" for name in _DROP_IN.names or ()
+    )
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}"
+    return f"{header}end_header\n".encode("ascii")
+
+
+def ply_rows(xyz: Float32[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"]) -> memoryview:
+    """The body of such a PLY: some of its points."""
+    rows = np.zeros(len(xyz), _DROP_IN)
+    for i, (axis, channel) in enumerate(zip(XYZ, ("red", "green", "blue"), strict=True)):
+        rows[axis], rows[channel] = xyz[:, i], rgb[:, i]
+    return rows.view(np.uint8).data
+
+
+def refuse_model(path: Path) -> None:
+    """Refuse a file whose name is that of a format of trained Gaussians.
+
+    Raises:
+        SceneFormatError: It is one.
+    """
+    kind = _MODELS.get(path.suffix.lower())
+    if kind is not None and path.is_file():
+        raise _is_model(path, kind)
+
+
+def refuse_packed(path: Path, properties: Collection[str]) -> None:
+    """Refuse a PLY whose properties are those of packed Gaussians.
+
+    Raises:
+        SceneFormatError: They are.
+    """
+    if "packed_position" in properties:
+        raise _is_model(path, "Gaussians compressed as PlayCanvas's .compressed.ply")
+
+
+def _is_model(path: Path, kind: str) -> SceneFormatError:
+    return SceneFormatError(
+        f"{path} to be a scene, or a .ply of points",
+        found=f"{kind}: a trained model",
+        fix="Score it with splatseed evaluate MODEL --scene SCENE, look at it with splatseed view "
+        "MODEL; a .ply of it, by splatseed export MODEL -o OUT.ply, is read as points too.",
+    )
+
+
+def _vertex_of(path: Path, header: Header) -> Element:
+    for each in header.elements:
+        refuse_packed(path, [prop.name for prop in each.properties])
+    first = header.elements[0] if header.elements else Element("no element", 0, ())
+    names = [each.name for each in first.properties]
+    if first.name == "vertex" and set(XYZ) <= set(names) and not first.has_lists:
+        return first
+    raise SceneFormatError(
+        f"{path} to begin with vertices that have x, y, z and no lists",
+        found=f"{first.name} with {', '.join(names)[:200] or 'no properties'}",
+        fix=EXPORT_PLY_AGAIN,
+    )

@@ -1,1 +1,0 @@
-"""PLY files: points, and recognising trained Gaussians without reading them."""
