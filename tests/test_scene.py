@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from splatseed.camera import Intrinsics, rotation_from_quat
+from splatseed.camera import Intrinsics
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Scene, Tracks
 
@@ -37,20 +37,6 @@ def test_the_split_takes_every_eighth_name(count, rng):
     assert [image.name for image in test] == names[::8]
     assert sorted(image.name for image in train + test) == names
     assert [image.name for image in train] == sorted(image.name for image in train)
-
-
-def test_an_images_camera_has_its_pose_and_lens(rng):
-    quat, translation = rng.normal(size=4), rng.normal(size=3)
-    camera = _image("a", quat, translation).camera
-    np.testing.assert_array_equal(camera.cam_from_world[:3, :3], rotation_from_quat(quat))
-    np.testing.assert_array_equal(camera.cam_from_world[:, 3], [*translation, 1])
-    np.testing.assert_array_equal(camera.K, INTRINSICS.K)
-    assert (camera.width, camera.height) == (64, 48)
-
-
-def test_track_lengths(scene):
-    assert scene.tracks.lengths.tolist() == [2, 3, 2, 4, 2]
-    assert len(scene.tracks) == 5
 
 
 def test_tracks_stay_with_the_points_they_belong_to(scene):
@@ -90,13 +76,3 @@ def test_features_of_points_that_went_belong_to_none(scene):
     np.testing.assert_array_equal(ids, [0, NO_POINT, NO_POINT, 4])
     others = scene.replace(points=scene.points.replace(xyz=scene.points.xyz + 1))
     assert (others.images[0].observations.point_ids == NO_POINT).all()
-
-
-def test_tracks_given_with_the_points_are_kept(scene):
-    tracks = scene.tracks
-    changed = scene.replace(points=scene.points.select(slice(1)), tracks=tracks)
-    assert changed.tracks is tracks
-
-
-def test_observations_are_counted():
-    assert len(Observations(np.zeros((7, 2)), np.full(7, -1))) == 7

@@ -23,7 +23,7 @@ from splatseed.seeding.budget import thin
 from splatseed.seeding.cover import cover
 from splatseed.seeding.coverage import HIDING, NEARER, covered_share, grid_from_world, grid_of
 from splatseed.views.view import View
-from splatseed.views.viewpoint import look_at
+from splatseed.views.visibility import look_at
 
 __all__: list[str] = []
 

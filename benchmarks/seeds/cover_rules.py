@@ -19,7 +19,7 @@ from scipy.spatial import Delaunay, QhullError
 from splatseed.io import load_scene
 from splatseed.progress import silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding import coverage, guess
+from splatseed.seeding import cover, coverage
 from splatseed.views.view import View, poses_of
 
 __all__ = ["rule_table"]
@@ -52,14 +52,14 @@ class Hole:
     cell: tuple[int, int]
     truth: float
     view: View
-    witnesses: guess.Witnesses
+    witnesses: cover.Witnesses
 
     def sectors(self, num_witnesses: int) -> float:
         """The rule of ``cover``, asking some of the other views."""
-        depths, _ = guess.guess_depths(
+        depths, _ = cover.guess_depths(
             self.quartiles,
             np.array([self.cell[0] * self.quartiles.shape[1] + self.cell[1]]),
-            guess.world_from_grid(self.view, CELL),
+            cover.world_from_grid(self.view, CELL),
             self.witnesses,
             np.arange(num_witnesses),
         )
@@ -176,7 +176,7 @@ def _make_hole(
         (int(target[0]), int(target[1])),
         float(depth[row]),
         view,
-        guess.call_witnesses(asked, rest, CELL, silent),
+        cover.depth_maps_of_views(asked, rest, CELL, silent),
     )
 
 

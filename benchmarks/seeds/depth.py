@@ -34,15 +34,15 @@ from PIL import Image as PilImage
 from scipy.spatial import cKDTree
 
 import splatseed as ss
-from splatseed.depth.planar import map_camera
+from splatseed.depth.alignment import map_camera
 from splatseed.errors import SceneNotFoundError
 from splatseed.io import find_depths
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.progress import in_threads, silent
 from splatseed.scene import Scene, SceneSource, Tracks
 from splatseed.view.points import render_points
-from splatseed.views.photographs import user_cache_dir
-from splatseed.views.viewpoint import choose_camera
+from splatseed.views.view import user_cache_dir
+from splatseed.views.visibility import choose_camera
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # as the command line does
 

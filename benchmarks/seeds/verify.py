@@ -34,7 +34,7 @@ from splatseed.seeding import verify as module
 from splatseed.seeding.photographs import MAX_SIZE, read_views
 from splatseed.synthetic.room import build_room
 from splatseed.upsample.method import NewPoints
-from splatseed.views.photographs import user_cache_dir
+from splatseed.views.view import user_cache_dir
 from splatseed.views.visibility import find_visibility
 
 __all__ = ["whole_run"]

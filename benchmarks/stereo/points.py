@@ -16,9 +16,8 @@ import numpy as np
 from benchmarks.common.clouds import find_scenes
 
 import splatseed as ss
-from splatseed.camera import Camera
 from splatseed.stereo.depths import find_stereo
-from splatseed.stereo.result import Stereo
+from splatseed.stereo.result import StereoResult
 from splatseed.stereo.settings import StereoSettings
 from splatseed.views.view import data_factor, load_views
 from splatseed.views.visibility import Visibility, find_visibility
@@ -130,10 +129,10 @@ def _only(visibility: Visibility, mine: np.ndarray) -> Visibility:
     return Visibility(visibility.xyz, visibility.point_idx[mine], start, count)
 
 
-def _errors(stereo: Stereo, i: int, xyz: np.ndarray) -> np.ndarray:
+def _errors(stereo: StereoResult, i: int, xyz: np.ndarray) -> np.ndarray:
     """Relative error at the pixels of points, [M]; NaN where there is no depth."""
     view, grid = stereo.views[i], stereo.settings.grid
-    uv, z = Camera(view.K, view.width, view.height, view.cam_from_world).project(xyz)
+    uv, z = view.camera.project(xyz)
     rows, columns = stereo.costs[i].shape
     inside = (z > 0) & ((uv >= 0) & (uv < [columns * grid, rows * grid])).all(axis=1)
     uv, z = uv[inside], z[inside]

@@ -32,11 +32,11 @@ from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError, SplatseedError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.poses_alone.pose_error import pose_error
+from splatseed.seeding.poses import pose_error
 from splatseed.sfm.refining import refined
 from splatseed.similarity import fit_similarity
 from splatseed.stereo.of_scene import stereo_depths
-from splatseed.views.photographs import user_cache_dir
+from splatseed.views.view import user_cache_dir
 
 __all__: list[str] = []
 

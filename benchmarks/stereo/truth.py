@@ -24,7 +24,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.stereo.depths import find_stereo
 from splatseed.stereo.fusion import fuse
-from splatseed.stereo.result import Stereo
+from splatseed.stereo.result import StereoResult
 from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.without_points import known_visibility
 from splatseed.synthetic import make_capture, write_capture
@@ -157,7 +157,7 @@ def first(scene: Scene, limit: int) -> Scene:
     return scene.replace(images=tuple(ordered[:limit]))
 
 
-def _map_shares(stereo: Stereo, scene: Scene) -> tuple[float, float, float]:
+def _map_shares(stereo: StereoResult, scene: Scene) -> tuple[float, float, float]:
     """Of all pixels those kept; of these those within 1% and 5% of the truth."""
     errors, pixels, kept = [], 0, 0
     for i in range(len(stereo.views)):

@@ -46,12 +46,12 @@ from splatseed.errors import SplatseedError
 from splatseed.evaluate import EvalResult, evaluate_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.seeding.poses_alone.random_start import random_start
+from splatseed.seeding.poses import random_start
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.run import TrainingRun
 from splatseed.train.settings import Seeding, StrategyName
 from splatseed.views import View
-from splatseed.views.photographs import user_cache_dir
+from splatseed.views.view import user_cache_dir
 
 __all__ = ["train_all"]
 

@@ -15,7 +15,7 @@ from benchmarks.common.markdown import table
 from scipy.interpolate import SmoothBivariateSpline
 
 from splatseed.upsample.neighbors import prepare
-from splatseed.upsample.surfaces.frames import local_frames
+from splatseed.upsample.patches import local_frames
 
 __all__ = ["smoothing_table"]
 

@@ -23,7 +23,7 @@ from PIL import Image as PillowImage, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
 import splatseed as ss
-from splatseed.depth import align
+from splatseed.depth.alignment import align
 from splatseed.io import find_depths
 from splatseed.io.depth.folder import depth_folder
 from splatseed.io.output.staging import atomic_file
@@ -33,8 +33,7 @@ from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.upsample import methods_for
 from splatseed.view.maps import preview_depth
 from splatseed.view.points import render_points
-from splatseed.views.viewpoint import choose_camera, choose_image, look_at
-from splatseed.views.visibility import find_visibility
+from splatseed.views.visibility import choose_camera, choose_image, find_visibility, look_at
 
 HERE = Path(__file__).parent
 RATIO = 8

@@ -10,10 +10,8 @@ import pytest
 
 import splatseed as ss
 from splatseed.camera import Intrinsics
-from splatseed.depthmap import DepthMap
 from splatseed.errors import (
     ParameterError,
-    PointCloudError,
     SceneFormatError,
     SceneNotFoundError,
 )
@@ -76,13 +74,6 @@ def test_a_lens_with_distortion_is_refused(exact):
             assert upsample(exact.replace(images=images)).finite.all()
 
 
-def test_maps_that_know_nothing_are_an_error(exact, make_maps):
-    empty = exact.replace(depths=make_maps("z", lambda z, _: z * np.nan))
-    for options in ({}, {"align": False}, {"profile": "paper"}):
-        with pytest.raises(SceneFormatError, match=r"none among 12; view_000.*has no depth"):
-            upsample(empty, **options)
-
-
 def test_units_a_thousand_times_too_large_are_aligned_or_refused(exact, make_maps):
     scene = exact.replace(depths=make_maps("z", lambda z, _: 1000 * z))
     aligned = upsample(scene)
@@ -104,30 +95,6 @@ def test_infinities_zeros_and_negatives_are_never_lifted(exact, make_maps):
         assert np.abs(seeds.xyz).max() < 10
 
 
-def test_more_than_the_maps_have_is_an_error_that_says_how_many(exact):
-    with pytest.raises(PointCloudError, match=r"can give 1,000,000 points; found 2[12]\d,\d{3}"):
-        ss.upsample(exact, "depth", num_points=len(exact.points) + 1_000_000)
-
-
-@pytest.mark.parametrize("names", [["b.png", "a.png"], ["x/10.png", "x/9.png"]])
-def test_names_need_no_order(names, exact, tmp_path):
-    images = []
-    maps = type(exact.depths)()
-    for name, image in zip(names, exact.images, strict=False):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        shutil.copy(exact.source.image_dir / image.name, tmp_path / name)
-        images.append(dataclasses.replace(image, name=name))
-        maps[name] = exact.depths.read(image.name)
-    source = dataclasses.replace(exact.source, image_dir=tmp_path)
-    scene = exact.replace(images=tuple(images), depths=dict_of(maps), source=source)
-    assert upsample(scene).finite.all()
-
-
-def dict_of(maps):
-    """Maps in the order of another container, which must not matter."""
-    return type(maps)(reversed(maps.items()))
-
-
 def test_a_parameter_is_checked_before_anything_is_read(exact):
     class Untouchable(dict):
         def read(self, name):
@@ -136,10 +103,3 @@ def test_a_parameter_is_checked_before_anything_is_read(exact):
     scene = exact.replace(depths=Untouchable(exact.depths))
     with pytest.raises(ParameterError, match="tolerance"):
         upsample(scene, tolerance=2.0)
-
-
-def test_a_tiny_map_is_enough(exact, make_maps):
-    scene = exact.replace(depths=make_maps("z", lambda z, _: z[::40, ::40]))
-    assert DepthMap(scene.depths.read("view_000.png").values).width == 4
-    seeds = ss.upsample(scene, "depth", num_points=len(exact.points) + 20, align=False)
-    assert seeds.finite.all()

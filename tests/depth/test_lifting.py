@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 import splatseed as ss
-from splatseed.camera import Camera
 from splatseed.depth import lifting, views
-from splatseed.depth.planar import PlanarDepth, lift_pixels, ray_length
-from splatseed.upsample import configure
+from splatseed.depth.alignment import PlanarDepth, lift_pixels, ray_length
 
 FLOAT32 = 3e-6  # metres, in a room of 5
 
@@ -48,22 +46,6 @@ def test_lifted_points_lie_on_the_surfaces(kind, exact, capture, make_maps):
     assert capture.surfaces.distance(new.xyz.astype(np.float64)).max() < FLOAT32
     aligned = lifted(scene, 5000)  # SfM points are off by millimetres
     assert np.median(capture.surfaces.distance(aligned.xyz.astype(np.float64))) < 0.002
-
-
-def test_half_of_a_pixel_would_lift_off_the_surfaces(exact, capture):
-    image = exact.images[3]
-    depth = exact.depths.read(image.name)
-    pixel = np.flatnonzero(depth.values > 0)
-    off = []
-    for shift in (0.0, 0.5, -0.5):
-        K = image.camera.K.copy()
-        K[:2, 2] += shift
-        camera = Camera(K, 160, 120, image.camera.cam_from_world)
-        z = depth.values.ravel()[pixel]
-        xyz = lift_pixels(pixel, z, camera, np.empty((len(pixel), 3), np.float32))
-        off.append(capture.surfaces.distance(xyz.astype(np.float64)))
-    assert off[0].max() < FLOAT32
-    assert min(off[1].mean(), off[2].mean()) > 1000 * off[0].mean()
 
 
 def test_equation_9_is_a_loop_over_pixels(exact, rng):
@@ -149,25 +131,6 @@ def test_new_points_turn_and_grow_with_the_scene(exact):
     assert near.mean() > 0.98  # where two are equally good, the last bit decides
 
 
-def test_maps_for_half_of_the_images_are_enough_and_said(exact, make_maps):
-    maps, notes = make_maps(), []
-    for image in exact.images[::2]:
-        del maps[image.name]
-    lifted(exact.replace(depths=maps), 500, note=notes.append)
-    assert notes == ["6 of 12 images have no depth map and give no points."]
-
-
-def test_images_that_do_not_fit_are_left_out_and_said(exact, capture, make_maps):
-    def change(z, i):
-        return z * np.random.default_rng(0).uniform(0.3, 2.0, z.shape) if i in {2, 5} else z
-
-    notes = []
-    new = lifted(exact.replace(depths=make_maps("z", change)), 2000, note=notes.append)
-    assert len(notes) == 1
-    assert "2 of 12 depth maps are left out (view_002.png: depth is off by" in notes[0]
-    assert np.percentile(capture.surfaces.distance(new.xyz.astype(np.float64)), 99) < 0.01
-
-
 def test_held_out_images_are_not_even_read(exact):
     class Watched(dict):
         def read(self, name):
@@ -179,16 +142,6 @@ def test_held_out_images_are_not_even_read(exact):
     lifted(scene, 200, hold_out=8)
     test_names = {image.name for image in scene.split(8)[1]}
     assert names == {image.name for image in scene.images} - test_names
-
-
-def test_a_map_of_another_size_gives_its_own_pixels(exact, capture, make_maps):
-    scene = exact.replace(depths=make_maps("z", lambda z, _: z[1::2, 1::2]))
-    # Every second pixel, whose centres are half a pixel off those of an 80 x 60 map.
-    new = lifted(scene, 2000, align=False)
-    assert np.median(capture.surfaces.distance(new.xyz.astype(np.float64))) < 0.02
-    uv, _ = exact.images[0].camera.project(new.xyz[:50].astype(np.float64))
-    centre = uv / 2.0 - 0.5
-    np.testing.assert_allclose(centre, np.round(centre), atol=1e-3)
 
 
 def test_a_second_reading_comes_when_the_first_was_not_enough(exact, make_maps, monkeypatch):
@@ -208,13 +161,6 @@ def test_a_second_reading_comes_when_the_first_was_not_enough(exact, make_maps, 
     assert len(set(reads)) > 1
     assert max(reads) <= lifting.MAX_OVERSAMPLING * 3000 / 12 + 1
     assert any("confirmed by fewer than 2 other views" in note for note in notes)
-
-
-def test_one_photograph_is_enough(exact):
-    scene, notes = exact.replace(images=exact.images[:1]), []
-    new = lifted(scene, 100, note=notes.append)
-    assert new.finite.all()
-    assert "100 of 100 new points are confirmed by fewer than 2" in notes[0]
 
 
 def test_every_pixel_can_be_had_but_no_more(exact):
@@ -237,10 +183,3 @@ def test_without_points_metric_depth_will_do(exact, capture):
         ss.upsample(empty, "depth", ratio=4, align=False)
     with pytest.raises(ss.errors.PointCloudError, match="at least one original"):
         ss.upsample(empty, "depth", num_points=1500)
-
-
-def test_the_method_is_also_a_value(exact):
-    chosen = configure("depth", "paper", region=0.8)
-    by_value = ss.upsample(exact, chosen, ratio=2)
-    by_name = ss.upsample(exact, "depth", ratio=2, profile="paper", region=0.8)
-    assert by_value.xyz.tobytes() == by_name.xyz.tobytes()

@@ -6,9 +6,8 @@ import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from scipy.spatial import cKDTree
 
-from splatseed.depth.voxel_thinning import _Cubes, thin_by_voxels
+from splatseed.depth.candidates import _Cubes, thin_by_voxels
 
 
 def sheet(rng, num):
@@ -57,22 +56,6 @@ def test_exactly_so_many_come_out(num, rng):
     assert (np.diff(chosen) > 0).all()
 
 
-def test_only_the_eligible_are_chosen(rng):
-    xyz, eligible = sheet(rng, 3000), rng.random(3000) < 0.5
-    taken = thin_by_voxels(xyz, np.ones(3000, np.float32), eligible, xyz[:0], 800, rng)
-    assert np.count_nonzero(taken) == 800
-    assert eligible[taken].all()
-
-
-def test_points_come_apart(rng):
-    xyz = sheet(rng, 20_000)
-    chosen = xyz[spread(xyz, 1000, rng)]
-    random = xyz[rng.choice(20_000, 1000, replace=False)]
-    places = sheet(rng, 3000) * [1, 1, 1]
-    gap = [cKDTree(cloud).query(places)[0].max() for cloud in (chosen, random)]
-    assert gap[0] < 0.6 * gap[1]
-
-
 def test_originals_keep_their_surroundings(rng):
     xyz = sheet(rng, 20_000)
     originals = xyz[xyz[:, 0] < 0.5][::4]
@@ -91,13 +74,6 @@ def test_many_candidates_are_estimated_from_some(rng):
     assert len(chosen) == 20_000
 
 
-@pytest.mark.parametrize("copies", [1, 50])
-def test_one_place_fills_up(copies, rng):
-    xyz = np.tile(np.float32([[1, 2, 3]]), (copies, 1))
-    chosen = spread(xyz, copies, rng)
-    assert len(chosen) == copies
-
-
 def test_threads_do_not_matter(rng):
     xyz = sheet(rng, 80_000)
     footprint = rng.random(80_000).astype(np.float32)
@@ -111,12 +87,3 @@ def test_threads_do_not_matter(rng):
     finally:
         numba.set_num_threads(available)
     assert len(set(results)) == 1
-
-
-def test_far_outliers_do_not_spoil_it(rng):
-    xyz = np.concatenate([sheet(rng, 5000), np.float32([[1e4, 0, 0], [0, -1e4, 0]])])
-    chosen = spread(xyz, 1000, rng)
-    near = xyz[chosen][np.abs(xyz[chosen]).max(axis=1) < 10]
-    assert len(near) >= 998
-    distance = cKDTree(near).query(near, 2)[0][:, 1]
-    assert np.median(distance) > 0.02

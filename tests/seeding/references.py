@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from splatseed.views.view import View
-from splatseed.views.viewpoint import look_at
+from splatseed.views.visibility import look_at
 
 NEARER, HIDING, WITNESSES = 0.1, 5, 12
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -65,16 +64,6 @@ def _scene(poses):
         images.append(replace(image, translation=-rotation @ np.asarray(center, float)))
     cloud = PointCloud(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8))
     return Scene(cloud, tuple(images), (lens,))
-
-
-def test_what_seeds_are_said_to_gain_before_growth_is_what_was_measured():
-    page = Path(__file__).parents[2] / "docs/results/tables/arms_by_scene.md"
-    rows = [[each.strip() for each in line.split("|")] for line in page.read_text().splitlines()]
-    gains = {row[1]: row[3:7] for row in rows if len(row) > 3 and row[2] == "grow"}
-    first, others = ([float(each.split()[0]) for each in gains[name]] for name in ("sfm", "auto"))
-    most = max(after - before for before, after in zip(first, others, strict=True))
-    said = advise(FERN, most_seeds=30_000, strategy="grow").reasons[1]
-    assert f"gained {most:.1f} dB at most" in said
 
 
 ANGLES = np.linspace(0, 2 * np.pi, 8, endpoint=False)

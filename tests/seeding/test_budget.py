@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.seeding.budget import _places_in_views, median_pixels, thin
+from splatseed.seeding.budget import _places_in_views, thin
 from splatseed.seeding.coverage import covered_share
 
 from . import references as slow
@@ -22,13 +22,6 @@ def sheet(rng, num):
 
 def views_of(rng, num):
     return [slow.make_view(rng, 64, 48, 60, name=f"{k}") for k in range(num)]
-
-
-def test_the_median_view_counts(rng):
-    views = [slow.make_view(rng, side, 10) for side in (10, 20, 90)]
-    assert median_pixels(views) == 200
-    with pytest.raises(ParameterError, match="in rho"):
-        median_pixels([])
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0.3, 30.0))
@@ -86,10 +79,6 @@ def test_originals_come_first_among_equals(rng):
     high = np.arange(1000) >= 500
     assert (thin(twice, views_of(rng, 3), 100, priority=high) >= 500).all()
     assert (thin(twice, views_of(rng, 3), 100, first=500, priority=high) < 500).all()
-
-
-def test_enough_room_keeps_all(rng):
-    np.testing.assert_array_equal(thin(sheet(rng, 9), views_of(rng, 1), 9), np.arange(9))
 
 
 def test_threads_change_nothing(rng):

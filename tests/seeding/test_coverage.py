@@ -8,7 +8,6 @@ from hypothesis import given, settings, strategies as st
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.seeding.coverage import cell_depths, covered_cells, covered_share
-from splatseed.views.view import poses_of
 
 from . import references as slow
 
@@ -22,14 +21,6 @@ def test_depths_are_those_of_the_loop(seed, cell, spread):
     xyz = (spread * rng.normal(size=(rng.integers(0, 600), 3))).astype(np.float32)
     expected = slow.cell_depths(view, xyz, cell)
     np.testing.assert_array_equal(cell_depths(view, xyz, cell), expected)
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=10, deadline=None)
-def test_the_order_of_points_does_not_matter(seed):
-    rng = np.random.default_rng(seed)
-    view, xyz = slow.make_view(rng), rng.normal(size=(900, 3)).astype(np.float32)
-    np.testing.assert_array_equal(cell_depths(view, xyz, 8), cell_depths(view, xyz[::-1], 8))
 
 
 def test_a_surface_hides_what_shows_between_its_points(rng):
@@ -67,12 +58,6 @@ def test_only_finite_points_before_the_camera_count(rng):
     assert covered_share([view], np.empty((0, 3), np.float32)) == 0.0
 
 
-def test_no_photograph_is_needed(room_capture):
-    images = room_capture.scene.images[:2]
-    views = poses_of(images)
-    assert 0.1 < covered_share(views, room_capture.scene.points.xyz) < 1.0
-
-
 def test_bad_input_is_refused(rng):
     view, xyz = slow.make_view(rng), np.zeros((1, 3), np.float32)
     with pytest.raises(ParameterError, match="at least one view"):
@@ -82,9 +67,3 @@ def test_bad_input_is_refused(rng):
             covered_share([view], xyz, cell)
     with pytest.raises(PointCloudError, match=r"\[N, 3\]"):
         covered_share([view], xyz[:, :2])
-
-
-def test_progress_ends_at_one(rng):
-    told = []
-    covered_share([slow.make_view(rng)] * 3, np.zeros((1, 3)), progress=lambda *a: told.append(a))
-    assert [fraction for _, fraction in told] == pytest.approx([1 / 3, 2 / 3, 1])

@@ -109,18 +109,6 @@ def test_the_place_is_that_of_the_loop(num_sources, images, warps, points):
     assert np.ptp(moves) > 1.0  # the loop above compared different things
 
 
-def test_the_place_is_where_the_pictures_lie_on_each_other(images, warps, points):
-    uv, planes, reach = points
-    planes = planes * [[1, 0, 0]]
-    inside = (uv[:, 0] > 16) & (uv[:, 0] < WIDTH - 16)
-    t = (planes[:, 0] - 1) / reach  # w / (1 + t h / (n X)) = 1
-    near = inside & (np.abs(t) < 1.2)
-    assert near.sum() > 3
-    moves, costs, _ = run(images, warps, uv, planes.astype(np.float32), reach)
-    np.testing.assert_allclose(moves[near], t[near], atol=0.08)
-    assert costs[near].max() < 0.1
-
-
 def test_the_variance_is_that_of_the_window(images, warps, points):
     faint = (images[0] // 10).astype(np.uint8)  # as faint as what has to be told from no texture
     _, _, variances = run([faint, *images[1:]], warps, *points)
@@ -129,13 +117,6 @@ def test_the_variance_is_that_of_the_window(images, warps, points):
         c = window_weights(faint, u, v)
         r = np.array([bilinear(faint, u + dx - 0.5, v + dy - 0.5) for dx, dy in WINDOW])
         assert found == pytest.approx(c @ (r - c @ r) ** 2, rel=0.02)
-
-
-def test_a_point_does_not_depend_on_its_neighbours_in_the_list(images, warps, points, rng):
-    whole, order = run(images, warps, *points), rng.permutation(NUM)[: NUM - 4]
-    part = run(images, warps, *(each[order] for each in points))
-    for one, other in zip(whole, part, strict=True):
-        assert one[order].tobytes() == other.tobytes()
 
 
 @pytest.mark.parametrize("level", [0, 255])

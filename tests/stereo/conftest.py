@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatseed.scene import Scene
-from splatseed.stereo.depths import Stereo, find_stereo
+from splatseed.stereo.depths import StereoResult, find_stereo
 from splatseed.stereo.settings import StereoSettings
 from splatseed.synthetic.surfaces import Union
 from splatseed.views.view import load_views
@@ -26,10 +26,10 @@ class Planted:
 
     scene: Scene
     surfaces: Union
-    stereo: Stereo
+    stereo: StereoResult
 
 
-def find(scene: Scene) -> Stereo:
+def find(scene: Scene) -> StereoResult:
     views = load_views(scene, scene.images)
     return find_stereo(views, scene.images, find_visibility(scene), SETTINGS)
 

@@ -21,7 +21,7 @@ from splatseed.synthetic.raycast import pixel_rays, render_view
 from splatseed.synthetic.room import Room
 from splatseed.synthetic.surfaces import Rectangle, Sphere, Surface, Union
 from splatseed.synthetic.texture import Mottled, Plain, Texture
-from splatseed.views.viewpoint import look_at
+from splatseed.views.visibility import look_at
 
 WIDTH, HEIGHT, FOCAL = 96, 80, 100.0
 FAR = 3.0

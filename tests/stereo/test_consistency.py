@@ -56,15 +56,3 @@ def test_it_is_the_loop(warp, maps):
             assert bits[row, column] == expected
     if warp is not WARPS["behind"]:
         assert 0.2 < bits.mean() < 0.9
-
-
-def test_a_map_confirms_itself_where_it_is_good(maps):
-    first = maps[0]
-    same = asked((first, first), np.hstack([np.eye(3), np.zeros((3, 1))]), 1e-5)
-    np.testing.assert_array_equal(same, first[1] <= MAX_COST)
-
-
-def test_a_wider_tolerance_confirms_more(maps):
-    narrow, wide = (asked(maps, WARPS["moved"], tolerance) for tolerance in (0.01, 0.05))
-    assert (narrow <= wide).all()
-    assert narrow.sum() < wide.sum()

@@ -7,7 +7,7 @@ import pytest
 from numba import njit
 
 from splatseed.kernels.simd import LANES, load, store
-from splatseed.stereo.quads import grey_image, make_quads, sample, square_root
+from splatseed.stereo.quads import grey_image, make_quads, sample
 
 from .references import bilinear
 
@@ -15,11 +15,6 @@ from .references import bilinear
 @njit
 def _sample(quads, width, height, columns, rows, out):
     store(out, 0, sample(quads, width, height, load(columns, 0), load(rows, 0)))
-
-
-@njit
-def _square_root(values, out):
-    store(out, 0, square_root(load(values, 0)))
 
 
 def sampled(image: np.ndarray, columns, rows) -> np.ndarray:
@@ -40,12 +35,6 @@ def test_between_pixels_and_beyond_the_border(shape, rough, rng):
         np.testing.assert_allclose(sampled(image, columns, rows), expected, atol=1e-3)
 
 
-def test_whole_places_are_the_pixels_themselves():
-    image = np.arange(16, dtype=np.uint8).reshape(4, 4) * 17
-    rows, columns = np.indices(image.shape).reshape(2, -1)
-    np.testing.assert_array_equal(sampled(image, columns, rows), image.ravel())
-
-
 def test_places_that_are_no_numbers_read_some_pixel(rough):
     image = rough(5, 6)
     odd = [np.nan, np.inf, -np.inf, 3e38, -3e38]
@@ -59,10 +48,3 @@ def test_grey_is_the_luma_of_the_colours(rng):
     assert np.abs(grey_image(image) - expected).max() <= 1  # where rounding is a toss-up
     flat = np.arange(256, dtype=np.uint8)[None, :, None].repeat(3, axis=2)
     np.testing.assert_array_equal(grey_image(flat)[0], np.arange(256))
-
-
-def test_square_root(rng):
-    values = rng.uniform(0, 1e6, LANES).astype(np.float32)
-    out = np.empty(LANES, np.float32)
-    _square_root(values, out)
-    np.testing.assert_array_equal(out, np.sqrt(values))

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import splatseed as ss
-from splatseed.upsample.surfaces.spline_gcv import LAMBDAS
+from splatseed.upsample.splines import LAMBDAS
 
 from . import references as slow
 from .references_voronoi import voronoi

@@ -11,8 +11,8 @@ import pytest
 from scipy import stats
 
 import splatseed as ss
-from splatseed.upsample.neighbors import Bases, Neighbors, draw_bases, prepare
-from splatseed.upsample.surfaces.placement import place_in_box, place_in_triangle, place_on_disc
+from splatseed.upsample.neighbors import draw_bases, prepare
+from splatseed.upsample.patches import place_in_box, place_in_triangle, place_on_disc
 
 NUM = 20_000
 
@@ -72,14 +72,6 @@ def test_disc_is_uniform_by_area(one_base, rng):
     assert_uniform((np.arctan2(v, u) / (2 * np.pi)) % 1.0)
 
 
-def test_a_disc_on_a_line_is_a_segment(one_base, rng):
-    _, neighbors, bases, _ = one_base
-    line = np.ones(len(neighbors.idx), bool)
-    u, v = place_on_disc(neighbors, bases, line, 1.5, rng).T
-    assert not v.any()
-    assert abs(np.mean(u > 0) - 0.5) < 0.02
-
-
 def test_every_pair_of_the_eight_nearest_spans_a_triangle(one_base, rng):
     cloud, neighbors, bases, frames = one_base
     uv = place_in_triangle(cloud, neighbors, bases, frames, rng).astype(np.float64)
@@ -120,9 +112,3 @@ def test_random_is_uniform_in_the_bounding_box_with_the_originals_colors(rng):
     for axis in range(3):
         assert_uniform((xyz[:, axis] - low[axis]) / (high[axis] - low[axis]))
     assert stats.binomtest(int((rgb[:, 0] == 255).sum()), NUM, 1 / 50).pvalue > 1e-3
-
-
-def test_bases_are_layouts_of_counts():
-    bases = Bases(np.array([0, 2]), np.array([2, 1]), 3)
-    assert bases.total == bases.count.sum()
-    assert Neighbors(np.zeros((1, 3), np.int32), np.array([[1.0, 2.0, 6.0]])).spacing[0] == 3.0

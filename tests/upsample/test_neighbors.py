@@ -1,4 +1,4 @@
-"""Preparing a cloud: what is kept, who is whose neighbour, who may be a base."""
+"""Preparing a cloud: what is kept, whose neighbour, who may be a base; colours in between."""
 
 from __future__ import annotations
 
@@ -8,9 +8,18 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from splatseed import PointCloud
-from splatseed.upsample.nearest_points import distances_of
-from splatseed.upsample.neighbors import draw_bases, prepare, sound_bases
+from splatseed import PointCloud, Scene
+from splatseed.progress import silent
+from splatseed.scene import Tracks
+from splatseed.upsample import configure
+from splatseed.upsample.nearest import interpolate_colors
+from splatseed.upsample.neighbors import (
+    distances_of,
+    draw_bases,
+    prepare,
+    sound_bases,
+    trusted_originals,
+)
 
 from . import references as slow
 
@@ -36,24 +45,6 @@ def test_rows_are_the_distinct_finite_originals(wavy):
         in_file_order(prepared, prepared.xyz) + prepared.center, wavy.xyz, rtol=0, atol=1e-12
     )
     np.testing.assert_array_equal(in_file_order(prepared, prepared.rgb), wavy.rgb)
-
-
-def test_zero_has_no_sign():
-    xyz = np.array([[0.0, 1, 2], [-0.0, 1, 2], [3, -0.0, 1], [3, 0.0, 1]], np.float32)
-    assert len(prepare(PointCloud(xyz, np.zeros((4, 3), np.uint8)))) == 2
-
-
-def test_duplicates_are_found_among_many(rng):
-    xyz = rng.integers(0, 12, (5000, 3)).astype(np.float32)  # nearly every place is taken twice
-    prepared = prepare(PointCloud(xyz, np.zeros((5000, 3), np.uint8)))
-    _, first = np.unique(xyz, axis=0, return_index=True)
-    found = in_file_order(prepared, prepared.xyz + prepared.center)
-    np.testing.assert_allclose(found, xyz[np.sort(first)], rtol=0, atol=1e-9)
-
-
-def test_an_empty_choice_of_trusted_rows_trusts_all(prepared, rng):
-    bases = draw_bases(prepared, 500, rng, weight=np.zeros(len(prepared)))
-    assert np.count_nonzero(bases.count) > 100
 
 
 def test_untrusted_points_are_neighbors_but_never_bases(wavy, rng):
@@ -86,12 +77,6 @@ def test_distances_are_the_same_bytes_without_numba(rng, monkeypatch):
     assert by_kernel.min() == 1e-3
 
 
-def test_spacing_is_the_mean_of_six(wavy_exact, prepared):
-    fast = in_file_order(prepared, prepared.neighbors(16).spacing)
-    expected = [slow.spacing(wavy_exact.xyz, i) for i in range(len(wavy_exact.xyz))]
-    np.testing.assert_allclose(fast, expected, rtol=1e-12)
-
-
 @pytest.mark.parametrize("k", [8, 16, 25])
 def test_isolated_points_are_those_of_the_rule(wavy_exact, prepared, k):
     fast = in_file_order(prepared, sound_bases(prepared, prepared.neighbors(k)))
@@ -113,3 +98,80 @@ def test_outputs_are_laid_out_by_rank_without_gaps(prepared, rng):
     bases = draw_bases(prepared, 999, rng, weight=np.ones(len(prepared)))
     start, count = (in_file_order(prepared, a) for a in (bases.start, bases.count))
     np.testing.assert_array_equal(start, np.cumsum(count) - count)
+
+
+def scene_with(lengths, errors):
+    n = len(lengths)
+    xyz = np.random.default_rng(0).random((n, 3)).astype(np.float32)
+    offsets = np.concatenate([[0], np.cumsum(lengths)])
+    total = int(offsets[-1])
+    tracks = Tracks(
+        np.arange(1, n + 1),
+        xyz.astype(np.float64),
+        np.asarray(errors, np.float64),
+        offsets,
+        np.zeros(total, np.uint32),
+        np.zeros(total, np.uint32),
+    )
+    return Scene(PointCloud(xyz, np.zeros((n, 3), np.uint8)), tracks=tracks)
+
+
+MISTRUSTED = scene_with(np.full(300, 3), np.where(np.arange(300) == 7, 50.0, 0.5))
+
+
+def test_short_and_bad_together_are_not_trusted():
+    lengths, errors = [3, 3, 9, 9, 5], [0.5, 5.0, 0.5, 5.0, 0.5]
+    assert trusted_originals(scene_with(lengths, errors)).tolist() == [
+        True,
+        False,
+        True,
+        True,
+        True,
+    ]
+
+
+def test_unknown_errors_are_trusted():
+    assert trusted_originals(scene_with([2, 2], [-1.0, -1.0])) is None
+    assert trusted_originals(scene_with([2, 2, 2], [-1.0, 1.0, 1.0])).all()
+
+
+@pytest.mark.parametrize(("profile", "weight"), [("default", 0.0), ("paper", 1.0)])
+def test_nothing_grows_from_a_mistrusted_point(profile, weight):
+    cloud = prepare(MISTRUSTED.points, trusted_originals(MISTRUSTED))
+    weights, _ = configure("linear", profile).weigh(cloud, cloud.neighbors(8), silent)
+    assert weights[cloud.rank == 7] == weight
+
+
+def colors_at(cloud, place, k=5):
+    """Colour of one new point per row, at ``place(row)`` relative to the base."""
+    prepared = prepare(cloud)
+    neighbors, n = prepared.neighbors(k), len(prepared)
+    bases = draw_bases(prepared, n, np.random.default_rng(0), weight=np.ones(n))
+    bases.count[:], bases.start[:] = 1, prepared.rank
+    xyz = np.empty((n, 3), np.float32)
+    xyz[bases.start] = place(prepared, neighbors) + prepared.center
+    return interpolate_colors(prepared, neighbors, bases, xyz), xyz
+
+
+def test_a_point_on_its_base_has_nearly_its_color(wavy):
+    rgb, _ = colors_at(wavy, lambda prepared, _: prepared.xyz)
+    assert np.abs(rgb.astype(int) - wavy.rgb).max() <= 255 * 5 * 0.01 * 2
+    assert np.abs(rgb.astype(int) - wavy.rgb).mean() < 4
+
+
+def test_a_point_midway_to_its_neighbor_mixes_both_equally(wavy):
+    def middle(prepared, neighbors):
+        return (prepared.xyz + prepared.xyz[neighbors.idx[:, 0]]) / 2
+
+    rgb, xyz = colors_at(wavy, middle, k=1)
+    distance = np.linalg.norm(wavy.xyz[None].astype(np.float64) - wavy.xyz[:, None], axis=2)
+    np.fill_diagonal(distance, np.inf)
+    expected = (wavy.rgb.astype(float) + wavy.rgb[distance.argmin(axis=1)]) / 2
+    assert np.abs(rgb - expected).max() <= 1.0
+    assert np.isfinite(xyz).all()
+
+
+def test_one_color_stays_that_color(wavy):
+    plain = wavy.replace(rgb=np.full_like(wavy.rgb, 255))
+    rgb, _ = colors_at(plain, lambda prepared, _: prepared.xyz + 0.01)
+    assert (rgb == 255).all()

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 import splatseed as ss
 from splatseed import METHODS
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.upsample import Upsampler, configure, planned_size
+from splatseed.upsample import configure
 from splatseed.upsample.method import NewPoints
-from splatseed.upsample.registry import SOURCE_CODES, origin_name
 
 from .contract import METHOD_NAMES, PHOTOGRAPH_METHODS, Copies
 from .surroundings import scene_around
 
 BUILT_IN = [name for name in METHOD_NAMES if name != "copies"]
-SOURCES = {"linear": 1, "triangle": 2, "spline": 3, "mls": 4, "voronoi": 5, "depth": 6, "random": 7}
 
 WRONG_PARAMETERS = [
     ("mls", {"k": 2}, "mls.k of at least 3"),
@@ -104,26 +100,6 @@ def test_nothing_to_add_gives_the_originals(method, size, wavy):
     np.testing.assert_array_equal(seeds.rgb, wavy.rgb)
 
 
-@pytest.mark.parametrize(
-    ("size", "expected"),
-    [({}, 640), ({"ratio": 1.33}, 213), ({"ratio": 2.5}, 400), ({"num_points": 161}, 161)],
-    ids=str,
-)
-def test_sizes_count_the_originals(size, expected, wavy):
-    assert len(ss.upsample(wavy, "linear", **size)) == expected
-    assert planned_size(160, size.get("ratio"), size.get("num_points")) == expected
-
-
-@pytest.mark.parametrize("method", BUILT_IN)
-def test_source_says_which_method_made_a_point(method, wavy):
-    scene = scene_around(wavy)
-    by_name = ss.upsample(scene, method, ratio=2).source
-    by_instance = ss.upsample(scene, configure(method), ratio=2).source
-    for source in (by_name, by_instance):
-        assert set(source[:160]) == {0}
-        assert set(source[160:]) == {SOURCES[method]}
-
-
 @pytest.mark.parametrize("method", BUILT_IN)
 def test_an_instance_and_its_name_do_the_same(method, wavy):
     scene = scene_around(wavy)
@@ -137,16 +113,6 @@ def test_arrays_and_clouds_give_the_same(wavy):
     seeds = ss.upsample(wavy, "mls", ratio=2, k=12)
     np.testing.assert_array_equal(xyz, seeds.xyz)
     np.testing.assert_array_equal(rgb, seeds.rgb)
-
-
-@pytest.mark.parametrize("method", BUILT_IN)
-def test_methods_are_frozen_and_follow_the_protocol(method):
-    chosen = configure(method)
-    assert isinstance(chosen, Upsampler)
-    assert METHODS[method].__doc__
-    if dataclasses.fields(chosen):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            setattr(chosen, dataclasses.fields(chosen)[0].name, 0)
 
 
 PAPER_VALUES = [
@@ -205,19 +171,6 @@ def test_what_a_method_knows_of_its_points_is_handed_on(wavy):
     assert ss.upsample(wavy, Copies(), num_points=len(wavy) + 4).attributes == {}
 
 
-@pytest.mark.parametrize("length", [2, 3])
-def test_a_plain_tuple_will_do(wavy, length):
-    class Plain(Copies):
-        def __call__(self, cloud, num_new, rng, progress):
-            new = super().__call__(cloud, num_new, rng, progress)
-            return (new.xyz, new.rgb, ("A note.",))[:length]
-
-    notes = []
-    seeds = ss.upsample(wavy, Plain(), num_points=len(wavy) + 4, note=notes.append)
-    assert seeds.source[-4:].tolist() == [255] * 4
-    assert notes == ["A note."][: length - 2]
-
-
 @pytest.mark.parametrize("source", [np.zeros(4, np.uint8), np.full(4, 256), np.full(4, 8.0)])
 def test_new_points_are_no_originals(wavy, source):
     class Posing(Copies):
@@ -226,11 +179,3 @@ def test_new_points_are_no_originals(wavy, source):
 
     with pytest.raises(PointCloudError, match="codes from 1 to 255"):
         ss.upsample(wavy, Posing(), num_points=len(wavy) + 4)
-
-
-def test_every_built_in_method_has_a_code_and_every_code_a_name():
-    assert set(BUILT_IN) <= set(SOURCE_CODES)
-    assert len({0, *SOURCE_CODES.values()}) == len(SOURCE_CODES) + 1
-    assert [origin_name(code) for code in (0, 4, 8, 9, 255)] == [
-        *("original", "mls", "stereo", "cover", "other")
-    ]

@@ -36,7 +36,7 @@ from splatseed.view.models import (
     stage_frame,
 )
 from splatseed.views.view import View, poses_of
-from splatseed.views.viewpoint import look_at
+from splatseed.views.visibility import look_at
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -1,12 +1,13 @@
-"""Which views are compared with each other, against a loop over points and views."""
+"""Which views are compared with each other, against loops; places on a view's grid."""
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 
+from splatseed.camera import Camera, rotation_from_quat
 from splatseed.views.pairs import FULL, LEAST, MOST, WIDE, choose_sources
+from splatseed.views.projection import place
 
 
 def weight(degrees: float) -> float:
@@ -50,15 +51,6 @@ def test_nobody_is_paired_without_a_common_point():
     np.testing.assert_array_equal(choose_sources(seen, xyz, centers, 2), [[1, -1], [0, 2], [1, -1]])
 
 
-def test_a_view_from_the_same_place_tells_nothing():
-    xyz = np.tile([0.0, 0, 4], (3, 1))
-    centers = np.array([[0.0, 0, 0], [0.0, 0, 0], [0.7, 0, 0]])
-    every = [np.arange(3)] * 3
-    np.testing.assert_array_equal(
-        choose_sources(every, xyz, centers, 2), [[2, -1], [2, -1], [0, 1]]
-    )
-
-
 @pytest.mark.parametrize("num_views", [0, 1, 3])
 def test_without_points_there_are_no_pairs(num_views):
     none = [np.empty(0, np.int64)] * num_views
@@ -66,22 +58,25 @@ def test_without_points_there_are_no_pairs(num_views):
     np.testing.assert_array_equal(chosen, np.full((num_views, 5), -1))
 
 
-def test_a_point_at_a_camera_spoils_nothing(capture):
-    seen, xyz, centers = capture
-    before = choose_sources(seen, xyz, centers, 4)
-    alone = np.array(len(xyz))
-    odd = [np.append(mine, alone) if i == 2 else mine for i, mine in enumerate(seen)]
-    after = choose_sources(odd, np.vstack([xyz, centers[2]]), centers, 4)
-    np.testing.assert_array_equal(before, after)
-    shared = [np.append(mine, alone) for mine in seen]
-    assert (choose_sources(shared, np.vstack([xyz, centers[2]]), centers, 4) < 8).all()
+@pytest.fixture
+def camera(rng):
+    cam_from_world = np.eye(4)
+    cam_from_world[:3, :3] = rotation_from_quat(rng.normal(size=4))
+    cam_from_world[:3, 3] = rng.normal(size=3)
+    return Camera(np.array([[50.0, 0, 20], [0, 60.0, 15], [0, 0, 1]]), 40, 30, cam_from_world)
 
 
-def test_any_number_of_threads(capture):
-    before = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        alone = choose_sources(*capture, 5)
-    finally:
-        numba.set_num_threads(before)
-    np.testing.assert_array_equal(alone, choose_sources(*capture, 5))
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_places_are_those_of_the_camera(camera, rng, dtype):
+    xyz = rng.normal(size=(50, 3)).astype(dtype)
+    placed = np.array([place(point, camera.K @ camera.cam_from_world[:3]) for point in xyz])
+    uv, depth = camera.project(xyz)
+    assert np.allclose(placed[:, 2], depth, rtol=1e-12, atol=1e-14)
+    assert 10 < (depth > 0).sum() < 50
+    assert np.allclose(placed[depth > 0, :2], uv[depth > 0], rtol=1e-9)
+
+
+def test_a_point_in_the_plane_of_the_camera_is_nowhere():
+    column, row, depth = place(np.array([1.0, 0.0, 0.0]), np.eye(3, 4))
+    assert depth == 0
+    assert not np.isfinite([column, row]).any()

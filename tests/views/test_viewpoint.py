@@ -9,7 +9,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene
-from splatseed.views.viewpoint import choose_camera, choose_image, look_at
+from splatseed.views.visibility import choose_camera, choose_image, look_at
 
 INTRINSICS = Intrinsics(1, "PINHOLE", 160, 120, (150.0, 150.0, 80.0, 60.0))
 

@@ -22,7 +22,7 @@ from splatseed.io.output.staging import atomic_file, check_output, check_parents
 from splatseed.literal import counted
 from splatseed.requirements import require
 from splatseed.train.settings import Backend, TrainSettings
-from splatseed.views.photographs import user_cache_dir
+from splatseed.views.view import user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.scores import EvalResult

@@ -43,7 +43,7 @@ class Planned:
         pixels = round(float(np.median(sizes))) if sizes else BUDGET
         number = max(2, min(BUDGET, pixels))
         if budget is not None:
-            from splatseed.seeding.thinning import points_within  # noqa: PLC0415  (loads Numba)
+            from splatseed.seeding.upsampling import points_within  # noqa: PLC0415  (loads Numba)
 
             number = max(2, points_within(scene, budget))
         settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)

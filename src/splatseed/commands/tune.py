@@ -47,7 +47,7 @@ from splatseed.io.files import read_text
 from splatseed.io.output.staging import atomic_file
 from splatseed.literal import quoted, visible
 from splatseed.process.interruption import exit_code
-from splatseed.seeding.amounts import parse_budget
+from splatseed.seeding.upsampling import parse_budget
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 
 SCENE = "scene"

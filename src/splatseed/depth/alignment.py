@@ -1,10 +1,13 @@
-"""The scale (and shift) that takes an image's depth map to scene units, from its SfM points.
+"""Depth maps in a scene's units: the scale (and shift) of each, by its SfM points; lifting pixels.
 
 Notation: at an SfM point that falls into a pixel, ``value`` is the map's and ``z`` the point's
-planar depth. For maps of the kinds "z" and "ray" z = scale value (value divided by the length of
-the pixel's ray for "ray"; the shift is 0), for "inverse" 1 / z = scale value + shift. Promise: an
-image is left out when too few of its points see depth, or when it fits much worse than the others;
-each such image is reported with the reason.
+planar depth, float64 [M]. For maps of the kinds "z" and "ray" z = scale value (value divided by the
+length of the pixel's ray for "ray"; the shift is 0), for "inverse" 1 / z = scale value + shift: the
+*line* that networks of the MiDaS kind leave open. A ray has unit z in camera axes, so that its
+length is distance over planar depth, and passes through its pixel's centre, at +0.5.
+Promise: an image is left out when too few of its points see depth, or when it fits much worse than
+the others; each such image is reported with the reason. Nothing is random; multiplying ``z`` by a
+power of two divides or multiplies the result by it exactly.
 """
 
 from __future__ import annotations
@@ -13,22 +16,219 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, Int, Int64
 
 from splatseed.camera import Camera
-from splatseed.depth.fits import (
-    least_squares_line,
-    least_squares_scale,
-    median,
-    median_scale,
-    robust_line,
-)
-from splatseed.depth.planar import map_camera, ray_length
 from splatseed.depthmap import DepthKind, DepthMap
-from splatseed.errors import SceneNotFoundError
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, in_threads, silent
-from splatseed.scene import Scene
+from splatseed.scene import Image, Scene
 from splatseed.views.visibility import SeenPoints, camera_points, find_visibility
+
+PAIRS = 256
+"""Pairs of points whose lines are tried; nothing is random, as they follow the R2 sequence."""
+GOLDEN = np.array([0.7548776662466927, 0.5698402909980532])
+"""Steps of the R2 sequence, which fills a square evenly (Roberts, 2018)."""
+TUKEY = 4.685
+"""Tukey's biweight at 95% efficiency, in standard deviations."""
+STEPS = 20
+"""Most steps of reweighting."""
+SIGMA_OF_MEDIAN = 1.4826
+"""Standard deviation of a normal variable over the median of its absolute value."""
+
+Values = Float64[np.ndarray, " M"]
+
+
+@inline
+def median(values):  # type: ignore[no-untyped-def]  # Numba's types
+    """NumPy's median for float64 without NaN, without its overhead on a thousand values."""
+    return np.median(values)
+
+
+def least_squares_scale(value: Values, z: Values) -> float:
+    """The s that minimises sum (s value - z)^2: the paper's equation 7."""
+    return float(value @ z / (value @ value))
+
+
+def median_scale(value: Values, z: Values) -> float:
+    """The median of z / value: up to half of the points may be wrong."""
+    return float(median(z / value))
+
+
+def least_squares_line(value: Values, z: Values) -> tuple[float, float]:
+    """The (a, b) that minimise sum (a value + b - 1 / z)^2."""
+    return _weighted_line(value, 1.0 / z, np.ones_like(z))
+
+
+def robust_line(value: Values, z: Values) -> tuple[float, float]:
+    """The (a, b) that most points agree with, by relative error r = z (a value + b) - 1.
+
+    Of the lines through 256 pairs of points, the one whose errors have the least median is refined
+    by iteratively reweighted least squares with Tukey's biweight, as LO-RANSAC refines its best
+    sample.
+    """
+    line = _best_of_pairs(value, 1.0 / z)
+    floor = 1e-6  # an exact fit must not divide by zero
+    for _ in range(STEPS):
+        r = z * (line[0] * value + line[1]) - 1.0
+        sigma = max(SIGMA_OF_MEDIAN * float(np.median(np.abs(r))), floor)
+        # Tukey's biweight (1 - u^2)^2, 0 from 4.685 sigma on
+        u = np.minimum(np.abs(r) / (TUKEY * sigma), 1.0)
+        # The residual is relative, so a point's weight on 1 / z also has the factor z squared.
+        line, before = _weighted_line(value, 1.0 / z, (1.0 - u * u) ** 2 * z * z), line
+        if np.allclose(line, before, rtol=1e-9, atol=0.0):
+            break
+    return line
+
+
+def _best_of_pairs(value: Values, inverse: Values) -> tuple[float, float]:
+    """The line through two points with the smallest median of relative errors."""
+    order = np.argsort(value, kind="stable")
+    steps = (np.arange(1, PAIRS + 1)[:, None] * GOLDEN) % 1.0
+    first, second = order[(steps * len(value)).astype(np.int64)].T
+    run = value[first] - value[second]
+    usable = run != 0
+    if not usable.any():
+        return 0.0, float(np.median(inverse))
+    first, second, run = first[usable], second[usable], run[usable]
+    # The line 1 / z = a value + b through both points.
+    a = (inverse[first] - inverse[second]) / run
+    b = inverse[first] - a * value[first]
+    error = np.abs((a[:, None] * value + b[:, None]) / inverse - 1.0)
+    best = int(np.argmin(np.median(error, axis=1)))
+    return float(a[best]), float(b[best])
+
+
+def _weighted_line(value: Values, target: Values, weight: Values) -> tuple[float, float]:
+    """Weighted least squares of target = a value + b, about the weighted means for accuracy."""
+    # a = cov(value, target) / var(value), b = mean target - a mean value
+    weight = weight / weight.sum()
+    mean_value, mean_target = weight @ value, weight @ target
+    spread = weight @ (value - mean_value) ** 2
+    if not spread > 0:
+        return 0.0, float(mean_target)
+    a = weight @ ((value - mean_value) * (target - mean_target)) / spread
+    return float(a), float(mean_target - a * mean_value)
+
+
+def map_camera(depth: DepthMap, image: Image) -> Camera:
+    """The camera of an image in the pixels of its map.
+
+    Raises:
+        SceneFormatError: The map and the image differ in aspect ratio.
+    """
+    try:
+        return depth.camera(image.camera)
+    except SceneFormatError as error:
+        raise SceneFormatError(
+            f"for {image.name} {error.expected}", found=error.found, fix=error.fix
+        ) from None
+
+
+def ray_length(
+    camera: Camera, column: Int[np.ndarray, " ..."], row: Int[np.ndarray, " ..."]
+) -> Float64[np.ndarray, " ..."]:
+    """Distance over planar depth along the rays through pixel centres; the arguments broadcast."""
+    x = (column + (0.5 - camera.K[0, 2])) / camera.K[0, 0]
+    y = (row + (0.5 - camera.K[1, 2])) / camera.K[1, 1]
+    return np.asarray(np.sqrt(x * x + y * y + 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarDepth:
+    """A map whose planar depth is computed only where needed.
+
+    Most maps need only one factor, and multiplying a whole map takes longer than everything done
+    with the few pixels that are lifted.
+
+    Args:
+        values: float32 [H, W]; NaN, or not above 0, where depth is unknown.
+        scale: Scene units per unit of ``values``.
+        along_ray: Whether values are distances along the ray.
+        camera: The image's camera in pixels of the map.
+    """
+
+    values: Float32[np.ndarray, "H W"]
+    scale: float
+    along_ray: bool
+    camera: Camera
+
+    @classmethod
+    def of(
+        cls, depth: DepthMap, camera: Camera, scale: float, shift: float, *, unit_ray: bool
+    ) -> PlanarDepth:
+        """A map with its alignment.
+
+        Args:
+            depth: The map.
+            camera: The image's camera in pixels of the map.
+            scale: As in ``Alignment``.
+            shift: Likewise.
+            unit_ray: Whether to take planar depth as distance along the ray: equation 9's letter.
+        """
+        if depth.kind != "inverse":
+            return cls(depth.values, scale, depth.kind == "ray" or unit_ray, camera)
+        inverse = scale * depth.values + shift
+        with np.errstate(divide="ignore", invalid="ignore"):
+            values = np.where(inverse > 0, 1.0 / inverse, np.nan).astype(np.float32)
+        return cls(values, 1.0, unit_ray, camera)
+
+    def every(self, first: int, step: int) -> Float32[np.ndarray, "h w"]:
+        """Planar depth, before multiplication by the scale, at every ``step``-th row and column."""
+        z = self.values[first::step, first::step].copy()
+        if self.along_ray:
+            row, column = (np.arange(first, size, step) for size in self.values.shape)
+            z /= ray_length(self.camera, column, row[:, None]).astype(np.float32)
+        z[~(z < np.inf)] = np.nan
+        return np.asarray(z)
+
+    def whole(self) -> Float64[np.ndarray, "H W"]:
+        """Planar depth in scene units of every pixel."""
+        return self.every(0, 1) * np.float64(self.scale)
+
+    def at(self, pixel: Int64[np.ndarray, " C"]) -> Float32[np.ndarray, " C"]:
+        """Planar depth in scene units of pixels numbered row * W + column, [C]."""
+        z = self.values.ravel()[pixel] * self.scale
+        if self.along_ray:
+            row, column = np.divmod(pixel, self.camera.width)
+            z = z / ray_length(self.camera, column, row)
+        return np.asarray(z, np.float32)
+
+
+def lift_pixels(
+    pixel: Int64[np.ndarray, " C"],
+    z: Float32[np.ndarray, " C"],
+    camera: Camera,
+    out: Float32[np.ndarray, "C 3"],
+    factor: float = 1.0,
+) -> Float32[np.ndarray, "C 3"]:
+    """Write the world positions of pixels into ``out`` [C, 3], and return it.
+
+    Equation 9: P = c + z v, where v is the ray through the pixel's centre, with unit z in camera
+    axes; the text's P = c + s d v / |v| is the same with z = s d / |v|.
+
+    Args:
+        pixel: Numbers row * W + column, [C].
+        z: Their planar depth, scene units, [C].
+        camera: The camera whose pixels they are.
+        out: The output array.
+        factor: Multiplies depth.
+    """
+    world_from_pixel = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K)
+    _lift(pixel, z, camera.width, world_from_pixel, camera.center, factor, out)
+    return out
+
+
+@inline
+def _lift(pixel, depth, width, m, center, factor, xyz):  # type: ignore[no-untyped-def]  # Numba's types
+    """P = c + z M (u, v, 1), in float64."""
+    for k in range(len(pixel)):
+        u, v = pixel[k] % width + 0.5, pixel[k] // width + 0.5
+        z = factor * np.float64(depth[k])
+        for axis in range(3):
+            xyz[k, axis] = center[axis] + z * (m[axis, 0] * u + m[axis, 1] * v + m[axis, 2])
+
 
 Fit = Literal["robust", "least-squares"]
 """Medians and reweighting, or the paper's equation 7."""
@@ -40,6 +240,7 @@ MAX_RESIDUAL = 0.25
 """An image whose median error exceeds this is not aligned at all."""
 
 
+NO_DEPTH = "the map has no depth at any pixel"
 UNIT_POINTS = 20
 UNIT_SLACK = 1.25
 """A map in scene units is refused if at least this many SfM points show it off by this factor."""
@@ -108,11 +309,8 @@ def align(
             alignments[i] = align_map(depth, camera, points, fit, min_points)
 
     in_threads(work, len(images), 1, "align depth", progress)
-    aligned = {
-        image.name: alignment
-        for image, alignment in zip(images, alignments, strict=True)
-        if alignment is not None
-    }
+    found = zip(images, alignments, strict=True)
+    aligned = {image.name: alignment for image, alignment in found if alignment is not None}
     return reject_outliers(aligned, max_residual_ratio)
 
 
@@ -129,11 +327,16 @@ def align_map(
         min_points: As in ``align``.
     """
     value, z = values_at(depth, camera, points)
-    if len(value) < max(min_points, 1):
-        return Alignment(np.nan, 0.0, len(value), np.nan, _too_few(depth, len(value), min_points))
-    if np.ptp(depth.values[np.isfinite(depth.values)]) == 0:
-        told = "the map has one value everywhere: its estimation failed on this image"
-        return Alignment(np.nan, 0.0, len(value), np.nan, told)
+    known = depth.values[np.isfinite(depth.values)]
+    refused = None
+    if not known.size:
+        refused = NO_DEPTH
+    elif len(value) < max(min_points, 1):
+        refused = f"{len(value)} SfM points see depth; {max(min_points, 1)} are needed"
+    elif np.ptp(known) == 0:
+        refused = "the map has one value everywhere: its estimation failed on this image"
+    if refused is not None:
+        return Alignment(np.nan, 0.0, len(value), np.nan, refused)
     scale, shift = _fit(depth.kind, value, z, fit)
     residual = _residual(depth.kind, value, z, scale, shift)
     return Alignment(scale, shift, len(value), residual, _misfit(depth.kind, scale, residual))
@@ -150,7 +353,7 @@ def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignmen
     value, z = values_at(depth, camera, points)
     plain = Alignment(1.0, 0.0, len(value), np.nan)
     if not np.isfinite(depth.values).any():
-        return replace(plain, rejected=_too_few(depth, 0, 0))
+        return replace(plain, rejected=NO_DEPTH)
     if len(value) < UNIT_POINTS:
         return plain
     plain = replace(plain, residual=_residual(depth.kind, value, z, 1.0, 0.0))
@@ -196,38 +399,21 @@ def reject_outliers(
     }
 
 
-def _fit(
-    kind: DepthKind, value: Float64[np.ndarray, " M"], z: Float64[np.ndarray, " M"], fit: Fit
-) -> tuple[float, float]:
+def _fit(kind: DepthKind, value: Values, z: Values, fit: Fit) -> tuple[float, float]:
     """Scale and shift for the kind of map."""
     if kind == "inverse":
         return (robust_line if fit == "robust" else least_squares_line)(value, z)
     return (median_scale if fit == "robust" else least_squares_scale)(value, z), 0.0
 
 
-def _residual(
-    kind: DepthKind,
-    value: Float64[np.ndarray, " M"],
-    z: Float64[np.ndarray, " M"],
-    scale: float,
-    shift: float,
-) -> float:
-    """Median relative error of depth.
-
-    A point that would lie behind the camera has an infinite error.
-    """
+def _residual(kind: DepthKind, value: Values, z: Values, scale: float, shift: float) -> float:
+    """Median relative error of depth; infinite at a point that would lie behind the camera."""
     aligned = scale * value + shift
     if kind == "inverse":
         # Where 1 / z would not be positive there is no depth.
         aligned = 1.0 / np.where(aligned > 0, aligned, np.nan)
     error = np.abs(aligned / z - 1.0)
     return float(median(np.where(np.isfinite(error), error, np.inf)))
-
-
-def _too_few(depth: DepthMap, num: int, min_points: int) -> str:
-    if not np.isfinite(depth.values).any():
-        return "the map has no depth at any pixel"
-    return f"{num} SfM points see depth; {max(min_points, 1)} are needed"
 
 
 def _misfit(kind: DepthKind, scale: float, residual: float) -> str | None:

@@ -10,7 +10,7 @@ allowed. A note says how many of the less certain ones were needed.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -20,10 +20,9 @@ from jaxtyping import Float32, Float64, UInt8
 from splatseed.depth.alignment import reject_outliers
 from splatseed.depth.candidates import NEAR_EDGE, UNCONFIRMED, choose, gather
 from splatseed.depth.settings import Settings
-from splatseed.depth.views import Reader, View
+from splatseed.depth.views import DepthView, Reader
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.literal import agreeing
-from splatseed.pointcloud import ORIGINAL
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 from splatseed.views.visibility import find_visibility
@@ -81,13 +80,19 @@ def lift(
     notes = _missing_notes(scene, len(images), settings.hold_out)
     images, views, more = _leave_out(images, views, settings.max_residual_ratio)
     candidates = gather(views, settings, progress)
-    while candidates.num_sound < num and factor < MAX_OVERSAMPLING and not _exhausted(views):
+    while (
+        candidates.num_sound < num
+        and factor < MAX_OVERSAMPLING
+        and not all(v.exhausted for v in views)
+    ):
         # In proportion to what was sound, so that one more round mostly suffices.
         growth = SURPLUS * num / max(candidates.num_sound, 1)
         factor = min(factor * min(growth, MAX_GROWTH), MAX_OVERSAMPLING)
         views = _read_all(reader, images, factor * num, rng, progress)
         candidates = gather(views, settings, progress)
-    chosen = choose(candidates, _originals(scene), num, settings, rng, progress)
+    points = scene.points.originals
+    originals = np.asarray(points.xyz[points.finite])
+    chosen = choose(candidates, originals, num, settings, rng, progress)
     notes = (*notes, *more, *_relaxed_notes(candidates.tier[chosen], settings))
     xyz = candidates.xyz[chosen]
     np.add(xyz, center, out=xyz, casting="same_kind")  # in float64, then rounded
@@ -115,22 +120,17 @@ def _centered(scene: Scene) -> tuple[Scene, Float64[np.ndarray, " 3"]]:
 def _images_with_maps(scene: Scene, hold_out: int) -> list[Image]:
     """The images to lift from, in the order of the scene."""
     depths = scene.depths
-    used = set(_sources(scene, hold_out))
-    images = [image for image in scene.images if image.name in used]
-    if depths is None or not images:
+    used = {image.name for image in (scene.split(hold_out)[0] if hold_out else scene.images)}
+    images = [
+        im for im in scene.images if im.name in used and depths is not None and im.name in depths
+    ]
+    if not images:
         raise SceneNotFoundError(
             "a scene with depth maps of its images",
             found=f"{len(scene.images)} images, and maps of none of them",
             fix="Name the folder with the maps: --depth DIR.",
         )
     return images
-
-
-def _sources(scene: Scene, hold_out: int) -> list[str]:
-    """Names of the images that have a map and are not held out."""
-    names = sorted({image.name for image in scene.images})
-    used = {image.name for image in scene.split(hold_out)[0]} if hold_out else set(names)
-    return [n for n in names if n in used and scene.depths is not None and n in scene.depths]
 
 
 def _reader(scene: Scene, settings: Settings) -> Reader:
@@ -150,12 +150,12 @@ def _read_all(
     num: float,
     rng: np.random.Generator,
     progress: Progress,
-) -> list[View]:
+) -> list[DepthView]:
     """The views of all images, which share the number of candidates equally."""
     per_image = math.ceil(num / len(images))
     # One seed per image, drawn in order, so that threads do not matter.
     seeds = rng.integers(0, 1 << 63, len(images))
-    views: list[View | None] = [None] * len(images)
+    views: list[DepthView | None] = [None] * len(images)
 
     def work(start: int, stop: int) -> None:
         for i in range(start, stop):
@@ -166,8 +166,8 @@ def _read_all(
 
 
 def _leave_out(
-    images: Sequence[Image], views: Sequence[View], max_ratio: float | None
-) -> tuple[list[Image], list[View], tuple[str, ...]]:
+    images: Sequence[Image], views: Sequence[DepthView], max_ratio: float | None
+) -> tuple[list[Image], list[DepthView], tuple[str, ...]]:
     """The images and views whose maps are aligned, and notes on the others.
 
     Raises:
@@ -185,24 +185,13 @@ def _leave_out(
             fix="Look at them with splatseed info SCENE --depth DIR; check --depth-kind and "
             "--depth-scale.",
         )
-    used = [
-        (image, view)
-        for image, view in zip(images, views, strict=True)
-        if image.name not in reasons
-    ]
-    return (
-        [image for image, _ in used],
-        [view for _, view in used],
-        _left_out_notes(reasons, images),
-    )
-
-
-def _left_out_notes(reasons: Mapping[str, str], images: Sequence[Image]) -> tuple[str, ...]:
     if not reasons:
-        return ()
+        return list(images), list(views), ()
     named = "; ".join(f"{name}: {reason}" for name, reason in list(reasons.items())[:NAMED])
     more = ", ..." if len(reasons) > NAMED else ""
-    return (f"{len(reasons)} of {len(images)} depth maps are left out ({named}{more}).",)
+    note = f"{len(reasons)} of {len(images)} depth maps are left out ({named}{more})."
+    kept = [i for i, image in enumerate(images) if image.name not in reasons]
+    return [images[i] for i in kept], [views[i] for i in kept], (note,)
 
 
 def _missing_notes(scene: Scene, num_used: int, hold_out: int) -> tuple[str, ...]:
@@ -212,15 +201,6 @@ def _missing_notes(scene: Scene, num_used: int, hold_out: int) -> tuple[str, ...
     lacking = expected - num_used
     what = agreeing(lacking, "has no depth map and gives", "have no depth map and give")
     return (f"{lacking} of {expected} images {what} no points.",)
-
-
-def _exhausted(views: Sequence[View]) -> bool:
-    return all(view.exhausted for view in views)
-
-
-def _originals(scene: Scene) -> Float32[np.ndarray, "N 3"]:
-    points = scene.points
-    return np.asarray(points.xyz[(points.source == ORIGINAL) & points.finite])
 
 
 def _relaxed_notes(tier: UInt8[np.ndarray, " M"], settings: Settings) -> tuple[str, ...]:

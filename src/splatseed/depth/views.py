@@ -2,31 +2,40 @@
 
 Notation: a *view* is what remains of an image once its files are closed: C candidates, and the map
 and the photograph reduced to at most ``GRID`` pixels along the longer side, with which other
-images' candidates are compared. Promise: each file is read once; the candidates depend on the
-image, the seed and the settings only, not on threads or other images.
+images' candidates are compared. A map is H x W; ``cells`` are squares of ``step`` pixels with a
+weight each; a pixel's number is row * W + column. w = 1 / depth is linear in the image on a plane
+at any slant, so w(-k) + w(+k) = 2 w(0) there, and a discontinuity shows as a residual.
+Promise: each file is read once; pixels drawn are known ones, away from discontinuities, where SfM
+has few points; none is drawn twice, and at least as many as are asked for, or all there are. The
+candidates depend on the image, the seed and the settings only, not on threads or other images.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.camera import Camera
-from splatseed.depth.alignment import Alignment, align_map, trust_units
-from splatseed.depth.pixel_sampling import Drawn, sample_pixels
-from splatseed.depth.planar import PlanarDepth, lift_pixels, map_camera
+from splatseed.depth.alignment import (
+    Alignment,
+    PlanarDepth,
+    align_map,
+    lift_pixels,
+    map_camera,
+    trust_units,
+)
 from splatseed.depth.settings import Settings
-from splatseed.depthmap import ASPECT_SLACK, DepthMap, DepthMaps
+from splatseed.depthmap import ASPECT_SLACK, DepthMaps
 from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
 from splatseed.kernels.jit import inline
 from splatseed.scene import Image
 from splatseed.views.view import check_lens
-from splatseed.views.visibility import SeenPoints, Visibility, camera_points
+from splatseed.views.visibility import Visibility, camera_points
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage
@@ -57,7 +66,7 @@ class Reduced:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class DepthView:
     """What remains of an image; if its map is rejected, only the alignment.
 
     Args:
@@ -114,7 +123,7 @@ class Reader:
     visibility: Visibility
     settings: Settings
 
-    def read(self, image: Image, num: int, rng: np.random.Generator) -> View:
+    def read(self, image: Image, num: int, rng: np.random.Generator) -> DepthView:
         """Read an image and its map, and draw ``num`` candidates, or a few more.
 
         Raises:
@@ -122,60 +131,42 @@ class Reader:
             SceneFormatError: A file is damaged, has the wrong aspect ratio, or the lens distorts.
         """
         check_lens(image, reason="along whose rays pixels are lifted")
-        seen = self._read_map(image, num, rng)  # frees the map before reading the photograph
-        if seen.alignment.rejected is not None:
-            return _nothing(seen.alignment, seen.camera)
-        photograph = decode_photograph(
-            self.folder / image.name, photograph_bytes(self.folder / image.name)
-        )
-        _check_shape(self.folder / image.name, photograph, seen.camera)
-        return View(
-            seen.alignment,
-            seen.camera,
-            seen.drawn.pixel,
-            seen.z,
-            _colors_at(photograph, seen.drawn.pixel, seen.camera),
-            seen.drawn.edge,
-            exhausted=len(seen.drawn.pixel) < num,
-            reduced=None if seen.coarse is None else _reduce(seen, seen.coarse, photograph),
-        )
+        view, coarse, unit = self._read_map(image, num, rng)  # its map is freed by now
+        if view.alignment.rejected is not None:
+            return view
+        path, camera = self.folder / image.name, view.camera
+        photograph = decode_photograph(path, photograph_bytes(path))
+        _check_shape(path, photograph, camera)
+        rgb = np.empty((len(view), 3), np.uint8)
+        _take_colors(np.asarray(photograph), view.pixel, camera.width, camera.height, rgb)
+        reduced = None if coarse is None else _reduce(camera, coarse, unit, photograph)
+        return replace(view, rgb=rgb, exhausted=len(view) < num, reduced=reduced)
 
-    def _read_map(self, image: Image, num: int, rng: np.random.Generator) -> _Seen:
-        """Everything that is needed from a map."""
-        depth = self.depths.read(image.name)
+    def _read_map(
+        self, image: Image, num: int, rng: np.random.Generator
+    ) -> tuple[DepthView, Float32[np.ndarray, "h w"] | None, float]:
+        """What is taken from a map: the view without colours, a coarse copy, and its unit."""
+        depth, settings = self.depths.read(image.name), self.settings
         camera = map_camera(depth, image)
         points = camera_points(camera, self.visibility.of(image))
-        alignment = self._align(depth, camera, points)
+        if settings.align:
+            alignment = align_map(depth, camera, points, settings.fit, settings.min_points)
+        else:
+            alignment = trust_units(depth, camera, points)
+        no_rgb = np.empty((0, 3), np.uint8)
         if alignment.rejected is not None:
-            nothing = np.empty(0, np.int64)
-            return _Seen(alignment, camera, Drawn(nothing, nothing > 0), np.empty(0, np.float32))
+            none, no_z = np.empty(0, np.int64), np.empty(0, np.float32)
+            return DepthView(alignment, camera, none, no_z, no_rgb, none > 0, True, None), None, 1.0
         planar = PlanarDepth.of(
-            depth, camera, alignment.scale, alignment.shift, unit_ray=self.settings.unit_ray
+            depth, camera, alignment.scale, alignment.shift, unit_ray=settings.unit_ray
         )
-        drawn = sample_pixels(planar.values, num, points.uv, self.settings, rng)
-        seen = _Seen(alignment, camera, drawn, planar.at(drawn.pixel))
-        if not (self.settings.compares_views or self.settings.synchronizes):
-            return seen
+        pixel, edge = sample_pixels(planar.values, num, points.uv, settings, rng)
+        view = DepthView(alignment, camera, pixel, planar.at(pixel), no_rgb, edge, False, None)
+        if not (settings.compares_views or settings.synchronizes):
+            return view, None, 1.0
         # The whole step at which the longer side keeps at most GRID pixels.
         factor = -(-max(planar.values.shape) // GRID)
-        return replace(seen, coarse=planar.every(factor // 2, factor), unit=planar.scale)
-
-    def _align(self, depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignment:
-        if not self.settings.align:
-            return trust_units(depth, camera, points)
-        return align_map(depth, camera, points, self.settings.fit, self.settings.min_points)
-
-
-@dataclass(frozen=True, eq=False)
-class _Seen:
-    """What is taken from a map: the fields of ``View`` before scales are synchronised."""
-
-    alignment: Alignment
-    camera: Camera
-    drawn: Drawn
-    z: Float32[np.ndarray, " C"]
-    coarse: Float32[np.ndarray, "h w"] | None = None
-    unit: float = 1.0
+        return view, planar.every(factor // 2, factor), planar.scale
 
 
 def _check_shape(path: Path, photograph: PilImage.Image, camera: Camera) -> None:
@@ -186,15 +177,6 @@ def _check_shape(path: Path, photograph: PilImage.Image, camera: Camera) -> None
             found=f"{photograph.width} x {photograph.height}",
             fix="Use the images that the model was made from, or a resized copy of them.",
         )
-
-
-def _colors_at(
-    photograph: PilImage.Image, pixel: Int64[np.ndarray, " C"], camera: Camera
-) -> UInt8[np.ndarray, "C 3"]:
-    """The colours of a photograph of any size at the centres of a map's pixels."""
-    out = np.empty((len(pixel), 3), np.uint8)
-    _take_colors(np.asarray(photograph), pixel, camera.width, camera.height, out)
-    return out
 
 
 @inline
@@ -208,9 +190,10 @@ def _take_colors(photograph, pixel, width, height, out):  # type: ignore[no-unty
             out[k, channel] = photograph[row, column, channel]
 
 
-def _reduce(seen: _Seen, coarse: Float32[np.ndarray, "h w"], photograph: PilImage.Image) -> Reduced:
+def _reduce(
+    camera: Camera, coarse: Float32[np.ndarray, "h w"], unit: float, photograph: PilImage.Image
+) -> Reduced:
     """Every f-th pixel of the map, as means would bridge edges; block means of the photograph."""
-    camera = seen.camera
     factor = -(-max(camera.width, camera.height) // GRID)
     first = factor // 2 + 0.5
     grid_from_map = np.array([[1, 0, -first], [0, 1, -first], [0, 0, factor]]) / factor
@@ -221,22 +204,221 @@ def _reduce(seen: _Seen, coarse: Float32[np.ndarray, "h w"], photograph: PilImag
     block_from_map = np.array(size) / [camera.width, camera.height]
     return Reduced(
         coarse,
-        seen.unit,
+        unit,
         grid_from_map @ camera.K @ camera.cam_from_world[:3],
         np.asarray(samples.reduce(2)),
         block_from_map[:, None] * [[factor, first]],
     )
 
 
-def _nothing(alignment: Alignment, camera: Camera) -> View:
-    """The view of an image that is left out."""
-    return View(
-        alignment,
-        camera,
-        np.empty(0, np.int64),
-        np.empty(0, np.float32),
-        np.empty((0, 3), np.uint8),
-        np.empty(0, np.bool_),
-        exhausted=True,
-        reduced=None,
-    )
+CELLS = 64
+"""Most cells along the longer side of a map."""
+
+ROUNDS = 4
+"""Most rounds of drawing, each for what the last has left missing."""
+DIAGONAL = 2.0**0.5
+"""Length of a diagonal step, in cells."""
+LEAST_DISTANCE = 0.5
+"""Distance, in cells, given to a cell that has points itself: it stays open to new ones."""
+
+SURPLUS = 1.15
+"""Overdraw factor: some pixels will be unknown or near a discontinuity."""
+LEAST_SHARE = 0.05
+"""Fraction of the drawn pixels that is assumed usable."""
+
+
+class Drawn(NamedTuple):
+    """Pixels drawn from one map."""
+
+    pixel: Int64[np.ndarray, " C"]
+    """Their numbers."""
+    edge: Bool[np.ndarray, " C"]
+    """Which lie near a depth discontinuity: taken only when nothing else is left."""
+
+
+def sample_pixels(
+    values: Float32[np.ndarray, "H W"],
+    num: int,
+    points: Float64[np.ndarray, "M 2"],
+    settings: Settings,
+    rng: np.random.Generator,
+) -> Drawn:
+    """Draw ``num`` distinct pixels with depth, or a few more; fewer if the map has fewer.
+
+    Args:
+        values: The map: positive where known, else NaN.
+        num: How many.
+        points: Where SfM points are, in pixels of the map.
+        settings: Region, placement and edges.
+        rng: Draws them.
+    """
+    box = _region(values.shape, settings.region)
+    step = -(-max(values.shape) // CELLS)
+    weight = _cell_weights(values.shape, step, points, settings)
+    cumulative = np.cumsum(weight, dtype=np.float64)
+    # Radius and tolerance of the discontinuity test; radius 0 passes all.
+    edges = (0, np.inf)
+    if settings.edge_tolerance is not None:
+        edges = settings.edge_radius, settings.edge_tolerance
+    pixel, tried = np.empty(0, np.int64), 0
+    for _ in range(ROUNDS):
+        missing = num - len(pixel)
+        if missing <= 0:
+            break
+        # The share of usable pixels so far tells how many to try.
+        will_do = max(len(pixel) / tried, LEAST_SHARE) if tried else 1.0
+        picks = _picks(int(SURPLUS * missing / will_do) + 1, settings.placement, rng)
+        # Inverse of the cumulative weight: a cell is drawn in proportion to its weight.
+        picks *= cumulative[-1]
+        jitter = rng.random((len(picks), 2), dtype=np.float32)
+        part = np.empty(len(picks), np.int64)
+        drawn = _draw(values, cumulative, weight.shape[1], step, box, picks, jitter, *edges, part)
+        pixel = part[:drawn] if not tried else np.unique(np.concatenate([pixel, part[:drawn]]))
+        tried += len(picks)
+    if len(pixel) < num:
+        return _with_rest(values, pixel, num, box, edges, rng)
+    return Drawn(pixel, np.zeros(len(pixel), np.bool_))
+
+
+def _region(shape: tuple[int, int], share: float) -> tuple[int, int, int, int]:
+    """Top, left, bottom and right of the central share of each dimension, in pixels."""
+    top, left = (round(0.5 * (1.0 - share) * size) for size in shape)
+    return top, left, shape[0] - top, shape[1] - left
+
+
+def _cell_weights(
+    shape: tuple[int, int], step: int, points: Float64[np.ndarray, "M 2"], settings: Settings
+) -> Float64[np.ndarray, "R C"]:
+    """Weight of every cell: the root of its distance to the nearest one with an SfM point, or 1.
+
+    The distance itself would leave too little for the surroundings of points: compared with
+    held-out frames of two captures, the root leaves the smallest gaps.
+    """
+    rows, columns = -(-shape[0] // step), -(-shape[1] // step)
+    if settings.placement == "uniform" or not len(points):
+        return np.ones((rows, columns))
+    distance = np.full((rows, columns), np.inf)
+    column, row = (points // step).astype(np.int64).T
+    distance[row, column] = 0.0
+    _spread_distance(distance)
+    return np.asarray(np.sqrt(np.maximum(distance, LEAST_DISTANCE)))
+
+
+def _picks(num: int, placement: str, rng: np.random.Generator) -> Float64[np.ndarray, " num"]:
+    """Ascending numbers in [0, 1): independent, or stratified with one in each ``num``-th."""
+    if placement == "uniform":
+        return np.sort(rng.random(num))
+    return (np.arange(num) + rng.random(num)) / num
+
+
+def _with_rest(
+    values: Float32[np.ndarray, "H W"],
+    pixel: Int64[np.ndarray, " C"],
+    num: int,
+    box: tuple[int, int, int, int],
+    edges: tuple[int, float],
+    rng: np.random.Generator,
+) -> Drawn:
+    """The drawn pixels and as many others as are missing, whatever their weight, edges last."""
+    top, left, bottom, right = box
+    free = np.zeros(values.shape, bool)
+    inner = values[top:bottom, left:right]
+    free[top:bottom, left:right] = (inner > 0) & (inner < np.inf)
+    free.ravel()[pixel] = False
+    rest = rng.permutation(np.flatnonzero(free))
+    edge = np.empty(len(rest), np.bool_)
+    _mark_edges(values, rest, *edges, edge)
+    chosen = np.argsort(edge, kind="stable")[: num - len(pixel)]
+    edge = np.concatenate([np.zeros(len(pixel), np.bool_), edge[chosen]])
+    return Drawn(np.concatenate([pixel, rest[chosen]]), edge)
+
+
+@inline
+def _spread_distance(distance):  # type: ignore[no-untyped-def]  # Numba's types
+    """Chamfer distances from a grid's zeros, in place, at most 8% too long (Borgefors, 1986)."""
+    rows, columns = distance.shape
+    # Forward from the upper left, then backward from the lower right.
+    for sweep in range(2):
+        for a in range(rows):
+            row = a if sweep == 0 else rows - 1 - a
+            before = row - 1 if sweep == 0 else row + 1
+            for b in range(columns):
+                column = b if sweep == 0 else columns - 1 - b
+                beside = column - 1 if sweep == 0 else column + 1
+                least = distance[row, column]
+                if 0 <= beside < columns:
+                    least = min(least, distance[row, beside] + 1.0)
+                if 0 <= before < rows:
+                    least = min(least, distance[before, column] + 1.0)
+                    if column > 0:
+                        least = min(least, distance[before, column - 1] + DIAGONAL)
+                    if column < columns - 1:
+                        least = min(least, distance[before, column + 1] + DIAGONAL)
+                distance[row, column] = least
+
+
+@inline
+def _draw(values, cumulative, columns, step, box, picks, jitter, radius, tolerance, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Pixels in the cells that ascending ``picks`` fall into; returns the number of usable ones."""
+    top, left, bottom, right = box
+    cell, count, first = 0, 0, 0  # out[first:count] belong to this cell
+    for k in range(len(picks)):
+        while cell < len(cumulative) - 1 and cumulative[cell] <= picks[k]:
+            cell += 1
+            first = count
+        row = cell // columns * step + int(jitter[k, 0] * step)
+        column = cell % columns * step + int(jitter[k, 1] * step)
+        if row < top or row >= bottom or column < left or column >= right:
+            continue
+        pixel = row * values.shape[1] + column
+        if not 0 < values[row, column] < np.inf or _contains(out[first:count], pixel):
+            continue
+        if radius == 0 or not _near_edge(values, row, column, radius, tolerance):
+            out[count] = pixel
+            count += 1
+    return count
+
+
+@inline
+def _contains(numbers, number):  # type: ignore[no-untyped-def]  # Numba's types
+    """Whether a short list contains a number."""
+    for each in numbers:  # noqa: SIM110  (Numba has no any() of a generator)
+        if each == number:
+            return True
+    return False
+
+
+@inline
+def _mark_edges(values, pixel, radius, tolerance, out):  # type: ignore[no-untyped-def]  # Numba's types
+    """Which of the pixels lie near a depth discontinuity."""
+    width = values.shape[1]
+    for k in range(len(pixel)):
+        row, column = pixel[k] // width, pixel[k] % width
+        out[k] = radius > 0 and _near_edge(values, row, column, radius, tolerance)
+
+
+@inline
+def _near_edge(values, row, column, radius, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
+    """Whether 1 / depth bends within ``radius``, across, down or diagonally, or is mostly unknown.
+
+    All distances are tested along the row, where memory is near, and only the largest one
+    elsewhere: there, a discontinuity that is crossed twice can be missed.
+    """
+    # w(-k) + w(+k) - 2 w(0), relative to w(0): 0 on any plane
+    here = 2.0 / values[row, column]
+    known, pairs = 0, 0
+    for k in range(1, radius + 4):
+        dy, dx = 0, k
+        if k > radius:
+            dy, dx = radius, radius * (k - radius - 2)
+        y0, x0, y1, x1 = row - dy, column - dx, row + dy, column + dx
+        if y0 < 0 or y1 >= values.shape[0] or min(x0, x1) < 0 or max(x0, x1) >= values.shape[1]:
+            continue
+        pairs += 1
+        before, after = values[y0, x0], values[y1, x1]
+        if 0 < before < np.inf and 0 < after < np.inf:
+            known += 1
+            if abs(1.0 / before + 1.0 / after - here) > 0.5 * tolerance * here:
+                return True
+    # Beside unknown depth there may be an edge, too.
+    return 2 * known < pairs

@@ -1,9 +1,8 @@
-"""Advice: what to do with a scene's points before training, from measurements made in seconds.
+"""Which seeds? The one answer: what to do with a scene's points before training, and why.
 
 Notation: *room* is the number of seeds with which training can begin under its budget, per point
 of the scene. Promise: ``advise`` depends only on the measurements and the plan, not on files or
-chance, so that it can be tested against a benchmark's ledger (``bench.analysis.arms.advice``); it
-may advise against any change.
+chance, so that it can be tested against a benchmark's runs; it may advise against any change.
 
 The rules rest on validation views at 1,500 steps (benchmarks/README.md): where
 Structure-from-Motion left room (fern, fox), ``auto`` gained 0 to 0.5 dB with densification and 1.1
@@ -15,15 +14,21 @@ gained 0.02 to 0.05 dB there (seed 0 of both), and -0.05 to 0.09 dB on the test 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from splatseed.io.output.earlier import was_upsampled
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
+from splatseed.upsample import Upsampler
 
 Layout: TypeAlias = Literal["facing one way", "around something", "through a place"]
+DEFAULT_METHOD, FALLBACK = "auto", "mls"
+"""The default method, and its replacement for scenes without photographs."""
 AS_IT_IS = "sfm"
 """The advice to leave the points as they are."""
 SEEDED = "seeded"
@@ -39,8 +44,6 @@ SAME_WAY = 0.95
 """Least length of the mean viewing direction at which cameras face one way."""
 INWARD = 0.7
 """Least share of cameras that look towards the point nearest to all optical axes in an orbit."""
-GROWS = "grow"
-"""The strategy that needs no seeds."""
 PLACES_ITSELF = (
     "Strategy grow puts new Gaussians at the depth that stereo finds; points that method auto "
     "added before it gained 0.1 dB at most on some of the captures measured, and cost as much on "
@@ -98,10 +101,12 @@ class Advice:
     Args:
         method: The method for new points, ``AS_IT_IS`` or ``SEEDED``.
         reasons: A sentence each.
+        measured: The numbers on which it rests.
     """
 
     method: str
     reasons: tuple[str, ...]
+    measured: Measured
 
     @property
     def sentence(self) -> str:
@@ -113,10 +118,53 @@ class Advice:
         return f"add points by method {self.method}"
 
 
+def advice_for(
+    scene: Scene,
+    most_seeds: int,
+    *,
+    strategy: str = "default",
+    empty: float | None = None,
+    progress: Progress | None = None,
+) -> Advice:
+    """What to do with a scene's points before training.
+
+    Args:
+        scene: The scene.
+        most_seeds: Most seeds with which training can begin under its budget.
+        strategy: The strategy of that training.
+        empty: Share of the photographs' cells without points, if known.
+        progress: Told how much is done. Given this, stereo is tried on a few photographs, if there
+            is room for new points; else no photograph is opened.
+    """
+    measured = measure(scene, empty)
+    if was_upsampled(scene) and len(scene.points):
+        kept = scene.points.num_original
+        new = f"{len(scene.points) - kept:,} of its points and kept {kept:,}"
+        made = f"splatseed upsample made {new}."
+        return Advice(SEEDED if scene.has_photographs else AS_IT_IS, (made,), measured)
+    said = advise(measured, most_seeds, strategy=strategy)
+    if progress is not None and said.method == DEFAULT_METHOD and measured.num_points:
+        measured = replace(measured, agreement=stereo_agreement(scene, progress=progress))
+        said = advise(measured, most_seeds, strategy=strategy)
+    return said
+
+
+def method_for(
+    scene: Scene | PointCloud,
+    method: str | Upsampler = DEFAULT_METHOD,
+    note: Callable[[str], None] = lambda _: None,
+) -> str | Upsampler:
+    """The default method, or its replacement if there are no photographs."""
+    if isinstance(scene, Scene) and scene.has_photographs:
+        return method
+    note(f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}.")
+    return FALLBACK
+
+
 def advise(
     measured: Measured, most_seeds: int, *, strategy: str = "default", room: float = ROOM
 ) -> Advice:
-    """What to do with a scene's points.
+    """The rule behind ``advice_for``.
 
     Args:
         measured: Measurements of the scene.
@@ -124,38 +172,38 @@ def advise(
         strategy: The strategy of that training.
         room: Least room at which new points are worth making; scoring fits it.
     """
+
+    def said(method: str, *reasons: str) -> Advice:
+        return Advice(method, reasons, measured)
+
     if not measured.num_points:
         maps = "Its depth maps can give some, too: --method depth --no-align --num-points N."
         how = ": depth comes from comparing the photographs" if measured.photographs else ""
         none = f"There are no points to begin with{how}."
-        return Advice("auto", (none, maps) if measured.depth_maps else (none,))
+        return said(DEFAULT_METHOD, none, *([maps] if measured.depth_maps else []))
     if not measured.photographs:
-        return Advice("mls", ("Without photographs and their poses, points are interpolated.",))
+        return said(FALLBACK, "Without photographs and their poses, points are interpolated.")
     has = most_seeds / measured.num_points
     per_pixel = f"{measured.num_points:,} points, {_share(measured.points_per_pixel)} per pixel"
-    if has < room or strategy == GROWS:
+    if has < room or strategy == "grow":
         full = (
             f"Training begins with {most_seeds:,} at most, so there is no room for more: adding "
             "some cost up to 0.4 dB where that was measured."
         )
-        why = full if has < room else PLACES_ITSELF
-        return Advice(AS_IT_IS, (f"It has {per_pixel}.", why))
+        return said(AS_IT_IS, f"It has {per_pixel}.", full if has < room else PLACES_ITSELF)
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
     if measured.depth_maps:
-        return Advice("depth", (*reasons, "Its depth maps say where the surfaces are."))
-    if measured.empty is not None:
-        reasons.append(
-            f"No point falls in {measured.empty:.0%} of the cells of a coarse grid over the "
-            "pictures."
-        )
-    if measured.agreement is not None:
-        reasons.append(
-            f"Stereo finds a confirmed depth for {measured.agreement:.0%} of the pixels."
-        )
-    little = measured.agreement is not None and measured.agreement < LOW_AGREEMENT
-    if little and measured.empty is not None and measured.empty < FEW_EMPTY:
-        return Advice(AS_IT_IS, (*reasons, "That is too little to add to what there is."))
-    return Advice("auto", tuple(reasons))
+        return said("depth", *reasons, "Its depth maps say where the surfaces are.")
+    empty, agreement = measured.empty, measured.agreement
+    if empty is not None:
+        cells = f"{empty:.0%} of the cells of a coarse grid over the pictures"
+        reasons.append(f"No point falls in {cells}.")
+    if agreement is not None:
+        reasons.append(f"Stereo finds a confirmed depth for {agreement:.0%} of the pixels.")
+    little = agreement is not None and agreement < LOW_AGREEMENT
+    if little and empty is not None and empty < FEW_EMPTY:
+        return said(AS_IT_IS, *reasons, "That is too little to add to what there is.")
+    return said(DEFAULT_METHOD, *reasons)
 
 
 def measure(scene: Scene, empty: float | None = None, pixels: float | None = None) -> Measured:

@@ -68,12 +68,24 @@ def covered_cells(
 ) -> tuple[Bool[np.ndarray, "rows cols"], ...]:
     """Which cells of each view are covered; arguments and errors as in ``covered_share``."""
     xyz = check_points(views, xyz, cell)
-    covered: list[Bool[np.ndarray, "rows cols"]] = []
+    depths = depths_of_views(views, xyz, cell, progress, "look for uncovered cells")
+    return tuple(np.isfinite(each) for each in depths)
+
+
+def depths_of_views(
+    views: Sequence[View],
+    xyz: Float32[np.ndarray, "N 3"],
+    cell: float,
+    progress: Progress,
+    stage: str,
+) -> list[Float32[np.ndarray, "rows cols"]]:
+    """``cell_depths`` of each view, on all threads."""
+    found: list[Float32[np.ndarray, "rows cols"]] = []
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the kernels release the GIL
         for depths in pool.map(lambda view: cell_depths(view, xyz, cell), views):
-            covered.append(np.isfinite(depths))
-            progress("look for uncovered cells", len(covered) / len(views))
-    return tuple(covered)
+            found.append(depths)
+            progress(stage, len(found) / len(views))
+    return found
 
 
 def check_points(

@@ -9,9 +9,10 @@ looked at.
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -25,27 +26,15 @@ from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
     from splatseed.stereo.maps import StereoMap
-    from splatseed.stereo.result import Stereo as FoundStereo
+    from splatseed.stereo.result import StereoResult
     from splatseed.views.view import View
 
 MAX_SIZE = 800
 """Longer side in pixels at which photographs are used."""
 
 
-class _Given(NamedTuple):
-    """The input of a method."""
-
-    scene: Scene
-    images: Sequence[Image]
-    """The images whose photographs are used."""
-    views: Sequence[View]
-    """Their views, in the same order."""
-    rng: np.random.Generator
-    progress: Progress
-
-
 @dataclass(frozen=True)
-class PhotographMethod:
+class PhotographMethod(ABC):
     """The base of the three methods."""
 
     max_size: int = MAX_SIZE
@@ -59,18 +48,11 @@ class PhotographMethod:
     def __post_init__(self) -> None:
         check_fields(self)
         require(self.max_size >= 64, f"{self.name}.max_size of at least 64", self.max_size)
-        require(
-            self.hold_out != 1 and self.hold_out >= 0,
-            f"{self.name}.hold_out of 0 or 2 and more",
-            self.hold_out,
-        )
-        for field in fields(self):
-            if field.name in {"spacing", "cell"}:
-                value = getattr(self, field.name)
-                require(1 <= value <= 256, f"{self.name}.{field.name} from 1 to 256", value)
-            if field.name == "grid":
-                grid = getattr(self, field.name)
-                require(1 <= grid <= MOST_GRID, f"{self.name}.grid from 1 to {MOST_GRID}", grid)
+        held = self.hold_out
+        require(held >= 0 and held != 1, f"{self.name}.hold_out of 0 or 2 and more", held)
+        for field, most in (("spacing", 256), ("cell", 256), ("grid", MOST_GRID)):
+            value = getattr(self, field, 1)
+            require(1 <= value <= most, f"{self.name}.{field} from 1 to {most}", value)
 
     def __call__(
         self,
@@ -86,19 +68,11 @@ class PhotographMethod:
                 found="a cloud of points alone",
                 fix="Load the scene they were made from.",
             )
-        return self.seed(scene, rng, progress)
+        return self.seeds(scene, rng, progress)
 
-    def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
+    @abstractmethod
+    def seeds(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
         """The new points of a scene."""
-        return self._look(self._read(scene, rng, progress))
-
-    def _read(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> _Given:
-        images = photographed(scene, self.hold_out)
-        views = read_views(scene, images, self.max_size, progress)
-        return _Given(scene, images, views, rng, progress)
-
-    def _look(self, given: _Given) -> NewPoints:
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -123,48 +97,60 @@ class Stereo(PhotographMethod):
             seed: The same seed gives the same bytes.
             progress: Called with the stage and the fraction done.
         """
-        given = self._read(scene, np.random.default_rng(seed), progress)
-        stereo = self.find(given, only)
+        images = photographed(scene, self.hold_out)
+        views = read_views(scene, images, self.max_size, progress)
+        stereo = self._compare(scene, images, views, np.random.default_rng(seed), progress, only)
         return tuple(stereo.map(i) for i in only)
 
-    def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
-        """The new points of a scene; without points, its poses are checked first."""
-        if has_points(scene):
-            return super().seed(scene, rng, progress)
-        from splatseed.seeding.poses_alone.pose_check import check_poses  # noqa: PLC0415  (loads with its use)
-        from splatseed.seeding.poses_alone.pose_error import pose_error  # noqa: PLC0415  (loads with its use)
+    def seeds(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
+        """The new points of a scene."""
+        return self.seeds_and_stereo(scene, rng, progress)[0]
 
-        images = photographed(scene, self.hold_out)
-        check_poses(scene, images, progress)
-        error = pose_error(scene, images, progress)
-        made = super().seed(scene, rng, progress)
-        warnings = (error.warning,) if error and error.warning else ()
-        return made._replace(notes=(*made.notes, *warnings))
+    def seeds_and_stereo(
+        self, scene: Scene, rng: np.random.Generator, progress: Progress
+    ) -> tuple[NewPoints, StereoResult]:
+        """The new points of a scene, and what comparing the photographs found.
 
-    def _look(self, given: _Given) -> NewPoints:
+        Without points, the scene's poses are checked first.
+        """
         from splatseed.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
 
-        start = time.perf_counter()
-        stereo = self.find(given)
-        seeds = fuse(stereo, self.spacing, given.progress)
-        source = np.full(len(seeds), source_code("stereo"), np.uint8)
-        seconds = time.perf_counter() - start
-        notes = () if begins_from_points(given.scene) else (_known(given.scene, stereo, seconds),)
-        return NewPoints(
-            seeds.xyz, seeds.rgb, notes, seeds.normals, seeds.sizes, seeds.confidence, source
-        )
+        images = photographed(scene, self.hold_out)
+        warnings: tuple[str, ...] = ()
+        if not has_points(scene):
+            from splatseed.seeding.poses import check_poses, pose_error  # noqa: PLC0415  (loads Numba)
 
-    def find(self, given: _Given, only: Sequence[int] | None = None) -> FoundStereo:
+            check_poses(scene, images, progress)
+            error = pose_error(scene, images, progress)
+            warnings = (error.warning,) if error and error.warning else ()
+        views = read_views(scene, images, self.max_size, progress)
+        start = time.perf_counter()
+        stereo = self._compare(scene, images, views, rng, progress)
+        seeds = fuse(stereo, self.spacing, progress)
+        found = _found(scene, stereo, time.perf_counter() - start)
+        source = np.full(len(seeds), source_code("stereo"), np.uint8)
+        new = NewPoints(
+            seeds.xyz, seeds.rgb, (*found, *warnings), seeds.normals, seeds.sizes,
+            seeds.confidence, source,
+        )  # fmt: skip
+        return new, stereo
+
+    def _compare(
+        self,
+        scene: Scene,
+        images: Sequence[Image],
+        views: Sequence[View],
+        rng: np.random.Generator,
+        progress: Progress,
+        only: Sequence[int] | None = None,
+    ) -> StereoResult:
         """Compare the photographs, or what some of them need."""
         from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
         from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
         from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415  (loads with its use)
 
-        settings, seed = StereoSettings(grid=self.grid), int(given.rng.integers(1 << 32))
-        visibility = known_visibility(given.scene)
-        return find_stereo(
-            given.views, given.images, visibility, settings, seed, given.progress, only
-        )
+        settings, seed = StereoSettings(grid=self.grid), int(rng.integers(1 << 32))
+        return find_stereo(views, images, known_visibility(scene), settings, seed, progress, only)
 
 
 @dataclass(frozen=True)
@@ -176,19 +162,17 @@ class Cover(PhotographMethod):
 
     name: ClassVar[str] = "cover"
 
-    def seed(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
+    def seeds(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
         """The new points of a scene, which needs some already: their depths are carried on."""
-        if not scene.points.originals.finite.any():
+        originals = scene.points.originals
+        if not originals.finite.any():
             raise PointCloudError(
                 "points for the method cover, which carries their depths into the gaps",
                 found="none",
                 fix="Choose --method auto, which compares the photographs first.",
             )
-        return super().seed(scene, rng, progress)
-
-    def _look(self, given: _Given) -> NewPoints:
-        originals = given.scene.points.originals
-        return cover_cloud(given.views, originals, self.cell, given.rng, given.progress)
+        views = read_views(scene, photographed(scene, self.hold_out), self.max_size, progress)
+        return cover_cloud(views, originals, self.cell, rng, progress)
 
 
 @dataclass(frozen=True)
@@ -200,12 +184,19 @@ class Auto(Stereo):
 
     name: ClassVar[str] = "auto"
 
-    def _look(self, given: _Given) -> NewPoints:
-        seeds = super()._look(given)
-        new = PointCloud(seeds.xyz, seeds.rgb)
-        known = PointCloud.concatenate(given.scene.points.originals, new)
-        gaps = cover_cloud(given.views, known, self.cell, given.rng, given.progress)
-        return _join(seeds, gaps)
+    def seeds_and_stereo(
+        self, scene: Scene, rng: np.random.Generator, progress: Progress
+    ) -> tuple[NewPoints, StereoResult]:
+        """The same, and a seed in each part that is then still empty."""
+        seeds, stereo = super().seeds_and_stereo(scene, rng, progress)
+        known = PointCloud.concatenate(scene.points.originals, PointCloud(seeds.xyz, seeds.rgb))
+        gaps = cover_cloud(stereo.views, known, self.cell, rng, progress)
+        arrays = {
+            name: np.concatenate([getattr(seeds, name), getattr(gaps, name)])
+            for name in NewPoints._fields
+            if name != "notes"
+        }
+        return NewPoints(**arrays, notes=seeds.notes), stereo
 
 
 def has_points(scene: Scene) -> bool:
@@ -301,21 +292,14 @@ def with_cover(
     return PointCloud.concatenate(points, PointCloud(new.xyz, new.rgb, source, **known))
 
 
-def _known(scene: Scene, stereo: FoundStereo, seconds: float) -> str:
-    """What comparing photographs found, and how long it took, in a sentence."""
+def _found(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[str, ...]:
+    """What comparing photographs found if points could not guide it, and how long it took."""
+    if begins_from_points(scene):
+        return ()
     points = "too few" if has_points(scene) else "no"
     share = np.mean([stereo.kept(i).mean() for i in range(len(stereo.views))])
-    return (
+    told = (
         f"There were {points} points to begin from: comparing the photographs gave {share:.0%} of "
         f"their pixels a confirmed depth, in {seconds:.0f} s."
     )
-
-
-def _join(first: NewPoints, second: NewPoints) -> NewPoints:
-    """Points of two methods one after the other."""
-    arrays = {
-        name: np.concatenate([getattr(first, name), getattr(second, name)])
-        for name in NewPoints._fields
-        if name != "notes"
-    }
-    return NewPoints(**arrays, notes=(*first.notes, *second.notes))
+    return (told,)

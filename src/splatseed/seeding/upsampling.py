@@ -1,30 +1,39 @@
-"""``upsample``: new points for a scene, made, verified, completed and thinned.
+"""``upsample``: new points for a scene, made, verified, completed and thinned to a budget.
 
 Four steps, all but the first optional: a method makes points; ``verify`` checks interpolated ones
 against the photographs; ``cover`` gives a seed to the parts of photographs that no point falls in;
-a budget thins all.
-Promise: without a budget the originals come first and unchanged; the same seed gives the same bytes
+a budget thins all: measured points by visibility, then guesses.
+Promise: without a budget the originals come first and unchanged; with one, there are no more points
+than its number, and exactly the number if there are enough; the same seed gives the same bytes
 whatever the number of threads; every point is finite.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from splatseed.errors import ParameterError
 from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views, with_cover
-from splatseed.seeding.thinning import frames_of, points_within, thin_to
-from splatseed.upsample import Profile, Upsampler, upsample as add_points
+from splatseed.seeding.advice import DEFAULT_METHOD, method_for
+from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views, with_cover
+from splatseed.upsample import Profile, Upsampler, as_cloud, upsample as add_points
 from splatseed.upsample.method import NewPoints
 from splatseed.upsample.registry import source_code
+from splatseed.views.view import View, data_factor, poses_of
 
-DEFAULT_METHOD, FALLBACK = "auto", "mls"
-"""The default method, and its replacement for scenes without photographs."""
+if TYPE_CHECKING:
+    from splatseed.stereo.result import StereoResult
+
+RHO = "rho"
+"""The unit of Gaussians per pixel of a photograph."""
+MOST = 10**12
+"""More points than any trainer holds."""
 CELL = 8
 """Side in pixels of the cells by which coverage is measured."""
 
@@ -34,6 +43,11 @@ photographs."""
 
 FILLING = ("auto", "cover", "stereo")
 """Methods that look where there are points already."""
+COVER, CLOUD = source_code("cover"), source_code("cloud")
+MOST_COVER = 0.1
+"""Largest part of a budget for cover's guesses; their cells grow until they fit."""
+COARSER = 1.25
+"""Growth factor of the cells."""
 
 Note = Callable[[str], None]
 
@@ -47,7 +61,7 @@ def upsample(
     budget: int | str | None = None,
     cover: int | None = None,
     verify: bool = False,
-    beside: Upsampler | None = None,
+    extra_method: Upsampler | None = None,
     seed: int = 0,
     profile: Profile = "default",
     progress: Progress = silent,
@@ -70,8 +84,8 @@ def upsample(
         cover: Side in pixels of the parts of the photographs that get a seed if no point falls in.
         verify: Check interpolated points against the photographs: slide them onto the surface, drop
             those that do not fit.
-        beside: Another method, such as ``Cloud().of("scan.laz")``, whose points come before those
-            of ``method``; ``auto`` and ``cover`` take them into account.
+        extra_method: Another method, such as ``Cloud().of("scan.laz")``, whose points come before
+            those of ``method``; ``auto`` and ``cover`` take them into account.
         seed: The same seed gives the same bytes, whatever the number of threads.
         profile: "default", or "paper" for the paper's text to the letter.
         progress: Called with the stage and the fraction done.
@@ -98,20 +112,15 @@ def upsample(
     """
     whole = scene if isinstance(scene, Scene) else Scene(scene)
     most = None if budget is None else points_within(whole, budget)
-    if beside is None and DEFAULT_METHOD in {method, getattr(method, "name", None)}:
+    if extra_method is None and DEFAULT_METHOD in {method, getattr(method, "name", None)}:
         method = method_for(scene, method, note)
-        originals = whole.points.originals
-        originals = originals.select(originals.distinct)
-        plain = ratio is None and num_points is None and cover is None
-        if plain and most is not None and len(originals) >= most:  # nothing else would stay
-            note(
-                f"There is room for {most:,} points, and there are {len(originals):,} already: "
-                "they are thinned, and none are added."
-            )
-            return thin_to(whole, originals, most, CELL, 0, seed, progress)
+        if ratio is None and num_points is None and cover is None:
+            full = _full_already(whole, most, seed, progress, note)
+            if full is not None:
+                return full
     options: dict[str, Any] = {"seed": seed, "progress": progress, "note": note}
     # Measured points come first, so that the method fills what they leave.
-    first = None if beside is None else add_points(whole, beside, **options)
+    first = None if extra_method is None else add_points(whole, extra_method, **options)
     cloud = add_points(
         scene if first is None else _with(whole, first, method), method, ratio=ratio,
         num_points=num_points, profile=profile, **options, **parameters,
@@ -126,6 +135,54 @@ def upsample(
         hold_out = getattr(method, "hold_out", parameters.get("hold_out", 0))
         cloud = thin_to(whole, cloud, most, cover or CELL, hold_out, seed, progress)
     return cloud
+
+
+def upsample_with_stereo(
+    scene: Scene,
+    method: Stereo,
+    budget: int | None = None,
+    *,
+    progress: Progress = silent,
+    note: Note = lambda _: None,
+) -> tuple[PointCloud, StereoResult | None]:
+    """``upsample`` with seed 0, and what comparing the photographs found on the way.
+
+    Args:
+        scene: A scene with photographs.
+        method: Method ``auto`` or ``stereo``.
+        budget: Most points in all.
+        progress: Called with the stage and the fraction done.
+        note: Called with what was left out, one sentence each.
+
+    Returns:
+        The points, and stereo's result; None where the originals fill the budget.
+    """
+    full = _full_already(scene, budget, 0, progress, note)
+    if full is not None:
+        return full, None
+    new, stereo = method.seeds_and_stereo(scene, np.random.default_rng(0), progress)
+    for sentence in new.notes:
+        note(sentence)
+    made = as_cloud(new, len(new.xyz), source_code(method.name))
+    cloud = PointCloud.concatenate(scene.points.originals, made)
+    if budget is not None:
+        cloud = thin_to(scene, cloud, budget, CELL, method.hold_out, 0, progress)
+    return cloud, stereo
+
+
+def _full_already(
+    scene: Scene, most: int | None, seed: int, progress: Progress, note: Note
+) -> PointCloud | None:
+    """The originals within a budget that leaves no room for others; None if it does."""
+    originals = scene.points.originals
+    originals = originals.select(originals.distinct)
+    if most is None or len(originals) < most:
+        return None
+    note(
+        f"There is room for {most:,} points, and there are {len(originals):,} already: "
+        "they are thinned, and none are added."
+    )
+    return thin_to(scene, originals, most, CELL, 0, seed, progress)
 
 
 def _with(scene: Scene, points: PointCloud, method: str | Upsampler) -> Scene:
@@ -213,11 +270,112 @@ def share_covered(scene: Scene, cloud: PointCloud, cell: int = CELL) -> float:
     return covered_share(frames_of(scene), cloud.xyz[cloud.finite], cell)
 
 
-def method_for(
-    scene: Scene | PointCloud, method: str | Upsampler = DEFAULT_METHOD, note: Note = lambda _: None
-) -> str | Upsampler:
-    """The default method, or its replacement if there are no photographs."""
-    if isinstance(scene, Scene) and scene.has_photographs:
-        return method
-    note(f"Without photographs, method {FALLBACK} is used instead of {DEFAULT_METHOD}.")
-    return FALLBACK
+def points_within(scene: Scene, budget: int | str) -> int:
+    """The number of points that a budget allows a scene.
+
+    Args:
+        scene: The scene whose photographs define rho.
+        budget: A number, or a string such as "0.25rho".
+
+    Raises:
+        ParameterError: It is neither, or below one point.
+    """
+    from splatseed.seeding.budget import median_pixels  # noqa: PLC0415  (loads Numba)
+
+    photographs = poses_of(scene.images)
+    return parse_budget(budget, median_pixels(photographs) if photographs else 0)
+
+
+def thin_to(
+    scene: Scene,
+    cloud: PointCloud,
+    num: int,
+    cell: int,
+    hold_out: int,
+    seed: int,
+    progress: Progress,
+) -> PointCloud:
+    """At most ``num`` of a cloud's points, originals before others of equal use.
+
+    Cover is recomputed for what thinning leaves: a guess fills a gap, and must not replace a
+    measured point. If there are at least ``num`` originals, only originals stay: they are dense
+    where there is detail, which is where few Gaussians are needed most. But a scan's points, which
+    the user has asked for, are thinned together with them.
+
+    Args:
+        scene: The scene of the points.
+        cloud: The points.
+        num: How many, at least 1.
+        cell: Smallest side of cover's cells, in pixels.
+        hold_out: Photographs that cover must not use, as in ``PhotographMethod``.
+        seed: Determines the order of the views.
+        progress: Called with the stage and the fraction done.
+    """
+    if len(cloud) <= num:
+        return cloud
+    points = cloud.select(cloud.distinct)
+    guessed = points.source == COVER
+    if not guessed.any() or guessed.all():
+        return _keep(scene, points, num)
+    known = points.select(~guessed)
+    if known.num_original >= num and not (known.source == CLOUD).any():
+        return _keep(scene, known.originals, num)
+    views = read_views(scene, photographed(scene, hold_out), MAX_SIZE, progress)
+    # Guesses get what the measured points leave, and a tenth at least.
+    room = max(num - len(known), round(MOST_COVER * num))
+    kept = _keep(scene, known, num - room)
+    while cell <= MAX_SIZE:
+        filled = with_cover(views, kept, cell, seed, progress).select(slice(len(kept), None))
+        if len(filled) <= room:
+            return PointCloud.concatenate(_keep(scene, known, num - len(filled)), filled)
+        cell = math.ceil(COARSER * cell)
+    return _keep(scene, known, num)
+
+
+def frames_of(scene: Scene) -> tuple[View, ...]:
+    """The views of a scene without their pixels, at the size that methods use."""
+    return poses_of(scene.images, data_factor(scene.images, MAX_SIZE)) if scene.images else ()
+
+
+def _keep(scene: Scene, points: PointCloud, num: int) -> PointCloud:
+    """At most ``num`` of the points, chosen by the views that see them."""
+    from splatseed.seeding.budget import thin  # noqa: PLC0415  (kernels load with use)
+
+    if len(points) <= num or num < 1:
+        return points.select(slice(max(num, 0)))
+    first = int(np.count_nonzero(points.source == ORIGINAL))
+    kept = thin(points.xyz, frames_of(scene), num, first=first, priority=points.confidence)
+    return points.select(kept)
+
+
+def parse_budget(budget: str | float, pixels: float) -> int:
+    """The number of points or Gaussians that a budget allows.
+
+    Args:
+        budget: A number such as 50000, "50000", "50k" or "0.5M", or "0.25rho" for Gaussians per
+            pixel of one image.
+        pixels: Pixels of one image.
+
+    Raises:
+        ParameterError: It is neither, or allows none, or more than anything can hold.
+
+    Example:
+        >>> parse_budget("50k", 0), parse_budget("0.25rho", 800 * 600)
+        (50000, 120000)
+    """
+    text = str(budget).strip().lower()
+    units = {RHO: pixels, "k": 1e3, "m": 1e6}
+    unit = next((each for each in units if text.endswith(each)), "")
+    try:
+        number = float(text.removesuffix(unit)) * units.get(unit, 1.0)
+    except ValueError:
+        number = math.nan
+    if not (0.5 < number <= MOST) or (not unit and number < 1):
+        raise ParameterError(
+            "a budget such as 50000, 50k, or 0.25rho (a quarter of the pixels of an image)",
+            found=f"{budget!r}, of {pixels:,.6g} pixels" if unit == RHO else repr(budget),
+            fix=f"Did you mean {text}rho?"
+            if not unit and 0 < number < 1
+            else "Give a number of at least 1.",
+        )
+    return round(number)

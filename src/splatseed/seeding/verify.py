@@ -1,11 +1,15 @@
 """verify: interpolated points compared with the photographs, then moved or dropped.
 
-Notation: M new points, each with a spacing h and a normal from the originals around it
-(``surroundings``), and up to two views that judge it (``judges``), each with its sources. In each,
-the point slides along its normal to where the photographs agree best (``sliding``), at a cost of
-one minus correlation; the better judge counts. Promise: the order of points stays; the same input
-gives the same bytes, whatever the number of threads; points that no photograph can judge are kept
-and reported.
+Notation: n originals, M new points; the *base* of a new point is its nearest original, and h, the
+mean distance of the base to its 6 nearest, its spacing. The normal is the last principal axis of
+the base and its 16 nearest. Up to two *reference views* judge a point: those that see its base, and
+in whose frame, and in those of two of their sources (of the only one, if there is no more), it lies
+well within; the closer and the more frontal a view, the better it sees the point. In each, the
+point slides along its normal to where the photographs agree best (``sliding``), at a cost of one
+minus correlation; the better view counts.
+Promise: the order of points stays; a point's surroundings and reference views depend on that point,
+the originals, poses and visibility, not on other points; the same input gives the same bytes,
+whatever the number of threads; points that no photograph can judge are kept and reported.
 """
 
 from __future__ import annotations
@@ -16,17 +20,201 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
+from splatseed.kernels.jit import inline, kernel, parallel_range
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image
-from splatseed.seeding.judges import choose_judges
 from splatseed.seeding.sliding import slide
-from splatseed.seeding.surroundings import Surroundings, survey
 from splatseed.stereo.matching import make_quad_images
 from splatseed.stereo.quads import grey_image
 from splatseed.upsample.method import NewPoints
-from splatseed.views.pairs import choose_sources
+from splatseed.upsample.neighbors import Neighbors, PreparedCloud, prepare
+from splatseed.upsample.patches import local_frames
+from splatseed.views.pairs import choose_sources, views_of_points
+from splatseed.views.projection import place
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility
+
+NEIGHBORS = 16
+"""Neighbours that determine a normal, as for mls."""
+FLAT = 0.4
+"""A neighbourhood counts as flat up to this ratio of thickness to width; noise alone has about
+0.7."""
+BLOCK = 1 << 13
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """The surroundings of M new points.
+
+    Args:
+        base: The nearest original, as its row, int64 [M].
+        spacing: h, float64 [M], scene units.
+        normals: Unit, of either sign, float64 [M, 3]; NaN where the originals are collinear.
+        flat: Whether the originals there are coplanar, bool [M].
+    """
+
+    base: Int64[np.ndarray, " M"]
+    spacing: Float64[np.ndarray, " M"]
+    normals: Float64[np.ndarray, "M 3"]
+    flat: Bool[np.ndarray, " M"]
+
+
+def survey(
+    originals: Float64[np.ndarray, "n 3"],
+    xyz: Float32[np.ndarray, "M 3"],
+    progress: Progress = silent,
+) -> Surroundings:
+    """The surroundings of each new point.
+
+    Args:
+        originals: Distinct finite positions, at least 2.
+        xyz: The new points' positions.
+        progress: Called with the stage and the fraction done.
+    """
+    nothing = np.zeros((len(originals), 3), np.uint8)
+    cloud = prepare(PointCloud(originals.astype(np.float32), nothing), progress=progress)
+    neighbors = cloud.neighbors(NEIGHBORS)
+    frames, collinear = local_frames(cloud.xyz, neighbors.idx)
+    flat = _thickness(cloud, neighbors, frames, progress) <= FLAT
+    rank = _nearest(cloud, xyz, progress)
+    # The tree numbers points in file order, neighbours are stored by row.
+    row_of_rank = np.argsort(cloud.rank)
+    row = row_of_rank[rank]
+    normals = np.where(collinear[row, None], np.nan, frames[row, 2])
+    return Surroundings(rank, neighbors.spacing[row], normals, (flat & ~collinear)[row])
+
+
+def _thickness(
+    cloud: PreparedCloud,
+    neighbors: Neighbors,
+    frames: Float64[np.ndarray, "n 3 3"],
+    progress: Progress,
+) -> Float64[np.ndarray, " n"]:
+    """Extent of each neighbourhood along the normal, relative to the second axis."""
+    thickness = np.empty(len(cloud))
+
+    def work(start: int, stop: int) -> None:
+        near = cloud.xyz[neighbors.idx[start:stop]] - cloud.xyz[start:stop, None]
+        # The base itself, at the origin.
+        near = np.concatenate([near, np.zeros((stop - start, 1, 3))], axis=1)
+        spread = (near @ frames[start:stop, 1:].swapaxes(1, 2)).std(axis=1)
+        thickness[start:stop] = spread[:, 1] / np.maximum(spread[:, 0], np.finfo(float).tiny)
+
+    in_threads(work, len(cloud), BLOCK, "look at the originals", progress)
+    return thickness
+
+
+def _nearest(
+    cloud: PreparedCloud, xyz: Float32[np.ndarray, "M 3"], progress: Progress
+) -> Int64[np.ndarray, " M"]:
+    """The original nearest to each point."""
+    nearest = np.empty(len(xyz), np.int64)
+
+    def work(start: int, stop: int) -> None:
+        nearest[start:stop] = cloud.tree.query(xyz[start:stop] - cloud.center)[1]
+
+    in_threads(work, len(xyz), BLOCK, "find the nearest originals", progress)
+    return nearest
+
+
+REFERENCE_VIEWS = 2
+"""Views that judge a point; the better verdict counts, as one of them may not see it after all."""
+WITNESSES = 2
+"""Sources that must contain a point: this many determine its cost."""
+MARGIN = 5.0
+"""Pixels between a point and the frame: the window around it lies inside."""
+OBLIQUE = 0.3
+"""Weight of closeness for a surface seen edge on: normals are uncertain."""
+
+
+def choose_reference_views(
+    xyz: Float32[np.ndarray, "M 3"],
+    around: Surroundings,
+    views: Sequence[View],
+    seen: Sequence[Int64[np.ndarray, " N"]],
+    num_originals: int,
+    sources: Int64[np.ndarray, "V K"],
+) -> Int64[np.ndarray, "M J"]:
+    """The views that judge each point, best first, int64 [M, JUDGES]; -1 where there is none.
+
+    Args:
+        xyz: New points, world positions.
+        around: Their bases and normals.
+        views: The views.
+        seen: The originals that each view sees.
+        num_originals: The number of originals.
+        sources: The views that each is compared with; -1 = none.
+    """
+    order, offsets = views_of_points(seen, num_originals)
+    poses = np.stack([view.cam_from_world for view in views])
+    matrices = np.stack([view.K @ view.cam_from_world[:3] for view in views])
+    centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
+    sizes = np.array([(view.width, view.height) for view in views], np.float64)
+    focals = np.array([view.K[0, 0] for view in views])
+    judges = np.full((len(xyz), REFERENCE_VIEWS), -1)
+    normals = np.nan_to_num(around.normals)
+    _choose_views(
+        xyz, around.base, normals, order, offsets, matrices, sizes, centers, focals,
+        sources, judges,
+    )  # fmt: skip
+    return judges
+
+
+@kernel
+def _choose_views(  # type: ignore[no-untyped-def]  # Numba's types
+    xyz, base, normals, order, offsets, matrices, sizes, centers, focals, sources, judges
+):
+    """The best views of each point."""
+    for i in parallel_range(len(xyz)):
+        worth = np.zeros(REFERENCE_VIEWS)
+        for t in range(offsets[base[i]], offsets[base[i] + 1]):
+            view = order[t]
+            if not _holds(matrices[view], sizes[view], xyz[i]):
+                continue
+            if not _has_witnesses(xyz[i], sources[view], matrices, sizes):
+                continue
+            # Pixels per unit of length at the point, weighted by the angle.
+            value = focals[view] * _sight(xyz[i], normals[i], centers[view])
+            # Insertion into a sorted list of two.
+            for k in range(REFERENCE_VIEWS):
+                if value > worth[k]:
+                    for after in range(REFERENCE_VIEWS - 1, k, -1):
+                        worth[after], judges[i, after] = worth[after - 1], judges[i, after - 1]
+                    worth[k], judges[i, k] = value, view
+                    break
+
+
+@inline
+def _has_witnesses(point, sources, matrices, sizes):  # type: ignore[no-untyped-def]  # Numba's types
+    """Whether enough of a view's sources contain a point."""
+    asked, holding = 0, 0
+    for other in sources:
+        if other >= 0:
+            asked += 1
+            holding += _holds(matrices[other], sizes[other], point)
+    return holding > 0 and holding >= min(asked, WITNESSES)
+
+
+@inline
+def _holds(matrix, size, point):  # type: ignore[no-untyped-def]  # Numba's types
+    """Whether a point lies in front of a camera and well within its frame."""
+    u, v, z = place(point, matrix)
+    inside = MARGIN <= u <= size[0] - MARGIN and MARGIN <= v <= size[1] - MARGIN
+    return z > 0.0 and inside
+
+
+@inline
+def _sight(point, normal, center):  # type: ignore[no-untyped-def]  # Numba's types
+    """How well a surface is seen: (cos of the angle to its normal + OBLIQUE) / distance."""
+    dot, squared = 0.0, 0.0
+    for axis in range(3):
+        ray = point[axis] - center[axis]
+        dot += ray * normal[axis]
+        squared += ray * ray
+    distance = np.sqrt(squared)
+    return (abs(dot) / distance + OBLIQUE) / distance
+
 
 NUM_SOURCES = 5
 """Views that a judge is compared with."""
@@ -96,7 +284,7 @@ def verify(
     centers = -np.einsum("vji,vj->vi", poses[:, :3, :3], poses[:, :3, 3])
     sources = choose_sources(seen, visibility.xyz, centers, NUM_SOURCES)
     around = survey(visibility.xyz, new.xyz, progress)
-    judges = choose_judges(new.xyz, around, views, seen, len(visibility.xyz), sources)
+    judges = choose_reference_views(new.xyz, around, views, seen, len(visibility.xyz), sources)
     trials = _try_all(new.xyz, around, views, judges, sources, progress)
     return _decide(new, around, trials, centers[judges])
 

@@ -12,14 +12,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.camera import Camera
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image
 from splatseed.stereo.matching import match_views
-from splatseed.stereo.result import Stereo
+from splatseed.stereo.result import StereoResult
 from splatseed.stereo.settings import TOO_FEW, StereoSettings
 from splatseed.stereo.start import Hints, hints_from
-from splatseed.stereo.without_points import glimpse
+from splatseed.stereo.without_points import coarse_stereo
 from splatseed.views.pairs import choose_sources
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility
@@ -33,7 +32,7 @@ def find_stereo(
     seed: int = 0,
     progress: Progress = silent,
     only: Sequence[int] | None = None,
-) -> Stereo:
+) -> StereoResult:
     """Compare photographs with each other.
 
     Args:
@@ -48,7 +47,7 @@ def find_stereo(
             views are computed only as far as they confirm these. All when left out.
     """
     if len(visibility.xyz) < TOO_FEW:
-        visibility = glimpse(views, seed, progress)
+        visibility = coarse_stereo(views, seed, progress)
     seen = [visibility.rows_of(image) for image in images]
     centers = np.stack([image.camera.center for image in images])
     sources = choose_sources(seen, visibility.xyz, centers, settings.num_witnesses)
@@ -62,6 +61,6 @@ def find_stereo(
 
 def _hints(view: View, xyz: Float64[np.ndarray, "M 3"]) -> Hints | None:
     """What the points that a view sees tell about its depth."""
-    uv, z = Camera(view.K, view.width, view.height, view.cam_from_world).project(xyz)
+    uv, z = view.camera.project(xyz)
     front = z > 0
     return hints_from(uv[front], 1.0 / z[front]) if front.any() else None

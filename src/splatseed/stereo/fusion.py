@@ -16,11 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
-from splatseed.camera import Camera
 from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, silent
 from splatseed.stereo.matching import other_from_view
-from splatseed.stereo.result import Stereo
+from splatseed.stereo.result import StereoResult
 
 SAME = 0.03
 """Relative difference of depth up to which two seeds in a cell count as one."""
@@ -50,7 +49,7 @@ class StereoSeeds:
         return len(self.xyz)
 
 
-def fuse(stereo: Stereo, cell: float, progress: Progress = silent) -> StereoSeeds:
+def fuse(stereo: StereoResult, cell: float, progress: Progress = silent) -> StereoSeeds:
     """Seeds ``cell`` pixels apart in the photographs.
 
     Args:
@@ -75,7 +74,7 @@ def fuse(stereo: Stereo, cell: float, progress: Progress = silent) -> StereoSeed
 
 
 def _choose(
-    stereo: Stereo,
+    stereo: StereoResult,
     i: int,
     cell: float,
     taken: Float32[np.ndarray, " C"],
@@ -133,14 +132,16 @@ def _take(order, planes, agreeing, own, others, matrices, grid, cell, taken, off
                 taken[places[k]] = depths[k]
 
 
-def _seeds(stereo: Stereo, i: int, chosen: Int64[np.ndarray, " M"], cell: float) -> StereoSeeds:
+def _seeds(
+    stereo: StereoResult, i: int, chosen: Int64[np.ndarray, " M"], cell: float
+) -> StereoSeeds:
     """The seeds at some of a view's pixels."""
     view, grid = stereo.views[i], stereo.settings.grid
     width = stereo.costs[i].shape[1]
     row, column = chosen // width, chosen % width
     z = 1.0 / stereo.planes[i][0][row, column].astype(np.float64)
     uv = (np.stack([column, row], axis=1) + 0.5) * grid
-    camera = Camera(view.K, view.width, view.height, view.cam_from_world)
+    camera = view.camera
     # n' R = (R' n)': from camera axes to the world's.
     normals = stereo.normals(i)[row, column] @ view.cam_from_world[:3, :3]
     return StereoSeeds(

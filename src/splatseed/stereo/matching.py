@@ -17,7 +17,7 @@ from splatseed.progress import Progress, in_threads
 from splatseed.stereo.consistency import confirm
 from splatseed.stereo.patchmatch import QuadImages, begin, sweep
 from splatseed.stereo.quads import grey_image, make_quads
-from splatseed.stereo.result import Stereo
+from splatseed.stereo.result import StereoResult
 from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.start import Hints, first_planes
 from splatseed.views.view import View
@@ -58,7 +58,7 @@ def match_views(
     settings: StereoSettings,
     seed: int,
     progress: Progress,
-) -> Stereo:
+) -> StereoResult:
     """Compare photographs with each other.
 
     Args:
@@ -82,7 +82,7 @@ def match_views(
     in_threads(work, len(views), 1, "compare photographs", progress)
     planes, costs = [each[0] for each in matched], [each[1] for each in matched]
     agreeing = _confirm_all(views, planes, costs, sources, settings, progress)
-    return Stereo(tuple(views), planes, costs, agreeing, sources, settings)
+    return StereoResult(tuple(views), planes, costs, agreeing, sources, settings)
 
 
 def _match(

@@ -18,7 +18,7 @@ from splatseed.views.view import View
 
 
 @dataclass(frozen=True, eq=False)
-class Stereo:
+class StereoResult:
     """The result of stereo.
 
     Args:

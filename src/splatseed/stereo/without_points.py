@@ -1,6 +1,6 @@
-"""Points for a scene that has too few: from its depth maps, or a glimpse at small photographs.
+"""Points for a scene that has too few: from its depth maps, or from coarse stereo.
 
-Notation: a *glimpse* is stereo on copies about ``SMALL`` pixels wide, in two steps: a few views
+Notation: *coarse stereo* is stereo on copies about ``SMALL`` pixels wide, in two steps: a few views
 over every depth, then all views over the depths seen by those few. Promise: as for all of stereo,
 the same seed gives the same result; no point is made that the photographs do not confirm.
 """
@@ -25,8 +25,8 @@ from splatseed.views.view import View
 from splatseed.views.visibility import Visibility, find_visibility
 
 LEAST_SEEN = 300
-"""A scene counts as having no points if half of its images see fewer. A glimpse takes two or three
-times as long as what follows, and as many pixels become known as from 800 points an image: of
+"""A scene counts as having no points if half of its images see fewer. Coarse stereo takes two or
+three times as long as what follows, and as many pixels become known as from 800 points an image: of
 fern's .49, where 80 points an image give .44 and 8 give .41 (benchmarks/stereo)."""
 SMALL = 200
 """Longer side of a small photograph, in pixels."""
@@ -63,7 +63,7 @@ def enough_points(visibility: Visibility, images: Sequence[Image]) -> bool:
     return bool(seen) and bool(np.median(seen) >= LEAST_SEEN)
 
 
-def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
+def coarse_stereo(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
     """Points that small copies of photographs confirm.
 
     Args:
@@ -76,7 +76,7 @@ def glimpse(views: Sequence[View], seed: int, progress: Progress) -> Visibility:
     spread = _spread_of_depth(small, seed, progress)
     # All views are compared with those that see such depths at a good angle.
     xyz, seen = _imagined_points(small, spread)
-    centers = np.stack([_camera(view).center for view in small])
+    centers = np.stack([view.camera.center for view in small])
     sources = choose_sources(seen, xyz, centers, LOOK.num_witnesses)
     # ``spread`` holds inverse depths, so low is far and high is near.
     hints = [_between(low / AROUND, high * AROUND) for low, _, high in spread]
@@ -107,10 +107,6 @@ def _unseen(xyz: Float64[np.ndarray, "N 3"]) -> Visibility:
     """A subset of points whose visibility is unknown."""
     every = max(1, -(-len(xyz) // MOST_POINTS))
     return Visibility(xyz[::every], np.empty(0, np.int64), {}, {})
-
-
-def _camera(view: View) -> Camera:
-    return Camera(view.K, view.width, view.height, view.cam_from_world)
 
 
 def _small(view: View) -> View:
@@ -158,7 +154,7 @@ def any_depth(views: Sequence[View], i: int, sources: Int64[np.ndarray, " K"]) -
             are in its own place, there are no hints.
     """
     others = sources[sources >= 0]
-    apart = [np.linalg.norm(_camera(views[j]).center - _camera(views[i]).center) for j in others]
+    apart = [np.linalg.norm(views[j].camera.center - views[i].camera.center) for j in others]
     # A sideways step b moves a point at inverse depth w by focal b w pixels.
     moves = views[i].K[0, 0] * float(np.median(apart)) if apart else 0.0
     return _between(LEAST_MOVE / moves, views[i].width / moves) if moves > 0 else None
@@ -173,9 +169,9 @@ def _imagined_points(
         # 5 x 4 places of the image, each at the three depths.
         share = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
         uv = np.tile(share * [view.width, view.height], (3, 1))
-        points.append(_camera(view).unproject(uv, np.repeat(1 / inverse, 20)))
+        points.append(view.camera.unproject(uv, np.repeat(1 / inverse, 20)))
     xyz = np.concatenate(points)
-    return xyz, [_inside(_camera(view), xyz) for view in views]
+    return xyz, [_inside(view.camera, xyz) for view in views]
 
 
 def _inside(camera: Camera, xyz: Float64[np.ndarray, "P 3"]) -> Int64[np.ndarray, " M"]:

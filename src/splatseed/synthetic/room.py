@@ -16,7 +16,7 @@ from splatseed.synthetic.foliage import Discs
 from splatseed.synthetic.surfaces import Box, Cylinder, Rectangle, Sphere, Surface, Union, yaw_frame
 from splatseed.synthetic.texture import Mottled, Plain, Texture, Tiles
 from splatseed.synthetic.wavy import SineSheet
-from splatseed.views.viewpoint import look_at
+from splatseed.views.visibility import look_at
 
 BARE = "bare wall"
 """Name of the surface without texture."""

@@ -16,8 +16,13 @@ from scipy.spatial import cKDTree
 
 from splatseed.progress import in_threads, silent
 from splatseed.tiles.store import Points, TileStore
-from splatseed.upsample.nearest_points import distances_of, nearest_others, sort_rows
-from splatseed.upsample.neighbors import Neighbors, PreparedCloud
+from splatseed.upsample.neighbors import (
+    Neighbors,
+    PreparedCloud,
+    distances_of,
+    nearest_others,
+    sort_rows,
+)
 
 QUERY_BLOCK = 1 << 13
 NOBODY = np.iinfo(np.int64).max

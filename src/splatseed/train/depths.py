@@ -23,7 +23,7 @@ from splatseed.io.output.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.stereo.of_scene import stereo_depths
-from splatseed.stereo.result import Stereo
+from splatseed.stereo.result import StereoResult
 from splatseed.stereo.settings import StereoSettings
 from splatseed.train.settings import TrainSettings
 
@@ -71,7 +71,7 @@ def known_depths(
     settings: TrainSettings,
     device: str,
     *,
-    stereo: Stereo | None = None,
+    stereo: StereoResult | None = None,
     kept: Path | None = None,
     note: Callable[[str], None] = lambda _: None,
     progress: Progress = silent,

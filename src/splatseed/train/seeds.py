@@ -15,7 +15,7 @@ import hashlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
@@ -30,7 +30,7 @@ from splatseed.train.settings import AS_3DGS, TrainSettings
 from splatseed.views.view import View
 
 if TYPE_CHECKING:
-    from splatseed.stereo.result import Stereo
+    from splatseed.stereo.result import StereoResult
 
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
 """Most seeds as a fraction of the cap, for strategies that add Gaussians; others may use it all."""
@@ -56,7 +56,7 @@ def seeded(
     device: str,
     note: Callable[[str], None],
     progress: Progress,
-) -> tuple[Scene, Stereo | None]:
+) -> tuple[Scene, StereoResult | None]:
     """The scene with the points that method ``auto`` makes, if the settings ask for them.
 
     Also returns the depth maps that it computed, if any: growth uses them too.
@@ -80,21 +80,14 @@ def seeded(
     if settings.seeding == "scene" or why_not_seeded(scene, settings):
         return scene, None
     from splatseed.seeding.photographs import Auto  # noqa: PLC0415  (loads with its use)
-    from splatseed.seeding.upsampling import upsample  # noqa: PLC0415  (kernels load with use)
-
-    results: list[Stereo] = []
-
-    class Remembering(Auto):
-        def find(self, *given: Any) -> Stereo:
-            results.append(super().find(*given))
-            return results[-1]
+    from splatseed.seeding.upsampling import upsample_with_stereo  # noqa: PLC0415  (kernels load with use)
 
     start = time.perf_counter()
     size = stereo_size(scene.split(settings.test_every)[0], settings, device)
-    cloud = upsample(
+    cloud, stereo = upsample_with_stereo(
         scene,
-        Remembering(hold_out=settings.test_every, max_size=size),
-        budget=None if settings.cap is None else most_seeds(settings, settings.cap),
+        Auto(hold_out=settings.test_every, max_size=size),
+        None if settings.cap is None else most_seeds(settings, settings.cap),
         progress=progress,
         note=note,
     )
@@ -106,7 +99,7 @@ def seeded(
         note(f"Seeds by method auto: {made}. --seeds scene begins with the scene's points alone.")
     else:
         note(f"Seeds by method auto: {len(cloud):,} points, in {seconds:.0f} s.")
-    return scene.replace(points=cloud), results[-1] if results else None
+    return scene.replace(points=cloud), stereo
 
 
 def why_not_seeded(scene: Scene, settings: TrainSettings) -> str:

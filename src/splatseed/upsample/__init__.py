@@ -30,6 +30,7 @@ __all__ = [
     "Profile",
     "Traits",
     "Upsampler",
+    "as_cloud",
     "chooses_number",
     "configure",
     "methods_for",
@@ -137,11 +138,10 @@ def upsample(
             fix="Check that the scene holds the point cloud you meant.",
         )
     new = NewPoints(*chosen(whole, num_new or 0, rng, progress))  # a plain tuple will do
-    _check_finite(new)
     for sentence in new.notes:
         note(sentence)
     made = len(new.xyz) if num_new is None else num_new
-    return PointCloud.concatenate(originals, _as_cloud(new, made, source_code(name)))
+    return PointCloud.concatenate(originals, as_cloud(new, made, source_code(name)))
 
 
 def number_of_new(
@@ -266,8 +266,18 @@ def _generator(seed: int) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def _check_finite(new: NewPoints) -> None:
-    """Check every method, including third parties', for the promise of finite points."""
+def as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
+    """The new points with all attributes from their method; third parties' are checked, too.
+
+    Args:
+        new: What a method returned.
+        num_new: How many points it was to make.
+        code: Their ``source``, if the method gives none.
+
+    Raises:
+        PointCloudError: Points are not finite, arrays do not fit, or new points claim to be
+            originals.
+    """
     if not np.isfinite(new.xyz).all():
         bad = int(np.flatnonzero(~np.isfinite(new.xyz).all(axis=1))[0])
         raise PointCloudError(
@@ -275,14 +285,6 @@ def _check_finite(new: NewPoints) -> None:
             found=f"{new.xyz[bad].tolist()} at new point {bad}",
             fix="Report this with the scene; float32 may be too small for its coordinates.",
         )
-
-
-def _as_cloud(new: NewPoints, num_new: int, code: int) -> PointCloud:
-    """The new points with all attributes from their method.
-
-    Raises:
-        PointCloudError: Arrays do not fit, or new points claim to be originals.
-    """
     source = np.full(num_new, code, np.uint8) if new.source is None else np.asarray(new.source)
     if source.dtype != np.uint8 or (source == ORIGINAL).any():
         raise PointCloudError(

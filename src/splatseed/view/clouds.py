@@ -30,7 +30,7 @@ from splatseed.view.page import (
     write_grid,
 )
 from splatseed.view.points import origin_colors, origin_picture, picture_size, render_points
-from splatseed.views.viewpoint import choose_camera, choose_image
+from splatseed.views.visibility import choose_camera, choose_image
 
 PAIR_SIDE = 800
 GREY = 150

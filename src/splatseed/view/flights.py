@@ -38,7 +38,7 @@ from splatseed.view.models import (
     with_size,
 )
 from splatseed.views.view import View
-from splatseed.views.viewpoint import look_at
+from splatseed.views.visibility import look_at
 
 SMOOTHING = 0.02
 """Standard deviation of the filter along a path, as a fraction of the path's length."""

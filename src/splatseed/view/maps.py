@@ -16,8 +16,7 @@ from jaxtyping import Float, Float64, UInt8
 from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.camera import Camera
-from splatseed.depth import Alignment
-from splatseed.depth.planar import PlanarDepth, map_camera
+from splatseed.depth.alignment import Alignment, PlanarDepth, map_camera
 from splatseed.scene import Image, Scene
 from splatseed.stereo import StereoMap
 from splatseed.view.page import (

@@ -31,7 +31,7 @@ from splatseed.view.models import Shown, stage_frame
 from splatseed.view.pictures import Drawn, Entry, fitted_fov, stage_pose
 from splatseed.view.session import Session
 from splatseed.views.view import View
-from splatseed.views.viewpoint import choose_camera, choose_image
+from splatseed.views.visibility import choose_camera, choose_image
 
 if TYPE_CHECKING:
     from splatseed.train.run import TrainingRun

@@ -3,8 +3,15 @@
 ``view`` reads a scene's images as pinhole views, ``photographs`` their pixels.
 """
 
-from splatseed.views.photographs import load_photograph, user_cache_dir
-from splatseed.views.view import View, check_lens, load_split, load_views, poses_of
+from splatseed.views.view import (
+    View,
+    check_lens,
+    load_photograph,
+    load_split,
+    load_views,
+    poses_of,
+    user_cache_dir,
+)
 
 __all__ = [
     "View",

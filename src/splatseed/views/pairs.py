@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatseed.kernels.jit import inline, kernel, parallel_range
-from splatseed.views.parallax import cosine_between
+from splatseed.views.projection import cosine_between
 
 LEAST, FULL, WIDE, MOST = 1.0, 4.0, 15.0, 45.0
 """Degrees between which the weight rises, stays full, and falls."""

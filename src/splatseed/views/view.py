@@ -2,27 +2,40 @@
 
 Notation: a view is W x H pixels; ``K`` is in its own pixels, the centre of the top-left one at
 (0.5, 0.5); ``cam_from_world`` maps the scene's world to OpenCV camera axes. Promise: views have
-pinhole cameras only; a photograph is downsampled once, by a whole factor, and never enlarged.
+pinhole cameras only. A photograph is downsampled once, by a whole factor f, and never enlarged: a
+smaller copy is the mean over f x f blocks, rounded (pixels at the right and lower edge that do not
+fill a block are cut off), so intrinsics are divided by f and nothing else changes. Copies are kept
+by the content of the original, so a changed photograph is never mistaken for the old one. Only
+``cache_dir`` is written to, and a failure to write there is ignored.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
+import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.photograph import open_photograph, photograph_bytes
+from splatseed.camera import Camera
+from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io.output.staging import atomic_file
+from splatseed.io.photograph import decode_photograph, open_photograph, photograph_bytes
 from splatseed.lens import undistort_first
 from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.views.photographs import load_photograph
+
+if TYPE_CHECKING:
+    from PIL import Image as PilImage
 
 ASPECT_SLACK = 0.02
 """By how much a file's aspect ratio may differ from its camera's: the rounding of a copy."""
@@ -53,6 +66,11 @@ class View:
     height: int
     cam_from_world: Float64[np.ndarray, "4 4"]
     mask: Bool[np.ndarray, "H W"] | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """Its camera."""
+        return Camera(self.K, self.width, self.height, self.cam_from_world)
 
 
 def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
@@ -260,3 +278,77 @@ def _file_from_camera(
             fix="Use the images that the model was made from, or a resized copy of them.",
         )
     return np.asarray(scale)
+
+
+FILTER = "box-2"
+"""Part of the key: change it whenever the downsampling changes."""
+
+
+def load_photograph(
+    path: Path, factor: int = 1, cache_dir: Path | None = None
+) -> tuple[UInt8[np.ndarray, "H W 3"], tuple[int, int]]:
+    """The pixels of an image file, downsampled by ``factor``, and the file's width and height.
+
+    Transparent pixels are laid over black, which Gaussians are drawn on.
+
+    Args:
+        path: The image.
+        factor: 1 or more; a block of factor x factor pixels becomes one.
+        cache_dir: Where smaller copies are kept; nowhere when left out.
+
+    Raises:
+        ParameterError: The factor is less than 1.
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is no image, or too small for the factor.
+    """
+    if factor < 1:
+        raise ParameterError(
+            "--data-factor of 1 or more", found=f"{factor}", fix="Images are never enlarged."
+        )
+    encoded = photograph_bytes(path)
+    kept = None if cache_dir is None or factor == 1 else cache_dir / _key(encoded, factor)
+    if kept is not None and kept.is_file():
+        with suppress(SceneFormatError):  # a damaged copy is made again
+            photograph = decode_photograph(kept, photograph_bytes(kept))
+            return np.array(photograph), open_photograph(path, encoded).size
+    original = decode_photograph(path, encoded)
+    photograph = _reduce(path, original, factor)
+    if kept is not None:
+        _keep(photograph, kept)
+    return np.array(photograph), original.size
+
+
+def user_cache_dir() -> Path:
+    """Where this user's programs cache files (not created here)."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Caches"
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "splatseed" / "images"
+
+
+def _key(encoded: bytes, factor: int) -> str:
+    digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode())
+    return f"{digest.hexdigest()}_{factor}.png"
+
+
+def _reduce(path: Path, original: PilImage.Image, factor: int) -> PilImage.Image:
+    if factor == 1:
+        return original
+    width, height = original.width // factor, original.height // factor
+    if not width or not height:
+        raise SceneFormatError(
+            f"{path} to be larger than --data-factor {factor}",
+            found=f"{original.width} x {original.height}",
+            fix="Choose a smaller --data-factor.",
+        )
+    return original.reduce(factor, (0, 0, width * factor, height * factor))
+
+
+def _keep(photograph: PilImage.Image, path: Path) -> None:
+    with suppress(OutputError, OSError):  # a cache that cannot be written is done without
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_file(path) as partial:
+            photograph.save(partial, compress_level=1)

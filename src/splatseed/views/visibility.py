@@ -1,10 +1,11 @@
-"""Which SfM points each image sees: the reference for aligning depth maps.
+"""Which points each image sees, and the camera from which to look at a scene.
 
-Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the scene's
-world.
-Promise: only distinct finite originals take part. A point with a track is seen by the images of the
+Notation: V images, N points; ``xyz`` float64 [M, 3] are the points of one image, in the world;
+``uv`` are pixels [M, 2]; an image's *fill* is how much of its frame has points.
+Promise: only distinct finite originals are seen. A point with a track is seen by the images of the
 track. Without tracks, points are projected; where several fall close together in an image, only the
-nearest are kept, as the others are probably hidden.
+nearest are kept, as the others are probably hidden. The camera chosen is one of the scene's own if
+it has any, else one made up from the cloud alone.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from splatseed.camera import Camera
+from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Image, Scene
 
@@ -106,3 +108,127 @@ def _in_front(xyz: Float64[np.ndarray, "N 3"], camera: Camera) -> Int64[np.ndarr
     np.minimum.at(nearest, cell, z[inside])
     # A tenth beyond the nearest point of the cell may still be its surface.
     return np.asarray(inside[z[inside] <= HIDDEN * nearest[cell]])
+
+
+SAMPLE = 20_000
+"""Points considered when choosing a camera."""
+
+FRAME_CELLS = (16, 12)
+"""Columns and rows of the grid by which a frame's fill is measured."""
+
+CORE_SHARE = 0.6
+"""Share of the points, those nearest to the median, that a made-up camera frames."""
+
+ELEVATION = 28.0
+"""Degrees by which a made-up camera looks down."""
+MADE_UP_SIZE = (800, 600)
+"""Its width and height in pixels."""
+MADE_UP_FOCAL = 900.0
+"""Its focal length in pixels."""
+
+
+def look_at(
+    eye: Float64[np.ndarray, " 3"],
+    target: Float64[np.ndarray, " 3"],
+    up: Float64[np.ndarray, " 3"],
+) -> Float64[np.ndarray, "4 4"]:
+    """``cam_from_world`` [4, 4] of an OpenCV camera at ``eye`` that sees ``target`` upright.
+
+    Args:
+        eye: The camera's centre, world, [3].
+        target: A point on its axis, apart from ``eye``, [3].
+        up: The direction that is upward in the image, not along the view, [3].
+    """
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    cam_from_world = np.eye(4)
+    cam_from_world[:3, :3] = rotation
+    cam_from_world[:3, 3] = -rotation @ eye
+    return cam_from_world
+
+
+def choose_camera(scene: Scene) -> Camera:
+    """The camera of ``choose_image``; for a bare cloud, one made up to frame its densest part.
+
+    The made-up camera takes the direction in which the cloud is flattest as the vertical, upward
+    where the cloud thins out, and looks down on the points nearest the median at 28 degrees.
+
+    Raises:
+        PointCloudError: The scene has neither finite points nor images.
+    """
+    image = choose_image(scene)
+    return _made_up_camera(_finite_sample(scene)) if image is None else image.camera
+
+
+def choose_image(scene: Scene) -> Image | None:
+    """The image whose points fill most of its frame; among equals, the one with the most points.
+
+    An image's points are its features with a 3D point if the scene has features at all, else those
+    of a sample that project into its frame. The mere number of points would favour close-ups of the
+    richest texture. A scene without points, such as an RGB-D capture, gives the image in the middle
+    of its list; one without images gives None.
+
+    Raises:
+        PointCloudError: The scene has neither finite points nor images.
+    """
+    if scene.images and not scene.points.finite.any():
+        return scene.images[len(scene.images) // 2]
+    xyz = _finite_sample(scene)
+    seen = [_features(image) for image in scene.images]
+    if not any(len(uv) for uv in seen):
+        seen = [image.camera.project(xyz)[0] for image in scene.images]
+    fill = [_fill(image.camera, uv) for image, uv in zip(scene.images, seen, strict=True)]
+    return scene.images[fill.index(max(fill))] if fill else None
+
+
+def _features(image: Image) -> Float64[np.ndarray, "M 2"]:
+    """Pixels of the image's features that belong to a point."""
+    if image.observations is None:
+        return np.empty((0, 2))
+    return image.observations.xy[image.observations.point_ids >= 0]
+
+
+def _fill(camera: Camera, uv: Float64[np.ndarray, "M 2"]) -> tuple[int, int]:
+    """How many cells of a grid over the frame hold a point, and how many points it has."""
+    cells = uv / [camera.width, camera.height] * FRAME_CELLS
+    inside = ((cells >= 0) & (cells < FRAME_CELLS)).all(axis=1)  # NaN compares false
+    column, row = cells[inside].astype(np.int64).T
+    return len(np.unique(row * FRAME_CELLS[0] + column)), int(inside.sum())
+
+
+def _finite_sample(scene: Scene) -> Float64[np.ndarray, "N 3"]:
+    """At most ``SAMPLE`` finite points, evenly spaced in the file's order."""
+    xyz = scene.points.xyz[scene.points.finite].astype(np.float64)
+    if len(xyz) == 0:
+        raise PointCloudError(
+            "at least one finite point to look at",
+            found=f"none among {len(scene.points)}",
+            fix="Check that the cloud was read correctly.",
+        )
+    return np.asarray(xyz[:: -(-len(xyz) // SAMPLE)])
+
+
+def _made_up_camera(xyz: Float64[np.ndarray, "N 3"]) -> Camera:
+    center = np.median(xyz, axis=0)
+    radius = np.linalg.norm(xyz - center, axis=1)
+    core = xyz[radius <= np.quantile(radius, CORE_SHARE)]
+    _, axes = np.linalg.eigh(np.cov((core - center).T) if len(core) > 1 else np.eye(3))
+    up = _thin_side(core - center, axes[:, 0])
+    backward = _thin_side(core - center, axes[:, 1])
+    tilt = np.radians(ELEVATION)
+    toward_eye = np.cos(tilt) * backward + np.sin(tilt) * up
+    width, height = MADE_UP_SIZE
+    extent = float(np.linalg.norm(core - center, axis=1).max()) or 1.0
+    eye = center + toward_eye * extent * 2.0 * MADE_UP_FOCAL / width
+    K = np.array([[MADE_UP_FOCAL, 0, width / 2], [0, MADE_UP_FOCAL, height / 2], [0, 0, 1.0]])
+    return Camera(K, width, height, look_at(eye, center, up))
+
+
+def _thin_side(
+    offsets: Float64[np.ndarray, "N 3"], axis: Float64[np.ndarray, " 3"]
+) -> Float64[np.ndarray, " 3"]:
+    """The axis, directed to the cloud's longer tail: usually away from the ground."""
+    low, middle, high = np.percentile(offsets @ axis, [5, 50, 95])
+    return axis if high - middle >= middle - low else -axis

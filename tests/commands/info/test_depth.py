@@ -12,7 +12,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.commands.depth.next_steps import number_for
-from splatseed.depth import align
+from splatseed.depth.alignment import align
 from splatseed.io import find_depths, load_scene
 from splatseed.io.depth.folder import depth_folder
 from splatseed.synthetic import make_capture, write_capture

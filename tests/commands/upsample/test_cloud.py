@@ -125,7 +125,6 @@ SPOILT = {
         ("cut short", r"scan\.npz to be an archive of NumPy arrays"),
         ("empty", "points with finite coordinates in .*found none"),
         ("not a number", "found 9 that are not finite"),
-        ("degrees", "longitude and latitude: export the cloud in metres"),
         ("a national grid", r"none of 60,000, .* \(56\d{4}, 59\d{5}, .*--align.*--recenter would"),
         ("another place", "at its depth. It is in another frame .* or of another place"),
         ("once, a million times", "found none of 1,000,000"),

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from splatseed.progress import silent
-from splatseed.seeding.clouds import evidence as module
-from splatseed.seeding.clouds.evidence import FreeRays, find_evidence, find_surfaces
+from splatseed.seeding.clouds import judging as module
+from splatseed.seeding.clouds.judging import FreeRays, find_evidence, find_surfaces
 from splatseed.views.view import View
 
 W, H, F = 64, 48, 60.0
@@ -76,19 +76,3 @@ def test_rays_are_free_up_to_what_stereo_knows(wall):
     assert evidence.confirmed[:-1].max() == 2
     nearer = FreeRays.of(VIEWS, [ghost.astype(float), *nobody[1:]], [known] * 4)
     assert nearer.depths[0].min() == 2.0
-
-
-def test_rays_to_tracked_points_are_free(wall):
-    ghost = np.array([[0.02, 0.02, 2.0]], np.float32)
-    xyz = np.concatenate([wall, ghost])
-    surfaces, cell = find_surfaces(VIEWS, xyz, silent)
-    tracked = []
-    for each in VIEWS[:3]:  # where their rays through the ghost meet the wall
-        center = -each.cam_from_world[:3, 3]
-        tracked.append((center + 2 * (ghost[0].astype(float) - center))[None])
-    rays = FreeRays.of(VIEWS, [*tracked, np.empty((0, 3))])
-    found = find_evidence(VIEWS, xyz, surfaces, cell, rays, silent)
-    assert found.through[-1] == 3
-    assert found.confirmed[-1] == 0
-    assert found.confirmed[:-1].max() == 1
-    assert found.through[:-1].max() == 0

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 
 import splatseed as ss
-from splatseed.errors import ParameterError, PointCloudError
+from splatseed.errors import PointCloudError
 from splatseed.seeding.clouds.method import Cloud
 from splatseed.similarity import Similarity
 from splatseed.upsample.registry import SOURCE_CODES
@@ -88,17 +87,6 @@ def test_a_grid_far_away_and_another_scale_lose_nothing(room, scan, seeds, tmp_p
     assert np.quantile(KDTree(first.xyz).query(again.xyz)[0], 0.99) < 1e-4
 
 
-def test_the_number_of_threads_does_not_matter(room, path, seeds):
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
-    try:
-        again = ss.upsample(room, Cloud().of(path))
-    finally:
-        numba.set_num_threads(threads)
-    np.testing.assert_array_equal(again.xyz, seeds[0].xyz)
-    np.testing.assert_array_equal(again.rgb, seeds[0].rgb)
-
-
 def test_colours_from_photographs_where_the_cloud_has_none(room, scan, tmp_path):
     np.savez(tmp_path / "bare.npz", xyz=scan[0][:NUM])
     bare = ss.upsample(room, Cloud(clean=False).of(tmp_path / "bare.npz"))
@@ -111,7 +99,7 @@ def test_colours_from_photographs_where_the_cloud_has_none(room, scan, tmp_path)
 
 
 def test_beside_cover_and_a_budget(room, path):
-    both = ss.upsample(room, "cover", beside=Cloud().of(path), budget="8k")
+    both = ss.upsample(room, "cover", extra_method=Cloud().of(path), budget="8k")
     assert len(both) == 8000
     assert {0, CLOUD} <= set(both.source)
     alone = ss.upsample(room, "cover")
@@ -128,25 +116,3 @@ def test_what_is_elsewhere_is_refused(room, scan, tmp_path):
     refused(room, far, "none of 153,000.*--align.*--transform")
     turned = written(tmp_path, (0.7 * scan[0][:, [2, 0, 1]] + (0.4, -1, 0.5), scan[1]))
     refused(room, turned, "of another place")
-
-
-def test_nothing_but_nan_is_refused(room, tmp_path):
-    np.savez(tmp_path / "nan.npz", xyz=np.full((9, 3), np.nan))
-    refused(room, tmp_path / "nan.npz", "9 that are not finite")
-    np.savez(tmp_path / "none.npz", xyz=np.zeros((0, 3)))
-    refused(room, tmp_path / "none.npz", "found none")
-
-
-def test_a_corner_is_told(room, scan, tmp_path):
-    corner = (scan[0] > (0.2, 0.2, 0)).all(axis=1)
-    notes = []
-    path = written(tmp_path, (scan[0][corner], scan[1][corner]))
-    ss.upsample(room, Cloud().of(path), note=notes.append)
-    assert any("covers" in note and "--method auto" in note for note in notes)
-
-
-def test_without_a_file_or_cameras(room, path):
-    with pytest.raises(ParameterError, match="--cloud FILE"):
-        ss.upsample(room, "cloud")
-    with pytest.raises(ParameterError, match="a scene with cameras"):
-        ss.upsample(room.points, Cloud().of(path))

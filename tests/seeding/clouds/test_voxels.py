@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from splatseed.seeding.clouds.support import find_support
+from splatseed.seeding.clouds.judging import find_support
 from splatseed.seeding.clouds.voxels import ASIDE, EvenVoxels, Voxels
 from splatseed.views.view import View
 
@@ -76,15 +76,6 @@ def test_chunks_do_not_matter_and_no_point_is_lost(size, capacity):
     assert whole.count.sum() + whole.unseen == len(xyz)
     for name in ("xyz", "rgb", "count", "side"):
         np.testing.assert_array_equal(getattr(whole, name), getattr(parts, name))
-
-
-def test_millions_of_duplicates_are_one_voxel():
-    voxels = Voxels(VIEWS, 2.0, 64)
-    for _ in range(4):
-        voxels.add(np.tile([[0.0, 0.0, 3.0]], (250_000, 1)), np.full((250_000, 3), 9, np.uint8))
-    assert len(voxels) == 1
-    assert voxels.count[0] == 1_000_000
-    np.testing.assert_allclose(voxels.xyz[0], (0, 0, 3))
 
 
 def test_even_voxels_fit_their_capacity_at_the_smallest_side(rng):

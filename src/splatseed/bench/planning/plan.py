@@ -27,7 +27,7 @@ from splatseed.bench.planning.records import (
 from splatseed.bench.planning.scenes import SceneFacts
 from splatseed.errors import ParameterError
 from splatseed.literal import did_you_mean
-from splatseed.seeding.amounts import RHO, parse_budget
+from splatseed.seeding.upsampling import RHO, parse_budget
 from splatseed.train.settings import Backend, StrategyName, TrainSettings
 from splatseed.upsample import METHODS, Profile, Upsampler, chooses_number, configure
 

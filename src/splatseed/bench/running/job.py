@@ -36,9 +36,9 @@ from splatseed.process.peak import peak_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
-from splatseed.seeding.upsampling import DEFAULT_METHOD
+from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.train.depths import stereo_size
-from splatseed.views.photographs import user_cache_dir
+from splatseed.views.view import user_cache_dir
 
 if TYPE_CHECKING:  # PyTorch, which takes a while
     from splatseed.evaluate import Covisible

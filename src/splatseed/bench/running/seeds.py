@@ -22,9 +22,9 @@ from splatseed.kernels.compilation import watched
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
+from splatseed.seeding.advice import DEFAULT_METHOD
 from splatseed.seeding.clouds.method import Cloud
-from splatseed.seeding.thinning import thin_to
-from splatseed.seeding.upsampling import CELL, DEFAULT_METHOD, upsample
+from splatseed.seeding.upsampling import CELL, thin_to, upsample
 from splatseed.upsample import Upsampler, chooses_number, configure
 
 PLAIN = "linear"
@@ -122,8 +122,8 @@ def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
         begin = f"{CLOUD}."
         own = {name: v for name, v in spec.parameters.items() if not name.startswith(begin)}
         cloud = {n.removeprefix(begin): v for n, v in spec.parameters.items() if n not in own}
-        beside = Cloud(**cloud).of(spec.cloud_path)
-        return configure(plain(arm.method), arm.profile, **own), {"beside": beside}
+        extra = Cloud(**cloud).of(spec.cloud_path)
+        return configure(plain(arm.method), arm.profile, **own), {"extra_method": extra}
     method = configure(arm.method, arm.profile, **spec.parameters)
     if chooses_number(arm.method):
         return method, {}

@@ -25,7 +25,7 @@ from splatseed.seeding.diagnostics import GeometryScore, measure, spacing
 from splatseed.synthetic import Capture, make_capture, write_capture
 from splatseed.upsample import methods_for
 from splatseed.view.clouds import preview_errors, preview_methods, preview_pair
-from splatseed.views.viewpoint import choose_camera
+from splatseed.views.visibility import choose_camera
 
 if TYPE_CHECKING:  # which imports this module
     from splatseed.commands.demo import Options

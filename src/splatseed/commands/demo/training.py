@@ -19,7 +19,7 @@ from splatseed.evaluate import evaluate_views
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scores import TrainingResult
-from splatseed.seeding.poses_alone.random_start import random_start
+from splatseed.seeding.poses import random_start
 from splatseed.splat.pictures import FULL_ERROR, error_map
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings

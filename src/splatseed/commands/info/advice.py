@@ -5,7 +5,7 @@ Promise: nothing is written; without ``looked_at`` no photograph is opened.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -15,19 +15,14 @@ from splatseed.commands.options import parse_options
 from splatseed.commands.planned import Planned
 from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
-from splatseed.io.output.earlier import was_upsampled
 from splatseed.lens import undistort_command, undistorted
 from splatseed.literal import quoted
-from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.advice import (
     AS_IT_IS,
     SEEDED,
     Advice,
-    Measured,
-    advise,
-    measure,
-    stereo_agreement,
+    advice_for,
 )
 from splatseed.seeding.diagnostics import empty_regions, is_distorted, untrainable
 from splatseed.train.schedule import FULL_RUN
@@ -42,38 +37,9 @@ Budget = Annotated[
 ]
 
 
-def advice_for(
-    scene: Scene, planned: Planned, empty: float | None, progress: Progress | None = None
-) -> tuple[Advice, Measured]:
-    """What to do, and the measurements on which that rests.
-
-    Args:
-        scene: The scene.
-        planned: How it will be trained.
-        empty: Share of the photographs' cells without points, if known.
-        progress: Told how much is done. Given this, stereo is tried on a few photographs, if there
-            is room for new points.
-    """
-    measured = measure(scene, empty)
-    if was_upsampled(scene) and len(scene.points):
-        return _seeded(scene), measured
-    said = advise(measured, planned.most_seeds, strategy=planned.strategy)
-    if progress is not None and said.method == "auto" and measured.num_points:
-        measured = replace(measured, agreement=stereo_agreement(scene, progress=progress))
-        said = advise(measured, planned.most_seeds, strategy=planned.strategy)
-    return said, measured
-
-
-def _seeded(scene: Scene) -> Advice:
-    """The advice for a scene that ``splatseed upsample`` wrote."""
-    kept = scene.points.num_original
-    made = f"splatseed upsample made {len(scene.points) - kept:,} of its points and kept {kept:,}."
-    return Advice(SEEDED if scene.has_photographs else AS_IT_IS, (made,))
-
-
-def advice_rows(advice: Advice, measured: Measured, planned: Planned) -> list[tuple[str, str]]:
+def advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
     """The advice as a table's rows: what, why, and for which training."""
-    layout = [("cameras stand", measured.layout)] if measured.layout else []
+    layout = [("cameras stand", stand)] if (stand := advice.measured.layout) else []
     why = [("why" if i == 0 else "", reason) for i, reason in enumerate(advice.reasons)]
     plan = (
         f"{planned.budget:,} Gaussians at most, {planned.max_steps:,} steps, strategy "
@@ -147,8 +113,10 @@ def run_advice(arguments: list[str]) -> None:
         planned = Planned.of(scene, options.budget, options.max_steps)
         regions = empty_regions(scene, clock)
         empty = None if regions is None else regions.mean
-        advice, measured = advice_for(scene, planned, empty, clock)
-    print_pairs(str(options.scene), advice_rows(advice, measured, planned))
+        advice = advice_for(
+            scene, planned.most_seeds, strategy=planned.strategy, empty=empty, progress=clock
+        )
+    print_pairs(str(options.scene), advice_rows(advice, planned))
     commands = advice_commands(options.scene, scene, advice, planned)
     tunes = any("splatseed tune" in command for _, command in commands)
     tests = "; splatseed tune tests this very scene" if tunes else ""

@@ -19,7 +19,7 @@ from splatseed.scene import Scene
 from splatseed.seeding.diagnostics import CloudStatistics, EmptyRegions, TrackStatistics
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
-    from splatseed.depth import Alignment
+    from splatseed.depth.alignment import Alignment
 
 
 def print_json(

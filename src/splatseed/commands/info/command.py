@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands.depth.next_steps import number_for, use
-from splatseed.commands.info.advice import advice_commands, advice_for, advice_rows
+from splatseed.commands.info.advice import advice_commands, advice_rows
 from splatseed.commands.info.as_json import print_json
 from splatseed.commands.info.poses import Poses, look_at_poses
 from splatseed.commands.options import parse_options
@@ -26,6 +26,7 @@ from splatseed.io.output.earlier import was_upsampled
 from splatseed.io.output.staging import check_parents
 from splatseed.literal import quoted, visible
 from splatseed.scene import Scene
+from splatseed.seeding.advice import advice_for
 from splatseed.seeding.diagnostics import (
     EMPTY_CELLS,
     CloudStatistics,
@@ -40,7 +41,7 @@ from splatseed.seeding.diagnostics import (
 from splatseed.train.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
-    from splatseed.depth import Alignment
+    from splatseed.depth.alignment import Alignment
 
 KINDS_SHOWN = 3
 """Kinds of cameras listed; collections of photographs from the web have one per photograph."""
@@ -155,7 +156,7 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
     """How each map fits the SfM points, drawn if requested; None if no maps were named."""
     if options.depth is None:
         return None
-    from splatseed.depth import align  # noqa: PLC0415  (loads Numba)
+    from splatseed.depth.alignment import align  # noqa: PLC0415  (loads Numba)
 
     alignments = align(scene, progress=clock)
     if options.picture is not None:
@@ -187,7 +188,7 @@ def _next_commands(
     advised, refine = [], poses is not None and poses.refine
     if len(scene.points) or ((poses is None or poses.usable) and scene.has_photographs):
         planned = Planned.of(scene, options.budget, options.max_steps)
-        advice, _ = advice_for(scene, planned, None)
+        advice = advice_for(scene, planned.most_seeds, strategy=planned.strategy)
         advised = advice_commands(options.scene, scene, advice, planned, refine=refine)[:1]
     if len(scene.points):
         return [("", advised[0][1])]
@@ -282,7 +283,8 @@ def _advice_rows(
         return []
     planned = Planned.of(scene, options.budget, options.max_steps)
     empty = None if regions is None else regions.mean
-    return advice_rows(*advice_for(scene, planned, empty), planned)
+    said = advice_for(scene, planned.most_seeds, strategy=planned.strategy, empty=empty)
+    return advice_rows(said, planned)
 
 
 def _region_rows(regions: EmptyRegions | None) -> list[tuple[str, str]]:

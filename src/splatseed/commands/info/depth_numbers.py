@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from splatseed.console import OUT, print_pairs, print_table
-from splatseed.depth import Alignment
+from splatseed.depth.alignment import Alignment
 from splatseed.depthmap import DepthKind, DepthMap, DepthMaps
 from splatseed.scene import Scene
 

@@ -11,7 +11,7 @@ from splatseed.scene import Scene
 from splatseed.seeding.photographs import has_points, photographed
 
 if TYPE_CHECKING:  # kernels load with its use
-    from splatseed.seeding.poses_alone.pose_error import PoseError
+    from splatseed.seeding.poses import PoseError
 
 REFINE = "--refine-poses"
 """What problems that it can mend name."""
@@ -56,8 +56,7 @@ def look_at_poses(scene: Scene, progress: Progress) -> Poses | None:
     """Compare a few photographs of a scene without points; None with points or without any."""
     if has_points(scene) or not scene.has_photographs:
         return None
-    from splatseed.seeding.poses_alone.pose_check import check_poses  # noqa: PLC0415  (loads Numba)
-    from splatseed.seeding.poses_alone.pose_error import pose_error  # noqa: PLC0415  (loads with its use)
+    from splatseed.seeding.poses import check_poses, pose_error  # noqa: PLC0415  (loads Numba)
 
     try:
         images = photographed(scene)

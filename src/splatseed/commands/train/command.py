@@ -40,7 +40,7 @@ from splatseed.process.interruption import exit_code
 from splatseed.requirements import require
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
-from splatseed.seeding.amounts import parse_budget
+from splatseed.seeding.upsampling import parse_budget
 from splatseed.train.folder import RunFolder
 from splatseed.train.seeds import why_not_seeded
 from splatseed.train.settings import (
@@ -52,8 +52,7 @@ from splatseed.train.settings import (
     StrategyName,
     TrainSettings,
 )
-from splatseed.views.photographs import user_cache_dir
-from splatseed.views.view import poses_of
+from splatseed.views.view import poses_of, user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun

@@ -23,9 +23,9 @@ from splatseed.scene import Scene
 from splatseed.similarity import Similarity
 
 if TYPE_CHECKING:
-    from splatseed.seeding.alignment.align import Alignment
+    from splatseed.seeding.alignment.align import CloudAlignment
     from splatseed.seeding.clouds.method import Cloud
-    from splatseed.seeding.clouds.streaming import MemoryPlan
+    from splatseed.seeding.clouds.voxels import MemoryPlan
 
 CLOUD = "cloud"
 RECENTER = "recenter.json"
@@ -98,7 +98,7 @@ class Brought(NamedTuple):
     scene: Scene
     method: Cloud
     """The method ``cloud``, with its files if there are any."""
-    alignment: Alignment | None = None
+    alignment: CloudAlignment | None = None
     offset: Float64[np.ndarray, " 3"] | None = None
     """What was subtracted from all coordinates of the scene."""
     files: tuple[Path, ...] = ()

@@ -55,10 +55,10 @@ from splatseed.literal import counted, visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.process.memory import bytes_of
 from splatseed.scene import Scene
+from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.diagnostics import far_share
 from splatseed.seeding.photographs import photographed
-from splatseed.seeding.thinning import points_within
-from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for, share_covered, upsample
+from splatseed.seeding.upsampling import points_within, share_covered, upsample
 from splatseed.upsample import (
     METHODS,
     Profile,
@@ -306,10 +306,10 @@ def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
     number = number_words(total, most, changed_by)
     _announce(options, scene, method, number, _idle(options, methods), brought.takes)
     with stage_display(clock):
-        beside = None
+        extra_method = None
         if options.cloud_files and options.method != CLOUD:
-            beside = dataclasses.replace(cast("GivenClouds", methods[CLOUD]), alone=False)
-        seeds = _make(options, scene, method, beside, total, clock, notes)
+            extra_method = dataclasses.replace(cast("GivenClouds", methods[CLOUD]), alone=False)
+        seeds = _make(options, scene, method, extra_method, total, clock, notes)
         clock("check", 0.0)
         checks = _check(scene, seeds, method)
         clock("write", 0.0)
@@ -393,7 +393,7 @@ def _make(
     options: Options,
     scene: Scene,
     method: Upsampler,
-    beside: Upsampler | None,
+    extra_method: Upsampler | None,
     total: int | None,
     clock: StageClock,
     notes: list[str],
@@ -401,7 +401,8 @@ def _make(
     """The originals and the new points."""
     return upsample(
         scene, method, num_points=total, budget=options.budget, cover=options.cover_cell,
-        verify=options.verify, beside=beside, seed=options.seed, progress=clock, note=notes.append,
+        verify=options.verify, extra_method=extra_method, seed=options.seed, progress=clock,
+        note=notes.append,
     )  # fmt: skip
 
 

@@ -31,7 +31,7 @@ from splatseed.pointcloud import PointCloud
 from splatseed.process.memory import free_memory, option_of, words_of
 from splatseed.progress import Progress
 from splatseed.scene import Scene
-from splatseed.seeding.upsampling import DEFAULT_METHOD, method_for
+from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.upsample import BYTES_EACH, Upsampler, planned_size, traits_of
 from splatseed.upsample.registry import source_code
 

@@ -6,7 +6,7 @@ A *rival* is another alignment, turned by more than ``TURNED`` degrees, scaled b
 ``SCALED`` or shifted by more than ``SHIFTED`` extents. The *error* is the standard error of the
 alignment at the farthest corner of the marks, whatever their variances: it is large where the cloud
 lets the scene slide. It is that of the marks: a principal point that is off moves all of them at
-once, and the *sway* is how far half a pixel of it would turn the alignment.
+once, and the *sensitivity* is how far half a pixel of it would turn the alignment.
 Promise: an alignment is returned only if most marks lie on the cloud, no rival is nearly as good,
 and the error is small; else the reason is told.
 """
@@ -19,15 +19,15 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, UInt8
+from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.alignment.coarse import Unit, find_starts
-from splatseed.seeding.alignment.icp import Fitted, Surface, fit
+from splatseed.seeding.alignment.icp import Fitted, Surface, fit, polish
 from splatseed.seeding.alignment.marks import LEAST_MARKS, MOST_MARKS, Marks, find_marks
-from splatseed.seeding.alignment.polish import polish
-from splatseed.seeding.alignment.sampling import CloudSample, normals_of, sample_cloud
+from splatseed.seeding.clouds.voxels import normals_of, sample_cloud
 from splatseed.similarity import Similarity
 
 ROUNDS = (
@@ -57,7 +57,7 @@ _FIX = "Give the transform with --transform FILE, or bring more of the scene in 
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class CloudAlignment:
     """Where a cloud lies in a scene.
 
     Args:
@@ -66,7 +66,8 @@ class Alignment:
         residual: Median distance of these from the surface, scene units.
         error: Standard error at the farthest corner, scene units.
         turn: Standard error of the rotation, degrees.
-        sway: Degrees that it would be turned by were the principal points off by half a pixel.
+        principal_point_sensitivity: Degrees that it would be turned by were the principal points
+            off by half a pixel.
         extent: Of the marks, scene units.
         likeness: Correlation of brightness between marks and cloud, -1 to 1; None without colours.
         rival: Share of the best rival; 0 without one.
@@ -81,7 +82,7 @@ class Alignment:
     residual: float
     error: float
     turn: float
-    sway: float
+    principal_point_sensitivity: float
     extent: float
     likeness: float | None
     rival: float
@@ -101,7 +102,7 @@ class Alignment:
             "median_residual": self.residual,
             "standard_error": self.error,
             "standard_error_degrees": self.turn,
-            "degrees_by_half_a_pixel": self.sway,
+            "degrees_by_half_a_pixel": self.principal_point_sensitivity,
             "extent": self.extent,
             "likeness_of_colours": self.likeness,
             "share_of_next_best": self.rival,
@@ -123,10 +124,10 @@ class Alignment:
         doubts = ""
         if 2 * self.turn > EXACT:
             doubts += f" Warning: it may be turned by more than {EXACT:g} degrees."
-        if self.sway > EXACT / 2:
+        if self.principal_point_sensitivity > EXACT / 2:
             doubts += (
                 " The photographs stand so close together that principal points half a pixel off "
-                f"would turn it by {self.sway:.2g} degrees."
+                f"would turn it by {self.principal_point_sensitivity:.2g} degrees."
             )
         return doubts
 
@@ -139,7 +140,7 @@ class _Candidate:
     share: float
 
 
-def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> Alignment:
+def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> CloudAlignment:
     """Find where clouds lie in a scene.
 
     Args:
@@ -157,29 +158,31 @@ def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> A
     progress("align", 0.0)
     unit_of_marks, unit_of_cloud = Unit.of(marks.xyz), Unit.of(sample.xyz)
     small = marks.through(unit_of_marks.similarity)
-    surface = _surface_of(unit_of_cloud.similarity.points(sample.xyz))
+    cloud = unit_of_cloud.similarity.points(sample.xyz)
+    tree = cKDTree(cloud, balanced_tree=False)
+    surface = Surface(cloud, normals_of(cloud, tree), tree)
     first, *others = _candidates(surface, small.xyz, progress)
-    best, sway = _polished(surface, small, first)
+    best, sensitivity = _polished(surface, small, first)
     rival = next((each for each in others if _differs(best.fitted, each.fitted)), None)
-    told = rival is not None and _unlike(best, rival, surface, small, sample.rgb)
+    likeness = _likeness(best, surface, small, sample.rgb)
+    if rival is not None and likeness is not None and likeness > LIKE:
+        # Colours may tell the best from its rival.
+        told = (_likeness(rival, surface, small, sample.rgb) or 0.0) < UNLIKE
+    else:
+        told = False
     error = _error(best.fitted, small.xyz)
     _check(best, None if told else rival, error)
-    to_unit = _recentred(sample, unit_of_cloud).then(best.fitted.cloud_from_scene.inverse)
+    # The offset in double precision, then to unit size.
+    centred = Similarity(1.0, np.eye(3), -sample.offset).then(unit_of_cloud.similarity)
+    to_unit = centred.then(best.fitted.cloud_from_scene.inverse)
     to_scene = to_unit.then(unit_of_marks.similarity.inverse)
     extent, residuals = unit_of_marks.extent, best.fitted.residuals
-    return Alignment(
+    return CloudAlignment(
         to_scene, best.share, float(np.median(residuals[residuals < CLOSE])) * extent,
-        error * extent, np.degrees(best.fitted.turn), np.degrees(sway), extent,
-        _likeness(best, surface, small, sample.rgb), rival.share if rival else 0.0, marks.xyz,
+        error * extent, np.degrees(best.fitted.turn), np.degrees(sensitivity), extent,
+        likeness, rival.share if rival else 0.0, marks.xyz,
         residuals * extent, to_scene.points(sample.xyz + sample.offset), sample.rgb,
     )  # fmt: skip
-
-
-def _surface_of(cloud: Float64[np.ndarray, "N 3"]) -> Surface:
-    from scipy.spatial import cKDTree  # noqa: PLC0415  (slow to import)
-
-    tree = cKDTree(cloud, balanced_tree=False)
-    return Surface(cloud, normals_of(cloud, tree), tree)
 
 
 def _candidates(
@@ -212,26 +215,12 @@ def _candidates(
 
 
 def _polished(surface: Surface, marks: Marks, candidate: _Candidate) -> tuple[_Candidate, float]:
-    """A candidate after the last stage, and its sway in radians; as it was where that fails."""
+    """A candidate after the last stage, or as it was, and its sensitivity in radians."""
     polished = polish(surface, marks, candidate.fitted.cloud_from_scene, CLOSE)
     if polished is None:
         return candidate, 0.0
     share = float(np.mean(polished.fitted.residuals < CLOSE))
-    return _Candidate(polished.fitted, share), float(np.linalg.norm(polished.sway)) / 2
-
-
-def _unlike(
-    best: _Candidate,
-    rival: _Candidate,
-    surface: Surface,
-    marks: Marks,
-    rgb: UInt8[np.ndarray, "N 3"] | None,
-) -> bool:
-    """Whether colours tell the best from its rival."""
-    likeness = _likeness(best, surface, marks, rgb)
-    if likeness is None or likeness <= LIKE:
-        return False
-    return (_likeness(rival, surface, marks, rgb) or 0.0) < UNLIKE
+    return _Candidate(polished.fitted, share), float(np.linalg.norm(polished.sensitivity)) / 2
 
 
 def _different(candidates: list[_Candidate]) -> list[_Candidate]:
@@ -308,8 +297,3 @@ def _check(best: _Candidate, rival: _Candidate | None, error: float) -> None:
 
 def _unsure(found: str) -> PointCloudError:
     return PointCloudError("one alignment of the cloud that is sure", found=found, fix=_FIX)
-
-
-def _recentred(sample: CloudSample, unit: Unit) -> Similarity:
-    """From the cloud's file to its unit frame, with the offset in double precision."""
-    return Similarity(1.0, np.eye(3), -sample.offset).then(unit.similarity)

@@ -22,6 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.fft import irfftn, rfftn
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial.transform import Rotation
 
 from splatseed.progress import Progress, silent
 from splatseed.similarity import Similarity
@@ -95,8 +98,6 @@ def find_starts(
         num: How many starts.
         progress: Told how far it is.
     """
-    from scipy.fft import rfftn  # noqa: PLC0415  (slow to import)
-
     distances, some = _distances(cloud), even(marks, EVEN)
     fields = [rfftn(np.maximum(FAR - distances / scale, 0).astype(np.float32)) for scale in SCALES]
     spread = spread_rotations(ROTATIONS)
@@ -114,8 +115,6 @@ def _correlate(
     progress: Progress,
 ) -> Starts:
     """Each rotation with its best scale and shift."""
-    from scipy.fft import irfftn, rfftn  # noqa: PLC0415  (slow to import)
-
     shape, side = (CELLS,) * 3, 2 * HALF / CELLS
     reward = np.full(len(rotations), -np.inf)
     scale, shift = np.empty(len(rotations)), np.empty((len(rotations), 3))
@@ -138,8 +137,6 @@ def _correlate(
 
 def _around(rotations: Float64[np.ndarray, "n 3 3"]) -> Float64[np.ndarray, "m 3 3"]:
     """Rotations a little off each of these, about all axes."""
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
-
     turns = [turn for turn in product(AROUND, repeat=3) if any(turn)]
     small = Rotation.from_rotvec(np.radians(turns)).as_matrix()
     return np.asarray(rotations[:, None] @ small).reshape(-1, 3, 3)
@@ -169,8 +166,6 @@ def spread_rotations(num: int) -> Float64[np.ndarray, "n 3 3"]:
 
 def _distances(cloud: Float64[np.ndarray, "N 3"]) -> np.ndarray:
     """Distances to the cloud at the centres of the grid's cells, float32."""
-    from scipy.ndimage import distance_transform_edt  # noqa: PLC0415  (slow to import)
-
     side = 2 * HALF / CELLS
     place = np.floor((cloud + HALF) / side).astype(np.int64)
     place = place[((place >= 0) & (place < CELLS)).all(axis=1)]

@@ -4,8 +4,8 @@ Notation: mark X was observed by cameras k with Jacobians J_k = d pixel / d X [2
 sigma pixels in each coordinate its covariance is sigma^2 (sum J_k^T J_k)^-1, to first order
 (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., sec. 5.2): long along the rays where
 cameras stand close together. If all principal points were off by c pixels, it would lie off by
--(sum J_k^T J_k)^-1 (sum J_k^T) c: its *sway*, which all marks share, so that no number of marks
-makes it smaller.
+-(sum J_k^T J_k)^-1 (sum J_k^T) c: its *sensitivity*, which all marks share, so that no number of
+marks makes it smaller.
 Promise: marks without tracks get the median variance of the others, in all directions.
 """
 
@@ -41,20 +41,20 @@ class Marks:
         brightness: 0 to 255, float64 [M].
         covariance: Of the positions, scene units squared, float64 [M, 3, 3]; 0 where none of the
             marks has a track.
-        sway: How far each moves per pixel of the principal points in x and y, scene units, float64
-            [M, 3, 2].
+        sensitivity: How far each moves per pixel of the principal points in x and y, scene units,
+            float64 [M, 3, 2].
     """
 
     xyz: Float64[np.ndarray, "M 3"]
     brightness: Float64[np.ndarray, " M"]
     covariance: Float64[np.ndarray, "M 3 3"]
-    sway: Float64[np.ndarray, "M 3 2"]
+    sensitivity: Float64[np.ndarray, "M 3 2"]
 
     def through(self, similarity: Similarity) -> Marks:
         """The marks in another frame."""
         A = similarity.scale * similarity.rotation
         xyz = similarity.points(self.xyz)
-        return Marks(xyz, self.brightness, A @ self.covariance @ A.T, A @ self.sway)
+        return Marks(xyz, self.brightness, A @ self.covariance @ A.T, A @ self.sensitivity)
 
 
 def find_marks(scene: Scene) -> Marks:
@@ -76,20 +76,20 @@ def find_marks(scene: Scene) -> Marks:
     which = np.flatnonzero(own)
     which = which[:: -(-len(which) // MOST_MARKS)]
     xyz = points.xyz[which].astype(np.float64)
-    covariance, sway = np.full((len(which), 3, 3), np.nan), np.zeros((len(which), 3, 2))
+    covariance, sensitivity = np.full((len(which), 3, 3), np.nan), np.zeros((len(which), 3, 2))
     if tracks is not None:
         tracked = which < len(tracks)
         chosen = tracks.select(np.isin(np.arange(len(tracks)), which))
         xyz[tracked] = chosen.xyz
-        covariance[tracked], sway[tracked] = triangulation(chosen, scene.images)
+        covariance[tracked], sensitivity[tracked] = triangulation(chosen, scene.images)
     brightness = points.rgb[which].astype(np.float64).mean(axis=1)
-    return Marks(xyz, brightness, _filled(covariance), sway)
+    return Marks(xyz, brightness, _filled(covariance), sensitivity)
 
 
 def triangulation(
     tracks: Tracks, images: tuple[Image, ...]
 ) -> tuple[Float64[np.ndarray, "N 3 3"], Float64[np.ndarray, "N 3 2"]]:
-    """Covariance and sway of triangulated points, in scene units (squared) and per pixel.
+    """Covariance and sensitivity of triangulated points, in scene units (squared) and per pixel.
 
     Args:
         tracks: The points.

@@ -22,15 +22,14 @@ from splatseed.errors import ParameterError, PointCloudError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views
-from splatseed.seeding.thinning import frames_of
+from splatseed.seeding.upsampling import frames_of
 from splatseed.similarity import Similarity
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
-    from splatseed.seeding.clouds.evidence import FreeRays
-    from splatseed.seeding.clouds.judging import Judged
-    from splatseed.seeding.clouds.streaming import MemoryPlan, Streamed
+    from splatseed.seeding.clouds.judging import FreeRays, Judged
+    from splatseed.seeding.clouds.voxels import MemoryPlan, Streamed
     from splatseed.views.view import View
 
 FITS = 0.2
@@ -44,12 +43,8 @@ UNKNOWN = 0.5
 CORNER = 0.5
 """Below this share of the photographs' cells, a note says how little the cloud covers."""
 CELL = 8
-DEGREES = 0.01
-"""Extent to the sides over height, below which coordinates may be degrees: a degree is 100 km."""
 GRID = 1e5
 """Coordinates from here on, in metres, are those of a national grid."""
-TWO = 2
-"""Photographs that stereo compares at least."""
 
 
 @dataclass(frozen=True)
@@ -124,9 +119,15 @@ class GivenClouds(Cloud):
         Raises:
             ParameterError: The scene has no cameras, or the memory is not enough.
         """
-        from splatseed.seeding.clouds.streaming import plan_memory  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.clouds.voxels import plan_memory  # noqa: PLC0415  (loads Numba)
 
-        return plan_memory(self.memory, _frames(scene))
+        if not scene.images:
+            raise ParameterError(
+                "a scene with cameras, which choose among the points of a cloud",
+                found="none",
+                fix="Name the scene of the photographs; for a cloud alone: --method mls or linear.",
+            )
+        return plan_memory(self.memory, frames_of(scene))
 
     def __call__(
         self,
@@ -143,11 +144,10 @@ class GivenClouds(Cloud):
             PointCloudError: No point is in view, or the cloud does not fit the scene.
             ParameterError: The scene has no cameras, or the memory is not enough.
         """
-        from splatseed.seeding.clouds.streaming import stream  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.clouds.voxels import stream  # noqa: PLC0415  (loads Numba)
 
-        frames, capacity = _frames(scene), self.plan(scene).capacity
-        paths = [Path(each) for each in self.files]
-        streamed = stream(paths, self.transform, frames, self.pixels, capacity, progress)
+        capacity, paths = self.plan(scene).capacity, [Path(each) for each in self.files]
+        streamed = stream(paths, self.transform, frames_of(scene), self.pixels, capacity, progress)
         _check_in_view(streamed, scene)
         return self._choose(scene, streamed, rng, progress)
 
@@ -156,10 +156,13 @@ class GivenClouds(Cloud):
     ) -> NewPoints:
         """The points that stay, their colours, and notes."""
         from splatseed.seeding.clouds.judging import judge  # noqa: PLC0415  (loads Numba)
+        from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (loads Numba)
         from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
-        voxels, images = streamed.voxels, _images(scene, self.hold_out)
-        views = _views(scene, images, progress)
+        voxels, images, views = streamed.voxels, scene.images, frames_of(scene)
+        if scene.has_photographs:
+            images = photographed(scene, self.hold_out)
+            views = read_views(scene, images, MAX_SIZE, progress)
         visibility = find_visibility(scene)
         nothing = np.empty((0, 3))
         seen = [visibility.of(image) if len(visibility.xyz) else nothing for image in images]
@@ -173,36 +176,22 @@ class GivenClouds(Cloud):
         rgb = evidence.rgb if own is None else own[judged.kept]
         if scene.has_photographs and (self.recolor or not colored):
             rgb = evidence.rgb
-        notes = (*_read_notes(streamed), *_check_fit(judged), *_fates(judged, len(voxels)))
+        gone = [f"{count:,} {reason}" for reason, count in judged.reasons.items() if count]
+        gone = [f"{judged.hidden:,} are hidden in every photograph", *gone]
+        kept = f"Kept {len(judged.kept):,} of {len(voxels):,} merged points: {', '.join(gone)}."
+        notes = (*_read_notes(streamed), *_check_fit(judged), kept)
         if scene.has_photographs and not colored:
             lacks = "no colours" if own is None else "intensity only"
             notes = (*notes, f"The cloud has {lacks}: colours are those of the photographs.")
+        share = covered_share(frames_of(scene), xyz, CELL, silent)
+        if share < CORNER:
+            hint = ": --method auto beside --cloud seeds the rest" if self.alone else ""
+            notes = (*notes, f"The cloud covers {share:.0%} of the photographs{hint}.")
         return NewPoints(
-            xyz, rgb, (*notes, *_note_on_cover(scene, xyz, alone=self.alone)),
+            xyz, rgb, notes,
             confidence=np.nan_to_num(evidence.agreement, nan=UNKNOWN),
             source=np.full(len(xyz), source_code("cloud"), np.uint8),
         )  # fmt: skip
-
-
-def _frames(scene: Scene) -> tuple[View, ...]:
-    if not scene.images:
-        raise ParameterError(
-            "a scene with cameras, which choose among the points of a cloud",
-            found="none",
-            fix="Name the scene of the photographs; for a cloud alone: --method mls or linear.",
-        )
-    return frames_of(scene)
-
-
-def _images(scene: Scene, hold_out: int) -> tuple[Image, ...]:
-    return photographed(scene, hold_out) if scene.has_photographs else scene.images
-
-
-def _views(scene: Scene, images: Sequence[Image], progress: Progress) -> tuple[View, ...]:
-    """The photographs, or their frames alone if there are none."""
-    if scene.has_photographs:
-        return read_views(scene, images, MAX_SIZE, progress)
-    return frames_of(scene)
 
 
 def _free_rays(
@@ -214,10 +203,10 @@ def _free_rays(
     progress: Progress,
 ) -> FreeRays | None:
     """Where rays are known to be free: up to tracked points, and up to what stereo confirms."""
-    from splatseed.seeding.clouds.evidence import FreeRays  # noqa: PLC0415  (loads Numba)
+    from splatseed.seeding.clouds.judging import FreeRays  # noqa: PLC0415  (loads Numba)
 
     certain = seen if scene.tracks is not None else [np.empty((0, 3))] * len(views)
-    if not scene.has_photographs or len(views) < TWO:
+    if not scene.has_photographs or len(views) < 2:
         return FreeRays.of(views, certain) if scene.tracks is not None else None
     from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
     from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
@@ -242,8 +231,6 @@ def _check_in_view(streamed: Streamed, scene: Scene) -> None:
     fix += "--transform FILE."
     if max(np.abs(streamed.low).max(), np.abs(streamed.high).max()) > GRID:
         fix += " --recenter would move both alike: it is for a scene in the cloud's own grid."
-    if _like_degrees(streamed.low, streamed.high):
-        fix = "They look like longitude and latitude: export the cloud in metres, then --align it."
     raise PointCloudError(
         "points of the cloud in view of the scene's cameras, which stand "
         f"{_span(centers.min(axis=0), centers.max(axis=0))}",
@@ -252,21 +239,13 @@ def _check_in_view(streamed: Streamed, scene: Scene) -> None:
     )
 
 
-def _like_degrees(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> bool:
-    """Whether a cloud is flat as a sheet on edge, as metres above degrees are."""
-    across, up = (high - low)[:2].max(), (high - low)[2]
-    within = max(abs(low[0]), abs(high[0])) <= 180 and max(abs(low[1]), abs(high[1])) <= 90
-    return bool(within and across < DEGREES * up)
-
-
 def _span(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> str:
-    first, last = (", ".join(_plain(value) for value in each) for each in (low, high))
+    """From corner to corner, without an exponent where digits matter."""
+    first, last = (
+        ", ".join(f"{x:.0f}" if GRID <= abs(x) < 1e12 else f"{x:.6g}" for x in each)
+        for each in (low, high)
+    )
     return f"from ({first}) to ({last})"
-
-
-def _plain(value: float) -> str:
-    """A coordinate without an exponent where its digits matter."""
-    return f"{value:.0f}" if GRID <= abs(value) < 1e12 else f"{value:.6g}"
 
 
 def _check_fit(judged: Judged) -> tuple[str, ...]:
@@ -289,14 +268,6 @@ def _check_fit(judged: Judged) -> tuple[str, ...]:
     return (f"The cloud fits: {share} lie at its depth, within 3%{doubt}.",)
 
 
-def _fates(judged: Judged, num: int) -> tuple[str, ...]:
-    """How many voxels stay, and why others do not."""
-    gone = [f"{count:,} {reason}" for reason, count in judged.reasons.items() if count]
-    gone = [f"{judged.hidden:,} are hidden in every photograph", *gone]
-    told = f"{len(judged.kept):,} stay of the {num:,} points that they were merged to"
-    return (f"{told}: {', '.join(gone)}.",)
-
-
 def _read_notes(streamed: Streamed) -> tuple[str, ...]:
     voxels = streamed.voxels
     outside = f"{voxels.unseen:,} of them outside of every photograph"
@@ -310,13 +281,3 @@ def _read_notes(streamed: Streamed) -> tuple[str, ...]:
             "within the memory: pass more --memory."
         )
     return tuple(told)
-
-
-def _note_on_cover(scene: Scene, xyz: np.ndarray, *, alone: bool) -> tuple[str, ...]:
-    from splatseed.seeding.coverage import covered_share  # noqa: PLC0415  (loads Numba)
-
-    share = covered_share(frames_of(scene), xyz, CELL, silent)
-    if share >= CORNER:
-        return ()
-    hint = ": --method auto beside --cloud seeds the rest" if alone else ""
-    return (f"The cloud covers {share:.0%} of the photographs{hint}.",)

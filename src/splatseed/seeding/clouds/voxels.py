@@ -1,24 +1,35 @@
-"""Voxels of a pixel's size, filled while a cloud is read: memory follows the photographs, not it.
+"""Clouds of any size, merged into voxels while they are read: memory follows the photographs.
 
 Notation: the *footprint* of a point is the side of a pixel at its depth, least over the views in
 whose frames it falls. Its voxel has level L and side 2^(L + s), where 2^L is the greatest power of
 two within the footprint, and s, at first 0, counts how often all voxels were made coarser. A voxel
-holds the mean position and colour of its points, and their number.
+holds the mean position and colour of its points, and their number. An even *sample* has voxels of
+one side; its coordinates are relative to ``offset``, the file's first point.
 Promise: the result depends on the points and their order, not on how they were cut into chunks nor
-on the threads. Points that fall in no frame are counted and dropped. When ``capacity`` voxels are
-filled, all are merged with their neighbours into voxels of twice the side.
+on the threads. Coordinates are float64 until they are in the scene's frame, so that those of
+national grids lose nothing; memory holds one chunk and the voxels. Points that fall in no frame are
+counted and dropped. When ``capacity`` voxels are filled, all are merged with their neighbours into
+voxels of twice the side.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int16, Int32, UInt8
+from scipy.spatial import cKDTree
 
+from splatseed.errors import ParameterError, PointCloudError
+from splatseed.io.clouds import CloudChunk, CloudFile, open_cloud
 from splatseed.kernels.hashing import scramble
 from splatseed.kernels.jit import inline, kernel, parallel_range
+from splatseed.process.memory import free_memory, option_of, words_of
+from splatseed.progress import Progress
 from splatseed.seeding.coverage import grid_from_world
+from splatseed.similarity import Similarity
 from splatseed.views.view import View
 
 BYTES_EACH = 320
@@ -289,3 +300,176 @@ def _slot(key, keys, table):  # type: ignore[no-untyped-def]  # Numba's types
     while table[slot] != 0 and keys[table[slot] - 1] != key:
         slot = (slot + np.uint64(1)) & last
     return slot
+
+
+CHUNK = 1 << 19
+"""Points in memory at a time: 50 MB with all that is computed of them."""
+FEWEST, MOST = 1 << 16, 1 << 24
+"""Least and greatest number of voxels."""
+DEFAULT = 4 << 30
+"""Most bytes of memory, unless the user says so."""
+RESERVED = 700_000_000
+"""Bytes for the program, its libraries and a chunk."""
+PER_PIXEL = 8
+"""Bytes for each pixel of the photographs: the pixel, grey as well, and what stereo knows of it."""
+SAMPLE, LEAST_SAMPLE = 1 << 18, 1000
+"""Most and fewest voxels of an even sample."""
+NEIGHBORS = 12
+TEXT_ROW = 40
+"""Bytes of a line of text, to tell how far reading is where the number of lines is not known."""
+
+
+class Streamed(NamedTuple):
+    """What was read."""
+
+    voxels: Voxels
+    files: tuple[CloudFile, ...]
+    bad: int
+    """Points that are not finite."""
+    low: Float64[np.ndarray, " 3"]
+    """Least coordinates of the others in the scene's frame."""
+    high: Float64[np.ndarray, " 3"]
+
+
+class MemoryPlan(NamedTuple):
+    """What seeds from a cloud will take."""
+
+    capacity: int
+    """Most voxels."""
+    memory: int
+    """Most bytes."""
+
+
+class CloudSample(NamedTuple):
+    """An even sample of some clouds in one frame."""
+
+    offset: Float64[np.ndarray, " 3"]
+    """What was subtracted."""
+    xyz: Float64[np.ndarray, "N 3"]
+    rgb: UInt8[np.ndarray, "N 3"] | None
+    """Colours; None if a cloud has none."""
+
+
+def plan_memory(most: int | None, views: Sequence[View]) -> MemoryPlan:
+    """How many voxels fit into memory, beside photographs.
+
+    Args:
+        most: Most bytes; ``DEFAULT`` when None. Never more than is free.
+        views: The views.
+
+    Raises:
+        ParameterError: The program, the photographs and the fewest voxels do not fit.
+    """
+    free = free_memory()
+    allowed = min(DEFAULT if most is None else most, free if free is not None else DEFAULT)
+    fixed = RESERVED + PER_PIXEL * sum(view.width * view.height for view in views)
+    needed = fixed + FEWEST * BYTES_EACH
+    if allowed < needed:
+        asked = most is not None and allowed == most
+        raise ParameterError(
+            f"at least {words_of(needed, up=True)} of memory for a cloud and {len(views):,} "
+            "photographs",
+            found=words_of(allowed) + ("" if asked else ", which are free"),
+            fix=f"Pass {option_of(needed)}." if asked else "Free some, or use a larger machine.",
+        )
+    capacity = min((allowed - fixed) // BYTES_EACH, MOST)
+    return MemoryPlan(capacity, fixed + capacity * BYTES_EACH)
+
+
+def stream(
+    paths: Sequence[Path],
+    scene_from_cloud: Similarity | None,
+    views: Sequence[View],
+    pixels: float,
+    capacity: int,
+    progress: Progress,
+) -> Streamed:
+    """Read clouds into voxels.
+
+    Args:
+        paths: The files.
+        scene_from_cloud: From their frame to the scene's; the same frame when None.
+        views: The views that determine the voxels' sides.
+        pixels: Side of a voxel in pixels.
+        capacity: Most voxels.
+        progress: Told how far it is.
+
+    Raises:
+        SceneNotFoundError: A file is missing.
+        SceneFormatError: One is damaged.
+        PointCloudError: One holds no finite point.
+    """
+    files = tuple(open_cloud(path) for path in paths)
+    painted = all(file.colors != "none" for file in files)
+    voxels = Voxels(views, pixels, capacity)
+    low, high, bad = np.full(3, np.inf), np.full(3, -np.inf), 0
+    for file in files:
+        before = voxels.total
+        for done, chunk in _read(file, progress, "read"):
+            finite = chunk.finite
+            bad += len(chunk) - int(np.count_nonzero(finite))
+            good = chunk if finite.all() else chunk.select(finite)
+            xyz = good.xyz if scene_from_cloud is None else scene_from_cloud.points(good.xyz)
+            if len(xyz):
+                low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
+                voxels.add(np.ascontiguousarray(xyz), good.rgb if painted else None)
+            progress(f"read {file.path.name}", done)
+        if voxels.total == before:
+            raise PointCloudError(
+                f"points with finite coordinates in {file.path}",
+                found=f"{bad:,} that are not finite" if bad else "none",
+                fix="Export the cloud again.",
+            )
+    return Streamed(voxels, files, bad, low, high)
+
+
+def _read(file: CloudFile, progress: Progress, stage: str) -> Iterator[tuple[float, CloudChunk]]:
+    """The chunks of a file, each with the share that is then read."""
+    progress(f"{stage} {file.path.name}", 0.0)
+    expected = file.count or max(file.path.stat().st_size // TEXT_ROW, 1)
+    given = 0
+    for chunk in file.chunks(CHUNK):
+        given += len(chunk)
+        yield min(given / expected, 1.0), chunk
+
+
+def sample_cloud(paths: Sequence[Path], progress: Progress) -> CloudSample:
+    """Read clouds, keeping an even sample.
+
+    Args:
+        paths: The files, in one frame.
+        progress: Told how far it is.
+
+    Raises:
+        SceneNotFoundError: A file is missing.
+        SceneFormatError: One is damaged.
+        PointCloudError: There are too few points.
+    """
+    files = [open_cloud(path) for path in paths]
+    painted = all(file.has_color for file in files)
+    voxels, offset = EvenVoxels(SAMPLE), None
+    for file in files:
+        for done, chunk in _read(file, progress, "look at"):
+            finite = chunk.select(chunk.finite)
+            if len(finite):
+                offset = finite.xyz[0].copy() if offset is None else offset
+                voxels.add(finite.xyz - offset, finite.rgb if painted else None)
+            progress(f"look at {file.path.name}", done)
+    if offset is None or len(voxels) < LEAST_SAMPLE:
+        raise PointCloudError(
+            f"at least {LEAST_SAMPLE:,} points apart, to align a cloud by",
+            found=f"{len(voxels):,}",
+            fix="Give the transform with --transform FILE.",
+        )
+    return CloudSample(offset, voxels.xyz.astype(np.float64), voxels.rgb if painted else None)
+
+
+def normals_of(xyz: Float64[np.ndarray, "N 3"], tree: cKDTree) -> Float64[np.ndarray, "N 3"]:
+    """Unit normals of either sign: the last principal axis of a point and its 11 neighbours."""
+    normals = np.empty_like(xyz)
+    for start in range(0, len(xyz), CHUNK // 16):
+        part = slice(start, start + CHUNK // 16)
+        idx = tree.query(xyz[part], min(NEIGHBORS, len(xyz)))[1]
+        near = xyz[idx] - xyz[idx].mean(axis=1, keepdims=True)
+        normals[part] = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))[1][:, :, 0]
+    return normals

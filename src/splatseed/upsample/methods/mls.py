@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.kernels.jit import inline, kernel, parallel_range
-from splatseed.upsample.surfaces.patches import Patches, PatchMethod
+from splatseed.upsample.patches import Patches, PatchMethod
 
 TERMS = 6
 """1, u, v, u^2, uv, v^2."""

@@ -1,6 +1,6 @@
 """B-spline surfaces (paper, eq. 3): a smooth tensor-product cubic at every base point.
 
-Default: a P-spline. Over the 6 x 6 control values c of ``spline_basis``, minimise
+Default: a P-spline. Over the 6 x 6 control values c of ``splines``, minimise
 sum_j (S(u_j, v_j) - z_j)^2 + lambda c' P c; the penalty makes the problem well-posed for 26 points
 and 36 unknowns. lambda is fixed, or chosen for every patch by generalised cross-validation.
 
@@ -20,10 +20,12 @@ from jaxtyping import Float32, Float64
 
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.upsample.method import require
-from splatseed.upsample.surfaces.patches import Patches, PatchMethod
-from splatseed.upsample.surfaces.spline_basis import (
+from splatseed.upsample.patches import Patches, PatchMethod
+from splatseed.upsample.splines import (
     CONTROL,
     PatchBasis,
+    bicubic_heights,
+    cross_validate,
     evaluate,
     patch_basis,
     penalty,
@@ -78,8 +80,6 @@ class Spline(PatchMethod):
     ) -> None:
         """Fit rows ``first:last`` and write S(u, v) of all their new points into ``out`` [M]."""
         if self.basis == "bicubic":
-            from splatseed.upsample.surfaces.spline_bicubic import bicubic_heights  # noqa: PLC0415  (LAPACK)
-
             bicubic_heights(patches, first, last, out)
             return
         basis = patch_basis(patches, first, last)
@@ -90,8 +90,6 @@ class Spline(PatchMethod):
     def _smoothing(self, basis: PatchBasis, count: np.ndarray) -> Float64[np.ndarray, " rows"]:
         """The penalty's weight for each row."""
         if isinstance(self.smoothing, str):
-            from splatseed.upsample.surfaces.spline_gcv import cross_validate  # noqa: PLC0415  (compiles)
-
             return cross_validate(basis, count)
         return np.full(len(basis.z), float(self.smoothing))
 

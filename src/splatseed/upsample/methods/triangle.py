@@ -15,7 +15,7 @@ import numpy as np
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress
 from splatseed.upsample.method import NewPoints
-from splatseed.upsample.nearest import Draws, Known, NearestMethod, blended
+from splatseed.upsample.nearest import NearestMethod, RowData, UniformSource, blended
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
 
 
@@ -40,9 +40,9 @@ class Triangle(NearestMethod):
         self,
         cloud: PreparedCloud,
         neighbors: Neighbors,
-        known: Known,  # noqa: ARG002  (the base's)
+        known: RowData,  # noqa: ARG002  (the base's)
         bases: Bases,
-        rng: Draws,
+        rng: UniformSource,
         progress: Progress,
     ) -> NewPoints:
         """Make the points of all bases."""

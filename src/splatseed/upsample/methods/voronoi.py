@@ -3,11 +3,11 @@
 A cell is drawn with probability proportional to its volume, and the point is uniform in the ball
 (c_i, r_i / 2) about the cell's centre; its colour comes from the 5 nearest originals.
 
-Default: cells are clamped to half the distance of the 25th neighbour (``cells.meshless``), and the
+Default: cells are clamped to half the distance of the 25th neighbour (``cells``), and the
 probability is the volume relative to the median of the neighbours', capped at 8: otherwise all new
 points go to the sparse background, most of them outside the scene.
 Paper: SciPy's Voronoi cells of the originals and the corners of the bounding box enlarged by 10%,
-drawn by volume (``cells.box``).
+drawn by volume (``cells``).
 """
 
 from __future__ import annotations
@@ -21,12 +21,11 @@ from jaxtyping import Float64
 
 from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress, blocks
-from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
-from splatseed.upsample.colors import interpolate_colors
+from splatseed.upsample.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
 from splatseed.upsample.method import NewPoints, require
-from splatseed.upsample.nearest import Draws, Known, NearestMethod
+from splatseed.upsample.nearest import NearestMethod, RowData, UniformSource, interpolate_colors
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud
-from splatseed.upsample.surfaces.frames import local_frames
+from splatseed.upsample.patches import local_frames
 
 BLOCK = 1 << 14
 
@@ -81,13 +80,11 @@ class Voronoi(NearestMethod):
 
     def weigh(
         self, cloud: PreparedCloud, neighbors: Neighbors, progress: Progress
-    ) -> tuple[Float64[np.ndarray, " n"], Known]:
+    ) -> tuple[Float64[np.ndarray, " n"], RowData]:
         """Weights by volume, and the cells' centres [n, 3] and radii [n]."""
         weight, _ = super().weigh(cloud, neighbors, progress)
         neighbors = neighbors.nearest(self.k)
         if self.cells == "box":
-            from splatseed.upsample.cells.box import box_cells  # noqa: PLC0415  (SciPy's Qhull)
-
             center, radius, volume = box_cells(cloud, progress)
             return weight * volume, {"center": center, "radius": radius}
         center, radius, volume, _ = _clamped_cells(cloud, neighbors, progress)
@@ -99,9 +96,9 @@ class Voronoi(NearestMethod):
         self,
         cloud: PreparedCloud,
         neighbors: Neighbors,
-        known: Known,
+        known: RowData,
         bases: Bases,
-        rng: Draws,
+        rng: UniformSource,
         progress: Progress,  # noqa: ARG002  (the base's)
     ) -> NewPoints:
         """Put the points of all bases in the balls of their cells."""

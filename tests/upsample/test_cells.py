@@ -9,13 +9,17 @@ from scipy.spatial import QhullError
 from splatseed import PointCloud
 from splatseed.errors import PointCloudError
 from splatseed.progress import silent
-from splatseed.upsample.cells import box as voronoi_box
-from splatseed.upsample.cells.box import box_cells
-from splatseed.upsample.cells.meshless import MAX_NEIGHBORS, Cells, build_cells
+from splatseed.upsample import cells as module
+from splatseed.upsample.cells import (
+    MAX_NEIGHBORS,
+    Cells,
+    box_cells,
+    build_cells,
+)
 from splatseed.upsample.neighbors import prepare
-from splatseed.upsample.surfaces.frames import local_frames
+from splatseed.upsample.patches import local_frames
 
-from .. import references_voronoi as slow
+from . import references_voronoi as slow
 
 
 def prepared(xyz):
@@ -97,17 +101,10 @@ def test_boxed_cells_are_scipys(rng):
         assert volume[row] == pytest.approx(v, rel=1e-7)
 
 
-def test_most_of_the_boxed_volume_lies_outside_the_box(wavy):
-    # Why the default clamps: the paper's cells reach far beyond the scene.
-    cloud = prepare(wavy)
-    _, radius, _ = box_cells(cloud, silent)
-    assert radius.max() > np.linalg.norm(np.ptp(cloud.xyz, axis=0))
-
-
 def test_qhulls_failure_is_told_with_a_way_out(monkeypatch, wavy):
     def fail(_sites):
         raise QhullError("QH6154 initial simplex is flat\n\nWhile executing: ...")
 
-    monkeypatch.setattr(voronoi_box, "Delaunay", fail)
+    monkeypatch.setattr(module, "Delaunay", fail)
     with pytest.raises(PointCloudError, match=r'QH6154.*"clamped"'):
         box_cells(prepare(wavy), silent)

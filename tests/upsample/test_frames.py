@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatseed.upsample.surfaces.frames import local_frames, world_frames
+from splatseed.upsample.patches import local_frames
 
-from .. import references as slow
+from . import references as slow
 
 STRETCHES = {
     "blob": (1.0, 0.7, 0.4),
@@ -59,16 +59,3 @@ def test_a_line_is_reported_with_its_direction(rng):
         along = (points[1] - points[0]) / np.linalg.norm(points[1] - points[0])
         assert collinear
         assert abs(frame[0] @ along) == pytest.approx(1.0)
-
-
-def test_a_round_neighborhood_still_has_a_frame():
-    octahedron = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
-    frame, collinear = axes_of(octahedron)
-    np.testing.assert_allclose(np.abs(frame @ frame.T), np.eye(3), atol=1e-12)
-    assert not collinear
-
-
-def test_world_frames_are_the_axes():
-    frames, collinear = world_frames(3)
-    np.testing.assert_array_equal(frames, np.tile(np.eye(3), (3, 1, 1)))
-    assert not collinear.any()

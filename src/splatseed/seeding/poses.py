@@ -1,0 +1,439 @@
+"""Scenes that have poses and no points: are the poses sound, how exact are they, where to begin.
+
+*Check.* Poses are ``cam_from_world`` [V, 4, 4]. A *look* compares a photograph and its best
+partners, ``SIDE`` pixels wide, over every depth; its *share* is that of the pixels whose depth
+others confirm. A *turn* undoes a usual mistake in writing poses. A scene is refused only if its
+photographs agree by chance at most, or clearly better after a turn.
+
+*Error.* What lies along an epipolar line is depth's; what lies across it is the poses' fault. View
+i's partner j is turned into i's orientation first, so that a point at inverse depth w moves from
+pixel p to ``K (K^-1 p + w c)``, c the partner's step. A *corner* of i is looked for in a band along
+that line; the *miss* is how far beside the line it is found. A corner counts only where one place
+of the band is clearly most alike.
+Promise: the scene's scale plays no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float64
+from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobel, uniform_filter
+from scipy.signal import correlate
+
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.literal import quoted
+from splatseed.pointcloud import PointCloud
+from splatseed.progress import Progress, silent
+from splatseed.scene import Image, Scene
+from splatseed.stereo.matching import match_views
+from splatseed.stereo.settings import StereoSettings
+from splatseed.stereo.without_points import any_depth
+from splatseed.views.pairs import choose_by_pose
+from splatseed.views.view import View, data_factor, load_views, poses_of
+
+Gray = Float64[np.ndarray, "H W"]
+
+CORNERS_SIDE = 400
+"""Longer side of the photographs that are compared, in pixels."""
+CORNERS_LOOKS, CORNERS_PARTNERS = 5, 2
+"""Photographs looked at, and those that each is compared with."""
+CORNERS = 100
+"""Corners of a photograph, at most."""
+APART = 9
+"""Pixels between corners, at least."""
+HALF = 5
+"""A patch is 2 HALF + 1 pixels wide."""
+REACH = 24
+"""Largest miss that is looked for, in pixels."""
+FARTHEST = 0.3
+"""A band's length: what a point moves at most, in widths of a photograph."""
+ALIKE, CLEARLY_BEST = 0.85, 0.1
+"""Least correlation of a corner's best place, and by how much it is above any other."""
+LEAST_FOUND = 8
+"""Corners of a pair that must be found for it to count."""
+LEAST_PAIRS = 1 / 3
+"""Share of the pairs that must count; at sound poses of eight captures six of ten and more do."""
+BY_CHANCE = 10.0
+"""A median of so many pixels may be chance: misses found by chance are spread over ``REACH``."""
+MOST_MISSED = 0.5
+"""Pixels at stereo's size up to which poses are exact. COLMAP's are 0.1 to 0.5 on eight captures;
+at 0.55, a tenth of a degree of noise, fern keeps 0.6 of its depths (benchmarks/stereo)."""
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """By how much photographs miss each other.
+
+    Args:
+        px: Median over pairs, in pixels of the photographs as they are stored.
+        degrees: The turn of a camera that moves its picture as far.
+        exact: Whether it is half a pixel at most, at the size at which stereo compares photographs.
+    """
+
+    px: float
+    degrees: float
+    exact: bool
+
+    def __str__(self) -> str:
+        return f"{self.px:.2g} px ({self.degrees:.2g} degrees)"
+
+    @property
+    def warning(self) -> str:
+        """What to do about it, in a sentence; empty if the poses are exact."""
+        if self.exact:
+            return ""
+        return (
+            f"The photographs miss each other by about {self} at these poses, and comparing them "
+            "needs half a pixel: --refine-poses may mend that."
+        )
+
+
+def pose_error(
+    scene: Scene, images: Sequence[Image], progress: Progress = silent
+) -> PoseError | None:
+    """Measure how exact the poses of photographs are, in a few seconds.
+
+    Args:
+        scene: A scene with photographs, whose points are not used.
+        images: The images whose photographs are compared; two at least.
+        progress: Called with the stage and the fraction done.
+
+    Returns:
+        None if too few corners are found again, as on plain walls or at poses that are far off.
+
+    Raises:
+        SceneFormatError: A photograph cannot be used.
+    """
+    poses = np.array([image.camera.cam_from_world for image in images])
+    partners = choose_by_pose(poses, CORNERS_PARTNERS)
+    looked = np.unique(np.linspace(0, len(images) - 1, CORNERS_LOOKS).round().astype(np.int64))
+    factor = data_factor(images, CORNERS_SIDE)
+    misses, pairs = [], 0
+    for number, i in enumerate(looked.tolist()):
+        others = [j for j in partners[i].tolist() if j >= 0]
+        some = [images[k] for k in (i, *others)]
+        view, *rest = load_views(scene, some, data_factor=factor, undistort=True)
+        pairs += len(rest)
+        for other in rest:
+            found = np.abs(_misses(view, other))
+            if len(found) >= LEAST_FOUND:
+                miss = float(np.median(found))
+                misses.append((miss, np.degrees(np.arctan(miss / view.K[0, 0]))))
+        progress("measure poses", (number + 1) / len(looked))
+    if len(misses) < max(1.0, LEAST_PAIRS * pairs):
+        return None
+    px, degrees = np.median(misses, axis=0).tolist()
+    if px > BY_CHANCE:
+        return None
+    exact = px * factor <= MOST_MISSED * data_factor(images, StereoSettings.max_size)
+    return PoseError(px * factor, degrees, exact)
+
+
+def _misses(view: View, other: View) -> Float64[np.ndarray, " M"]:
+    """How far beside their epipolar lines the corners of a view are found, in pixels."""
+    j_from_i = other.cam_from_world @ np.linalg.inv(view.cam_from_world)
+    margin = int(FARTHEST * view.width) + REACH + 2 * HALF
+    image = _gray(view)
+    turned = _turned(_gray(other), other.K, j_from_i[:3, :3], view, margin)
+    # c: the step in i's axes, as R d + w t = R (d + w R' t).
+    step = view.K @ (j_from_i[:3, :3].T @ j_from_i[:3, 3])
+    found = []
+    for p in _corners(image, view.mask):
+        # d/dw of K (K^-1 p + w c), at w = 0: where a far point begins to move.
+        along = step[:2] - step[2] * p
+        length = np.linalg.norm(along)
+        if length < 1e-9 * max(1.0, abs(step[2])):
+            continue
+        miss = _miss(image, turned, p, along / length, margin, FARTHEST * view.width)
+        if miss is not None:
+            found.append(miss)
+    return np.array(found)
+
+
+def _gray(view: View) -> Gray:
+    return np.asarray(view.photograph.mean(axis=2))
+
+
+def _turned(
+    image: Gray, K: Float64[np.ndarray, "3 3"], R: Float64[np.ndarray, "3 3"], view: View,
+    margin: int,
+) -> Gray:  # fmt: skip
+    """A photograph in the view's orientation, with a margin; NaN where it shows nothing."""
+    rows, columns = view.height + 2 * margin, view.width + 2 * margin
+    v, u = np.indices((rows, columns)) - margin + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ (K @ R @ np.linalg.inv(view.K)).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
+    behind = rays[..., 2] <= 0
+    places = np.where(behind, -1.0, [y - 0.5, x - 0.5])
+    return np.asarray(map_coordinates(image, places, order=1, cval=np.nan))
+
+
+def _corners(image: Gray, mask: Bool[np.ndarray, "H W"] | None) -> Float64[np.ndarray, "N 2"]:
+    """Pixels (column, row) around which a photograph changes most in every direction.
+
+    Masked ones are left out: a turntable's background does not turn with it.
+    """
+    x, y = sobel(image, axis=1), sobel(image, axis=0)
+    xx, xy, yy = (gaussian_filter(each, 2.0) for each in (x * x, x * y, y * y))
+    # The smaller eigenvalue of the structure tensor.
+    least = 0.5 * (xx + yy - np.hypot(xx - yy, 2 * xy))
+    peaks = (least == maximum_filter(least, APART)) & (least > 0)
+    if mask is not None:
+        peaks &= mask
+    row, column = np.nonzero(peaks)
+    best = np.argsort(-least[peaks], kind="stable")[:CORNERS]
+    return np.stack([column[best], row[best]], axis=1) + 0.5
+
+
+def _miss(
+    image: Gray, turned: Gray, p: Float64[np.ndarray, " 2"], along: Float64[np.ndarray, " 2"],
+    margin: int, farthest: float,
+) -> float | None:  # fmt: skip
+    """How far beside its line a corner is found; None unless one place is clearly best."""
+    patch = _sample(image, p, along, (-HALF, HALF), (-HALF, HALF))
+    if not np.isfinite(patch).all():  # beyond the picture's border
+        return None
+    # A little backwards, too: with wrong poses a far point may seem to be behind infinity.
+    start, stop = -HALF - REACH, HALF + int(farthest)
+    band = _sample(turned, p + margin, along, (start, stop), (-HALF - REACH, HALF + REACH))
+    scores = _correlation(patch, band)
+    at = np.unravel_index(np.argmax(scores), scores.shape)
+    best, (column, row) = scores[at], at
+    rest = scores.copy()
+    rest[max(column - HALF, 0) : column + HALF + 1, max(row - HALF, 0) : row + HALF + 1] = -1.0
+    inside = 0 < row < scores.shape[1] - 1
+    if best < ALIKE or best - rest.max() < CLEARLY_BEST or not inside:
+        return None
+    before, after = scores[column, row - 1], scores[column, row + 1]
+    # The peak of a parabola through three correlations.
+    bend = 2 * best - before - after
+    return float(row - REACH + (0.5 * (after - before) / bend if bend > 0 else 0.0))
+
+
+def _sample(
+    image: Gray, p: Float64[np.ndarray, " 2"], along: Float64[np.ndarray, " 2"],
+    length: tuple[int, int], width: tuple[int, int],
+) -> Gray:  # fmt: skip
+    """Values on a grid along a line through p and across it; NaN outside."""
+    a = np.arange(length[0], length[1] + 1)[:, None]
+    b = np.arange(width[0], width[1] + 1)[None]
+    x = p[0] - 0.5 + a * along[0] - b * along[1]
+    y = p[1] - 0.5 + a * along[1] + b * along[0]
+    return np.asarray(map_coordinates(image, [y, x], order=1, cval=np.nan))
+
+
+def _correlation(patch: Gray, band: Gray) -> Gray:
+    """The normalised correlation of a patch at each place of a band; -1 where unknown."""
+    known = np.isfinite(band)
+    filled = np.where(known, band, 0.0)
+    one = patch - patch.mean()
+    # sum (b - mean b) a = sum b a, as the sum of a is 0.
+    product = correlate(filled, one, mode="valid", method="fft")
+    inner = (slice(HALF, -HALF), slice(HALF, -HALF))
+    mean, square, share = (
+        uniform_filter(each, 2 * HALF + 1)[inner]
+        for each in (filled, filled * filled, known.astype(np.float64))
+    )
+    spread = np.sqrt(np.maximum(square - mean * mean, 1e-6) * patch.size)
+    return np.where(share > 1 - 1e-9, product / (spread * np.linalg.norm(one)), -1.0)
+
+
+Poses = Float64[np.ndarray, "V 4 4"]
+
+SIDE, GRID, SWEEPS = 200, 4, 6
+"""Size of the photographs, pixels between depths, and iterations of a look."""
+TOLERANCE, MAX_COST = 0.03, 0.4
+PARTNERS = 5
+LOOKS = 3
+"""Photographs looked at, while what is seen decides nothing."""
+ENOUGH = 0.3
+"""Share at which nothing else is tried; wrong poses reached 0.17."""
+CLEARLY = 2.0
+"""A share so many times another is clearly above it."""
+LEAST = 0.1
+"""Least share after a turn at which the turn is believed."""
+NIL = 0.03
+"""Share that photographs of eleven captures reached by chance, with their poses exchanged; with
+their own, the hardest reached 0.07."""
+MOST_SEEN = 24
+"""Photographs whose pictures are searched for any overlap."""
+
+_YZ, _XY = np.diag([1.0, -1.0, -1.0, 1.0]), np.diag([-1.0, -1.0, 1.0, 1.0])
+TURNS: Mapping[str, Callable[[Poses], Poses]] = MappingProxyType(
+    {
+        "the y and z axes of every camera are negated": lambda poses: _YZ @ poses,
+        "the x and y axes of every camera are negated": lambda poses: _XY @ poses,
+        "every pose is inverted": np.linalg.inv,
+        "every pose is inverted and its camera's y and z axes are negated": (
+            lambda poses: _YZ @ np.linalg.inv(poses)
+        ),
+    }
+)
+OPENCV = "with OpenCV's camera axes (x right, y down, z forward)"
+WRITTEN = {
+    "colmap": f"the model's images hold cam_from_world, {OPENCV}",
+    "rgbd": f"its trajectory holds world_from_cam, {OPENCV}",
+    "transforms": "each transform_matrix is world_from_cam, with OpenGL's camera axes (x right, "
+    "y up, z back)",
+}
+"""What each format's poses are."""
+
+
+def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = silent) -> float:
+    """Refuse photographs that cannot be compared at their poses, within seconds.
+
+    Args:
+        scene: A scene with photographs, whose points are not used.
+        images: The images whose photographs are to be compared.
+        progress: Called with the stage and the fraction done.
+
+    Returns:
+        The largest share of pixels whose depth other photographs confirm, of those looked at.
+
+    Raises:
+        SceneNotFoundError: There are fewer than two.
+        SceneFormatError: All cameras are in one place, no two photographs show the same, they agree
+            nowhere, or clearly better if poses are read otherwise; or one cannot be used.
+    """
+    poses = np.array([image.camera.cam_from_world for image in images])
+    _check_places(poses)
+    shares: list[float] = []
+    for number in range(LOOKS):
+        progress("check poses", number / LOOKS)
+        shares.append(_look(scene, images, poses, number))
+        if shares[-1] >= ENOUGH:
+            break
+        turned = {how: _look(scene, images, turn(poses), number) for how, turn in TURNS.items()}
+        best = max(turned, key=lambda how: turned[how])
+        if turned[best] >= max(CLEARLY * shares[-1], LEAST):
+            raise _turned_error(scene, shares[-1], best, turned[best])
+        if shares[-1] > max(CLEARLY * turned[best], NIL):
+            break
+    else:
+        if np.mean(shares) <= NIL:
+            raise _apart_error(scene, images, float(np.mean(shares)))
+    progress("check poses", 1.0)
+    return max(shares)
+
+
+def _check_places(poses: Poses) -> None:
+    """Refuse cameras that are alone, or all in one place."""
+    if len(poses) < 2:
+        raise SceneNotFoundError(
+            "at least two photographs with a pose, as the scene has no points",
+            found=f"{len(poses)}",
+            fix="Add photographs: depth comes from comparing them. Views held out do not count.",
+        )
+    centers = np.linalg.inv(poses)[:, :3, 3]
+    apart = np.abs(centers - centers[0]).max()
+    if apart <= np.finfo(np.float32).eps * np.abs(centers).max():
+        raise SceneFormatError(
+            "photographs from different places, as the scene has no points",
+            found=f"all {len(poses)} cameras in one place, as in a panorama",
+            fix="Take photographs while moving: cameras that only turn show no depth.",
+        )
+
+
+def _look(scene: Scene, images: Sequence[Image], poses: Poses, number: int) -> float:
+    """The share of a photograph and its partners at these poses."""
+    first = (2 * number + 1) * len(images) // (2 * LOOKS)
+    partners = choose_by_pose(poses, PARTNERS)[first]
+    chosen = [first, *partners[partners >= 0].tolist()]
+    some = [images[i] for i in chosen]
+    read = load_views(scene, some, data_factor=data_factor(some, SIDE), undistort=True)
+    views = [replace(view, cam_from_world=poses[i]) for view, i in zip(read, chosen, strict=True)]
+    sources = choose_by_pose(poses[chosen], PARTNERS)
+    settings = StereoSettings(grid=GRID, sweeps=SWEEPS, tolerance=TOLERANCE, max_cost=MAX_COST)
+    hints = [any_depth(views, i, others) for i, others in enumerate(sources)]
+    stereo = match_views(views, hints, sources, settings, 0, silent)
+    return float(np.mean([stereo.kept(i).mean() for i in range(len(views))]))
+
+
+def _turned_error(scene: Scene, share: float, how: str, after: float) -> SceneFormatError:
+    assert scene.source is not None  # noqa: S101  (its photographs were read)
+    return SceneFormatError(
+        f"photographs that agree at the poses of {scene.source.root}",
+        found=f"a depth that others confirm at {share:.1%} of their pixels, and at {after:.0%} once"
+        f" {how}",
+        fix=f"Write the poses so: {WRITTEN[scene.source.format]}.",
+    )
+
+
+def _apart_error(scene: Scene, images: Sequence[Image], share: float) -> SceneFormatError:
+    """The error for photographs that agree nowhere, and why they may not."""
+    assert scene.source is not None  # noqa: S101  (its photographs were read)
+    new = f"splatseed sfm {quoted(scene.source.image_dir or 'IMAGES')} -o SCENE"
+    if not _any_overlap(poses_of(images)):
+        return SceneFormatError(
+            f"photographs that show the same places, at the poses of {scene.source.root}",
+            found=f"no two of {len(images)} whose pictures overlap at any depth",
+            fix=f"Take more photographs in between, or find the poses anew: {new}.",
+        )
+    error = pose_error(scene, images)
+    if error is not None and not error.exact:
+        return SceneFormatError(
+            f"photographs that agree at the poses of {scene.source.root}",
+            found=f"a depth that others confirm at {share:.1%} of their pixels; they miss each "
+            f"other by about {error}",
+            fix=f"Mend the poses with --refine-poses, or find them anew: {new}.",
+        )
+    return SceneFormatError(
+        f"photographs that agree at the poses of {scene.source.root}",
+        found=f"a depth that others confirm at {share:.1%} of their pixels",
+        fix=f"Check that poses and names of the images belong together, or find poses anew: {new}.",
+    )
+
+
+def _any_overlap(views: Sequence[View]) -> bool:
+    """Whether a point at some depth before one view falls into another's picture."""
+    uv = (np.indices((4, 5)).reshape(2, -1).T[:, ::-1] + 0.5) / [5, 4]
+    looked = np.unique(np.linspace(0, len(views) - 1, MOST_SEEN).round().astype(np.int64))
+    for i in looked:
+        for j in range(len(views)):
+            first, other = views[i].camera, views[j].camera
+            gap = float(np.linalg.norm(first.center - other.center))
+            if i == j or not gap:
+                continue
+            z = gap * np.repeat(np.geomspace(0.1, 1000.0, 12), len(uv))
+            xyz = first.unproject(np.tile(uv * [first.width, first.height], (12, 1)), z)
+            seen = other.project(xyz)[0]  # NaN behind the camera
+            if ((seen >= 0) & (seen < [other.width, other.height])).all(axis=1).any():
+                return True
+    return False
+
+
+def random_start(
+    scene: Scene, rng: np.random.Generator, trainer: Literal["gsplat", "nerfstudio"] = "gsplat"
+) -> PointCloud:
+    """Points as a trainer draws them for a scene that has none, uniform in position and colour.
+
+    Args:
+        scene: A scene with at least two cameras.
+        rng: Draws positions and colours.
+        trainer: Whose rule: that of gsplat 1.5.3's simple_trainer (``init_type`` random), 100,000
+            points in a cube that reaches 3.3 times as far as the cameras; or nerfstudio 1.1.5's
+            splatfacto, 50,000 that reach 5 times as far as their coordinates.
+    """
+    centers = np.stack([image.camera.center for image in scene.images])
+    middle = centers.mean(axis=0)
+    if trainer == "nerfstudio":
+        return _in_cube(middle, 5.0 * np.abs(centers - middle).max(), 50_000, rng)
+    # Its world is centred at the median, over cameras, of the point on the optical axis that is
+    # nearest to the origin. It is turned, too, which a median of coordinates feels a little.
+    axes = np.stack([image.camera.cam_from_world[2, :3] for image in scene.images])
+    nearest = centers - (centers * axes).sum(axis=1, keepdims=True) * axes
+    reach = np.linalg.norm(centers - middle, axis=1).max()
+    return _in_cube(np.median(nearest, axis=0), 3.0 * 1.1 * reach, 100_000, rng)
+
+
+def _in_cube(
+    middle: Float64[np.ndarray, " 3"], half: float, num: int, rng: np.random.Generator
+) -> PointCloud:
+    xyz = middle + half * rng.uniform(-1.0, 1.0, (num, 3))
+    return PointCloud(xyz.astype(np.float32), rng.integers(0, 256, (num, 3), dtype=np.uint8))

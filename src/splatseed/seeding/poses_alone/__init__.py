@@ -1,1 +1,0 @@
-"""Scenes that have poses and no points: are the poses sound, and where would trainers begin?"""

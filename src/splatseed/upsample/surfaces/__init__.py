@@ -1,1 +1,0 @@
-"""Height fields over neighbourhoods: frames, patches, placement, splines."""
