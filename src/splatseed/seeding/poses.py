@@ -312,7 +312,13 @@ def check_poses(scene: Scene, images: Sequence[Image], progress: Progress = sile
         turned = {how: _look(scene, images, turn(poses), number) for how, turn in TURNS.items()}
         best = max(turned, key=lambda how: turned[how])
         if turned[best] >= max(CLEARLY * shares[-1], LEAST):
-            raise _turned_error(scene, shares[-1], best, turned[best])
+            assert scene.source is not None  # noqa: S101  (its photographs were read)
+            found = f"a depth that others confirm at {shares[-1]:.1%} of their pixels"
+            raise SceneFormatError(
+                f"photographs that agree at the poses of {scene.source.root}",
+                found=f"{found}, and at {turned[best]:.0%} once {best}",
+                fix=f"Write the poses so: {WRITTEN[scene.source.format]}.",
+            )
         if shares[-1] > max(CLEARLY * turned[best], NIL):
             break
     else:
@@ -355,16 +361,6 @@ def _look(scene: Scene, images: Sequence[Image], poses: Poses, number: int) -> f
     return float(np.mean([stereo.kept(i).mean() for i in range(len(views))]))
 
 
-def _turned_error(scene: Scene, share: float, how: str, after: float) -> SceneFormatError:
-    assert scene.source is not None  # noqa: S101  (its photographs were read)
-    return SceneFormatError(
-        f"photographs that agree at the poses of {scene.source.root}",
-        found=f"a depth that others confirm at {share:.1%} of their pixels, and at {after:.0%} once"
-        f" {how}",
-        fix=f"Write the poses so: {WRITTEN[scene.source.format]}.",
-    )
-
-
 def _apart_error(scene: Scene, images: Sequence[Image], share: float) -> SceneFormatError:
     """The error for photographs that agree nowhere, and why they may not."""
     assert scene.source is not None  # noqa: S101  (its photographs were read)
@@ -376,17 +372,13 @@ def _apart_error(scene: Scene, images: Sequence[Image], share: float) -> SceneFo
             fix=f"Take more photographs in between, or find the poses anew: {new}.",
         )
     error = pose_error(scene, images)
-    if error is not None and not error.exact:
-        return SceneFormatError(
-            f"photographs that agree at the poses of {scene.source.root}",
-            found=f"a depth that others confirm at {share:.1%} of their pixels; they miss each "
-            f"other by about {error}",
-            fix=f"Mend the poses with --refine-poses, or find them anew: {new}.",
-        )
+    off = error is not None and not error.exact
+    missed = f"; they miss each other by about {error}" if off else ""
+    check = "Check that poses and names of the images belong together"
     return SceneFormatError(
         f"photographs that agree at the poses of {scene.source.root}",
-        found=f"a depth that others confirm at {share:.1%} of their pixels",
-        fix=f"Check that poses and names of the images belong together, or find poses anew: {new}.",
+        found=f"a depth that others confirm at {share:.1%} of their pixels{missed}",
+        fix=f"{'Mend the poses with --refine-poses' if off else check}, or find poses anew: {new}.",
     )
 
 

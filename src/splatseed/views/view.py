@@ -83,24 +83,15 @@ def poses_of(images: Sequence[Image], data_factor: int = 1) -> tuple[View, ...]:
     Raises:
         SceneFormatError: A photograph would have no pixel left.
     """
+    unseen, views = np.empty((0, 0, 3), np.uint8), []
+    shrink = np.diag([1 / data_factor, 1 / data_factor, 1.0])
     for image in images:
-        sides = image.camera.width // data_factor, image.camera.height // data_factor
+        camera = image.camera
+        sides = camera.width // data_factor, camera.height // data_factor
         if not min(sides):
             raise _too_small(image.name, 1, data_factor, sides)
-    unseen = np.empty((0, 0, 3), np.uint8)
-    shrink = np.diag([1 / data_factor, 1 / data_factor, 1.0])
-    cameras = [(image.name, image.camera) for image in images]
-    return tuple(
-        View(
-            name,
-            unseen,
-            shrink @ camera.K,
-            camera.width // data_factor,
-            camera.height // data_factor,
-            camera.cam_from_world,
-        )
-        for name, camera in cameras
-    )
+        views.append(View(image.name, unseen, shrink @ camera.K, *sides, camera.cam_from_world))
+    return tuple(views)
 
 
 def data_factor(images: Sequence[Image], max_size: int) -> int:
@@ -176,11 +167,23 @@ def load_views(
         SceneNotFoundError: An image is missing.
         SceneFormatError: A camera has distortion that is not removed, or an image is unusable.
     """
-    folder = _image_folder(scene)
+    folder = scene.source.image_dir if scene.source else None
+    if folder is None:
+        raise SceneNotFoundError(
+            "a folder with the scene's photographs",
+            found="none",
+            fix="Put them beside the model in a folder named images.",
+        )
     for image in images if not undistort else ():
         check_lens(image, scene.source.root if scene.source else None)
     if images:
-        _check_memory(folder / images[0].name, len(images), max(data_factor, 1))
+        first, factor = folder / images[0].name, max(data_factor, 1)
+        width, height = open_photograph(first, photograph_bytes(first)).size
+        check_memory(
+            len(images) * width * height // factor**2, BYTES_A_PIXEL, "pixels of photographs",
+            found=f"{len(images)} of {width} x {height}, downsampled by {factor}",
+            fix="Downsample more (--data-factor), take fewer, or free some memory.",
+        )  # fmt: skip
     read = partial(
         _load_view, folder=folder, data_factor=data_factor, min_side=min_side, cache_dir=cache_dir
     )
@@ -190,29 +193,6 @@ def load_views(
             views.append(view)
             progress("read images", len(views) / len(images))
     return tuple(views)
-
-
-def _check_memory(first: Path, count: int, data_factor: int) -> None:
-    """Refuse photographs that would not fit into memory together, if all are like the first."""
-    width, height = open_photograph(first, photograph_bytes(first)).size
-    check_memory(
-        count * width * height // data_factor**2,
-        BYTES_A_PIXEL,
-        "pixels of photographs",
-        found=f"{count} of {width} x {height}, downsampled by {data_factor}",
-        fix="Downsample more (--data-factor), take fewer, or free some memory.",
-    )
-
-
-def _image_folder(scene: Scene) -> Path:
-    folder = scene.source.image_dir if scene.source else None
-    if folder is None:
-        raise SceneNotFoundError(
-            "a folder with the scene's photographs",
-            found="none",
-            fix="Put them beside the model in a folder named images.",
-        )
-    return folder
 
 
 def check_lens(
@@ -306,7 +286,8 @@ def load_photograph(
             "--data-factor of 1 or more", found=f"{factor}", fix="Images are never enlarged."
         )
     encoded = photograph_bytes(path)
-    kept = None if cache_dir is None or factor == 1 else cache_dir / _key(encoded, factor)
+    digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode()).hexdigest()
+    kept = None if cache_dir is None or factor == 1 else cache_dir / f"{digest}_{factor}.png"
     if kept is not None and kept.is_file():
         with suppress(SceneFormatError):  # a damaged copy is made again
             photograph = decode_photograph(kept, photograph_bytes(kept))
@@ -314,7 +295,10 @@ def load_photograph(
     original = decode_photograph(path, encoded)
     photograph = _reduce(path, original, factor)
     if kept is not None:
-        _keep(photograph, kept)
+        with suppress(OutputError, OSError):  # a cache that cannot be written is done without
+            kept.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_file(kept) as partial:
+                photograph.save(partial, compress_level=1)
     return np.array(photograph), original.size
 
 
@@ -329,11 +313,6 @@ def user_cache_dir() -> Path:
     return Path(base) / "splatseed" / "images"
 
 
-def _key(encoded: bytes, factor: int) -> str:
-    digest = hashlib.blake2b(encoded, digest_size=16, person=FILTER.encode())
-    return f"{digest.hexdigest()}_{factor}.png"
-
-
 def _reduce(path: Path, original: PilImage.Image, factor: int) -> PilImage.Image:
     if factor == 1:
         return original
@@ -345,10 +324,3 @@ def _reduce(path: Path, original: PilImage.Image, factor: int) -> PilImage.Image
             fix="Choose a smaller --data-factor.",
         )
     return original.reduce(factor, (0, 0, width * factor, height * factor))
-
-
-def _keep(photograph: PilImage.Image, path: Path) -> None:
-    with suppress(OutputError, OSError):  # a cache that cannot be written is done without
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_file(path) as partial:
-            photograph.save(partial, compress_level=1)
