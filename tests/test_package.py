@@ -126,7 +126,8 @@ def test_nothing_is_to_be_installed_that_is_not_published():
 
 
 def test_every_part_has_its_place():
-    parts = {path.stem for path in SOURCE.iterdir() if path.suffix == ".py" or path.is_dir()}
+    files = [*SOURCE.glob("*.py"), *(path.parent for path in SOURCE.glob("*/__init__.py"))]
+    parts = {path.stem for path in files}
     assert {part for part in parts if not part.startswith("__")} == set(ORDER)
 
 
