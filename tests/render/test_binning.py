@@ -92,16 +92,6 @@ def test_no_pair_is_missing_and_few_are_in_vain(rng, size: tuple[int, int]) -> N
     assert counts.sum() <= 1.15 * touched(view, 1e-4).sum() + 10
 
 
-def test_far_fewer_than_the_square_of_three_sigmas(rng) -> None:
-    view = random_view(rng, 300, 200, 160)
-    a, b, c = view[1].T.astype(float)
-    longest = 3 * np.sqrt(2.0 / (a + c - np.sqrt((a - c) ** 2 + 4 * b * b)))
-    low = np.clip((view[0] - longest[:, None]) / TILE, 0, (25, 20)).astype(int)
-    high = np.clip(np.ceil((view[0] + longest[:, None]) / TILE), 0, (25, 20)).astype(int)
-    squares = np.prod(high - low, axis=1).sum()
-    assert len(lists_of(*view).listed_rank) < 0.6 * squares
-
-
 def test_nothing_to_list() -> None:
     nothing = np.empty((0, 2), np.float32), np.empty((0, 3), np.float32), np.empty(0, np.float32)
     lists = lists_of(*nothing, 20, 10)

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from splatseed.render import rasterization
 
-from .scenes import gradients, random_scene
+from .scenes import PER_GAUSSIAN, gradients, random_scene
 
-PER_GAUSSIAN = ("means", "quats", "scales", "opacities", "colors")
 BROKEN = st.sampled_from([np.nan, np.inf, -np.inf])
 EXTREME = {
     "means": st.sampled_from([0.0, -3.0, 1e-6, 1e3, -1e6, 1e12, 3e38]),
@@ -102,25 +101,17 @@ def test_broken_coefficients(seed: int, degree: int) -> None:
     assert torch.equal(rendered, expected)
 
 
-def test_zero_gaussians() -> None:
-    scene = random_scene(np.random.default_rng(0), 3)
-    nothing = {**scene, **{name: scene[name][:0] for name in PER_GAUSSIAN}}
-    for options in ({}, {"packed": False}, {"render_mode": "RGB+ED"}):
-        image, alpha, grads = gradients(nothing, **options)
-        assert not alpha.any()
-        assert torch.equal(image[..., :3], scene["backgrounds"][:, None, None].expand_as(
-            image[..., :3]))  # fmt: skip
-        assert grads["means"].shape == (0, 3)
-
-
-@pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "ED"}])
+@pytest.mark.parametrize("options", [{}, {"packed": False}, {"render_mode": "RGB+ED"}])
 def test_none_visible(options: dict[str, Any]) -> None:
+    """Behind the camera, or none at all."""
     scene = random_scene(np.random.default_rng(0), 20)
     scene["viewmats"][:, 2, 3] = -10.0
-    image, alpha, grads = gradients(scene, **options)
-    assert not alpha.any()
-    assert image.isfinite().all()
-    assert not any(grads[name].any() for name in (*PER_GAUSSIAN, "viewmats"))
+    for each in (scene, {**scene, **{name: scene[name][:0] for name in PER_GAUSSIAN}}):
+        image, alpha, grads = gradients(each, **options)
+        assert not alpha.any()
+        behind = scene["backgrounds"][:, None, None].expand_as(image[..., :3])
+        assert torch.equal(image[..., :3], behind)
+        assert not any(grads[name].any() for name in (*PER_GAUSSIAN, "viewmats"))
 
 
 def test_on_the_near_plane_and_around_the_camera() -> None:
@@ -158,30 +149,13 @@ def test_a_giant_covers_everything_and_takes_little_memory(scale: float) -> None
     assert grads["opacities"].isfinite().all()
 
 
-def test_memory_grows_with_pairs_not_with_gaussians_times_pixels() -> None:
-    scene = random_scene(np.random.default_rng(0), 20_000, size=(320, 200))
-    scene["scales"] = scene["scales"].clamp(max=0.02)
-    gradients(scene)
-    tracemalloc.start()
-    gradients(scene)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert peak < 20_000 * 320 * 200 / 10
-
-
-@pytest.mark.parametrize("opacity", [0.0, 1.0])
-def test_all_transparent_or_all_opaque(opacity: float) -> None:
+@pytest.mark.parametrize("opacity", [0.0, 1.0, 30.0])
+def test_all_transparent_or_all_opaque_and_more(opacity: float) -> None:
     scene = random_scene(np.random.default_rng(0), 40)
     scene["opacities"] = torch.full((40,), opacity)
     assert_finite(scene)
     _, alpha, _ = rasterization(**scene)
     assert float(alpha.max()) == 0.0 if opacity == 0 else float(alpha.max()) > 0.99
-
-
-def test_opacity_above_one_is_held() -> None:
-    scene = random_scene(np.random.default_rng(0), 40)
-    scene["opacities"] = torch.full((40,), 30.0)
-    assert_finite(scene)
 
 
 def test_inputs_are_left_alone(rng) -> None:

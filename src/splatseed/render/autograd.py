@@ -188,23 +188,14 @@ class _Prepared(NamedTuple):
     records: np.ndarray
     """Records of the first pass of channels."""
     lists: TileLists
-    width: int
-    height: int
-
-    @property
-    def columns(self) -> int:
-        """Tiles per row."""
-        return -(-self.width // TILE)
-
-    @property
-    def row_order(self) -> np.ndarray:
-        """Rows of tiles in the order in which threads take them."""
-        return row_order(-(-self.height // TILE))
+    columns: int
+    """Tiles per row."""
+    rows: int
 
     @property
     def lanes(self) -> int:
         """Pixels of all tiles."""
-        return self.columns * -(-self.height // TILE) * TILE**2
+        return self.columns * self.rows * TILE**2
 
 
 class Blend(torch.autograd.Function):
@@ -241,15 +232,15 @@ class Blend(torch.autograd.Function):
         hits = np.empty(len(prepared.lists.listed_rank), np.uint8)
         for first in range(0, channels, blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
-            blocks = _forward(prepared, records, channels - first, hits)
+            blocks = _aligned(prepared.lanes * blending.CHANNELS), _aligned(prepared.lanes)
+            blending.forward(  # type: ignore[call-arg]  # star arguments
+                records, prepared.lists.tile_start, prepared.lists.listed_rank,
+                row_order(prepared.rows), blending.COLUMN, blending.ROW,
+                channels - first >= blending.CHANNELS, *blocks, hits,
+            )  # fmt: skip
             layout.from_blocks(*blocks, prepared.columns, behind, first, image, transmittance)  # type: ignore[call-arg]  # star arguments
-        ctx.prepared, ctx.on_absgrad, ctx.transmittance, ctx.image = (
-            prepared,
-            on_absgrad,
-            transmittance,
-            image,
-        )
-        ctx.hits = hits
+        ctx.prepared, ctx.on_absgrad, ctx.hits = prepared, on_absgrad, hits
+        ctx.transmittance, ctx.image = transmittance, image
         ctx.save_for_backward(means2d, conics, colors, opacities, background)
         return torch.from_numpy(image), torch.from_numpy(1.0 - transmittance)
 
@@ -261,18 +252,26 @@ class Blend(torch.autograd.Function):
         """Gradients of the inputs."""
         means2d, conics, colors, opacities, background = ctx.saved_tensors
         prepared: _Prepared = ctx.prepared
-        gradient, transmittance = _array(d_image), ctx.transmittance
+        lists, transmittance = prepared.lists, ctx.transmittance
+        gradient, alphas = _array(d_image), _array(d_alphas)
         absolute = ctx.on_absgrad is not None
         shapes = [tuple(each.shape) for each in (means2d, conics, opacities, colors)]
         shapes.append(shapes[0] if absolute else (0, 2))
         results = [np.zeros(shape, np.float32) for shape in shapes]
         for first in range(0, colors.shape[1], blending.CHANNELS):
             records = _records(prepared, means2d, conics, colors, first)
-            totals = _backward(
-                prepared, records, ctx.hits, gradient, ctx.image, _array(d_alphas), transmittance,
-                first,
-                absolute,
+            blocks = _aligned(prepared.lanes * blending.CHANNELS), _aligned(prepared.lanes)
+            layout.to_blocks(  # type: ignore[call-arg]  # star arguments
+                gradient, ctx.image, alphas, transmittance, prepared.columns, first, *blocks
+            )
+            sums = _aligned(int(lists.span_start[-1]) * blending_vjp.SUMS, zero=True)
+            blending_vjp.backward(  # type: ignore[call-arg]  # star arguments
+                records, lists.tile_start, lists.listed_rank, lists.listed_span, ctx.hits,
+                row_order(prepared.rows), blending.COLUMN, blending.ROW,
+                colors.shape[1] - first >= blending.CHANNELS, *blocks, absolute, sums,
             )  # fmt: skip
+            totals = np.empty((len(prepared.order), blending_vjp.SUMS), np.float32)
+            blending_vjp.sum_spans(lists.span_start, sums, totals)
             layout.scatter(  # type: ignore[call-arg]  # star arguments
                 prepared.order, totals, first, _array(conics), _array(opacities), *results
             )
@@ -303,17 +302,9 @@ def _prepare(
     order = depth_order(_array(depths), seen)
     # Blending wants exponents: alpha = exp(log opacity - sigma) takes one exp, not a product.
     log_opacities = np.log(np.minimum(alphas.take(order), GREATEST), dtype=np.float32)
-    records = _gather(order, log_opacities, means2d, conics, colors, 0)
+    records = _gathered(order, log_opacities, means2d, conics, colors, 0)
     lists = list_tiles(records, width, height)
-    return _Prepared(order, log_opacities, records, lists, width, height)
-
-
-def _aligned(size: int, *, zero: bool = False) -> np.ndarray:
-    """A float32 array aligned to the size of a vector register."""
-    make = np.zeros if zero else np.empty
-    array = make(size + ALIGNMENT // 4, np.float32)
-    first = -(array.ctypes.data // 4) % (ALIGNMENT // 4)
-    return array[first : first + size]
+    return _Prepared(order, log_opacities, records, lists, -(-width // TILE), -(-height // TILE))
 
 
 def _records(
@@ -322,10 +313,10 @@ def _records(
     """The records of this pass of channels."""
     if first == 0:
         return prepared.records
-    return _gather(prepared.order, prepared.log_opacities, means2d, conics, colors, first)
+    return _gathered(prepared.order, prepared.log_opacities, means2d, conics, colors, first)
 
 
-def _gather(
+def _gathered(
     order: np.ndarray,
     log_opacities: np.ndarray,
     means2d: Tensor,
@@ -340,42 +331,9 @@ def _gather(
     return records
 
 
-def _forward(
-    prepared: _Prepared, records: np.ndarray, channels: int, hits: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The block image and its transmittance; writes ``hits``."""
-    image, transmittance = _aligned(prepared.lanes * blending.CHANNELS), _aligned(prepared.lanes)
-    blending.forward(
-        records, prepared.lists.tile_start, prepared.lists.listed_rank, prepared.row_order,
-        blending.COLUMN, blending.ROW, channels >= blending.CHANNELS, image, transmittance, hits,
-    )  # fmt: skip
-    return image, transmittance
-
-
-def _backward(
-    prepared: _Prepared,
-    records: np.ndarray,
-    hits: np.ndarray,
-    d_image: np.ndarray,
-    image: np.ndarray,
-    d_alphas: np.ndarray,
-    transmittance: np.ndarray,
-    first: int,
-    absolute: bool,
-) -> np.ndarray:
-    """Gradient sums of every visible Gaussian, by depth rank, [G, 16]."""
-    lists, lanes = prepared.lists, prepared.lanes
-    gradient, behind = _aligned(lanes * blending.CHANNELS), _aligned(lanes)
-    layout.to_blocks(
-        d_image, image, d_alphas, transmittance, prepared.columns, first, gradient, behind
-    )
-    sums = _aligned(int(lists.span_start[-1]) * blending_vjp.SUMS, zero=True)
-    blending_vjp.backward(
-        records, lists.tile_start, lists.listed_rank, lists.listed_span, hits, prepared.row_order,
-        blending.COLUMN, blending.ROW, d_image.shape[2] - first >= blending.CHANNELS, gradient,
-        behind,
-        absolute, sums,
-    )  # fmt: skip
-    totals = np.empty((len(prepared.order), blending_vjp.SUMS), np.float32)
-    blending_vjp.sum_spans(lists.span_start, sums, totals)
-    return totals
+def _aligned(size: int, *, zero: bool = False) -> np.ndarray:
+    """A float32 array aligned to the size of a vector register."""
+    make = np.zeros if zero else np.empty
+    array = make(size + ALIGNMENT // 4, np.float32)
+    first = -(array.ctypes.data // 4) % (ALIGNMENT // 4)
+    return array[first : first + size]

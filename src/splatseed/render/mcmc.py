@@ -1,15 +1,125 @@
-"""gsplat's MCMC strategy on either device.
+"""gsplat's MCMC strategy on either device: what it has in CUDA only, relocation and covariances.
 
-Needs gsplat, unlike the rest of ``splatseed.render``, which imports it on demand.
+Notation: o opacity, s scales, n the number of Gaussians at one place. With o' = 1 - (1 - o)^(1/n)
+(3DGS as MCMC, Kheradmand et al. 2024, eq. 9; the double sum folded by the hockey-stick identity):
+
+    s' = s o / sum_{k=0}^{n-1} (-1)^k C(n, k+1) o'^(k+1) / sqrt(k+1)
+
+Promise: float64 inside, because the sum alternates; gsplat's files are not touched, and CUDA
+tensors go to gsplat's own functions.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Lock
 from typing import Any
 
 import gsplat
+import torch
+from gsplat.strategy import ops
+from gsplat.utils import normalized_quat_to_rotmat
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
 
-from splatseed.render.relocation import mcmc_on_cpu
+
+def compute_relocation(
+    opacities: Float[Tensor, " N"] | Float[Tensor, "N 1"],
+    scales: Float[Tensor, "N 3"],
+    ratios: Int[Tensor, " N"],
+    binoms: Float[Tensor, "M M"],
+) -> tuple[Tensor, Float[Tensor, "N 3"]]:
+    """Opacities (in their shape) and scales [N, 3] of ``ratios`` Gaussians that replace one.
+
+    Args:
+        opacities: From 0 to 1, [N] or [N, 1].
+        scales: Standard deviations, [N, 3].
+        ratios: Number of Gaussians at one place, [N]; limited to M.
+        binoms: gsplat's table of binomial coefficients; only its size is used.
+    """
+    if opacities.is_cuda:
+        from gsplat.relocation import compute_relocation as on_cuda  # noqa: PLC0415  (needs CUDA)
+
+        return on_cuda(opacities, scales, ratios, binoms)  # type: ignore[no-any-return]  # gsplat is untyped
+    largest = len(binoms)
+    shares = ratios.clamp(1, largest).view_as(opacities)  # the table ends at M
+    old = opacities.to(torch.float64)
+    # 1 - (1 - o)^(1/n), without losing the digits of a small o
+    new = -torch.expm1(torch.log1p(-old) / shares)
+    table = _coefficients(largest).to(old.device)
+    total = torch.zeros_like(old)
+    for k in reversed(range(largest)):  # Horner's rule
+        total = (total + table[shares, k]) * new
+    # A Gaussian that stays alone keeps its size to the bit.
+    factor = torch.where(shares == 1, 1.0, old / total)
+    return new.to(opacities.dtype), scales * factor.to(scales.dtype).view(-1, 1)
+
+
+def covariances(
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    compute_covar: bool = True,
+    compute_preci: bool = False,
+    triu: bool = False,
+) -> tuple[Float[Tensor, "N 3 3"], None]:
+    """R S S R' of each Gaussian, [N, 3, 3]; written out, because small products are slow in BLAS.
+
+    Args:
+        quats: wxyz rotations of any length, [N, 4].
+        scales: Standard deviations, [N, 3].
+        compute_covar: gsplat's flag; on the CPU covariances are always returned.
+        compute_preci: gsplat's flag; on the CPU precisions never are.
+        triu: gsplat's flag; on the CPU matrices are always full.
+    """
+    if quats.is_cuda:
+        return gsplat.quat_scale_to_covar_preci(quats, scales, compute_covar, compute_preci, triu)  # type: ignore[no-any-return]  # gsplat is untyped
+    half = normalized_quat_to_rotmat(normalize(quats, dim=-1)) * scales[:, None, :]
+    return (half[:, :, None, :] * half[:, None, :, :]).sum(dim=-1), None
+
+
+def _coefficients(largest: int) -> Float[Tensor, "n k"]:
+    """(-1)^k C(n, k+1) / sqrt(k+1) for n to ``largest``, zero beyond k = n - 1."""
+    rows = [
+        [(-1) ** k * math.comb(n, k + 1) / math.sqrt(k + 1) for k in range(largest)]
+        for n in range(largest + 1)
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
+class _Replaced:
+    """gsplat's own functions, while any ``mcmc_on_cpu`` block runs in any thread."""
+
+    lock = Lock()
+    blocks = 0
+    own: tuple[Any, Any]
+
+
+@contextmanager
+def mcmc_on_cpu() -> Iterator[None]:
+    """While the block runs, gsplat's MCMC strategy accepts CPU tensors; CUDA tensors as ever.
+
+    For code that uses gsplat's ``MCMCStrategy``, or a subclass, and stays unchanged: put its
+    training loop into the block. Blocks may be nested and run in several threads.
+
+    Example:
+        >>> with mcmc_on_cpu():  # here gsplat's strategy.step_post_backward(...) works
+        ...     pass
+    """
+    with _Replaced.lock:
+        if _Replaced.blocks == 0:
+            _Replaced.own = ops.compute_relocation, ops.quat_scale_to_covar_preci
+            ops.compute_relocation, ops.quat_scale_to_covar_preci = compute_relocation, covariances
+        _Replaced.blocks += 1
+    try:
+        yield
+    finally:
+        with _Replaced.lock:
+            _Replaced.blocks -= 1
+            if _Replaced.blocks == 0:
+                ops.compute_relocation, ops.quat_scale_to_covar_preci = _Replaced.own
 
 
 class MCMCStrategy(gsplat.MCMCStrategy):  # type: ignore[misc]  # gsplat has no types

@@ -8,29 +8,41 @@ distributed rendering, rolling shutter) is refused, never ignored.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, Literal
+from numbers import Integral
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from splatseed.errors import ParameterError
 from splatseed.render.autograd import Blend, Harmonics, Lens, Project
-from splatseed.render.info import Info, View, make_info
-from splatseed.render.validation import (
-    check_absgrad,
-    check_numbers,
-    check_sparse,
-    check_tensors,
-    check_unsupported,
-)
+from splatseed.render.blending import CHANNELS
+from splatseed.render.harmonics import MAX_DEGREE
+from splatseed.render.info import Info, Projected, make_info
 from splatseed.requirements import require
 
 RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 RasterizeMode = Literal["classic", "antialiased"]
 GSPLAT_TILE = 16
 """The size of the tiles that ``info`` lists, px."""
+CUDA_ONLY: Mapping[str, object] = {
+    "distributed": False,
+    "camera_model": "pinhole",
+    "segmented": False,
+    "covars": None,
+    "with_ut": False,
+    "with_eval3d": False,
+    "radial_coeffs": None,
+    "tangential_coeffs": None,
+    "thin_prism_coeffs": None,
+    "ftheta_coeffs": None,
+    "rolling_shutter": None,
+    "viewmats_rs": None,
+}
+"""gsplat's further arguments with their defaults."""
 
 
 def rasterization(
@@ -129,21 +141,28 @@ def rasterization(
             packed, tile_size, backgrounds, render_mode,
             sparse_grad, absgrad, rasterize_mode, channel_chunk, **unsupported,
         )  # fmt: skip
-    check_unsupported(unsupported)
-    check_numbers(
-        width, height, tile_size, near_plane, eps2d, sh_degree,
-        render_mode=(render_mode, RenderMode), rasterize_mode=(rasterize_mode, RasterizeMode),
-    )  # fmt: skip
-    check_tensors(
+    _check_unsupported(unsupported)
+    for name, size in (("width", width), ("height", height), ("tile_size", tile_size)):
+        fits = isinstance(size, Integral) and int(size) >= 1
+        _require(fits, f"{name} as an int of at least 1", size)
+    # Depths sort like their bits only if they are not negative.
+    for name, number in (("near_plane", near_plane), ("eps2d", eps2d)):
+        _require(number >= 0, f"{name} of at least 0", number)
+    degrees = (None, *range(MAX_DEGREE + 1))
+    _require(sh_degree in degrees, f"an sh_degree from 0 to {MAX_DEGREE} on the CPU", sh_degree)
+    for mode, modes in ((render_mode, RenderMode), (rasterize_mode, RasterizeMode)):
+        _require(mode in get_args(modes), f"a mode among {', '.join(get_args(modes))}", mode)
+    _check_tensors(
         colors,
         {"means": means, "quats": quats, "scales": scales, "opacities": opacities,
          "viewmats": viewmats, "Ks": Ks, "backgrounds": backgrounds},
         sh_degree,
     )  # fmt: skip
     batch = tuple(means.shape[:-2])
-    check_sparse(sparse_grad, packed, batch)
+    fits = not sparse_grad or (packed and not batch)
+    _require(fits, "packed=True and no batch dimensions with sparse_grad=True", batch or packed)
     parts = colors if isinstance(colors, tuple) else (colors,)
-    views: list[View] = []
+    views: list[Projected] = []
     shades: list[Tensor] = []
     for scene in _unbatched(batch, means, quats, scales, opacities, viewmats, Ks, *parts):
         gaussians, poses, intrinsics = scene[:4], scene[4], scene[5]
@@ -160,7 +179,9 @@ def rasterization(
             shade = _colors(scene[0], scene[6:], poses, camera, view, sh_degree)
             shades.append(_with_depth(shade, view, render_mode))
         views += projected
-    check_absgrad(absgrad, shades[0].shape[1])
+    # Absolute gradients of more channels than one pass takes are not additive.
+    limit = f"no more than {CHANNELS} channels, depth included, with absgrad on the CPU"
+    _require(not absgrad or shades[0].shape[1] <= CHANNELS, limit, shades[0].shape[1])
     info = make_info(views, batch, packed, width, height, tile_size)
     images, alphas = _blend(views, shades, info, _background(backgrounds, render_mode), absgrad)
     if render_mode in {"ED", "RGB+ED"}:
@@ -181,7 +202,7 @@ def _intrinsics(K: Tensor) -> np.ndarray:
     return np.asarray(K.detach().to(torch.float32).contiguous().numpy())
 
 
-def _project(gaussians: Sequence[Tensor], viewmat: Tensor, lens: Lens, sparse: bool) -> View:
+def _project(gaussians: Sequence[Tensor], viewmat: Tensor, lens: Lens, sparse: bool) -> Projected:
     """Means, quats, scales and opacities in one camera."""
     opacities = gaussians[3]
     radii, means2d, depths, conics, compensations = Project.apply(  # type: ignore[no-untyped-call]  # PyTorch's apply is untyped
@@ -189,7 +210,7 @@ def _project(gaussians: Sequence[Tensor], viewmat: Tensor, lens: Lens, sparse: b
     )
     if lens.antialiased:
         opacities = opacities * compensations
-    return View(radii, means2d, depths, conics, opacities)
+    return Projected(radii, means2d, depths, conics, opacities)
 
 
 def _colors(
@@ -197,7 +218,7 @@ def _colors(
     colors: Sequence[Tensor],
     viewmats: Tensor,
     camera: int,
-    view: View,
+    view: Projected,
     sh_degree: int | None,
 ) -> Tensor:
     """Colours of N Gaussians in one camera, [N, D]; ``colors`` is one tensor or a pair."""
@@ -212,7 +233,7 @@ def _colors(
     return shades
 
 
-def _with_depth(colors: Tensor, view: View, render_mode: RenderMode) -> Tensor:
+def _with_depth(colors: Tensor, view: Projected, render_mode: RenderMode) -> Tensor:
     """The channels of a render mode, depth last."""
     if render_mode == "RGB":
         return colors
@@ -229,7 +250,7 @@ def _background(backgrounds: Tensor | None, render_mode: RenderMode) -> Tensor |
 
 
 def _blend(
-    views: Sequence[View],
+    views: Sequence[Projected],
     shades: Sequence[Tensor],
     info: Info,
     backgrounds: Tensor | None,
@@ -267,3 +288,75 @@ def _blend(
 
 def _keep_absgrad(means2d: Any, rows: Any, gradient: Tensor) -> None:
     means2d.absgrad[rows] = gradient
+
+
+def _check_unsupported(arguments: Mapping[str, object]) -> None:
+    """Refuse arguments that only gsplat's CUDA code supports, and unknown ones."""
+    for name, value in arguments.items():
+        _require(name in CUDA_ONLY, "arguments of gsplat's rasterization", name)
+        default = CUDA_ONLY[name]
+        # gsplat's default for the shutter is an enumeration member, recognised by its name.
+        fits = value is default or getattr(value, "name", None) == "GLOBAL"
+        fits = fits or (isinstance(value, str) and value == default)
+        _require(fits, f"{name} to be left at its default on the CPU", value)
+
+
+def _check_tensors(
+    colors: Tensor | tuple[Tensor, Tensor],
+    tensors: Mapping[str, Tensor | None],
+    sh_degree: int | None,
+) -> None:
+    """Refuse whatever the kernels, which do not check bounds, could not read."""
+    parts = colors if isinstance(colors, tuple) else (colors,)
+    for name, each in (*tensors.items(), *(("colors", part) for part in parts)):
+        fits = isinstance(each, Tensor) and each.dtype == torch.float32
+        fits = fits and each.device.type == "cpu"  # type: ignore[union-attr]  # a tensor
+        optional = each is None and name == "backgrounds"
+        _require(fits or optional, f"{name} as a float32 tensor on the CPU, like means", each)
+    found = {name: tuple(each.shape) for name, each in tensors.items() if each is not None}
+    *batch, n, _ = found["means"] if len(found["means"]) > 1 else (0, 0, 0)
+    _require(0 not in batch, "means of shape [..., N, 3], no batch dimension 0", found["means"])
+    cameras = found["viewmats"][-3] if len(found["viewmats"]) == len(batch) + 3 else 0
+    like = f"viewmats of shape {[*batch, 'C', 4, 4]}, of at least one camera"
+    _require(cameras, like, found["viewmats"])
+    shared, own = (*batch, n), (*batch, cameras, n)
+    expected = {
+        "means": (*shared, 3), "quats": (*shared, 4), "scales": (*shared, 3), "opacities": shared,
+        "viewmats": (*own[:-1], 4, 4), "Ks": (*own[:-1], 3, 3),
+        "backgrounds": (*own[:-1], *parts[0].shape[-1:]),
+    }  # fmt: skip
+    for name, shape in found.items():
+        _require(shape == expected[name], f"{name} of shape {list(expected[name])}", shape)
+    _check_colors([tuple(part.shape) for part in parts], shared, own, sh_degree)
+
+
+def _check_colors(
+    shapes: Sequence[tuple[int, ...]],
+    shared: tuple[int, ...],
+    own: tuple[int, ...],
+    sh_degree: int | None,
+) -> None:
+    """Shared by the cameras or one set per camera: the number of axes decides."""
+    first, last = shapes[0], shapes[-1]
+    if sh_degree is None:
+        fits = len(shapes) == 1 and first[:-1] in (shared, own) and first[-1] >= 1
+        expected = f"colors of shape {[*shared, 'D']} or {[*own, 'D']}"
+    else:
+        terms = (sh_degree + 1) ** 2
+        if len(shapes) == 1:
+            fits, rest = first[:-2] in (shared, own), terms
+        else:
+            fits, rest = len(shapes) == 2 and first == (*shared, 1, 3), terms - 1
+            fits = fits and last[:-2] == shared
+        fits = fits and last[-2] >= rest and last[-1] == 3
+        ends = [f"K >= {terms}", 3]
+        expected = f"colors of shape {[*shared, *ends]} or {[*own, *ends]}, or the former in two"
+    _require(fits, expected, list(shapes))
+
+
+def _require(fits: object, expected: str, found: object) -> None:
+    if not fits:
+        if hasattr(found, "dtype"):
+            found = f"{type(found).__name__} of {found.dtype}"
+        fix = "Correct the arguments of rasterization, or render on CUDA."
+        raise ParameterError(expected, found=str(found), fix=fix)

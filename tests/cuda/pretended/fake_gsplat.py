@@ -148,7 +148,7 @@ class _C(Projection):
     def relocation(opacities, scales, ratios, binoms, n_max):
         check_input(opacities=opacities, scales=scales, binoms=binoms)
         check_input(torch.int32, ratios=ratios)
-        from splatseed.render.relocation import compute_relocation
+        from splatseed.render.mcmc import compute_relocation
 
         o, s = compute_relocation(elem(opacities), elem(scales), elem(ratios).long(), elem(binoms))
         return Pretend(o), Pretend(s)
