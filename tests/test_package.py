@@ -347,7 +347,7 @@ def test_dependencies_are_those_that_are_imported():
         trains = trains or path.name in {"torch_device.py", "gsplat_kernels.py"}
         allowed = base | more if trains else base
         allowed = base | names["depth"] if part == "monocular" else allowed
-        allowed = base | names["cluster"] if path.name == "ray_tasks.py" else allowed
+        allowed = base | names["cluster"] if path.name.startswith("ray_") else allowed
         if part in {"export", "view", "commands", "sfm"}:
             allowed = allowed | names["view"]
         if path.parent.name == "clouds":

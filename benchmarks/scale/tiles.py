@@ -11,6 +11,7 @@ tiles and after them, as a machine's pace changes. See README.md for what was me
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -30,7 +31,6 @@ from benchmarks.common.markdown import table
 from benchmarks.common.memory import FamilyWatch
 
 from splatseed.io.ply import ply_header, ply_rows
-from splatseed.process.interpreter import child_command, child_environment
 
 __all__: list[str] = []
 
@@ -124,8 +124,8 @@ def upsample(cloud: Path, points: int, method: str, threads: int, words: Sequenc
     command = ["upsample", str(cloud), "-o", str(out), "--method", method, "--ratio", "4", *words]
     started = time.perf_counter()
     process = subprocess.Popen(
-        child_command(PROGRAM, *command), stdout=subprocess.PIPE, text=True,
-        env=child_environment(thread_settings(threads)),
+        [sys.executable, "-P", "-c", PROGRAM, *command], stdout=subprocess.PIPE, text=True,
+        env={**os.environ, **thread_settings(threads)},
     )  # fmt: skip
     assert process.stdout is not None  # noqa: S101  (asked for above)
     with FamilyWatch(process.pid) as memory:

@@ -26,7 +26,7 @@ import splatseed as ss
 from splatseed.depth.alignment import align
 from splatseed.io import find_depths
 from splatseed.io.depth.folder import depth_folder
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 from splatseed.scene import Image
 from splatseed.seeding.diagnostics import spacing
 from splatseed.synthetic import Capture, make_capture, write_capture

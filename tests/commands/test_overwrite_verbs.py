@@ -7,7 +7,7 @@ import json
 import pytest
 
 from splatseed.bench.running.folder import make_bench_folder
-from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.staging import MANIFEST
 from splatseed.train.folder import RunFolder
 
 

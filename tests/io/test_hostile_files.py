@@ -23,8 +23,8 @@ from splatseed.io import files, load_originals, load_scene, write_scene
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.io.depth.arrays import read_npz
 from splatseed.io.files import open_file, read_file
-from splatseed.io.output.manifest import kind_of
 from splatseed.io.photograph import photograph_bytes
+from splatseed.io.staging import read_manifest
 from splatseed.seeding.diagnostics import untrainable
 
 
@@ -70,7 +70,7 @@ def test_what_is_no_file_is_not_called_missing(odd, name, is_, scene_dir, model)
 def test_notes_beside_a_scene_are_not_read_without_end(kind, odd, scene_dir):
     (scene_dir / "splatseed.json").symlink_to(odd / kind)
     assert load_originals(scene_dir).points.num_original == len(load_scene(scene_dir).points)
-    assert kind_of(scene_dir) is None
+    assert read_manifest(scene_dir) == {}
     for read in (read_plan, lambda path: with_config(["--config", str(path)], [])):
         with pytest.raises(SceneFormatError, match=r"a pipe|a device"):
             read(odd / kind)

@@ -27,8 +27,9 @@ from splatseed.errors import (
 from splatseed.io import load_scene
 from splatseed.io.rgbd.replica import load_rgbd
 from splatseed.pointcloud import PointCloud
+from splatseed.process import tasks
 from splatseed.scene import Image, Scene, Split
-from splatseed.sfm import reconstruct, triangulate, worker
+from splatseed.sfm import reconstruct, triangulate
 from splatseed.sfm.features import Run
 from splatseed.sfm.orientation import clear_orientation
 from splatseed.sfm.photos import Photo
@@ -281,7 +282,7 @@ def test_interrupt_leaves_nothing(photos: Path, tmp_path: Path) -> None:
 def test_a_dying_worker_is_one_clear_error(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, child: str, told: str
 ) -> None:
-    monkeypatch.setattr(worker, "_CHILD", child)
+    monkeypatch.setattr(tasks, "_PROGRAM", child)
     with pytest.raises(ReconstructionError, match=told):
         reconstruct(photos, tmp_path / "scene")
     assert not list(tmp_path.iterdir())

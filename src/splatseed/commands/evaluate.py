@@ -18,7 +18,7 @@ from splatseed.errors import (
     ParameterError,
     SceneNotFoundError,
 )
-from splatseed.io.output.staging import atomic_file, check_output, check_parents, output_folder
+from splatseed.io.staging import atomic_file, check_output, check_parents, output_folder
 from splatseed.literal import counted
 from splatseed.requirements import require
 from splatseed.train.settings import Backend, TrainSettings

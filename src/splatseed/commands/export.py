@@ -21,7 +21,7 @@ from splatseed.export import (
     read_model,
     write_model,
 )
-from splatseed.io.output.staging import check_parents
+from splatseed.io.staging import check_parents
 from splatseed.literal import quoted
 from splatseed.train.folder import RunFolder
 from splatseed.train.settings import TrainSettings

@@ -13,7 +13,7 @@ from splatseed.commands.models import model_file
 from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_note, print_pairs, stage_display
 from splatseed.errors import OutputError, ParameterError
-from splatseed.io.output.staging import check_parents
+from splatseed.io.staging import check_parents
 from splatseed.requirements import require
 from splatseed.train.settings import Backend
 

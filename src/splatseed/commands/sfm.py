@@ -24,7 +24,7 @@ from splatseed.console import (
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.io.files import is_video
-from splatseed.io.output.staging import check_output
+from splatseed.io.staging import check_output
 from splatseed.literal import counted, quoted, visible
 from splatseed.sfm import (
     DeviceName,

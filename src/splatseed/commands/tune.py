@@ -44,7 +44,7 @@ from splatseed.commands.options import check_least, parse_options
 from splatseed.console import OUT, print_commands, print_note, print_table, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SplatseedError
 from splatseed.io.files import read_text
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 from splatseed.literal import quoted, visible
 from splatseed.process.interruption import exit_code
 from splatseed.seeding.upsampling import parse_budget

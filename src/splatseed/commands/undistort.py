@@ -13,7 +13,7 @@ from splatseed.console import print_commands, print_note, print_pairs, stage_dis
 from splatseed.io import load_scene
 from splatseed.io.image_checks import warnings_but_lens
 from splatseed.io.output.earlier import was_upsampled
-from splatseed.io.output.staging import check_output
+from splatseed.io.staging import check_output
 from splatseed.literal import quoted
 from splatseed.seeding.diagnostics import is_distorted
 from splatseed.sfm import undistort

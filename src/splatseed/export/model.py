@@ -15,7 +15,7 @@ from splatseed.errors import SceneFormatError
 from splatseed.export import compressed_ply, sog, splat, spz
 from splatseed.export.formats import detect_format, format_of_name
 from splatseed.io.files import read_bytes
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.splat.gaussians import Gaussians
 from splatseed.splat.ply import read_gaussians, write_gaussians

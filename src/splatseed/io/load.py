@@ -18,10 +18,10 @@ from splatseed.io.files import is_video, odd_kind, read_text
 from splatseed.io.nerfstudio.blender import is_blender, read_blender
 from splatseed.io.nerfstudio.scene import read_transforms_scene
 from splatseed.io.output.earlier import recall_seeds
-from splatseed.io.output.manifest import MANIFEST, kind_of
 from splatseed.io.ply import read_ply, refuse_model
 from splatseed.io.rgbd.tum import is_tum, load_tum
 from splatseed.io.split import follow_lists
+from splatseed.io.staging import MANIFEST, read_manifest
 from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneSource
 
@@ -179,7 +179,7 @@ def _refuse_of_output(path: Path) -> None:
         SceneNotFoundError: It is a run's.
         SceneFormatError: It is a scene's.
     """
-    kind = kind_of(path.parent)
+    kind = read_manifest(path.parent).get("command")
     if kind is None or path.suffix != ".json" or path.name.startswith("transforms"):
         return
     if kind == "train":
@@ -201,7 +201,7 @@ def _scene_above(path: Path) -> Path | None:
 
 
 def _no_scene(path: Path) -> SceneNotFoundError:
-    if kind_of(path) == "train":
+    if read_manifest(path).get("command") == "train":
         raise _is_run(path)
     scenes = [each.name for each in sorted(path.iterdir()) if is_scene(each)]
     files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}

@@ -20,10 +20,9 @@ from typing import Literal
 from splatseed.errors import OutputError, PointCloudError
 from splatseed.io.cloud import clean_scene
 from splatseed.io.output.image_folders import bring
-from splatseed.io.output.layouts import write_colmap, write_json, write_transforms
-from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.output.layouts import write_colmap, write_transforms
 from splatseed.io.output.point_stream import PointStream, append_points
-from splatseed.io.output.staging import output_folder
+from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.pointcloud import ORIGINAL
 from splatseed.scene import Scene
 

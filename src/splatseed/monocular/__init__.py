@@ -23,13 +23,13 @@ from PIL import Image as PilImage
 from splatseed.depthmap import ASPECT_SLACK
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io.depth.folder import depth_folder
-from splatseed.io.output.staging import check_output
 from splatseed.io.photograph import (
     check_photograph,
     decode_photograph,
     photograph_bytes,
     photograph_folder,
 )
+from splatseed.io.staging import check_output
 from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene

@@ -1,8 +1,7 @@
-"""Ray: tasks on the nodes of a cluster, for benchmarks and for clouds in tiles.
+"""Tasks on the nodes of a Ray cluster, for benchmarks and for clouds in tiles.
 
-Notation: the *driver* is the process that the user started. A task *lands* when it returns, fails,
-or is given up. Promise: a task whose node or worker is lost is started again on another, up to
-``LOSSES`` times; Ray is imported only when a cluster is used.
+Promise: a task whose node or worker is lost is started again on another, up to ``LOSSES`` times;
+Ray is imported only when a cluster is used.
 """
 
 from __future__ import annotations
@@ -11,12 +10,16 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 from contextlib import chdir, contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any
 
-from splatseed.errors import ParameterError
+from splatseed.errors import ParameterError, TaskLostError
+from splatseed.process.interruption import interruption
+from splatseed.process.tasks import Function, Report, Result, Tasks
+from splatseed.process.threads import few_threads
 from splatseed.requirements import require
 
 LOSSES = 3
@@ -32,8 +35,6 @@ UNIMPORTED = "remote function failed to import"
 """What Ray says of a task whose function a worker could not import."""
 MOST_THREADS = 8
 """Default threads of a task: with more, they wait for each other."""
-
-Key = TypeVar("Key")
 
 
 @dataclass(frozen=True)
@@ -156,81 +157,77 @@ def _no_cluster(address: str | None, found: str) -> ParameterError:
     )
 
 
-@dataclass(frozen=True)
-class Landing:
-    """How a task ended.
+class RayTasks(Tasks):
+    """Tasks on the cluster that this process is connected to.
 
     Args:
-        value: What it returned.
-        error: What it raised.
-        lost: How it was lost with its node or worker, once too often; empty if it was not.
-    """
-
-    value: Any = None
-    error: BaseException | None = None
-    lost: str = ""
-
-
-class Flights(Generic[Key]):
-    """The tasks of one function that are under way on the cluster, by key.
-
-    Args:
-        function: What they call; nodes import it.
         share: The resources of each.
+        jobs: Most tasks at a time; as many as fit, when left out.
     """
 
-    def __init__(self, function: Callable[..., Any], share: Share) -> None:
+    def __init__(self, share: Share, jobs: int | None = None) -> None:
+        self._share, self._jobs = share, jobs
+        self.words = f"Ray, {self._most()} tasks at a time"
+
+    def run(
+        self, function: Function, calls: Sequence[tuple[Any, ...]], report: Report | None = None
+    ) -> Iterator[Result]:
+        """See ``Tasks``; the function is given no ``progress``."""
         import ray  # noqa: PLC0415  (an extra, and slow to import)
 
+        share = self._share
         options = {"num_cpus": share.threads, "num_gpus": share.gpus, "max_retries": LOSSES}
-        self._task = ray.remote(**options)(function)
-        self._flying: dict[Any, Key] = {}
+        task = ray.remote(**options)(_limited)
+        waiting, running = deque(range(len(calls))), dict[Any, int]()
+        with interruption() as stop:
+            try:
+                while (waiting or running) and not stop.requested:
+                    while waiting and len(running) < self._most():  # nodes may have come or gone
+                        index = waiting.popleft()
+                        running[task.remote(share.threads, function, calls[index])] = index
+                        if report is not None:
+                            report(index, "start", 0.0)
+                    for each in ray.wait(list(running), timeout=POLL_SECONDS)[0]:
+                        yield _result(running.pop(each), each)
+            finally:
+                for force in (False, True) if running else ():  # asked first, a task cleans up
+                    for each in running:
+                        with suppress(ray.exceptions.RayError):
+                            ray.cancel(each, force=force)
+                    ray.wait(list(running), num_returns=len(running), timeout=GRACE_SECONDS)
+        if stop.requested:
+            raise KeyboardInterrupt
 
-    def __len__(self) -> int:
-        return len(self._flying)
-
-    def launch(self, key: Key, *arguments: object) -> None:
-        """Start a task."""
-        self._flying[self._task.remote(*arguments)] = key
-
-    def landed(self) -> list[tuple[Key, Landing]]:
-        """The tasks that have ended, after at most ``POLL_SECONDS``."""
-        import ray  # noqa: PLC0415  (an extra, and slow to import)
-
-        ready, _ = ray.wait(list(self._flying), timeout=POLL_SECONDS)
-        return [(self._flying.pop(reference), _landing(reference)) for reference in ready]
-
-    def cancel(self) -> list[Key]:
-        """Stop all tasks; returns their keys."""
-        import ray  # noqa: PLC0415  (an extra, and slow to import)
-
-        if not self._flying:
-            return []
-        for force in (False, True):  # asked first, a task removes its temporary folder
-            for reference in self._flying:
-                with suppress(ray.exceptions.RayError):
-                    ray.cancel(reference, force=force)
-            ray.wait(list(self._flying), num_returns=len(self._flying), timeout=GRACE_SECONDS)
-        keys = list(self._flying.values())
-        self._flying.clear()
-        return keys
+    def _most(self) -> int:
+        return self._jobs or max(Cluster().capacity(self._share), 1)
 
 
-def _landing(reference: Any) -> Landing:
+def _limited(threads: int, function: Function, call: tuple[Any, ...]) -> Any:
+    """A task with its share of a node."""
+    with few_threads(threads):
+        return function(*call)
+
+
+def _result(index: int, reference: Any) -> Result:
     import ray  # noqa: PLC0415  (an extra, and slow to import)
 
     try:
-        return Landing(ray.get(reference))
+        return Result(index, ray.get(reference))
     except ray.exceptions.RayTaskError as error:
         told = str(error.cause)
         if isinstance(error.cause, ray.exceptions.RaySystemError) or UNIMPORTED in told:
-            return Landing(error=_not_installed(told))
-        return Landing(error=error.cause)
+            return Result(index, error=not_installed(told))
+        return Result(index, error=error.cause)
     except ray.exceptions.RayError as error:
-        return Landing(lost=" ".join(str(error).split()))
+        lost = TaskLostError(
+            "a node that lives until its work is done",
+            found=f"{1 + LOSSES} losses, the last: {' '.join(str(error).split())}",
+            fix="Check the cluster's memory and disks, and run the same command to go on.",
+        )
+        return Result(index, error=lost)
 
 
-def _not_installed(told: str) -> ParameterError:
+def not_installed(told: str) -> ParameterError:
     """What a worker's traceback means, if the worker could not import what it is to call."""
     reason = next(filter(None, map(str.strip, reversed(told.splitlines()))), "no reason")
     return ParameterError(

@@ -1,32 +1,59 @@
-"""Tasks without return values, in this process, in several, or on a Ray cluster.
+"""Functions called here, in child processes, or (``ray_tasks``) on a Ray cluster.
 
-A task leaves its result on a disk that all processes see, and may run twice. Promise: tasks whose
-process or node is lost are started again, up to ``LOSSES`` times; the first error that a task
-raises ends all, and is raised here; an interrupt waits for tasks under way in processes of this
-machine.
+Notation: a *task* is a call of a function at the top of a module, with arguments that can be
+pickled. Promise: a failure ends no other task; a process that dies is the failure of its task
+alone, which is tried once more after all others. Children import nothing from the working
+directory (a ``numpy.py`` that lies there is never executed), and end with us. On Ctrl-C they get a
+SIGTERM, at which training saves a checkpoint, and on a second one they are killed.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
+import pickle
+import queue
 import signal
+import subprocess
+import sys
+import tempfile
 import threading
+import time
+import traceback
 from abc import ABC, abstractmethod
-from collections import deque
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from typing import Any
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from typing import IO, Any, TypeAlias, cast
 
-from splatseed.errors import TaskLostError
-from splatseed.process.interpreter import safe_children
-from splatseed.process.ray_tasks import LOSSES, Cluster, Flights, Share
-from splatseed.process.threads import few_threads
-from splatseed.progress import Progress
+from splatseed.errors import SplatseedError, TaskLostError
+from splatseed.process.interruption import interruption
+from splatseed.progress import Progress, thread_limit
 
-Call = tuple[Any, ...]
-"""The arguments of a task."""
+Function: TypeAlias = Callable[..., Any]
+Report: TypeAlias = Callable[[int, str, float], None]
+"""Takes a task's index, its stage, and the fraction of it that is done."""
+
+_PROGRAM = "from splatseed.process.tasks import serve; serve()"
+_TRIES = 2
+_POLL_SECONDS = 0.2
+_REPORT_SECONDS = 0.5
+_LAST_WORDS = 40
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a task ended.
+
+    Args:
+        index: Which of the calls it was.
+        value: What it returned.
+        error: What it raised; a ``TaskLostError`` if its process or node died.
+    """
+
+    index: int
+    value: Any = None
+    error: Exception | None = None
 
 
 class Tasks(ABC):
@@ -42,19 +69,34 @@ class Tasks(ABC):
 
     @abstractmethod
     def run(
-        self, function: Callable[..., object], calls: Sequence[Call], stage: str, progress: Progress
-    ) -> None:
-        """Call a function once with each of some arguments; in any order.
+        self, function: Function, calls: Sequence[tuple[Any, ...]], report: Report | None = None
+    ) -> Iterator[Result]:
+        """Call a function once with each of some arguments; gives results as tasks end.
 
         Args:
-            function: At the top of a module, so that other processes find it.
+            function: The function.
             calls: Its arguments, task by task.
-            stage: What it does, for the progress.
-            progress: Called with the stage and the fraction done.
+            report: Told when a task starts; then the function is also given a ``progress``, and
+                what it tells that one is passed on, but for tasks on a cluster.
 
         Raises:
-            TaskLostError: A task was lost with its process too often.
+            KeyboardInterrupt: The user stopped it; tasks that ended in time were given before.
         """
+
+    def run_all(
+        self, function: Function, calls: Sequence[tuple[Any, ...]], stage: str, progress: Progress
+    ) -> None:
+        """Call a function with each of some arguments, for what it leaves on the disk.
+
+        Raises:
+            Exception: The first that a task raised; it ends all.
+        """
+        progress(stage, 0.0)
+        with closing(self.run(function, calls)) as results:  # type: ignore[type-var]  # a generator
+            for done, result in enumerate(results, start=1):
+                if result.error is not None:
+                    raise result.error
+                progress(stage, done / len(calls))
 
 
 class HereTasks(Tasks):
@@ -63,131 +105,264 @@ class HereTasks(Tasks):
     words = "this process"
 
     def run(
-        self, function: Callable[..., object], calls: Sequence[Call], stage: str, progress: Progress
-    ) -> None:
+        self, function: Function, calls: Sequence[tuple[Any, ...]], report: Report | None = None
+    ) -> Iterator[Result]:
         """See ``Tasks``."""
-        progress(stage, 0.0)
-        for done, call in enumerate(calls, start=1):
-            function(*call)
-            progress(stage, done / len(calls))
+        for index, call in enumerate(calls):
+            try:
+                yield Result(index, function(*call, **_progress_of(index, report)))
+            except Exception as error:  # noqa: BLE001  (the caller's to judge)
+                yield Result(index, error=error)
 
 
 class ProcessTasks(Tasks):
     """Tasks in processes of this machine.
 
     Args:
-        jobs: How many at a time.
-        threads: Threads of each.
+        environments: Variables of each process, such as ``slot_environment`` gives.
+        fresh: Whether each task gets a new process, as to measure its memory.
     """
 
-    def __init__(self, jobs: int, threads: int) -> None:
-        self._jobs, self._threads = jobs, threads
-        self.words = f"{jobs} processes"
-        self.processes = 1 + jobs
+    def __init__(self, environments: Sequence[Mapping[str, str]], *, fresh: bool = False) -> None:
+        self._environments, self._fresh = environments, fresh
+        self.words = f"{len(environments)} processes"
+        self.processes = 1 + len(environments)
 
     def run(
-        self, function: Callable[..., object], calls: Sequence[Call], stage: str, progress: Progress
-    ) -> None:
+        self, function: Function, calls: Sequence[tuple[Any, ...]], report: Report | None = None
+    ) -> Iterator[Result]:
         """See ``Tasks``."""
-        left, total = deque(calls), len(calls)
-        progress(stage, 0.0)
-        for _ in range(1 + LOSSES):
-            if not left:
-                return
+        slots = _Slots(function, calls, report, fresh=self._fresh)
+        threads = [
+            threading.Thread(target=slots.work, args=(environment,), daemon=True)
+            for environment in self._environments[: len(calls)]
+        ]
+        with interruption() as stop:
             try:
-                self._run(function, left, lambda: progress(stage, 1.0 - len(left) / total))
-            except BrokenProcessPool:  # one was killed, perhaps for its memory: start anew
-                continue
-        if left:
-            raise TaskLostError(
-                f"processes that live until their tiles are done ({stage})",
-                found=f"{1 + LOSSES} that were killed",
-                fix="Out of memory? Pass fewer --jobs, or a smaller --memory.",
-            )
-
-    def _run(
-        self, function: Callable[..., object], left: deque[Call], told: Callable[[], None]
-    ) -> None:
-        """Run what is left; what is done is removed from it."""
-        context = multiprocessing.get_context("spawn")
-        with safe_children(), ProcessPoolExecutor(self._jobs, context, _begin) as pool:
-            flying: dict[Any, Call] = {}
-            waiting = deque(left)
-            try:
-                while waiting or flying:
-                    while waiting and len(flying) < self._jobs:
-                        call = waiting.popleft()
-                        flying[pool.submit(_limited, self._threads, function, call)] = call
-                    for future in wait(flying, return_when=FIRST_COMPLETED).done:
-                        call = flying.pop(future)
-                        future.result()
-                        left.remove(call)
-                        told()
+                for thread in threads:
+                    thread.start()
+                while any(thread.is_alive() for thread in threads) or not slots.ended.empty():
+                    if stop.requested:
+                        slots.stop(signal.SIGTERM)
+                    with suppress(queue.Empty):
+                        yield slots.ended.get(timeout=_POLL_SECONDS)
             finally:
-                pool.shutdown(wait=True, cancel_futures=True)
+                slots.stop(signal.SIGKILL if os.name == "posix" else signal.SIGTERM)
+                for thread in threads:
+                    thread.join()
+        if stop.requested:
+            raise KeyboardInterrupt
 
 
-class RayTasks(Tasks):
-    """Tasks on the Ray cluster that this process is connected to.
+class _Slots:
+    """What the threads share that wait for the processes of ``ProcessTasks``."""
+
+    def __init__(
+        self,
+        function: Function,
+        calls: Sequence[tuple[Any, ...]],
+        report: Report | None,
+        *,
+        fresh: bool,
+    ) -> None:
+        self._function, self._calls, self._report, self._fresh = function, calls, report, fresh
+        self._waiting = deque(range(len(calls)))
+        self._deaths: Counter[int] = Counter()
+        self._children: set[Child] = set()
+        self._lock = threading.Lock()
+        self._sent: int | None = None
+        self.ended: queue.SimpleQueue[Result] = queue.SimpleQueue()
+
+    def work(self, environment: Mapping[str, str]) -> None:
+        """Have tasks done, in one process after another, until none is left."""
+        while self._waiting and self._sent is None:
+            try:
+                child = Child(environment, tempfile.TemporaryFile())  # noqa: SIM115  (the child's)
+            except OSError as error:
+                while (index := self._next()) is not None:
+                    self.ended.put(Result(index, error=error))
+                return
+            with self._lock:
+                self._children.add(child)
+            try:
+                self._employ(child)
+            finally:
+                with self._lock:
+                    self._children.remove(child)
+                child.close()
+
+    def _employ(self, child: Child) -> None:
+        """Give a process tasks until none is left, it dies, or the next wants a fresh one."""
+        while (index := self._next()) is not None:
+            try:
+                told = _progress_of(index, self._report)
+                value = child.call(self._function, *self._calls[index], **told)
+                self.ended.put(Result(index, value))
+            except TaskLostError as error:
+                self._deaths[index] += 1
+                if self._deaths[index] < _TRIES:
+                    self._waiting.append(index)
+                elif self._sent is None:
+                    self.ended.put(Result(index, error=error))
+                return
+            except Exception as error:  # noqa: BLE001  (the caller's to judge)
+                self.ended.put(Result(index, error=error))
+            if self._fresh:
+                return
+
+    def stop(self, number: int) -> None:
+        """Begin no more tasks, and send the children a signal, once."""
+        with self._lock:
+            if self._sent != number:
+                self._sent = number
+                for child in self._children:
+                    child.process.send_signal(number)
+
+    def _next(self) -> int | None:
+        with suppress(IndexError):
+            return None if self._sent is not None else self._waiting.popleft()
+        return None
+
+
+class Child:
+    """A process that calls functions for us, one after another.
 
     Args:
-        threads: CPUs of each; as many as every node has, up to 8, when left out.
-        jobs: Most tasks at a time; as many as fit, when left out.
+        environment: Variables to set.
+        log: Where its output goes; the terminal when left out. ``close`` closes it.
     """
 
-    def __init__(self, threads: int | None = None, jobs: int | None = None) -> None:
-        self._cluster, self._jobs = Cluster(), jobs
-        self._share: Share = self._cluster.share(threads, gpu=False)
-        self.words = f"Ray, {self._most()} tasks at a time"
-
-    def run(
-        self, function: Callable[..., object], calls: Sequence[Call], stage: str, progress: Progress
+    def __init__(
+        self, environment: Mapping[str, str] | None = None, log: IO[bytes] | None = None
     ) -> None:
-        """See ``Tasks``."""
-        flights: Flights[int] = Flights(_limited, self._share)
-        waiting, done = deque(enumerate(calls)), 0
-        progress(stage, 0.0)
-        try:
-            while waiting or len(flights):
-                while waiting and len(flights) < self._most():  # nodes may have come or gone
-                    number, call = waiting.popleft()
-                    flights.launch(number, self._share.threads, function, call)
-                for _, landing in flights.landed():
-                    _raise_failed(landing.error, landing.lost, stage)
-                    done += 1
-                    progress(stage, done / len(calls))
-        finally:
-            flights.cancel()
+        # An empty entry would stand for the working directory.
+        paths = os.pathsep.join(filter(None, sys.path))
+        self._log = log
+        self.process = subprocess.Popen(  # noqa: S603  (our own interpreter and module)
+            [sys.executable, "-P", "-c", _PROGRAM],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=log,
+            env={**os.environ, "PYTHONPATH": paths, "PYTHONSAFEPATH": "1", **(environment or {})},
+            process_group=0,  # Ctrl-C reaches only us
+        )
 
-    def _most(self) -> int:
-        return self._jobs or max(self._cluster.capacity(self._share), 1)
+    def start(self, function: Function, *arguments: object, reports: bool = False) -> None:
+        """Begin a call; ``wait`` gives its result.
 
+        Args:
+            function: At the top of a module.
+            arguments: Its arguments.
+            reports: Whether it is given a ``progress`` too.
+        """
+        commands = cast("IO[bytes]", self.process.stdin)
+        with suppress(BrokenPipeError):  # it has died, as waiting will tell
+            pickle.dump(pickle.dumps((function, arguments, reports)), commands)
+            commands.flush()
 
-def _raise_failed(error: BaseException | None, lost: str, stage: str) -> None:
-    if error is not None:
-        raise error
-    if lost:
-        raise TaskLostError(
-            f"nodes that live until their tiles are done ({stage})",
-            found=f"a task that was lost {1 + LOSSES} times: {lost}",
-            fix="Check the cluster's memory and disks, and run the same command to go on.",
+    def wait(self, progress: Progress | None = None) -> Any:
+        """What the function returns, or raises.
+
+        Args:
+            progress: Told what the function tells its own.
+
+        Raises:
+            TaskLostError: The process died.
+        """
+        while True:
+            try:
+                kind, *content = pickle.load(cast("IO[bytes]", self.process.stdout))  # noqa: S301  (our child)
+            except (EOFError, pickle.UnpicklingError):
+                raise self._death() from None
+            if kind == "done":
+                return content[0]
+            if kind == "failed":
+                raise content[0]
+            if progress is not None:
+                progress(*content)
+
+    def call(self, function: Function, *arguments: object, progress: Progress | None = None) -> Any:
+        """``start`` and ``wait``."""
+        self.start(function, *arguments, reports=progress is not None)
+        return self.wait(progress)
+
+    def close(self) -> None:
+        """End the process, whatever it is doing."""
+        self.process.kill()
+        self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout, self._log):
+            with suppress(BrokenPipeError):
+                if pipe is not None:
+                    pipe.close()
+
+    def _death(self) -> TaskLostError:
+        code, said = self.process.wait(), ""
+        how = (
+            f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended by exit code {code}"
+        )
+        if self._log is not None:
+            self._log.seek(0)
+            said = " ".join(self._log.read().decode("utf-8", "replace").split()[-_LAST_WORDS:])
+        return TaskLostError(
+            "a process that lives until its work is done",
+            found=f"one that {how}{': ' if said else ''}{said}",
+            fix="Out of memory? Use fewer processes at a time (--jobs), or smaller settings.",
         )
 
 
-def _limited(threads: int, function: Callable[..., object], call: Call) -> None:
-    """A task with its share of the machine."""
-    with few_threads(threads):
-        function(*call)
+def serve() -> None:
+    """Act as a child: call the functions that come in, until the parent ends."""
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print goes to the log
+    if "NUMBA_NUM_THREADS" in os.environ:
+        thread_limit.set(int(os.environ["NUMBA_NUM_THREADS"]))
+    commands: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(commands,), daemon=True).start()
+
+    def reply(*message: object) -> None:
+        replies.write(pickle.dumps(message))
+        replies.flush()
+
+    try:
+        while True:
+            function, arguments, reports = pickle.loads(commands.get())  # noqa: S301  (our parent)
+            told = {"progress": _seldom(lambda *each: reply("told", *each))} if reports else {}
+            try:
+                reply("done", function(*arguments, **told))
+            except Exception as error:  # noqa: BLE001  (the parent's to judge)
+                if not isinstance(error, SplatseedError):
+                    error.add_note(traceback.format_exc())
+                reply("failed", error)
+    except BaseException:  # noqa: BLE001  (the process ends here)
+        traceback.print_exc()
+    finally:
+        os._exit(1)  # at once: the other thread holds a lock that a usual end would wait for
 
 
-def _begin() -> None:
-    """Prepare a process for tasks: it leaves Ctrl-C to its parent, and ends with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def _listen(commands: queue.SimpleQueue[bytes]) -> None:
+    """Pass on what the parent sends; its end, even if it is killed, closes the pipe."""
+    with suppress(EOFError):
+        while True:
+            commands.put(pickle.load(sys.stdin.buffer))  # noqa: S301  (our parent)
+    os._exit(1)
 
 
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+def _seldom(progress: Progress) -> Progress:
+    """Progress that is passed on a few times per second."""
+    last = ("", 0.0)
+
+    def report(stage: str, fraction: float) -> None:
+        nonlocal last
+        if stage != last[0] or fraction >= 1.0 or time.monotonic() - last[1] > _REPORT_SECONDS:
+            last = (stage, time.monotonic())
+            progress(stage, float(fraction))
+
+    return report
+
+
+def _progress_of(index: int, report: Report | None) -> dict[str, Progress]:
+    """The argument for a task's progress, if any is wanted."""
+    if report is None:
+        return {}
+    report(index, "start", 0.0)
+    return {"progress": lambda stage, fraction: report(index, stage, fraction)}

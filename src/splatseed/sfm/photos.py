@@ -17,7 +17,7 @@ from PIL import Image as PilImage
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import VIDEO_SUFFIXES, open_file
-from splatseed.io.output.manifest import kind_of
+from splatseed.io.staging import read_manifest
 from splatseed.literal import quoted, told
 from splatseed.scene import Image, Scene
 
@@ -141,7 +141,7 @@ def _image_names(image_dir: Path) -> tuple[list[str], list[str]]:
             fix="Name the folder that holds the photographs, or a video "
             f"({', '.join(sorted(VIDEO_SUFFIXES))}).",
         )
-    if (kind := kind_of(image_dir)) is not None:
+    if (kind := read_manifest(image_dir).get("command")) is not None:
         images = image_dir / "images"
         fix = f"Name its photographs: {quoted(images)}."
         raise SceneNotFoundError(

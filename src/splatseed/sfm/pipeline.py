@@ -5,7 +5,6 @@ Here the input is checked and the output staged; the work is done by ``worker`` 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -15,8 +14,7 @@ from shutil import rmtree
 from typing import TypeAlias
 
 from splatseed.io.output.layouts import write_split
-from splatseed.io.output.manifest import MANIFEST
-from splatseed.io.output.staging import output_folder
+from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.sfm.jobs import Outcome, ReconstructJob, TriangulateJob
@@ -196,4 +194,4 @@ def _write_manifest(staging: Path, job: str, settings: Settings, report: SfmRepo
         "settings": asdict(settings),
         "report": {key: value for key, value in asdict(report).items() if key != "path"},
     }
-    (staging / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
+    write_json(staging / MANIFEST, manifest)

@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from splatseed.depthmap import DepthMaps
 from splatseed.io.files import ARCHIVE_FAILURES
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.coverage import NEARER, cell_depths, grid_from_world, grid_of

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 
 FULL_ERROR = 0.25
 """The error that is drawn brightest."""

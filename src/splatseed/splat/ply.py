@@ -14,8 +14,8 @@ import numpy as np
 
 from splatseed.errors import SceneFormatError
 from splatseed.io.files import ByteReader
-from splatseed.io.output.staging import atomic_file
 from splatseed.io.ply import EXPORT_PLY_AGAIN, Element, parse_header, refuse_packed
+from splatseed.io.staging import atomic_file
 from splatseed.splat.gaussians import Gaussians
 
 _MEANS = ("x", "y", "z")

@@ -19,7 +19,7 @@ from splatseed.camera import Camera, Intrinsics, quat_from_rotation
 from splatseed.errors import ParameterError
 from splatseed.io import write_scene
 from splatseed.io.depth.folder import write_description
-from splatseed.io.output.staging import output_folder
+from splatseed.io.staging import output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene, Tracks
 from splatseed.synthetic.raycast import render_views, visible

@@ -212,10 +212,10 @@ def _make(
     path = str(work.path)
     if work.facts("drawn") is None:
         left = [(path, method, tile) for tile in tiles if not work.has(weighed_name(tile))]
-        tasks.run(weigh, left, "neighbours", progress)
+        tasks.run_all(weigh, left, "neighbours", progress)
         draw(work, num_new, seed, progress)
     left = [(path, method, tile) for tile in tiles if not work.has(made_name(tile))]
-    tasks.run(place, left, "new points", progress)
+    tasks.run_all(place, left, "new points", progress)
     if repeats_known(work) is None:
         find_repeats(work, store, num_new, progress)
     for name in ("tiles", "weighed", "drawn", "tile_of_rank"):  # the output needs the space

@@ -20,7 +20,7 @@ import numpy as np
 
 from splatseed.errors import OutputError
 from splatseed.io.files import read_text
-from splatseed.io.output.leftovers import remove_tree
+from splatseed.io.staging import remove
 from splatseed.literal import visible
 
 JOB = "job.json"
@@ -55,13 +55,13 @@ class WorkFolder:
         """
         path = self.path / f"{name}{PARTIAL}"
         path.parent.mkdir(parents=True, exist_ok=True)
-        _remove(path)
+        remove(path)
         return path
 
     def complete(self, name: str) -> None:
         """Give a partial file or folder its name."""
         target = self.path / name
-        _remove(target)
+        remove(target)
         (self.path / f"{name}{PARTIAL}").rename(target)
 
     def finish(self, step: str, facts: Mapping[str, object]) -> None:
@@ -104,7 +104,7 @@ class WorkFolder:
 
     def discard(self, name: str) -> None:
         """Remove what is no longer needed."""
-        _remove(self.path / name)
+        remove(self.path / name)
 
 
 @contextmanager
@@ -200,13 +200,6 @@ def _held(path: Path) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        remove_tree(path)
-    else:
-        path.unlink(missing_ok=True)
 
 
 def free_space(path: Path) -> int:

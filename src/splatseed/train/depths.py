@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from splatseed.io.files import ARCHIVE_FAILURES
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
 from splatseed.stereo.of_scene import stereo_depths

@@ -7,18 +7,22 @@ request, and not before the new one is ready to start.
 from __future__ import annotations
 
 import json
-import secrets
-import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io import write_scene
 from splatseed.io.files import read_text
-from splatseed.io.output.manifest import MANIFEST, add_files
-from splatseed.io.output.staging import atomic_file, check_apart, check_output
+from splatseed.io.staging import (
+    MANIFEST,
+    add_files,
+    check_apart,
+    check_output,
+    oserror_as_output_error,
+    remove,
+    write_json,
+)
 from splatseed.scene import Scene
 
 KIND = "train"
@@ -93,48 +97,17 @@ class RunFolder:
         Raises:
             OutputError: It cannot be written.
         """
-        try:
-            if self.path.exists():
-                shutil.rmtree(self.path)
-        except OSError as error:
-            raise OutputError(
-                f"the earlier run at {self.path} to be removed",
-                found=error.strerror or type(error).__name__,
-                fix="Remove it yourself, or choose another folder.",
-            ) from None
-        # The mark first: a run that is interrupted here can be replaced.
-        files = [self.config, self.checkpoint, self.metrics, self.gaussians]
-        files += [self.curve_csv, self.curve_png, self.path / MANIFEST]
-        files += [] if refined is None else [self.scene]
-        mark = {"command": KIND, "version": config["splatseed"]}
-        write_json(self.path / MANIFEST, {**mark, "files": [path.name for path in files]})
+        # The manifest first: a run that is interrupted here can be replaced.
+        files = [self.config, self.checkpoint, self.metrics, self.gaussians, self.curve_csv]
+        files += [self.curve_png, *([] if refined is None else [self.scene])]
+        with oserror_as_output_error(self.path):
+            remove(self.path)
+        manifest = {"command": KIND, "version": config["splatseed"]}
+        write_json(self.path / MANIFEST, {**manifest, "files": [path.name for path in files]})
         if refined is not None:  # before the config, so that no run lacks it
             # COLMAP's layout keeps poses to the bit.
             write_scene(refined, self.scene, format="colmap")
         write_json(self.config, config)
-
-    @contextmanager
-    def results(self) -> Iterator[RunFolder]:
-        """Where to write results: all are moved into this folder once complete, the metrics last.
-
-        Raises:
-            OutputError: They cannot be moved into place.
-        """
-        staged = RunFolder(self.path / f".results.partial-{secrets.token_hex(4)}")
-        try:
-            staged.path.mkdir()
-            yield staged
-            each = sorted(staged.path.iterdir(), key=lambda path: path.name == self.metrics.name)
-            for path in each:
-                _move(path, self.path / path.name)
-        except OSError as error:
-            raise OutputError(
-                f"results to be written to {self.path}",
-                found=error.strerror or type(error).__name__,
-                fix="Check the disk and try again.",
-            ) from None
-        finally:
-            shutil.rmtree(staged.path, ignore_errors=True)
 
     def claim(self, paths: Iterable[Path]) -> None:
         """List files in the folder as the run's own, before or after they are written.
@@ -142,15 +115,7 @@ class RunFolder:
         Raises:
             OutputError: The list cannot be written.
         """
-        names = [path.relative_to(self.path).as_posix() for path in paths]
-        try:
-            add_files(self.path, names)
-        except OSError as error:
-            raise OutputError(
-                f"{self.path / MANIFEST} to be written",
-                found=error.strerror or type(error).__name__,
-                fix="Check the disk and try again.",
-            ) from None
+        add_files(self.path, [path.relative_to(self.path).as_posix() for path in paths])
 
     def read_config(self) -> dict[str, Any]:
         """What ``begin`` wrote.
@@ -174,23 +139,6 @@ class RunFolder:
         """
         refined = config.get("refine_poses") is True
         return str(self.scene.resolve()) if refined else config.get("scene")
-
-
-def _move(path: Path, target: Path) -> None:
-    """Rename a file or folder, replacing an earlier one."""
-    if target.is_dir() and not target.is_symlink():
-        shutil.rmtree(target)
-    path.replace(target)
-
-
-def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write a JSON object.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
-    with atomic_file(path) as partial:
-        partial.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
 
 
 def _unreadable(path: Path, found: str) -> SceneFormatError:

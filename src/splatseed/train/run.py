@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseed.errors import OutputError, PointCloudError, SceneNotFoundError
+from splatseed.io.staging import write_json
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
@@ -34,7 +35,7 @@ from splatseed.train.device import (
     peak_gpu_bytes,
     pick_device,
 )
-from splatseed.train.folder import RunFolder, write_json
+from splatseed.train.folder import RunFolder
 from splatseed.train.parameters import gaussians_of, make_optimizers, make_parameters
 from splatseed.train.record import (
     Board,
@@ -298,12 +299,11 @@ class TrainingRun:
             world = self._frame.gaussians_to_world(gaussians_of(self.state.params))
             scores = replace(scores, num_gaussians=len(world), model_bytes=world.num_bytes)
             result = self._result(scores)
-            with self.folder.results() as staged:
-                write_gaussians(staged.gaussians, world)
-                write_curve_csv(staged.curve_csv, self.state.records)
-                write_curve_png(staged.curve_png, self.state.records)
-                self._write_renders(staged, progress)
-                write_json(staged.metrics, result.to_dict())
+            write_gaussians(self.folder.gaussians, world)
+            write_curve_csv(self.folder.curve_csv, self.state.records)
+            write_curve_png(self.folder.curve_png, self.state.records)
+            self._write_renders(progress)
+            write_json(self.folder.metrics, result.to_dict())  # last: the run has finished
             self.folder.checkpoint.unlink(missing_ok=True)
         return result
 
@@ -351,11 +351,11 @@ class TrainingRun:
                 error.expected, found=error.found, fix=f"{error.fix} {kept}"
             ) from error
 
-    def _write_renders(self, staged: RunFolder, progress: Progress) -> None:
+    def _write_renders(self, progress: Progress) -> None:
         views = self.trainer.test_views
         names = [picture_name(view.name) for view in views]
         self.folder.claim([self.folder.renders / name for name in names])
         for i, (view, name) in enumerate(zip(views, names, strict=True)):
             picture = beside_photograph(view.photograph, self.trainer.render(view).cpu().numpy())
-            write_picture(staged.renders / name, picture)
+            write_picture(self.folder.renders / name, picture)
             progress("write", (i + 1) / len(views))

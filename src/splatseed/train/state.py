@@ -19,7 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from splatseed.errors import SceneFormatError
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 from splatseed.train.device import Capacity
 from splatseed.train.growing import NOWHERE, Growing
 from splatseed.train.parameters import Optimizers, Parameters, as_parameters, make_optimizers

@@ -21,7 +21,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_bytes
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 from splatseed.literal import counted, told
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require

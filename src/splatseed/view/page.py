@@ -16,8 +16,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image as PillowImage, ImageDraw, ImageFont
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.output.staging import atomic_file
 from splatseed.io.photograph import decode_photograph, photograph_bytes
+from splatseed.io.staging import atomic_file
 from splatseed.scene import Image, Scene
 
 GRID_SIDE = 600

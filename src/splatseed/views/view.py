@@ -27,8 +27,8 @@ from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.camera import Camera
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
-from splatseed.io.output.staging import atomic_file
 from splatseed.io.photograph import decode_photograph, open_photograph, photograph_bytes
+from splatseed.io.staging import atomic_file
 from splatseed.lens import undistort_first
 from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent

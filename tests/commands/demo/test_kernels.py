@@ -8,35 +8,37 @@ import pytest
 
 from splatseed.commands.demo import kernels
 from splatseed.kernels.compilation import tell
+from splatseed.process import tasks
 from splatseed.upsample import METHODS
 
-TOO_LONG = "import time; time.sleep(60)"
+TOO_LONG = "time.sleep(60)"
 
 
 @pytest.fixture
 def program(monkeypatch):
-    """Sets what the second process runs; it finds the folder and the parts in its arguments."""
-    return lambda text: monkeypatch.setattr(kernels, "PROGRAM", text)
+    """Sets what the second process runs, which has ``folder``."""
+    begin = "import pathlib, pickle, sys, time; call = pickle.loads(pickle.load(sys.stdin.buffer));"
+    begin += "folder = pathlib.Path(call[1][0]);"
+    return lambda text: monkeypatch.setattr(tasks, "_PROGRAM", begin + text)
 
 
 def test_it_starts_with_the_first_compilation_and_ends_with_the_block(program):
     program(TOO_LONG)
     with kernels.kernels_ahead(training=False) as ahead:
-        assert ahead._process is None
+        assert ahead._child is None
         tell(begins=True)
         tell(begins=False)
-        started = ahead._process
+        started = ahead._child
         tell(begins=True)
-        assert ahead._process is started
-        assert started.poll() is None
-    assert started.poll() is not None
+        assert ahead._child is started
+        assert started.process.poll() is None
+    assert started.process.poll() is not None
     tell(begins=True)
-    assert ahead._process is started
+    assert ahead._child is started
 
 
 def test_a_part_is_compiled_by_one_alone_and_waited_for(program):
     program(
-        "import sys, pathlib, time; folder = pathlib.Path(sys.argv[1]);"
         "(folder / 'auto').touch(); time.sleep(0.5); (folder / 'auto.done').touch(); time.sleep(60)"
     )
     with kernels.kernels_ahead(training=False) as ahead:
@@ -50,10 +52,10 @@ def test_a_part_is_compiled_by_one_alone_and_waited_for(program):
 
 
 def test_a_process_that_ended_is_not_waited_for(program):
-    program("import sys, pathlib; (pathlib.Path(sys.argv[1]) / 'auto').touch()")
+    program("(folder / 'auto').touch()")
     with kernels.kernels_ahead(training=False) as ahead:
         ahead.start()
-        ahead._process.wait()
+        ahead._child.process.wait()
         ahead.wait_for("auto")
         assert not (ahead._folder / "auto.done").exists()
 

@@ -54,15 +54,15 @@ def test_large_clouds_are_shared_among_processes(cloud, tmp_path, splatseed, mon
     class Processes(tasks.HereTasks):
         """As many as asked for, all of them this one."""
 
-        def __init__(self, jobs, threads):
-            self.words, self.processes = f"{jobs} processes of {threads} thread", 1 + jobs
+        def __init__(self, environments):
+            self.words, self.processes = f"{len(environments)} processes", 1 + len(environments)
 
     monkeypatch.setattr(tasks, "ProcessTasks", Processes)
     monkeypatch.setattr(threads, "cores", lambda: 2)
     monkeypatch.setattr(planning, "MOST", 30)  # a large cloud has at least 8 tiles of this size
     words = ("upsample", npz(cloud), "--method", "linear", "--ratio", 3)
     for given, told in (
-        ((), "2 processes of 1 thread"),
+        ((), "2 processes"),
         (("--jobs", 1), "this process"),
         (("--tile-points", 30), "this process"),
     ):

@@ -14,7 +14,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io import find_depths
 from splatseed.io.depth.folder import DESCRIPTION, depth_folder, read_description, write_description
-from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.staging import MANIFEST
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 

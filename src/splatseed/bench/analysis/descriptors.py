@@ -19,8 +19,8 @@ from jaxtyping import Float32, Float64
 
 from splatseed.errors import PointCloudError, SplatseedError
 from splatseed.io.files import read_text
-from splatseed.io.output.staging import atomic_file
 from splatseed.io.photograph import decode_photograph, photograph_bytes
+from splatseed.io.staging import atomic_file
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.diagnostics import empty_regions

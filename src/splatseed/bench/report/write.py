@@ -39,7 +39,7 @@ from splatseed.bench.report.views import ComparedView, compared_views, jpeg
 from splatseed.bench.running.folder import PLAN
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.io.files import read_text
-from splatseed.io.output.staging import atomic_file, output_folder
+from splatseed.io.staging import atomic_file, output_folder
 from splatseed.progress import Progress, silent
 
 REPORT = "report.html"

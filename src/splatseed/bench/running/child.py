@@ -24,7 +24,6 @@ from typing import IO, Any
 
 from splatseed.bench.planning.records import RunResult, RunSpec
 from splatseed.bench.running.job import JobOptions, Outcome, run_job
-from splatseed.process.interpreter import child_command, child_environment
 from splatseed.progress import Progress
 
 PROGRAM = "from splatseed.bench.running.child import serve; serve()"
@@ -72,11 +71,16 @@ class Child:
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(  # noqa: S603  (our own interpreter and module)
-                child_command(PROGRAM),
+                [sys.executable, "-P", "-c", PROGRAM],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
-                env=child_environment(environment),
+                env={
+                    **os.environ,
+                    "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
+                    "PYTHONSAFEPATH": "1",
+                    **environment,
+                },
                 text=True,
                 encoding="utf-8",
                 process_group=0,  # Ctrl-C reaches only us

@@ -7,16 +7,13 @@ neither empty nor a benchmark's is never written to.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from splatseed.bench.planning.scenes import SceneFacts
 from splatseed.bench.running.ledger import LEDGER, Ledger
 from splatseed.errors import OutputError
-from splatseed.io.files import read_text
-from splatseed.io.output.manifest import MANIFEST
-from splatseed.io.output.staging import atomic_file, check_output
+from splatseed.io.staging import MANIFEST, check_output, read_manifest, write_json
 
 DEMO_FACTS = SceneFacts(
     "demo",
@@ -80,8 +77,7 @@ def make_bench_folder(folder: Path) -> None:
         OutputError: It cannot be written.
     """
     if not (folder / MANIFEST).is_file():
-        with atomic_file(folder / MANIFEST) as partial:
-            partial.write_text(json.dumps({"command": "bench"}) + "\n", "utf-8")
+        write_json(folder / MANIFEST, {"command": "bench"})
 
 
 def make_demo_scene(folder: Path) -> Path:
@@ -111,8 +107,4 @@ def make_demo_scene(folder: Path) -> Path:
 
 def _command(folder: Path) -> str:
     """What wrote a folder, by its manifest."""
-    try:
-        content = json.loads(read_text(folder / MANIFEST))
-    except (OSError, ValueError):
-        return "something else"
-    return str(content.get("command")) if isinstance(content, dict) else "something else"
+    return str(read_manifest(folder).get("command", "something else"))

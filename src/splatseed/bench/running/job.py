@@ -30,7 +30,7 @@ from splatseed.bench.running.kept import (
 from splatseed.bench.running.seeds import is_full, make_seeds, scene_of
 from splatseed.bench.running.twins import find_twin, fingerprint, note_training
 from splatseed.errors import SceneFormatError, SplatseedError
-from splatseed.io.output.staging import check_output
+from splatseed.io.staging import check_output
 from splatseed.process.interruption import interruption
 from splatseed.process.peak import peak_bytes
 from splatseed.progress import Progress, silent

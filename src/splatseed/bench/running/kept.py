@@ -15,7 +15,7 @@ from pathlib import Path
 
 from splatseed.bench.planning.records import RunResult, RunSpec
 from splatseed.io.files import read_text
-from splatseed.io.output.staging import output_folder
+from splatseed.io.staging import output_folder
 from splatseed.train.folder import RunFolder
 
 RESULT = "result.json"

@@ -17,7 +17,7 @@ import numpy as np
 from splatseed.bench.planning.records import RunSpec
 from splatseed.errors import PointCloudError
 from splatseed.io.files import ARCHIVE_FAILURES
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 from splatseed.pointcloud import PointCloud
 
 SEEDS = "seeds"

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import socket
 import tempfile
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from splatseed.bench.planning.records import RunSpec
 from splatseed.bench.running.child import Child, Killed
@@ -25,11 +26,13 @@ from splatseed.bench.running.kept import kept_folder, read_result, work_folder, 
 from splatseed.bench.running.ledger import Ledger
 from splatseed.bench.running.watcher import Watcher
 from splatseed.errors import OutputError, ParameterError, SceneNotFoundError, SplatseedError
-from splatseed.io.output.manifest import MANIFEST
+from splatseed.io.staging import MANIFEST
 from splatseed.process.interruption import interruption
-from splatseed.process.ray_tasks import LOSSES, Cluster, Flights, Landing, Share
+from splatseed.process.ray_tasks import LOSSES, Cluster, Share, not_installed
 from splatseed.process.threads import slot_environment
 from splatseed.progress import silent
+
+Key = TypeVar("Key")
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,83 @@ class _Returned:
     outcome: Outcome
     killed: str = ""
     files: Mapping[str, bytes] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Landing:
+    """How a task ended.
+
+    Args:
+        value: What it returned.
+        error: What it raised.
+        lost: How it was lost with its node or worker, once too often; empty if it was not.
+    """
+
+    value: Any = None
+    error: BaseException | None = None
+    lost: str = ""
+
+
+class Flights(Generic[Key]):
+    """The tasks of one function that are under way on the cluster, by key.
+
+    Args:
+        function: What they call; nodes import it.
+        share: The resources of each.
+    """
+
+    def __init__(self, function: Callable[..., Any], share: Share) -> None:
+        import ray  # noqa: PLC0415  (an extra, and slow to import)
+
+        options = {"num_cpus": share.threads, "num_gpus": share.gpus, "max_retries": LOSSES}
+        self._task = ray.remote(**options)(function)
+        self._flying: dict[Any, Key] = {}
+
+    def __len__(self) -> int:
+        return len(self._flying)
+
+    def launch(self, key: Key, *arguments: object) -> None:
+        """Start a task."""
+        self._flying[self._task.remote(*arguments)] = key
+
+    def landed(self) -> list[tuple[Key, Landing]]:
+        """The tasks that have ended, after at most ``0.5``."""
+        import ray  # noqa: PLC0415  (an extra, and slow to import)
+
+        ready, _ = ray.wait(list(self._flying), timeout=0.5)
+        return [(self._flying.pop(reference), _landing(reference)) for reference in ready]
+
+    def cancel(self) -> list[Key]:
+        """Stop all tasks; returns their keys."""
+        import ray  # noqa: PLC0415  (an extra, and slow to import)
+
+        if not self._flying:
+            return []
+        for force in (False, True):  # asked first, a task removes its temporary folder
+            for reference in self._flying:
+                with suppress(ray.exceptions.RayError):
+                    ray.cancel(reference, force=force)
+            ray.wait(list(self._flying), num_returns=len(self._flying), timeout=10.0)
+        keys = list(self._flying.values())
+        self._flying.clear()
+        return keys
+
+
+def _landing(reference: Any) -> Landing:
+    import ray  # noqa: PLC0415  (an extra, and slow to import)
+
+    try:
+        return Landing(ray.get(reference))
+    except ray.exceptions.RayTaskError as error:
+        told = str(error.cause)
+        if (
+            isinstance(error.cause, ray.exceptions.RaySystemError)
+            or "remote function failed to import" in told
+        ):
+            return Landing(error=not_installed(told))
+        return Landing(error=error.cause)
+    except ray.exceptions.RayError as error:
+        return Landing(lost=" ".join(str(error).split()))
 
 
 class RayExecutor(Executor):

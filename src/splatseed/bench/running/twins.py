@@ -19,8 +19,7 @@ from pathlib import Path
 from splatseed.bench.planning.records import RunResult, RunSpec
 from splatseed.bench.running.kept import RESULT, read_result
 from splatseed.io.files import read_file, read_text
-from splatseed.io.output.manifest import MANIFEST
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import MANIFEST, atomic_file
 from splatseed.pointcloud import PointCloud
 from splatseed.train.seeds import seeds_digest, usable_seeds
 

@@ -23,7 +23,7 @@ from splatseed.commands.bench.prepare import Prepared, prepare
 from splatseed.commands.bench.summary import print_summary
 from splatseed.console import OUT, print_note, stage_display
 from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
-from splatseed.io.output.staging import atomic_file
+from splatseed.io.staging import atomic_file
 from splatseed.literal import counted, did_you_mean, visible
 from splatseed.process.interruption import exit_code
 

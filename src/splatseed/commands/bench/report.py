@@ -30,7 +30,7 @@ from splatseed.console import (
     stage_display,
 )
 from splatseed.errors import SceneNotFoundError
-from splatseed.io.output.staging import check_output, output_folder
+from splatseed.io.staging import check_output, output_folder
 from splatseed.literal import counted, quoted
 
 

@@ -23,7 +23,7 @@ from splatseed.commands.demo.methods import SHOWN
 from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import MissingDependencyError, OutputError, ParameterError
-from splatseed.io.output.manifest import MANIFEST, add_files, kind_of
+from splatseed.io.staging import MANIFEST, add_files, read_manifest
 from splatseed.literal import quoted
 from splatseed.requirements import require
 from splatseed.upsample import planned_size
@@ -81,7 +81,7 @@ def _check(options: Options) -> None:
         raise ParameterError(
             "--train-steps of 0 or more", found=f"{options.train_steps}", fix="Pass 0 not to train."
         )
-    if options.training == "only" and kind_of(options.output) != "demo":
+    if options.training == "only" and read_manifest(options.output).get("command") != "demo":
         raise OutputError(
             f"a demo at {options.output}", found="none", fix="Make it first: splatseed demo."
         )

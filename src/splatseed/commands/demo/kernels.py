@@ -11,7 +11,6 @@ does not start if everything is compiled already.
 from __future__ import annotations
 
 import os
-import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -23,7 +22,7 @@ from pathlib import Path
 from splatseed.commands.demo.methods import SHOWN, upsample_by
 from splatseed.console import StageClock
 from splatseed.kernels.compilation import watched
-from splatseed.process.interpreter import child_command, child_environment
+from splatseed.process.tasks import Child
 
 TRAINING = "training"
 PARTS = (SHOWN, "voronoi", "spline")
@@ -32,9 +31,6 @@ first."""
 SIZE = {"num_views": 8, "width": 96, "height": 72}
 POLL = 0.05
 """Seconds between checks of the other process's progress."""
-PROGRAM = (
-    "from splatseed.commands.demo.kernels import compile_parts as c; import sys; c(*sys.argv[1:])"
-)
 
 
 @contextmanager
@@ -64,24 +60,19 @@ class KernelsAhead:
     def __init__(self, folder: Path, parts: Sequence[str]) -> None:
         self._folder = folder
         self._parts = parts
-        self._process: subprocess.Popen[bytes] | None = None
+        self._child: Child | None = None
 
     def start(self, begins: bool = True) -> None:
         """Start the process, unless it has been started."""
-        if begins and self._process is None:
-            self._process = subprocess.Popen(  # noqa: S603  (our own interpreter and module)
-                child_command(PROGRAM, str(self._folder), *self._parts),
-                env=child_environment(),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
+        if begins and self._child is None:
+            self._child = Child(log=tempfile.TemporaryFile())  # noqa: SIM115  (the child closes it)
+            self._child.start(compile_parts, str(self._folder), *self._parts)
 
     def wait_for(self, part: str) -> None:
         """Return when the other process is not compiling ``part``: done, or never going to."""
-        if self._process is None or _claim(self._folder, part):
+        if self._child is None or _claim(self._folder, part):
             return
-        while self._process.poll() is None and not _done(self._folder, part).exists():
+        while self._child.process.poll() is None and not _done(self._folder, part).exists():
             time.sleep(POLL)
 
     def last_first(self, methods: Sequence[str]) -> list[str]:
@@ -90,9 +81,8 @@ class KernelsAhead:
 
     def stop(self) -> None:
         """End the process, whatever it is doing."""
-        if self._process is not None:
-            self._process.terminate()
-            self._process.wait()
+        if self._child is not None:
+            self._child.close()
 
 
 def wait(ahead: KernelsAhead, part: str, clock: StageClock) -> None:

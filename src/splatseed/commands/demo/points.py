@@ -17,8 +17,7 @@ from splatseed.commands.demo.kernels import KernelsAhead, wait
 from splatseed.commands.demo.methods import SHOWN, upsample_by
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.io import find_depths, load_scene, write_scene
-from splatseed.io.output.manifest import add_files
-from splatseed.io.output.staging import atomic_file, output_folder
+from splatseed.io.staging import add_files, atomic_file, output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.diagnostics import GeometryScore, measure, spacing

@@ -13,7 +13,7 @@ from splatseed.commands.options import parse_options
 from splatseed.commands.planned import Planned
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
-from splatseed.io.output.staging import check_output
+from splatseed.io.staging import check_output
 from splatseed.monocular import DepthReport, estimate_depths
 from splatseed.requirements import require
 from splatseed.scene import Scene

@@ -25,7 +25,7 @@ from splatseed.io.dense import (
     write_dense_workspace,
 )
 from splatseed.io.image_checks import warnings_but_lens
-from splatseed.io.output.staging import check_output
+from splatseed.io.staging import check_output
 from splatseed.literal import quoted, visible
 from splatseed.scene import Scene
 from splatseed.seeding.diagnostics import is_distorted

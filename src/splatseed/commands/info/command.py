@@ -23,7 +23,7 @@ from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.output.earlier import was_upsampled
-from splatseed.io.output.staging import check_parents
+from splatseed.io.staging import check_parents
 from splatseed.literal import quoted, visible
 from splatseed.scene import Scene
 from splatseed.seeding.advice import advice_for

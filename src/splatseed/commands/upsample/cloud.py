@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,9 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import ParameterError
-from splatseed.io.output.manifest import add_files
-from splatseed.io.output.staging import atomic_file
 from splatseed.io.recentring import check_precision, offset_of, recentred
+from splatseed.io.staging import add_files, write_json
 from splatseed.io.transform_file import read_cloud_transform
 from splatseed.literal import visible
 from splatseed.process.memory import words_of
@@ -145,22 +143,17 @@ class Brought(NamedTuple):
                 "offset": self.offset.tolist(),
                 "meaning": "coordinates before = after + offset",
             }
-            _write_json(folder / RECENTER, told)
+            write_json(folder / RECENTER, told)
         if self.alignment is not None:
             from splatseed.view.clouds import preview_alignment  # noqa: PLC0415  (Pillow)
 
             alignment = self.alignment
             report, picture = (folder / name for name in ALIGNMENT)
-            _write_json(report, alignment.report)
+            write_json(report, alignment.report)
             off = alignment.residuals / (2 * CLOSE * alignment.extent)
             preview_alignment(
                 self.scene, alignment.sample, alignment.rgb, alignment.marks, off, picture
             )
-
-
-def _write_json(path: Path, content: Mapping[str, object]) -> None:
-    with atomic_file(path) as partial:
-        partial.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 def bring_clouds(bringing: Bringing, scene: Scene, method: Cloud, progress: Progress) -> Brought:

@@ -50,7 +50,7 @@ from splatseed.errors import ParameterError
 from splatseed.io import WriteReport, find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.depth_search import with_own_depths
-from splatseed.io.output.staging import check_output
+from splatseed.io.staging import check_output
 from splatseed.literal import counted, visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.process.memory import bytes_of

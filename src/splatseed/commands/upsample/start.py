@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatseed.errors import OutputError, ParameterError
-from splatseed.io.output.staging import check_parents
+from splatseed.io.staging import check_parents
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.photographs import MAX_SIZE, photographed, read_views

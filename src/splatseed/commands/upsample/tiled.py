@@ -258,15 +258,15 @@ def _check_options(options: Options, source: Source, in_memory: str) -> None:
 def _tasks(options: Options, method: Upsampler, source: Source) -> Iterator[Tasks]:
     """Who works on tiles, while the block runs."""
     from splatseed.process import tasks  # noqa: PLC0415  (processes)
-    from splatseed.process.ray_tasks import ray_cluster  # noqa: PLC0415  (an extra)
-    from splatseed.process.threads import cores  # noqa: PLC0415  (loads with its use)
+    from splatseed.process.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
+    from splatseed.process.threads import cores, slot_environment  # noqa: PLC0415  (loads with its use)
 
     tiling = options.tiling
     if tiling.executor == "ray":
-        with ray_cluster(tiling.address):
-            yield tasks.RayTasks(1, tiling.jobs)
+        with ray_cluster(tiling.address) as cluster:
+            yield RayTasks(cluster.share(1, gpu=False), tiling.jobs)
     elif (jobs := tiling.jobs or _jobs(options, method, source, cores())) > 1:
-        yield tasks.ProcessTasks(jobs, max(1, cores() // jobs))
+        yield tasks.ProcessTasks([slot_environment(max(1, cores() // jobs))] * jobs)
     else:
         yield tasks.HereTasks()
 

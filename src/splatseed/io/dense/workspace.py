@@ -22,10 +22,8 @@ from splatseed.io.dense.overlap import OverlapPoints
 from splatseed.io.dense.photographs import Undistort, bring_photographs, check_image
 from splatseed.io.dense.report import DenseCount, DenseReport
 from splatseed.io.dense.sparse_model import Size, SparseModel, photograph_model
-from splatseed.io.output.layouts import write_json
-from splatseed.io.output.manifest import MANIFEST
-from splatseed.io.output.staging import output_folder
 from splatseed.io.photograph import photograph_folder
+from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 

@@ -22,9 +22,7 @@ from splatseed.depthmap import DepthKind
 from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io.depth.arrays import KINDS, check_stored
 from splatseed.io.files import read_bytes
-from splatseed.io.output.layouts import write_json
-from splatseed.io.output.manifest import MANIFEST
-from splatseed.io.output.staging import output_folder
+from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.literal import told
 
 CAMERA_FILE = "cam_params.json"

@@ -8,7 +8,6 @@ replaces the points made from them.
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from splatseed.io.files import read_text
-from splatseed.io.output.layouts import write_json
-from splatseed.io.output.manifest import MANIFEST
 from splatseed.io.output.seeds_npz import SEEDS, read_seeds
+from splatseed.io.staging import MANIFEST, read_manifest, write_json
 from splatseed.pointcloud import GENERATED, ORIGINAL
 from splatseed.scene import Scene
 
@@ -49,18 +46,22 @@ def _by_manifest(scene: Scene) -> UInt8[np.ndarray, " N"]:
     root = scene.source.root if scene.source else Path()
     total = len(scene.points)
     source = np.full(total, GENERATED, np.uint8)
-    source[: _num_original(root / MANIFEST, total)] = ORIGINAL
+    source[: number_of_originals(root, total)] = ORIGINAL
     return source
 
 
 def number_of_originals(root: Path, total: int) -> int:
-    """How many of the points of a file are originals, by the manifest beside it.
+    """How many of the points of a file are originals: all unless the manifest beside it says so.
 
     Args:
         root: The file's folder.
         total: Points of the file.
     """
-    return _num_original(root / MANIFEST, total)
+    facts = read_manifest(root)
+    originals = facts.get("num_original")
+    if facts.get("num_points") == total and isinstance(originals, int) and 0 <= originals < total:
+        return originals
+    return total
 
 
 def was_upsampled(scene: Scene) -> bool:
@@ -84,7 +85,7 @@ def upsampling(scene: Scene) -> dict[str, Any] | None:
     """
     if scene.source is None:
         return None
-    facts = _facts(scene.source.root / MANIFEST)
+    facts = read_manifest(scene.source.root)
     if facts.get("command") == "upsample":
         return facts
     carried = facts.get(UPSAMPLED)
@@ -104,23 +105,5 @@ def carry_seeds(scene: Scene, written: Path, folder: Path) -> None:
     """
     if (written / SEEDS).is_file():
         shutil.copyfile(written / SEEDS, folder / SEEDS)
-    counts = {key: _facts(written / MANIFEST)[key] for key in ("num_points", "num_original")}
+    counts = {key: read_manifest(written)[key] for key in ("num_points", "num_original")}
     write_json(folder / MANIFEST, {**counts, UPSAMPLED: upsampling(scene)})
-
-
-def _num_original(manifest: Path, total: int) -> int:
-    """How many of ``total`` points are originals; all unless a manifest for this cloud says so."""
-    facts = _facts(manifest)
-    originals = facts.get("num_original")
-    if facts.get("num_points") == total and isinstance(originals, int) and 0 <= originals < total:
-        return originals
-    return total
-
-
-def _facts(manifest: Path) -> dict[str, Any]:
-    """What a manifest says; nothing if there is none, or somebody else's file of that name."""
-    try:
-        facts = json.loads(read_text(manifest))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return facts if isinstance(facts, dict) else {}

@@ -7,11 +7,9 @@ COLMAP's root holds no PLY, because Brush loads any it finds there. Writers writ
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -31,6 +29,7 @@ from splatseed.io.output.image_folders import frame_folders, image_folders
 from splatseed.io.output.seeds_npz import write_seeds
 from splatseed.io.ply import write_ply
 from splatseed.io.split import MODEL_LISTS, ROOT_LISTS, split_fields
+from splatseed.io.staging import write_json
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 
@@ -86,15 +85,6 @@ def _turned(points: PointCloud, A: Float64[np.ndarray, "3 4"] | None) -> PointCl
     if points.normals is None:
         return points.replace(xyz=xyz)
     return points.replace(xyz=xyz, normals=points.normals @ A[:, :3].T)
-
-
-def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write readable JSON; paths and other foreign values become text, NumPy scalars numbers."""
-
-    def plain(value: Any) -> object:
-        return value.item() if isinstance(value, np.generic) else str(value)
-
-    path.write_text(json.dumps(content, indent=2, default=plain) + "\n", encoding="utf-8")
 
 
 def _all_cameras(scene: Scene) -> tuple[Intrinsics, ...]:

@@ -1,0 +1,368 @@
+"""Output that appears whole or not at all, and replaces only what splatseed wrote.
+
+Notation: the *target* is what the user named; the *partial* is a hidden sibling
+``.NAME.partial-XXXX`` that is written first and renamed to the target at the end. A folder's
+*manifest*, ``splatseed.json``, says what wrote it, its *kind* (``command``), and lists its files;
+an entry that names a folder with a manifest of its own stands for that one's list. Promise:
+whatever interrupts writing, an earlier output stays unharmed, and the partial is removed, after a
+kill by the next process that writes the same target. A folder is replaced on request only, by its
+own kind, and only if its manifest lists everything in it.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import logging
+import os
+import re
+import secrets
+import shutil
+import tempfile
+import time
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from splatseed.errors import OutputError
+from splatseed.io.files import read_text
+
+try:
+    import fcntl
+except ImportError:  # on Windows nothing can be locked, so leftovers stay
+    fcntl = None  # type: ignore[assignment]
+
+MANIFEST = "splatseed.json"
+"""The file that marks a folder as written by splatseed."""
+
+_SETTLED = 5.0
+"""Seconds after which a partial that nobody holds is a leftover: it is held once it is made."""
+_NOBODYS = re.compile(
+    r"preview(_methods|_maps|_cells|_origins)?\.png"  # ours, written after the manifest
+    r"|(.*/)?(\.DS_Store|Thumbs\.db|\.[^/]+\.partial-[0-9a-f]{8}(\.\w+|/.*)?"
+    r"|images_\d+_png/.*\.png)",  # gsplat's copies of the photographs
+    re.IGNORECASE,
+)
+_LOG = logging.getLogger(__name__)
+
+
+@contextmanager
+def output_folder(
+    path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
+) -> Iterator[Path]:
+    """A folder to write into that appears at ``path`` when the block ends without an error.
+
+    Missing parents are made. The manifest is completed at the end.
+
+    Args:
+        path: Where the output should be.
+        kind: What writes it: the verb of the command line, if any.
+        overwrite: Whether an earlier output of this kind may be replaced.
+        protect: Files and folders that are read: the output may not be, lie inside or contain any.
+
+    Yields:
+        The partial folder, empty.
+
+    Raises:
+        OutputError: ``path`` is taken or protected, or writing failed.
+    """
+    check_apart(path, protect)
+    target = _resolved(path)
+    _check_replaceable(target, kind, overwrite=overwrite)
+    with staged(target, folder=True) as partial:
+        yield partial
+        files = sorted({*_files(partial), MANIFEST})
+        write_json(partial / MANIFEST, {**read_manifest(partial), "command": kind, "files": files})
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """A file to write to; it appears at ``path`` when the block ends without an error.
+
+    Its name keeps the suffix. Missing parents are made, and an existing file is replaced.
+
+    Args:
+        path: Where the file should be.
+
+    Yields:
+        The name of the partial file, which is empty.
+
+    Raises:
+        OutputError: ``path`` is a folder or a device, or writing failed.
+    """
+    target = _resolved(path)
+    if os.path.lexists(target) and not target.is_file():  # a device would be replaced by a file
+        other = "a folder" if target.is_dir() else "a device, a pipe or a link to itself"
+        raise OutputError(f"a file name at {target}", found=other, fix="Choose another name.")
+    with staged(target, folder=False) as partial:
+        yield partial
+
+
+def write_json(path: Path, content: Mapping[str, object]) -> None:
+    """Write readable JSON, whole or not at all; NumPy scalars become numbers, paths text.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+
+    def plain(value: object) -> object:
+        return value.item() if isinstance(value, np.generic) else str(value)
+
+    with atomic_file(path) as partial:
+        partial.write_text(json.dumps(content, indent=2, default=plain) + "\n", encoding="utf-8")
+
+
+@contextmanager
+def staged(target: Path, *, folder: bool) -> Iterator[Path]:
+    """A partial that replaces ``target``, whatever that is, when the block ends without an error.
+
+    Args:
+        target: Where it goes; its parents are made.
+        folder: Whether it is a folder.
+
+    Yields:
+        The partial, empty.
+
+    Raises:
+        OutputError: Writing failed.
+    """
+    _remove_leftovers(target)
+    token = secrets.token_hex(4)
+    old = target.with_name(f".{target.name}.old-{token}")
+    partial = target.with_name(f".{target.name}.partial-{token}{'' if folder else target.suffix}")
+    missing = [each for each in target.parents if not each.exists()]
+    with oserror_as_output_error(target):
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            partial.mkdir() if folder else partial.touch()
+            with _held(partial):
+                yield partial
+                if folder and target.exists():
+                    target.rename(old)
+                partial.replace(target)
+        except BaseException:
+            if old.exists() and not target.exists():
+                old.rename(target)
+            with suppress(OSError):  # the next process tries again
+                remove(partial)
+                for each in missing:
+                    each.rmdir()
+            raise
+        finally:
+            if old.exists():
+                _discard(old, target)
+
+
+def add_files(folder: Path, names: Iterable[str]) -> None:
+    """List more of an output's files, so that ``--overwrite`` may replace them.
+
+    Args:
+        folder: An output with a manifest.
+        names: Paths inside it, with forward slashes, which need not exist yet. A folder without a
+            manifest stands for the files in it now.
+
+    Raises:
+        OutputError: The manifest cannot be written.
+    """
+    manifest, listed = read_manifest(folder), _listed(folder)
+    for name in names:
+        plain = (folder / name).is_dir() and not (folder / name / MANIFEST).is_file()
+        listed.update(_files(folder, prefix=f"{name}/") if plain else [name])
+    write_json(folder / MANIFEST, {**manifest, "files": sorted(listed)})
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """What a folder's manifest says; nothing where none can be read."""
+    try:
+        content = json.loads(read_text(folder / MANIFEST))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def unlisted_files(folder: Path) -> list[str]:
+    """Files in ``folder`` that its manifest does not list.
+
+    Raises:
+        OSError: The folder cannot be read.
+    """
+
+    def is_copy(name: str) -> bool:  # nerfstudio's smaller photographs
+        return bool(re.match("images_[248]/", name)) and (folder / f"images{name[8:]}").is_file()
+
+    names = _files(folder, {*_listed(folder), MANIFEST})
+    return sorted(name for name in names if not (_NOBODYS.fullmatch(name) or is_copy(name)))
+
+
+def check_output(
+    path: Path, *, kind: str, overwrite: bool = False, protect: Sequence[Path] = ()
+) -> None:
+    """Refuse what ``output_folder`` would refuse, before any work is done; arguments as there.
+
+    Raises:
+        OutputError: ``path`` is taken or protected, or ``check_parents`` refuses it.
+    """
+    check_apart(path, protect)
+    check_parents(path)
+    _check_replaceable(_resolved(path), kind, overwrite=overwrite)
+
+
+def check_apart(path: Path, protect: Sequence[Path]) -> None:
+    """Refuse an output that is one of ``protect``, lies inside one, or contains one.
+
+    Raises:
+        OutputError: It is one of these.
+    """
+    target = _resolved(path)
+    for source in (*map(_resolved, protect), Path.cwd()):
+        held = target == source or target in source.parents
+        if held or (source in target.parents and source != Path.cwd()):
+            raise OutputError(
+                "an output folder apart from the input and the working directory",
+                found=f"{target}, which {'holds or is' if held else 'lies in'} {source}",
+                fix="Choose a folder beside it.",
+            )
+
+
+def check_parents(path: Path) -> None:
+    """Refuse a place in which nothing can be made, or whose parent's parent is missing: a slip.
+
+    Raises:
+        OutputError: It is one of these.
+    """
+    target = _resolved(path)
+    if os.path.lexists(target):  # perhaps a run that goes on, in a write-protected folder
+        return
+    missing = [each for each in target.parents if not each.exists()]
+    above = target.parents[len(missing)]
+    try:  # permissions do not tell, least of all to root
+        Path(tempfile.mkdtemp(prefix=".splatseed-", dir=above)).rmdir()
+        found = f"no {missing[-1]}" if len(missing) > 1 else ""
+    except OSError:
+        found = f"{above}, which is {'write-protected' if above.is_dir() else 'not a folder'}"
+    if found:
+        expected = f"a folder for {target.name} that exists, or that can be made"
+        raise OutputError(expected, found=found, fix="Check the path, or make the folder first.")
+
+
+@contextmanager
+def oserror_as_output_error(target: Path) -> Iterator[None]:
+    """Let an ``OSError`` in the block become an ``OutputError`` that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        fix = "Check the disk and try again."
+        if error.errno in {errno.ENOSPC, errno.EDQUOT}:
+            fix = "Free some space, or choose another disk."
+        elif error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
+            fix = "Choose a folder that you may write to."
+        where = f" at {error.filename}" if error.filename else ""
+        found = f"{error.strerror or type(error).__name__}{where}"
+        raise OutputError(f"{target} to be written", found=found, fix=fix) from error
+
+
+def remove(path: Path) -> None:
+    """Remove one of our own files or folders, if it is there, with read-only folders in it.
+
+    Raises:
+        OSError: It cannot be removed.
+    """
+    if path.is_symlink() or not path.is_dir():
+        path.unlink(missing_ok=True)
+        return
+    path.chmod(0o700)
+    for parent, names, _ in os.walk(path):
+        for child in (Path(parent, name) for name in names):
+            if not child.is_symlink():  # what a link names is the user's
+                child.chmod(0o700)
+    shutil.rmtree(path)
+
+
+def _resolved(path: Path) -> Path:
+    return Path(os.path.realpath(path))
+
+
+def _check_replaceable(target: Path, kind: str, *, overwrite: bool) -> None:
+    with oserror_as_output_error(target):
+        if not os.path.lexists(target) or (target.is_dir() and not any(target.iterdir())):
+            return
+        found = "a file" if target.exists() else "a link that leads back to itself"
+        if target.is_dir():
+            found = _why_kept(target, kind)
+    fix = "Choose another name, or move what is there elsewhere."
+    if not found:
+        if overwrite:
+            return
+        found = "an earlier output"
+        fix = "Pass --overwrite (from Python, overwrite=True) to replace it, or choose another."
+    raise OutputError(f"no folder, or an empty one, at {target}", found=found, fix=fix)
+
+
+def _why_kept(folder: Path, kind: str) -> str:
+    """Why a folder may not be replaced; empty if it may."""
+    manifest = read_manifest(folder)
+    if manifest.get("command", kind) != kind:
+        return f"what splatseed {manifest['command']} wrote, not {kind}"
+    if "command" not in manifest or not isinstance(manifest.get("files"), list):
+        return f"files that splatseed did not write (no {MANIFEST} that lists them)"
+    names = unlisted_files(folder)
+    more = f" and {len(names) - 3:,} more" if len(names) > 3 else ""
+    some = f"{', '.join(names[:3])}{more}"
+    return f"an earlier output with files that splatseed did not write: {some}" if names else ""
+
+
+def _discard(old: Path, target: Path) -> None:
+    """Remove an earlier output, unless somebody has put files there while we worked."""
+    if (old / MANIFEST).is_file() and (names := unlisted_files(old)):
+        _LOG.warning("%s is complete; the earlier one is kept as %s for %s.", target, old, names)
+        return
+    remove(old)
+
+
+def _listed(folder: Path) -> set[str]:
+    files = read_manifest(folder).get("files")
+    return {name for name in files if isinstance(name, str)} if isinstance(files, list) else set()
+
+
+def _files(folder: Path, ours: Collection[str] = (), prefix: str = "") -> Iterator[str]:
+    """Paths of the files and links in a folder that are not in ``ours``."""
+    with os.scandir(folder / prefix) as entries:
+        for entry in entries:
+            name = prefix + entry.name
+            if not entry.is_dir(follow_symlinks=False):
+                if name not in ours:
+                    yield name
+            elif name in ours:  # itself an output
+                yield from (f"{name}/{each}" for each in unlisted_files(folder / name))
+            else:
+                yield from _files(folder, ours, name + "/")
+
+
+def _remove_leftovers(target: Path) -> None:
+    """Remove, and log, the partials of processes that were killed while they wrote ``target``."""
+    start, end = re.escape(f".{target.name}.partial-"), re.escape(target.suffix)
+    name = re.compile(f"{start}[0-9a-f]{{8}}({end})?")
+    there = list(target.parent.iterdir()) if fcntl and target.parent.is_dir() else []
+    for path in there:
+        with suppress(OSError):  # another process writes to it, or has removed it
+            if name.fullmatch(path.name) and time.time() - path.stat().st_mtime > _SETTLED:
+                with _held(path):
+                    remove(path)
+                _LOG.warning("Removed %s, left by a run that was killed.", path)
+
+
+@contextmanager
+def _held(path: Path) -> Iterator[None]:
+    """Lock a file or folder while the block runs; an OSError if another process has."""
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,327 @@
+"""Outputs appear whole or not at all, and nothing of the user's is overwritten or removed."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from splatseed.errors import OutputError
+from splatseed.io import load_scene, write_scene
+from splatseed.io.staging import (
+    MANIFEST,
+    add_files,
+    atomic_file,
+    check_output,
+    check_parents,
+    output_folder,
+    read_manifest,
+)
+from splatseed.synthetic import make_capture, write_capture
+
+
+def listing(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+
+
+def hidden(folder):
+    return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
+
+
+def write_output(path, text="x", **options):
+    with output_folder(path, kind="test", **options) as partial:
+        (partial / "text").write_text(text)
+
+
+@pytest.fixture
+def output(tmp_path):
+    path = tmp_path / "out"
+    with output_folder(path, kind="test") as partial:
+        for name in ("images/left/a.png", "sparse/0/points3D.bin", "text"):
+            (partial / name).parent.mkdir(parents=True, exist_ok=True)
+            (partial / name).write_text("first")
+    return path
+
+
+def test_a_folder_is_hidden_until_the_end_and_its_parent_is_made(tmp_path):
+    target = tmp_path / "a" / "b" / "out"
+    with output_folder(target, kind="test") as partial:
+        assert partial.parent == target.parent
+        assert partial.name.startswith(".out.partial-")
+        assert not target.exists()
+        (partial / "file").write_text("x")
+    assert listing(target) == ["file", MANIFEST]
+    assert read_manifest(target) == {"command": "test", "files": ["file", MANIFEST]}
+
+
+def test_a_file_is_replaced_whole_and_its_partial_keeps_the_suffix(tmp_path):
+    target = tmp_path / "deep" / "picture.png"
+    with atomic_file(target) as partial:
+        assert partial.suffix == ".png"
+        partial.write_text("first")
+        assert not target.exists()
+    with pytest.raises(UnicodeEncodeError), atomic_file(target) as partial:
+        partial.write_text("half, then \ud800", encoding="utf-8")
+    assert target.read_text() == "first"
+    assert listing(target.parent) == ["picture.png"]
+
+
+PERMISSION = PermissionError(errno.EACCES, "Permission denied")
+
+
+@pytest.mark.parametrize(
+    ("failure", "said"),
+    [
+        (RuntimeError("x"), "x"),
+        (KeyboardInterrupt(), None),
+        (OSError(errno.ENOSPC, "No space left"), "No space left.*Free some space"),
+        (PERMISSION, "may write to"),
+    ],
+)
+@pytest.mark.parametrize("there", [False, True])
+def test_a_failure_leaves_nothing_or_the_earlier_output(tmp_path, failure, said, there):
+    if there:
+        write_output(tmp_path / "out", "first")
+    before = listing(tmp_path)
+    expected = OutputError if isinstance(failure, OSError) else type(failure)
+
+    def fail():
+        with output_folder(tmp_path / "out", kind="test", overwrite=True) as partial:
+            (partial / "text").write_text("second")
+            raise failure
+
+    with pytest.raises(expected, match=said):
+        fail()
+    assert listing(tmp_path) == before
+    assert not there or (tmp_path / "out/text").read_text() == "first"
+
+
+@pytest.mark.parametrize(("method", "text"), [("rename", "first"), ("replace", "second")])
+def test_an_interrupt_between_renames_hides_no_output(output, monkeypatch, method, text):
+    """The interrupt comes right after a rename has worked, before the next line runs."""
+    real = getattr(Path, method)
+
+    def interrupted(self, other):
+        real(self, other)
+        if (other if method == "replace" else self) == output:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, method, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_output(output, "second", overwrite=True)
+    assert hidden(output.parent) == []
+    assert (output / MANIFEST).is_file()
+    assert (output / "text").read_text() == text
+
+
+@pytest.mark.parametrize("deep", [False, True])
+def test_a_place_in_which_nothing_can_be_made_is_refused_beforehand(tmp_path, monkeypatch, deep):
+    (tmp_path / "file").touch()
+    if deep:
+        bad = tmp_path / "nope" / "x" / "y" / "out"
+        with pytest.raises(OutputError, match="nope"):
+            check_parents(bad)
+    else:
+        bad = tmp_path / "file" / "out"
+    with pytest.raises(OutputError, match=r"nope|file"):
+        check_output(bad, kind="test")
+    check_output(tmp_path / "out", kind="test")
+    assert listing(tmp_path) == ["file"]
+
+    def refused(**_):
+        raise PERMISSION
+
+    monkeypatch.setattr(tempfile, "mkdtemp", refused)  # root may write nearly everywhere
+    with pytest.raises(OutputError, match="write-protected"):
+        check_output(tmp_path / "out", kind="test")
+    (tmp_path / "there").mkdir()
+    check_output(tmp_path / "there", kind="test")
+
+
+def test_only_an_earlier_output_is_replaced_and_only_when_asked(tmp_path):
+    target = tmp_path / "out"
+    target.mkdir()
+    write_output(target, "first")  # an empty folder is free
+    with pytest.raises(OutputError, match="--overwrite"):
+        write_output(target, "second")
+    write_output(target, "second", overwrite=True)
+    assert (target / "text").read_text() == "second"
+    with pytest.raises(OutputError, match="what splatseed test wrote, not train"):
+        check_output(target, kind="train", overwrite=True)
+    (tmp_path / "file").touch()
+    for path in (tmp_path / "file", tmp_path / "file" / "deeper"):
+        with pytest.raises(OutputError):
+            write_output(path, overwrite=True)
+    for path in (tmp_path, Path("/dev/null")):
+        with pytest.raises(OutputError), atomic_file(path):
+            pass
+
+
+def test_output_may_not_touch_what_is_read(tmp_path, monkeypatch):
+    scene = tmp_path / "data" / "scene"
+    scene.mkdir(parents=True)
+    link = tmp_path / "link"
+    link.symlink_to(scene, target_is_directory=True)
+    for target in (scene, scene / "out", scene.parent, link):
+        with pytest.raises(OutputError, match="apart from the input"):
+            write_output(target, protect=(scene,))
+    write_output(tmp_path / "data" / "out", protect=(scene,))
+    monkeypatch.chdir(scene)
+    with pytest.raises(OutputError, match="working directory"):
+        write_output(Path())
+
+
+@pytest.mark.parametrize("text", ["{}", '{"command": "test"}', "not JSON", "[]", None])
+def test_a_folder_without_a_list_is_somebody_elses(output, text):
+    (output / MANIFEST).unlink()
+    if text is not None:
+        (output / MANIFEST).write_text(text)
+    before = listing(output)
+    with pytest.raises(OutputError, match="did not write"):
+        write_output(output, overwrite=True)
+    assert listing(output) == before
+
+
+@pytest.mark.parametrize("name", ["sparse/0/project.ini", "notes.txt", "images_8", "sparse/1"])
+def test_a_file_or_link_of_the_users_is_spared_wherever_it_lies(output, name):
+    (output / name).symlink_to(output / MANIFEST)
+    with pytest.raises(OutputError, match=name):
+        write_output(output, overwrite=True)
+    assert (output / name).is_symlink()
+
+
+def test_what_is_put_there_while_we_work_is_spared(output, caplog):
+    with output_folder(output, kind="test", overwrite=True):
+        (output / "notes.txt").touch()
+    (kept,) = hidden(output.parent)
+    assert (output.with_name(kept) / "notes.txt").exists()
+    assert kept in caplog.text
+
+
+def test_an_output_in_an_output_has_its_own_list(output):
+    (output / "run").mkdir()
+    (output / "run" / MANIFEST).write_text('{"command": "train", "files": ["metrics.json"]}')
+    (output / "run/metrics.json").touch()
+    with pytest.raises(OutputError, match=r"run/metrics\.json"):
+        write_output(output, overwrite=True)
+    add_files(output, ["run"])
+    (output / "run/notes.txt").touch()
+    with pytest.raises(OutputError, match=r"did not write: run/notes\.txt"):
+        write_output(output, overwrite=True)
+    (output / "run/notes.txt").unlink()
+    (output / "extra").mkdir()
+    (output / "extra/file").touch()
+    add_files(output, ["extra"])
+    write_output(output, overwrite=True)
+    assert listing(output) == [MANIFEST, "text"]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "preview_methods.png",
+        "images_2/left/a.png",  # nerfstudio's
+        "images_2_png/left/a.png",  # gsplat's
+        ".points.partial-0123abcd",
+        ".a.partial-0123abcd.pt",
+    ],
+)
+def test_what_can_be_made_again_is_in_nobodys_way(output, name):
+    (output / name).parent.mkdir(parents=True, exist_ok=True)
+    (output / name).touch()
+    write_output(output, overwrite=True)
+    assert not (output / name).exists()
+    assert hidden(output.parent) == []
+
+
+def test_scenes_and_made_up_captures_may_be_replaced(tmp_path):
+    write_capture(make_capture(seed=0, num_views=4), tmp_path / "room")
+    for _ in range(2):
+        write_capture(make_capture(seed=0, num_views=4), tmp_path / "room", overwrite=True)
+        write_scene(
+            load_scene(tmp_path / "room"), tmp_path / "out", copy_images=True, overwrite=True
+        )
+    assert {"images/view_000.png", "depths/depths.json"} <= set(
+        read_manifest(tmp_path / "room")["files"]
+    )
+
+
+# What a kill leaves
+
+
+def leave(path, seconds=100):
+    path.mkdir() if not path.suffix.endswith(".csv") else path.touch()
+    os.utime(path, (time.time() - seconds,) * 2)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs locks of folders")
+def test_what_a_kill_left_is_removed_and_told_of(tmp_path, caplog):
+    gone = [".out.partial-0123abcd", ".curve.csv.partial-0123abcd.csv"]
+    others = [".other.partial-0123abcd", ".out.partial-notes", ".curve.csv.partial-mine.csv"]
+    for name in (*gone, *others):
+        leave(tmp_path / name)
+    leave(tmp_path / ".out.partial-0000aaaa", 0)  # perhaps another process's, not yet locked
+    with caplog.at_level(logging.WARNING), atomic_file(tmp_path / "curve.csv"):
+        pass
+    with caplog.at_level(logging.WARNING):
+        write_output(tmp_path / "out")
+    assert hidden(tmp_path) == sorted([*others, ".out.partial-0000aaaa"])
+    assert all(name in caplog.text for name in gone)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs locks of folders")
+def test_what_is_being_written_is_not_removed(tmp_path):
+    with output_folder(tmp_path / "out", kind="test") as first:
+        (first / "file").touch()
+        os.utime(first, (time.time() - 100,) * 2)
+        with pytest.raises(KeyboardInterrupt), output_folder(tmp_path / "out", kind="test"):
+            raise KeyboardInterrupt
+        assert (first / "file").exists()
+    assert (tmp_path / "out/file").exists()
+
+
+READ_ONLY = """
+import sys
+from pathlib import Path
+from splatseed.io.staging import output_folder
+
+out, pictures = Path(sys.argv[1]) / "out", Path(sys.argv[1]) / "pictures"
+def write():
+    with output_folder(out, kind="test", overwrite=True) as partial:
+        (partial / "deep/er").mkdir(parents=True)
+        (partial / "deep/er/file").touch()
+        (partial / "link").symlink_to(pictures, target_is_directory=True)
+        (partial / "deep/er").chmod(0o555)
+        (partial / "deep").chmod(0o555)
+        if len(sys.argv) > 2:
+            raise KeyboardInterrupt
+try:
+    write()
+    write()
+except KeyboardInterrupt:
+    pass
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX permissions")
+@pytest.mark.parametrize("how", [(), ("interrupted",)])
+def test_read_only_folders_of_ours_are_removed_and_links_are_not_followed(tmp_path, how):
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures").chmod(0o555)
+    run = [sys.executable, "-c", READ_ONLY, str(tmp_path), *how]
+    if os.geteuid() == 0:  # as a user whom permissions bind
+        setpriv = shutil.which("setpriv") or pytest.skip("runs as root, without setpriv")
+        run = [setpriv, "--bounding-set=-dac_override,-dac_read_search,-fowner", *run]
+    ended = subprocess.run(run, capture_output=True, text=True, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert hidden(tmp_path) == []
+    assert (tmp_path / "out").exists() == (not how)
+    assert (tmp_path / "pictures").stat().st_mode & 0o777 == 0o555
