@@ -6,7 +6,7 @@ import numpy as np
 
 from splatseed.camera import Camera
 from splatseed.stereo import StereoMap
-from splatseed.synthetic.raycast import pixel_rays, visible
+from splatseed.synthetic.room import pixel_rays, visible
 
 NUM_SOURCES = 4
 

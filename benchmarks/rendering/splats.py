@@ -24,8 +24,7 @@ from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.render.binning import RECORD, TILE, depth_order, list_tiles
 from splatseed.render.layout import gather
 from splatseed.splat.gaussians import SH_C0, Gaussians, neighbor_distances
-from splatseed.synthetic.raycast import render_views, visible
-from splatseed.synthetic.room import Room, build_room, orbit_cameras
+from splatseed.synthetic.room import Room, build_room, orbit_cameras, render_views, visible
 from splatseed.views.view import View
 
 __all__ = ["Workload", "make_workload", "useful_pairs"]

@@ -28,8 +28,7 @@ from splatseed.stereo.result import StereoResult
 from splatseed.stereo.settings import StereoSettings
 from splatseed.stereo.without_points import known_visibility
 from splatseed.synthetic import make_capture, write_capture
-from splatseed.synthetic.raycast import render_views
-from splatseed.synthetic.room import Room
+from splatseed.synthetic.room import Room, render_views
 from splatseed.synthetic.texture import Plain
 from splatseed.views.view import data_factor, load_views
 

@@ -15,8 +15,7 @@ import numpy as np
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.scene import Image
 from splatseed.seeding.verify import verify
-from splatseed.synthetic.raycast import render_view
-from splatseed.synthetic.room import Room
+from splatseed.synthetic.room import Room, render_view
 from splatseed.upsample.method import NewPoints
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility

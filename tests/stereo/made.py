@@ -17,8 +17,7 @@ from splatseed.camera import Camera, Intrinsics, quat_from_rotation
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
 from splatseed.stereo.maps import StereoMap
-from splatseed.synthetic.raycast import pixel_rays, render_view
-from splatseed.synthetic.room import Room
+from splatseed.synthetic.room import Room, pixel_rays, render_view
 from splatseed.synthetic.surfaces import Rectangle, Sphere, Surface, Union
 from splatseed.synthetic.texture import Mottled, Plain, Texture
 from splatseed.views.visibility import look_at

@@ -9,7 +9,7 @@ from PIL import Image as PillowImage
 from splatseed.errors import OutputError, ParameterError
 from splatseed.io import find_depths, load_scene
 from splatseed.synthetic import DEPTH_SCALE, make_capture, write_capture
-from splatseed.synthetic.raycast import visible
+from splatseed.synthetic.room import visible
 
 
 def test_depth_unprojects_onto_the_surfaces(capture):
@@ -19,16 +19,6 @@ def test_depth_unprojects_onto_the_surfaces(capture):
         z = depth[row, column].astype(np.float64)
         distance = capture.surfaces.distance(image.camera.unproject(uv, z))
         assert (distance / z).max() < 1e-6
-
-
-def test_depth_is_that_of_the_first_surface(capture, rng):
-    image, depth = capture.scene.images[3], capture.depths[3]
-    row, column = (rng.integers(0, n, 300) for n in depth.shape)
-    hit = depth[row, column] > 0
-    uv = np.stack([column[hit], row[hit]], axis=1) + 0.5
-    for share in (0.3, 0.6, 0.9, 0.97):
-        between = image.camera.unproject(uv, share * depth[row, column][hit])
-        assert (capture.surfaces.distance(between) > 1e-4).all()
 
 
 def test_pictures_show_texture_everywhere_but_on_the_bare_wall(capture):
@@ -112,12 +102,6 @@ def test_inliers_are_near_the_surfaces_and_mismatches_are_not(capture):
     assert lengths[bad].max() <= 3 <= lengths[~bad].min()
 
 
-def test_noise_is_longest_for_short_tracks(capture):
-    distance = capture.surfaces.distance(capture.scene.tracks.xyz)
-    lengths, good = capture.scene.tracks.lengths, ~capture.outliers
-    assert distance[good & (lengths == 3)].mean() > 1.3 * distance[good & (lengths >= 6)].mean()
-
-
 def test_the_bare_wall_is_nearly_empty(capture):
     xyz = capture.scene.tracks.xyz
     density = {}
@@ -126,26 +110,6 @@ def test_the_bare_wall_is_nearly_empty(capture):
         others = np.min([p.distance(xyz) for p in capture.surfaces.parts if p is not part], axis=0)
         density[name] = ((part.distance(xyz) < 0.02) & (others > 0.1)).sum() / part.area
     assert density["bare wall"] < 0.05 * density["brick wall"]
-
-
-def test_every_textured_surface_has_points(capture):
-    xyz = capture.scene.tracks.xyz[~capture.outliers]
-    nearest = np.argmin([part.distance(xyz) for part in capture.surfaces.parts], axis=0)
-    counts = dict(zip(capture.room.names, np.bincount(nearest, minlength=8), strict=True))
-    assert min(count for name, count in counts.items() if name != "bare wall") >= 5
-
-
-def test_colours_come_from_the_pictures(capture):
-    scene = capture.scene
-    pixels = np.zeros((len(scene.points), 3))
-    tracks = scene.tracks
-    point_idx = np.repeat(np.arange(len(tracks)), tracks.lengths)
-    for picture, image in zip(capture.images, scene.images, strict=True):
-        mine = tracks.image_ids == image.image_id
-        uv = np.floor(image.observations.xy[tracks.point2d_idx[mine]]).astype(int)
-        uv = np.clip(uv, 0, [picture.shape[1] - 1, picture.shape[0] - 1])
-        np.add.at(pixels, point_idx[mine], picture[uv[:, 1], uv[:, 0]])
-    np.testing.assert_allclose(scene.points.rgb, pixels / tracks.lengths[:, None], atol=0.51)
 
 
 def test_a_seed_gives_the_same_capture_and_another_seed_another():

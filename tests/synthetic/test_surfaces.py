@@ -7,9 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from splatseed.synthetic import SHAPES
-from splatseed.synthetic.foliage import Discs
-from splatseed.synthetic.surfaces import Box, Rectangle, Sphere, Union, yaw_frame
-from splatseed.synthetic.wavy import SineSheet
+from splatseed.synthetic.surfaces import Box, Discs, SineSheet, Sphere, Union, yaw_frame
 
 
 def _discs() -> Discs:
@@ -84,17 +82,6 @@ def test_normals_are_unit_and_across_the_surface(surface, rng):
         surface.distance(points + step * normals), surface.distance(points - step * normals)
     )
     assert np.median(rise) == pytest.approx(step, rel=1e-2)
-
-
-def test_rectangle_distance_beyond_its_edge():
-    square = Rectangle(np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 1.0, 0]))
-    points = np.array([[0.5, 0.5, -2.0], [4.0, 0.5, 4.0], [-3.0, -4.0, 0.0]])
-    np.testing.assert_allclose(square.distance(points), [2.0, 5.0, 5.0])
-
-
-def test_box_distance_is_unsigned_inside():
-    box = Box(np.zeros(3), np.array([1.0, 2.0, 3.0]), np.eye(3))
-    np.testing.assert_allclose(box.distance(np.array([[0.0, 0, 0], [0.75, 0, 0]])), [1.0, 0.25])
 
 
 def test_sine_sheet_distance_matches_a_fine_search(rng):

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 import splatseed as ss
 from splatseed.synthetic import SHAPES
-from splatseed.synthetic.shapes import parallel_plates, plane
+from splatseed.synthetic.surfaces import parallel_plates, plane
 from splatseed.upsample.neighbors import prepare, sound_bases
 
 NUM = 1500

@@ -5,7 +5,6 @@ Structure-from-Motion would; ``SHAPES`` holds single surfaces to measure a metho
 """
 
 from splatseed.synthetic.capture import DEPTH_SCALE, Capture, make_capture, write_capture
-from splatseed.synthetic.shapes import SHAPES
-from splatseed.synthetic.surfaces import Surface
+from splatseed.synthetic.surfaces import SHAPES, Surface
 
 __all__ = ["DEPTH_SCALE", "SHAPES", "Capture", "Surface", "make_capture", "write_capture"]

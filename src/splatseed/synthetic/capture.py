@@ -22,8 +22,7 @@ from splatseed.io.depth.folder import write_description
 from splatseed.io.staging import output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene, Tracks
-from splatseed.synthetic.raycast import render_views, visible
-from splatseed.synthetic.room import BARE, Room, build_room, orbit_cameras
+from splatseed.synthetic.room import BARE, Room, build_room, orbit_cameras, render_views, visible
 from splatseed.synthetic.surfaces import Union
 from splatseed.synthetic.tracks import TrackedPoints, track_points
 

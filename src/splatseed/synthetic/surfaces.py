@@ -1,21 +1,42 @@
-"""Analytic surfaces that can be measured, sampled and rendered.
+"""Analytic surfaces that can be measured, sampled and rendered, and shapes made of them.
 
 Notation: a surface is a set of points in the world, scene units. A ray is ``origin`` [3] plus
 ``t`` times ``directions`` [N, 3], which need not have unit length: with directions that advance one
 unit along the camera's z axis, ``t`` is planar z-depth. A ``frame`` [3, 3] holds three orthonormal
 axes as rows, so ``(xyz - center) @ frame.T`` are local coordinates. Promise: float64 throughout;
-distances are exact up to rounding, unsigned, and measured to the finite surface with its edges;
-samples are uniform by area and lie on the surface up to rounding.
+distances are exact up to rounding (``SineSheet``: to 1e-10 of its size), unsigned, and measured to
+the finite surface with its edges; samples are uniform by area and lie on the surface up to
+rounding; ``SHAPES`` are fixed, nothing random.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
+
+from splatseed.kernels.jit import inline
+
+Vector = Float64[np.ndarray, " 3"]
+Frame = Float64[np.ndarray, "3 3"]
+Points = Float[np.ndarray, "N 3"]
+"""Or directions, or normals."""
+Numbers = Float64[np.ndarray, " N"]
+"""One a point or ray."""
+
+_BISECTIONS = 36
+"""Halvings of a bracket that starts as a small part of a sine sheet."""
+_STEPS_PER_WAVE = 48
+"""Steps of the march along a ray, per wavelength of a sine sheet."""
+_GRID_PER_WAVE = 32
+"""Places along its profile from which the nearest point is bracketed."""
+_CHUNK = 20_000
+"""Points per pass, which bounds the memory of the grid of distances."""
 
 
 class Surface(Protocol):
@@ -26,38 +47,27 @@ class Surface(Protocol):
         """Area in squared scene units, each side of a sheet counted once."""
         ...
 
-    def distance(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    def distance(self, xyz: Points) -> Numbers:
         """Unsigned distance of each point to the nearest point of the surface, [N]."""
         ...
 
-    def sample(self, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "num 3"]:
+    def sample(self, num: int, rng: np.random.Generator) -> Points:
         """Points drawn uniformly by area, [num, 3]."""
         ...
 
-    def intersect(
-        self, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "N 3"]
-    ) -> Float64[np.ndarray, " N"]:
+    def intersect(self, origin: Vector, directions: Points) -> Numbers:
         """The smallest t > 0 at which each ray meets the surface, [N]; inf where it misses."""
         ...
 
-    def normals(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    def normals(self, xyz: Points) -> Points:
         """Unit normals at points on the surface, [N, 3], of either sign."""
         ...
 
 
-def yaw_frame(degrees: float) -> Float64[np.ndarray, "3 3"]:
+def yaw_frame(degrees: float) -> Frame:
     """Axes turned by ``degrees`` about the world's z axis, as rows, [3, 3]."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _first_hit(*candidates: tuple[np.ndarray, np.ndarray]) -> Float64[np.ndarray, " N"]:
-    """The smallest positive t [N] among pairs (t, whether it is a hit); inf if there is none.
-
-    Pairs, not a table: NumPy's reductions over an axis of two are many times slower.
-    """
-    hits = [np.where(ok & (t > 0), t, np.inf) for t, ok in candidates]
-    return hits[0] if len(hits) == 1 else np.minimum(hits[0], hits[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +80,9 @@ class Rectangle:
         edge_v: Second edge, from the corner, [3]; orthogonal to the first.
     """
 
-    corner: Float64[np.ndarray, " 3"]
-    edge_u: Float64[np.ndarray, " 3"]
-    edge_v: Float64[np.ndarray, " 3"]
+    corner: Vector
+    edge_u: Vector
+    edge_v: Vector
 
     @cached_property
     def size(self) -> Float64[np.ndarray, " 2"]:
@@ -80,7 +90,7 @@ class Rectangle:
         return np.array([np.linalg.norm(self.edge_u), np.linalg.norm(self.edge_v)])
 
     @cached_property
-    def frame(self) -> Float64[np.ndarray, "3 3"]:
+    def frame(self) -> Frame:
         """Unit edges and normal as rows, [3, 3]."""
         u, v = self.edge_u / self.size[0], self.edge_v / self.size[1]
         return np.stack([u, v, np.cross(u, v)])
@@ -90,20 +100,18 @@ class Rectangle:
         """See ``Surface.area``."""
         return float(self.size.prod())
 
-    def distance(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    def distance(self, xyz: Points) -> Numbers:
         """See ``Surface.distance``."""
         local = (np.asarray(xyz, np.float64) - self.corner) @ self.frame.T
         local[:, :2] -= np.clip(local[:, :2], 0.0, self.size)
         return np.asarray(np.linalg.norm(local, axis=1))
 
-    def sample(self, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "num 3"]:
+    def sample(self, num: int, rng: np.random.Generator) -> Points:
         """See ``Surface.sample``."""
         local = rng.random((num, 2)) * self.size
         return np.asarray(self.corner + local @ self.frame[:2])
 
-    def intersect(
-        self, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "N 3"]
-    ) -> Float64[np.ndarray, " N"]:
+    def intersect(self, origin: Vector, directions: Points) -> Numbers:
         """See ``Surface.intersect``."""
         offset = self.frame @ (origin - self.corner)
         local = directions @ self.frame.T
@@ -113,7 +121,7 @@ class Rectangle:
         inside = (u >= 0) & (u <= self.size[0]) & (v >= 0) & (v <= self.size[1])
         return _first_hit((t, inside))
 
-    def normals(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    def normals(self, xyz: Points) -> Points:
         """See ``Surface.normals``."""
         return np.broadcast_to(self.frame[2], np.shape(xyz))
 
@@ -128,12 +136,12 @@ class Box:
         frame: Its axes as rows, [3, 3].
     """
 
-    center: Float64[np.ndarray, " 3"]
-    half: Float64[np.ndarray, " 3"]
-    frame: Float64[np.ndarray, "3 3"]
+    center: Vector
+    half: Vector
+    frame: Frame
 
     @property
-    def _face_areas(self) -> Float64[np.ndarray, " 3"]:
+    def _face_areas(self) -> Vector:
         """Area of one face normal to each axis, [3]."""
         return np.asarray(4.0 * self.half.prod() / self.half)
 
@@ -142,31 +150,29 @@ class Box:
         """See ``Surface.area``."""
         return float(2.0 * self._face_areas.sum())
 
-    def distance(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    def distance(self, xyz: Points) -> Numbers:
         """See ``Surface.distance``."""
         local = (np.asarray(xyz, np.float64) - self.center) @ self.frame.T
         beyond = np.abs(local) - self.half
         outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
         return np.asarray(outside + np.maximum(-beyond.max(axis=1), 0.0))
 
-    def sample(self, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "num 3"]:
+    def sample(self, num: int, rng: np.random.Generator) -> Points:
         """See ``Surface.sample``."""
         axis = rng.choice(3, num, p=self._face_areas / self._face_areas.sum())
         local = rng.uniform(-1.0, 1.0, (num, 3))
         local[np.arange(num), axis] = rng.choice([-1.0, 1.0], num)
         return np.asarray(self.center + (local * self.half) @ self.frame)
 
-    def intersect(
-        self, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "N 3"]
-    ) -> Float64[np.ndarray, " N"]:
+    def intersect(self, origin: Vector, directions: Points) -> Numbers:
         """See ``Surface.intersect``."""
-        near, far = slab_interval(
+        near, far = _slab_interval(
             self.frame @ (origin - self.center), directions @ self.frame.T, -self.half, self.half
         )
         meets = near <= far
         return _first_hit((near, meets), (far, meets))
 
-    def normals(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    def normals(self, xyz: Points) -> Points:
         """See ``Surface.normals``."""
         local = (xyz - self.center) @ self.frame.T
         axis = (np.abs(local) - self.half).argmax(axis=1)
@@ -182,7 +188,7 @@ class Sphere:
         radius: Its radius.
     """
 
-    center: Float64[np.ndarray, " 3"]
+    center: Vector
     radius: float
 
     @property
@@ -190,27 +196,25 @@ class Sphere:
         """See ``Surface.area``."""
         return float(4.0 * np.pi * self.radius**2)
 
-    def distance(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    def distance(self, xyz: Points) -> Numbers:
         """See ``Surface.distance``."""
         to_center = np.linalg.norm(np.asarray(xyz, np.float64) - self.center, axis=1)
         return np.asarray(np.abs(to_center - self.radius))
 
-    def sample(self, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "num 3"]:
+    def sample(self, num: int, rng: np.random.Generator) -> Points:
         """See ``Surface.sample``."""
         ray = rng.normal(size=(num, 3))
         unit = ray / np.linalg.norm(ray, axis=1, keepdims=True)
         return np.asarray(self.center + self.radius * unit)
 
-    def intersect(
-        self, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "N 3"]
-    ) -> Float64[np.ndarray, " N"]:
+    def intersect(self, origin: Vector, directions: Points) -> Numbers:
         """See ``Surface.intersect``."""
         offset = origin - self.center
         a = np.einsum("ij,ij->i", directions, directions)
         t0, t1, real = _roots(a, directions @ offset, offset @ offset - self.radius**2)
         return _first_hit((t0, real), (t1, real))
 
-    def normals(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    def normals(self, xyz: Points) -> Points:
         """See ``Surface.normals``."""
         return np.asarray((xyz - self.center) / self.radius)
 
@@ -226,8 +230,8 @@ class Cylinder:
         height: Its length.
     """
 
-    center: Float64[np.ndarray, " 3"]
-    frame: Float64[np.ndarray, "3 3"]
+    center: Vector
+    frame: Frame
     radius: float
     height: float
 
@@ -236,23 +240,21 @@ class Cylinder:
         """See ``Surface.area``."""
         return float(2.0 * np.pi * self.radius * self.height)
 
-    def distance(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    def distance(self, xyz: Points) -> Numbers:
         """See ``Surface.distance``."""
         local = (np.asarray(xyz, np.float64) - self.center) @ self.frame.T
         radial = np.hypot(local[:, 0], local[:, 1]) - self.radius
         beyond = np.maximum(np.abs(local[:, 2]) - self.height / 2, 0.0)
         return np.asarray(np.hypot(radial, beyond))
 
-    def sample(self, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "num 3"]:
+    def sample(self, num: int, rng: np.random.Generator) -> Points:
         """See ``Surface.sample``."""
         angle = rng.uniform(0.0, 2.0 * np.pi, num)
         along = rng.uniform(-0.5, 0.5, num) * self.height
         local = np.stack([np.cos(angle) * self.radius, np.sin(angle) * self.radius, along], axis=1)
         return np.asarray(self.center + local @ self.frame)
 
-    def intersect(
-        self, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "N 3"]
-    ) -> Float64[np.ndarray, " N"]:
+    def intersect(self, origin: Vector, directions: Points) -> Numbers:
         """See ``Surface.intersect``."""
         offset = self.frame @ (origin - self.center)
         local = directions @ self.frame.T
@@ -264,7 +266,7 @@ class Cylinder:
         ]
         return _first_hit((t0, on_side[0]), (t1, on_side[1]))
 
-    def normals(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    def normals(self, xyz: Points) -> Points:
         """See ``Surface.normals``."""
         across = ((xyz - self.center) @ self.frame.T)[:, :2]
         return np.asarray(across @ self.frame[:2] / self.radius)
@@ -285,29 +287,27 @@ class Union:
         """See ``Surface.area``."""
         return sum(part.area for part in self.parts)
 
-    def distance(self, xyz: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, " N"]:
+    def distance(self, xyz: Points) -> Numbers:
         """See ``Surface.distance``."""
         nearest = np.full(len(xyz), np.inf)
         for part in self.parts:
             np.minimum(nearest, part.distance(xyz), out=nearest)
         return nearest
 
-    def sample(self, num: int, rng: np.random.Generator) -> Float64[np.ndarray, "num 3"]:
+    def sample(self, num: int, rng: np.random.Generator) -> Points:
         """See ``Surface.sample``."""
         areas = np.array([part.area for part in self.parts])
         counts = rng.multinomial(num, areas / areas.sum())
         pieces = [part.sample(int(n), rng) for part, n in zip(self.parts, counts, strict=True)]
         return np.concatenate(pieces)
 
-    def intersect(
-        self, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "N 3"]
-    ) -> Float64[np.ndarray, " N"]:
+    def intersect(self, origin: Vector, directions: Points) -> Numbers:
         """See ``Surface.intersect``."""
         return self.intersect_parts(origin, directions)[0]
 
     def intersect_parts(
-        self, origin: Float64[np.ndarray, " 3"], directions: Float64[np.ndarray, "N 3"]
-    ) -> tuple[Float64[np.ndarray, " N"], Int64[np.ndarray, " N"]]:
+        self, origin: Vector, directions: Points
+    ) -> tuple[Numbers, Int64[np.ndarray, " N"]]:
         """As ``intersect``, and the index of the part that was hit, [N]; -1 where none was."""
         nearest = np.full(len(directions), np.inf)
         which = np.full(len(directions), -1)
@@ -317,7 +317,7 @@ class Union:
             np.minimum(nearest, t, out=nearest)
         return nearest, which
 
-    def normals(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    def normals(self, xyz: Points) -> Points:
         """See ``Surface.normals``."""
         nearest = np.stack([part.distance(xyz) for part in self.parts]).argmin(axis=0)
         normals = np.empty(np.shape(xyz))
@@ -326,12 +326,204 @@ class Union:
         return normals
 
 
-def slab_interval(
-    origin: Float64[np.ndarray, " 3"],
-    directions: Float64[np.ndarray, "N 3"],
-    low: Float64[np.ndarray, " 3"],
-    high: Float64[np.ndarray, " 3"],
-) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+@dataclass(frozen=True, eq=False)
+class SineSheet:
+    """A rectangle bent into a sine wave along its first axis.
+
+    In its frame a point is (u, v, w), and the sheet is w = A sin(2 pi u / wavelength) for
+    0 <= u <= size[0], 0 <= v <= size[1]. A ray that only grazes a crest, entering and leaving
+    within a 48th of a wave, may count as a miss.
+
+    Args:
+        corner: The point u = v = w = 0, [3].
+        frame: The directions of u, v and w as rows, [3, 3].
+        size: Extent in u and v, [2].
+        amplitude: A, in scene units.
+        wavelength: In scene units.
+    """
+
+    corner: Vector
+    frame: Frame
+    size: Float64[np.ndarray, " 2"]
+    amplitude: float
+    wavelength: float
+
+    def _height(self, u: np.ndarray) -> np.ndarray:
+        return np.asarray(self.amplitude * np.sin(2.0 * np.pi / self.wavelength * u))
+
+    def _slope(self, u: np.ndarray) -> np.ndarray:
+        k = 2.0 * np.pi / self.wavelength
+        return np.asarray(self.amplitude * k * np.cos(k * u))
+
+    def _arc_length(self) -> tuple[np.ndarray, np.ndarray]:
+        """A fine table of u and the arc length from 0 to u."""
+        u = np.linspace(0.0, self.size[0], 4096)
+        speed = np.hypot(1.0, self._slope((u[1:] + u[:-1]) / 2))
+        return u, np.concatenate([[0.0], np.cumsum(speed * np.diff(u))])
+
+    @property
+    def area(self) -> float:
+        """See ``Surface.area``."""
+        return float(self._arc_length()[1][-1] * self.size[1])
+
+    def distance(self, xyz: Points) -> Numbers:
+        """See ``Surface.distance``."""
+        local = (np.asarray(xyz, np.float64) - self.corner) @ self.frame.T
+        across = local[:, 1] - np.clip(local[:, 1], 0.0, self.size[1])
+        in_profile = np.empty(len(local))
+        for start in range(0, len(local), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            in_profile[part] = self._profile_distance(local[part, 0], local[part, 2])
+        return np.asarray(np.hypot(in_profile, across))
+
+    def _profile_distance(self, u: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """Distance in the (u, w) plane to the curve: a grid finds the basin, bisection the foot."""
+        num = int(np.ceil(_GRID_PER_WAVE * self.size[0] / self.wavelength)) + 1
+        grid = np.linspace(0.0, self.size[0], num)
+        squared = (u[:, None] - grid) ** 2 + (w[:, None] - self._height(grid)) ** 2
+        best = squared.argmin(axis=1)
+        low = grid[np.maximum(best - 1, 0)]
+        high = grid[np.minimum(best + 1, num - 1)]
+        for _ in range(_BISECTIONS):
+            foot = (low + high) / 2
+            # Half the derivative of the squared distance, by u.
+            rising = (foot - u) + (self._height(foot) - w) * self._slope(foot) > 0
+            low, high = np.where(rising, low, foot), np.where(rising, foot, high)
+        return np.asarray(np.hypot(u - high, w - self._height(high)))
+
+    def sample(self, num: int, rng: np.random.Generator) -> Points:
+        """See ``Surface.sample``."""
+        table_u, table_length = self._arc_length()
+        u = np.interp(rng.random(num) * table_length[-1], table_length, table_u)
+        local = np.stack([u, rng.random(num) * self.size[1], self._height(u)], axis=1)
+        return np.asarray(self.corner + local @ self.frame)
+
+    def intersect(self, origin: Vector, directions: Points) -> Numbers:
+        """See ``Surface.intersect``."""
+        start = self.frame @ (origin - self.corner)
+        local = directions @ self.frame.T
+        low = np.array([0.0, 0.0, -self.amplitude])
+        near, far = _slab_interval(start, local, low, np.array([*self.size, self.amplitude]))
+        near = np.maximum(near, 0.0)
+        inside = np.flatnonzero(near < far)
+        t = np.full(len(directions), np.inf)
+        t[inside] = self._first_crossing(start, local[inside], near[inside], far[inside])
+        return t
+
+    def _first_crossing(
+        self, start: np.ndarray, directions: np.ndarray, near: np.ndarray, far: np.ndarray
+    ) -> np.ndarray:
+        """March from near to far, then bisect the first step whose ends lie on different sides.
+
+        A step covers a fixed part of a wave, so that rays across the sheet need few.
+        """
+        at_start = self._above(start, directions, near)
+        along_wave = np.maximum(np.abs(directions[:, 0]), 1e-12)
+        step = self.wavelength / _STEPS_PER_WAVE / along_wave
+        low, high = near.copy(), np.full(len(near), np.inf)
+        active = np.arange(len(near))
+        while len(active):
+            t = np.minimum(low[active] + step[active], far[active])
+            crossed = self._above(start, directions[active], t) != at_start[active]
+            high[active[crossed]] = t[crossed]
+            going = ~crossed & (t < far[active])
+            low[active[going]] = t[going]
+            active = active[going]
+        hit = np.isfinite(high)
+        high[hit] = self._bisect(start, directions[hit], low[hit], high[hit])
+        return high
+
+    def _bisect(
+        self, start: np.ndarray, directions: np.ndarray, low: np.ndarray, high: np.ndarray
+    ) -> np.ndarray:
+        side = self._above(start, directions, low)
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            before = self._above(start, directions, middle) == side
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        return high
+
+    def _above(self, start: np.ndarray, directions: np.ndarray, t: np.ndarray) -> np.ndarray:
+        """Whether the rays are above the wave at t, along w."""
+        u, w = (start[i] + t * directions[:, i] for i in (0, 2))
+        return np.asarray(w > self._height(u))
+
+    def normals(self, xyz: Points) -> Points:
+        """See ``Surface.normals``."""
+        slope = self._slope((xyz - self.corner) @ self.frame[0])
+        normal = self.frame[2] - slope[:, None] * self.frame[0]
+        return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Discs:
+    """Flat round leaves.
+
+    Args:
+        centers: Their centres, float64 [L, 3].
+        axes: Their unit normals, float64 [L, 3].
+        radii: Their radii, float64 [L].
+    """
+
+    centers: Float64[np.ndarray, "L 3"]
+    axes: Float64[np.ndarray, "L 3"]
+    radii: Float64[np.ndarray, " L"]
+
+    @property
+    def area(self) -> float:
+        """See ``Surface.area``."""
+        return float(np.pi * (self.radii**2).sum())
+
+    @cached_property
+    def _bound(self) -> Sphere:
+        """A sphere around all leaves: most rays of a photograph miss it."""
+        center = (self.centers.min(axis=0) + self.centers.max(axis=0)) / 2
+        reach = np.linalg.norm(self.centers - center, axis=1) + self.radii
+        return Sphere(center, float(reach.max()) * (1 + 1e-9))
+
+    def distance(self, xyz: Points) -> Numbers:
+        """See ``Surface.distance``."""
+        return np.asarray(self._nearest(xyz)[0])
+
+    def _nearest(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        points = np.ascontiguousarray(xyz, np.float64)
+        distances, which = _nearest_disc(points, self.centers, self.axes, self.radii)
+        return np.asarray(distances), np.asarray(which)
+
+    def sample(self, num: int, rng: np.random.Generator) -> Points:
+        """See ``Surface.sample``."""
+        leaf = rng.choice(len(self.radii), num, p=self.radii**2 / (self.radii**2).sum())
+        axis = self.axes[leaf]
+        # Any direction in the leaf's plane will do; one from a random vector is uniform in angle.
+        across = np.cross(axis, rng.normal(size=(num, 3)))
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        radius = self.radii[leaf] * np.sqrt(rng.random(num))
+        return np.asarray(self.centers[leaf] + radius[:, None] * across)
+
+    def intersect(self, origin: Vector, directions: Points) -> Numbers:
+        """See ``Surface.intersect``."""
+        t = np.full(len(directions), np.inf)
+        near = np.flatnonzero(np.isfinite(self._bound.intersect(origin, directions)))
+        t[near] = _first_disc(origin, directions[near], self.centers, self.axes, self.radii)
+        return t
+
+    def normals(self, xyz: Points) -> Points:
+        """See ``Surface.normals``."""
+        return np.asarray(self.axes[self._nearest(xyz)[1]])
+
+
+def _first_hit(*candidates: tuple[np.ndarray, np.ndarray]) -> Numbers:
+    """The smallest positive t [N] among pairs (t, whether it is a hit); inf if there is none.
+
+    Pairs, not a table: NumPy's reductions over an axis of two are many times slower.
+    """
+    hits = [np.where(ok & (t > 0), t, np.inf) for t, ok in candidates]
+    return hits[0] if len(hits) == 1 else np.minimum(hits[0], hits[1])
+
+
+def _slab_interval(
+    origin: Vector, directions: Points, low: Vector, high: Vector
+) -> tuple[Numbers, Numbers]:
     """Where rays enter and leave the box low..high, in the box's axes; near > far for a miss."""
     near = np.full(len(directions), -np.inf)
     far = np.full(len(directions), np.inf)
@@ -346,8 +538,8 @@ def slab_interval(
 
 
 def _roots(
-    a: Float64[np.ndarray, " N"], half_b: Float64[np.ndarray, " N"], c: float
-) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"], Bool[np.ndarray, " N"]]:
+    a: Numbers, half_b: Numbers, c: float
+) -> tuple[Numbers, Numbers, Bool[np.ndarray, " N"]]:
     """Both roots of a t² + 2 half_b t + c, [N] each, and whether they are real, [N].
 
     The product form of the smaller root avoids cancellation.
@@ -358,3 +550,99 @@ def _roots(
     q = -(half_b + np.copysign(np.sqrt(np.where(real, discriminant, 0.0)), half_b))
     with np.errstate(divide="ignore", invalid="ignore"):
         return q / a, c / q, real
+
+
+@inline
+def _nearest_disc(
+    xyz: np.ndarray,  # float64 [N, 3]
+    centers: np.ndarray,  # float64 [L, 3]
+    axes: np.ndarray,  # float64 [L, 3]
+    radii: np.ndarray,  # float64 [L]
+) -> tuple[np.ndarray, np.ndarray]:  # float64 [N], int64 [N]
+    """Distance to the nearest disc and its index."""
+    distances = np.empty(len(xyz))
+    which = np.empty(len(xyz), np.int64)
+    for i in range(len(xyz)):
+        best, best_j = np.inf, 0
+        for j in range(len(radii)):
+            x = xyz[i, 0] - centers[j, 0]
+            y = xyz[i, 1] - centers[j, 1]
+            z = xyz[i, 2] - centers[j, 2]
+            off = x * axes[j, 0] + y * axes[j, 1] + z * axes[j, 2]
+            x, y, z = x - off * axes[j, 0], y - off * axes[j, 1], z - off * axes[j, 2]
+            # Within the disc's plane: how far beyond its rim.
+            beyond = max(np.sqrt(x * x + y * y + z * z) - radii[j], 0.0)
+            squared = off * off + beyond * beyond
+            if squared < best:
+                best, best_j = squared, j
+        distances[i] = np.sqrt(best)
+        which[i] = best_j
+    return distances, which
+
+
+@inline
+def _first_disc(
+    origin: np.ndarray,  # float64 [3]
+    directions: np.ndarray,  # float64 [N, 3]
+    centers: np.ndarray,  # float64 [L, 3]
+    axes: np.ndarray,  # float64 [L, 3]
+    radii: np.ndarray,  # float64 [L]
+) -> np.ndarray:  # float64 [N]
+    """Smallest t > 0 at which each ray meets a disc; inf where none does."""
+    nearest = np.full(len(directions), np.inf)
+    for j in range(len(radii)):
+        nx, ny, nz = axes[j, 0], axes[j, 1], axes[j, 2]
+        ox, oy, oz = origin[0] - centers[j, 0], origin[1] - centers[j, 1], origin[2] - centers[j, 2]
+        height = ox * nx + oy * ny + oz * nz
+        limit = radii[j] * radii[j]
+        for i in range(len(directions)):
+            dx, dy, dz = directions[i, 0], directions[i, 1], directions[i, 2]
+            # Where the ray meets the disc's plane; infinite if parallel, and then no hit.
+            t = -height / (dx * nx + dy * ny + dz * nz)
+            x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+            if t > 0.0 and t < nearest[i] and x * x + y * y + z * z <= limit:
+                nearest[i] = t
+    return nearest
+
+
+# Shapes ------------------------------------------------------------------------------------------
+
+
+def plane(tilt: float = 35.0, center: Vector | None = None) -> Rectangle:
+    """A 2 x 2 square turned by ``tilt`` degrees about the x axis; 90 makes it a wall."""
+    c, s = np.cos(np.radians(tilt)), np.sin(np.radians(tilt))
+    edge_u, edge_v = np.array([2.0, 0.0, 0.0]), np.array([0.0, 2.0 * c, 2.0 * s])
+    middle = np.zeros(3) if center is None else center
+    return Rectangle(middle - (edge_u + edge_v) / 2, edge_u, edge_v)
+
+
+def sine_sheet() -> SineSheet:
+    """A 2 x 2 sheet of three and a third waves with an amplitude of 0.1."""
+    return SineSheet(np.array([-1.0, -1.0, 0.0]), np.eye(3), np.array([2.0, 2.0]), 0.1, 0.6)
+
+
+def parallel_plates(gap: float = 0.1) -> Union:
+    """Two tilted 2 x 2 plates ``gap`` apart: neighbours on one must not mix with the other's."""
+    lower = plane()
+    return Union((lower, plane(center=gap * lower.frame[2])))
+
+
+def _box_corner() -> Union:
+    """Three unit squares that meet at right angles: a corner and three edges."""
+    x, y, z = yaw_frame(30.0)
+    origin = np.zeros(3)
+    return Union((Rectangle(origin, x, y), Rectangle(origin, y, z), Rectangle(origin, z, x)))
+
+
+SHAPES: MappingProxyType[str, Callable[[], Surface]] = MappingProxyType(
+    {
+        "plane": plane,
+        "sphere": lambda: Sphere(np.zeros(3), 1.0),
+        "cylinder": lambda: Cylinder(np.zeros(3), yaw_frame(0.0), 0.5, 2.0),
+        "sine sheet": sine_sheet,
+        "parallel plates": parallel_plates,
+        "box corner": _box_corner,
+    }
+)
+"""Makers of shapes of about unit size near the origin, by name, each of which provokes one kind of
+error; what is flat is tilted, as that reveals methods that work in world axes."""

@@ -8,8 +8,8 @@ photographs, so that they do not alias.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -19,12 +19,9 @@ from splatseed.kernels.jit import inline
 Color = tuple[float, float, float]
 
 
-class Texture(Protocol):
-    """A colour for every point."""
-
-    def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
-        """Colours in 0..1 of points, [N, 3]."""
-        ...
+Points = Float64[np.ndarray, "N 3"]
+Texture = Callable[[Points], Points]
+"""A colour, 0..1, for every point."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +34,7 @@ class Plain:
 
     color: Color
 
-    def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    def __call__(self, xyz: Points) -> Points:
         """Colours in 0..1 of points, [N, 3]."""
         return np.broadcast_to(np.array(self.color), np.shape(xyz))
 
@@ -60,7 +57,7 @@ class Mottled:
     contrast: float = 2.2
     seed: int = 0
 
-    def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    def __call__(self, xyz: Points) -> Points:
         """Colours in 0..1 of points, [N, 3]."""
         noise = value_noise(xyz * np.array(self.frequency), self.octaves, self.seed)
         return _read_palette(self.palette, (noise - 0.5) * self.contrast + 0.5)
@@ -84,12 +81,12 @@ class Tiles:
     joint: float = 0.0
     seed: int = 0
 
-    def __call__(self, xyz: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    def __call__(self, xyz: Points) -> Points:
         """Colours in 0..1 of points, [N, 3]."""
         size = np.array(self.cell)
         # Offset by a fraction of a cell, so that no wall at a round coordinate lies on a joint.
         position = xyz / size + 0.37
-        colors = _read_palette(self.palette, _lattice_values(np.floor(position), self.seed))
+        colors = _read_palette(self.palette, value_noise(np.floor(position), 1, self.seed))
         from_joint = np.abs(position - np.round(position)) * size
         colors[(from_joint < self.joint / 2).any(axis=1)] *= 0.35
         return np.asarray(np.clip(colors * self.grain(xyz), 0.0, 1.0))
@@ -99,11 +96,6 @@ def _read_palette(palette: tuple[Color, ...], values: np.ndarray) -> np.ndarray:
     colors = np.array(palette)
     stops = np.linspace(0.0, 1.0, len(colors))
     return np.stack([np.interp(values, stops, channel) for channel in colors.T], axis=1)
-
-
-def _lattice_values(cells: np.ndarray, seed: int) -> np.ndarray:
-    """One random value in 0..1 for each integer cell, [N]."""
-    return value_noise(cells, 1, seed)
 
 
 def value_noise(

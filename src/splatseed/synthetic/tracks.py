@@ -17,8 +17,13 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from scipy import ndimage
 
 from splatseed.camera import Camera
-from splatseed.synthetic.raycast import visible
+from splatseed.synthetic.room import visible
 from splatseed.synthetic.surfaces import Surface
+
+Points = Float64[np.ndarray, "N 3"]
+Maps = Float32[np.ndarray, "V H W"]
+Indices = Int64[np.ndarray, " T"]
+Pixels = Float64[np.ndarray, "T 2"]
 
 MIN_STRENGTH = 6e-5
 """Least corner strength of a feature, for grey values 0..1: above that of a bare wall, below that
@@ -33,23 +38,13 @@ FULL_STRENGTH = 2e-3
 MIN_COSINE = 0.25
 """Smallest cosine between ray and normal at which a surface can be matched: 75 degrees."""
 
-MISMATCH_NOISE = 2.5
-"""Factor on the observation noise of mismatches."""
-
-
-@dataclass(frozen=True)
-class TrackNoise:
-    """How the reconstructed points differ from the truth.
-
-    Args:
-        pixel_sigma: Typical standard deviation of an observation in pixels, per axis.
-        outlier_share: Share of points that are mismatches: wrong by 15-80% of their depth.
-        min_track: Fewest views of a point that is not a mismatch.
-    """
-
-    pixel_sigma: float = 0.5
-    outlier_share: float = 0.025
-    min_track: int = 3
+PIXEL_SIGMA, MISMATCH_NOISE = 0.5, 2.5
+"""Standard deviation of an observation in pixels, per axis, and the factor on a mismatch's."""
+OUTLIER_SHARE = 0.025
+"""Share of points that are mismatches: wrong by 15-80% of their depth."""
+NEWTON_STEPS = 4
+MIN_TRACK = 3
+"""Fewest views of a point that is not a mismatch."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +60,15 @@ class TrackedPoints:
         uv: Pixel of each observation, float64 [T, 2].
     """
 
-    xyz: Float64[np.ndarray, "N 3"]
+    xyz: Points
     errors: Float64[np.ndarray, " N"]
     outliers: Bool[np.ndarray, " N"]
-    point_idx: Int64[np.ndarray, " T"]
-    view_idx: Int64[np.ndarray, " T"]
-    uv: Float64[np.ndarray, "T 2"]
+    point_idx: Indices
+    view_idx: Indices
+    uv: Pixels
 
 
-def corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+def _corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
     """The smaller eigenvalue of the structure tensor of the grey image, 0..1 per pixel, [H, W].
 
     Source: Shi and Tomasi, Good Features to Track, 1994.
@@ -86,7 +81,7 @@ def corner_strength(image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H
     return np.asarray((xx + yy) / 2 - np.hypot((xx - yy) / 2, xy), np.float32)
 
 
-def find_corners(strength: Float32[np.ndarray, "H W"]) -> Int64[np.ndarray, "M 2"]:
+def _find_corners(strength: Float32[np.ndarray, "H W"]) -> Int64[np.ndarray, "M 2"]:
     """Row and column of the local maxima above ``MIN_STRENGTH``, [M, 2]."""
     peak = (strength == ndimage.maximum_filter(strength, 3)) & (strength > MIN_STRENGTH)
     peak[:3], peak[-3:], peak[:, :3], peak[:, -3:] = (False,) * 4  # filters need neighbours
@@ -98,9 +93,8 @@ def track_points(
     surfaces: Surface,
     cameras: Sequence[Camera],
     images: UInt8[np.ndarray, "V H W 3"],
-    depths: Float32[np.ndarray, "V H W"],
+    depths: Maps,
     rng: np.random.Generator,
-    noise: TrackNoise | None = None,
 ) -> TrackedPoints:
     """Find corners, follow them through the views, and triangulate them.
 
@@ -110,36 +104,21 @@ def track_points(
         images: The photographs, uint8 [V, H, W, 3].
         depths: Their planar z-depths, float32 [V, H, W]; 0 = none.
         rng: Decides which views see a corner, the noise and the mismatches.
-        noise: Parameters of the noise and the mismatches.
     """
-    noise = noise or TrackNoise()
-    strengths = np.stack([corner_strength(image) for image in images])
+    strengths = np.stack([_corner_strength(image) for image in images])
     truth = _candidates(cameras, strengths, depths, rng)
     point_idx, view_idx = _observe(surfaces, cameras, strengths, truth, rng)
-    keep = np.bincount(point_idx, minlength=len(truth)) >= noise.min_track
+    keep = np.bincount(point_idx, minlength=len(truth)) >= MIN_TRACK
     truth, (point_idx, view_idx) = truth[keep], _renumber(keep, point_idx, view_idx)
 
-    outliers = rng.random(len(truth)) < noise.outlier_share
+    outliers = rng.random(len(truth)) < OUTLIER_SHARE
     truth, kept = _displace(cameras, truth, outliers, point_idx, view_idx, rng)
     # A mismatch that only one camera could have seen would never be triangulated.
     keep = np.bincount(point_idx[kept], minlength=len(truth)) >= 2
     truth, outliers = truth[keep], outliers[keep]
     point_idx, view_idx = _renumber(keep, point_idx[kept], view_idx[kept])
-    sigma = noise.pixel_sigma * rng.lognormal(-0.1, 0.45, len(truth))
+    sigma = PIXEL_SIGMA * rng.lognormal(-0.1, 0.45, len(truth))
     sigma[outliers] *= MISMATCH_NOISE
-    return _reconstruct(cameras, truth, outliers, sigma, point_idx, view_idx, rng)
-
-
-def _reconstruct(
-    cameras: Sequence[Camera],
-    truth: Float64[np.ndarray, "N 3"],
-    outliers: Bool[np.ndarray, " N"],
-    sigma: Float64[np.ndarray, " N"],
-    point_idx: Int64[np.ndarray, " T"],
-    view_idx: Int64[np.ndarray, " T"],
-    rng: np.random.Generator,
-) -> TrackedPoints:
-    """Observe the true points with noise of ``sigma`` px, and triangulate what was observed."""
     uv = _project(cameras, truth, point_idx, view_idx)
     uv += rng.normal(size=uv.shape) * sigma[point_idx, None]
     xyz = _triangulate(cameras, truth, point_idx, view_idx, uv)
@@ -149,15 +128,12 @@ def _reconstruct(
 
 
 def _candidates(
-    cameras: Sequence[Camera],
-    strengths: Float32[np.ndarray, "V H W"],
-    depths: Float32[np.ndarray, "V H W"],
-    rng: np.random.Generator,
-) -> Float64[np.ndarray, "N 3"]:
+    cameras: Sequence[Camera], strengths: Maps, depths: Maps, rng: np.random.Generator
+) -> Points:
     """Exact surface points under the corners of all views, near-duplicates merged."""
     per_view = []
     for camera, strength, depth in zip(cameras, strengths, depths, strict=True):
-        corners = find_corners(strength)
+        corners = _find_corners(strength)
         at_corner = strength[corners[:, 0], corners[:, 1]]
         chosen = rng.random(len(corners)) < at_corner / FULL_STRENGTH
         per_view.append(_unproject_corners(camera, corners[chosen], depth))
@@ -188,10 +164,10 @@ def _unproject_corners(
 def _observe(
     surfaces: Surface,
     cameras: Sequence[Camera],
-    strengths: Float32[np.ndarray, "V H W"],
-    xyz: Float64[np.ndarray, "N 3"],
+    strengths: Maps,
+    xyz: Points,
     rng: np.random.Generator,
-) -> tuple[Int64[np.ndarray, " T"], Int64[np.ndarray, " T"]]:
+) -> tuple[Indices, Indices]:
     """Which views detect which points: (point_idx, view_idx), sorted by point, then view.
 
     A view detects a point that it sees, not too obliquely, where its own image has a corner; and
@@ -214,7 +190,7 @@ def _observe(
 
 
 def _renumber(
-    keep: Bool[np.ndarray, " N"], point_idx: Int64[np.ndarray, " T"], view_idx: np.ndarray
+    keep: Bool[np.ndarray, " N"], point_idx: Indices, view_idx: np.ndarray
 ) -> tuple[Int64[np.ndarray, " S"], Int64[np.ndarray, " S"]]:
     """The observations of the points kept, with the points renumbered."""
     mine = keep[point_idx]
@@ -223,12 +199,12 @@ def _renumber(
 
 def _displace(
     cameras: Sequence[Camera],
-    xyz: Float64[np.ndarray, "N 3"],
+    xyz: Points,
     outliers: Bool[np.ndarray, " N"],
-    point_idx: Int64[np.ndarray, " T"],
-    view_idx: Int64[np.ndarray, " T"],
+    point_idx: Indices,
+    view_idx: Indices,
     rng: np.random.Generator,
-) -> tuple[Float64[np.ndarray, "N 3"], Bool[np.ndarray, " T"]]:
+) -> tuple[Points, Bool[np.ndarray, " T"]]:
     """Move mismatches along the ray of their first view, and cut their tracks to three views.
 
     Returns the positions, and which observations remain: the moved point must be in the image.
@@ -245,11 +221,8 @@ def _displace(
 
 
 def _project(
-    cameras: Sequence[Camera],
-    xyz: Float64[np.ndarray, "N 3"],
-    point_idx: Int64[np.ndarray, " T"],
-    view_idx: Int64[np.ndarray, " T"],
-) -> Float64[np.ndarray, "T 2"]:
+    cameras: Sequence[Camera], xyz: Points, point_idx: Indices, view_idx: Indices
+) -> Pixels:
     """Pixel of each observation's point in its view."""
     uv = np.empty((len(point_idx), 2))
     for v, camera in enumerate(cameras):
@@ -259,13 +232,8 @@ def _project(
 
 
 def _triangulate(
-    cameras: Sequence[Camera],
-    start: Float64[np.ndarray, "N 3"],
-    point_idx: Int64[np.ndarray, " T"],
-    view_idx: Int64[np.ndarray, " T"],
-    uv: Float64[np.ndarray, "T 2"],
-    num_steps: int = 4,
-) -> Float64[np.ndarray, "N 3"]:
+    cameras: Sequence[Camera], start: Points, point_idx: Indices, view_idx: Indices, uv: Pixels
+) -> Points:
     """Least-squares positions for all points at once, by Gauss-Newton from ``start``.
 
     With J the derivative of a pixel by the point, each step solves (sum JᵀJ) dx = sum Jᵀ r.
@@ -276,7 +244,7 @@ def _triangulate(
     center = np.stack([camera.K[:2, 2] for camera in cameras])[view_idx]
     starts = np.searchsorted(point_idx, np.arange(len(start)))
     xyz = start
-    for _ in range(num_steps):
+    for _ in range(NEWTON_STEPS):
         cam = np.einsum("tij,tj->ti", rotations, xyz[point_idx]) + shifts
         slope = cam[:, :2] / cam[:, 2:]
         # d (x / z) / dX = (R_x - (x / z) R_z) / z; likewise y
