@@ -25,7 +25,7 @@ from scipy.ndimage import gaussian_filter
 import splatseed as ss
 from splatseed.depth.alignment import align
 from splatseed.io import find_depths
-from splatseed.io.depth.folder import depth_folder
+from splatseed.io.depth_maps import depth_folder
 from splatseed.io.staging import atomic_file
 from splatseed.scene import Image
 from splatseed.seeding.diagnostics import spacing

@@ -16,7 +16,7 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.colmap.binary import write_images, write_points3d
-from splatseed.io.output.earlier import saw_all_photographs, was_upsampled
+from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.sfm import undistort
 from splatseed.views.view import check_lens, load_views
 

@@ -21,7 +21,7 @@ from splatseed.commands.train.config import with_config
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import files, load_originals, load_scene, write_scene
 from splatseed.io.colmap import binary as colmap_binary
-from splatseed.io.depth.arrays import read_npz
+from splatseed.io.depth_files import read_stored
 from splatseed.io.files import open_file, read_file
 from splatseed.io.photograph import photograph_bytes
 from splatseed.io.staging import read_manifest
@@ -82,7 +82,7 @@ READ_WHOLE = {
     "bench/report/html.py", "bench/analysis/paper.py", "kernels/sources.py",  # the package's own
     "sfm/worker.py", "sfm/orientation.py", "bench/running/child.py", "bench/report/clouds.py",
     "bench/running/ray_cluster.py", "commands/demo/command.py",  # written by this very command
-    "io/rgbd/tum.py",  # after is_file
+    "io/rgbd.py",  # after is_file
 }  # fmt: skip
 
 
@@ -174,14 +174,14 @@ def test_an_archive_that_would_burst_is_refused_by_its_header(tmp_path, little_m
         little_memory(),
         pytest.raises(SceneFormatError, match=r"bytes that would become 144,000,"),
     ):
-        read_npz(tmp_path / "bomb.npz")
+        read_stored(tmp_path / "bomb.npz")
 
 
 def test_a_map_of_one_value_and_other_arrays_are_fine(tmp_path, little_memory):
     _archive(tmp_path / "flat.npz", (480, 640))
-    assert read_npz(tmp_path / "flat.npz").values.shape == (480, 640)
+    assert read_stored(tmp_path / "flat.npz").values.shape == (480, 640)
     _archive(tmp_path / "more.npz", (48, 64))
     with zipfile.ZipFile(tmp_path / "more.npz", "a", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("normals.npy", bytes(1 << 25))  # never looked at
     with little_memory(1 << 20):
-        assert read_npz(tmp_path / "more.npz").values.shape == (48, 64)
+        assert read_stored(tmp_path / "more.npz").values.shape == (48, 64)

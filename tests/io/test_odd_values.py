@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -11,8 +10,7 @@ import pytest
 from splatseed.depth.alignment import align_map
 from splatseed.depthmap import DepthMap
 from splatseed.errors import SceneFormatError
-from splatseed.io import load_scene
-from splatseed.io.cloud import clean_scene, cloud_warnings
+from splatseed.io.cleaning import clean_scene, cloud_warnings
 from splatseed.io.colmap import binary as colmap_binary
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
@@ -31,14 +29,6 @@ def test_a_focal_length_of_0_or_below(module, suffix, focal, model, tmp_path):
     module.write_cameras(tmp_path / f"cameras.{suffix}", (camera,))
     with pytest.raises(SceneFormatError, match=rf"focal length above 0 .*found 500, {focal:g}"):
         module.read_cameras(tmp_path / f"cameras.{suffix}")
-
-
-def test_a_focal_length_of_0_in_transforms(scene_dir):
-    frame = {"file_path": "images/left/image000.jpg", "transform_matrix": np.eye(4).tolist()}
-    content = {"fl_x": 0, "w": 640, "h": 480, "frames": [frame]}
-    (scene_dir / "transforms.json").write_text(json.dumps(content))
-    with pytest.raises(SceneFormatError, match="focal length"):
-        load_scene(scene_dir / "transforms.json")
 
 
 @pytest.mark.parametrize(("module", "suffix"), FORMATS)

@@ -25,7 +25,7 @@ from splatseed.errors import (
     SceneNotFoundError,
 )
 from splatseed.io import load_scene
-from splatseed.io.rgbd.replica import load_rgbd
+from splatseed.io.rgbd import load_rgbd
 from splatseed.pointcloud import PointCloud
 from splatseed.process import tasks
 from splatseed.scene import Image, Scene, Split

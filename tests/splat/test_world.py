@@ -14,7 +14,7 @@ from splatseed.camera import quat_from_rotation, rotation_from_quat
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.evaluate import evaluate_model, load_model
 from splatseed.io import load_scene, write_scene
-from splatseed.io.recentring import recentred
+from splatseed.io.cleaning import recentred
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import Gaussians, initial_gaussians
 from splatseed.splat.ply import write_gaussians

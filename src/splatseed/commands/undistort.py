@@ -11,8 +11,8 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, stage_display
 from splatseed.io import load_scene
-from splatseed.io.image_checks import warnings_but_lens
-from splatseed.io.output.earlier import was_upsampled
+from splatseed.io.photograph import warnings_but_lens
+from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_output
 from splatseed.literal import quoted
 from splatseed.seeding.diagnostics import is_distorted

@@ -1,4 +1,4 @@
-"""Reading and writing scenes, one folder per format.
+"""Reading and writing scenes, a file or folder per format.
 
 ``load_scene`` recognises what a path holds; ``write_scene`` makes a folder that every 3D Gaussian
 Splatting trainer loads unchanged; ``find_depths`` finds the depth maps of a scene's images.
@@ -6,9 +6,8 @@ Promise: malformed input and failing output raise one error from ``splatseed.err
 this package loads neither Numba nor SciPy.
 """
 
-from splatseed.io.cloud import clean_scene
-from splatseed.io.depth.files import DepthFiles
-from splatseed.io.depth.folder import DepthWriter, depth_folder
+from splatseed.io.cleaning import clean_scene
+from splatseed.io.depth_maps import DepthFiles, DepthWriter, depth_folder
 from splatseed.io.depth_search import find_depths
 from splatseed.io.load import load_originals, load_scene
 from splatseed.io.write import WriteReport, write_scene

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -20,7 +19,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float64, Shaped, UInt8
 
-from splatseed.errors import SceneFormatError, SplatseedError
+from splatseed.errors import SceneFormatError
 from splatseed.io.files import COPY_AGAIN, open_file
 
 CHUNK = 1 << 20
@@ -106,25 +105,6 @@ class CloudFile(ABC):
         Raises:
             SceneFormatError: The file ends early, or a row makes no sense.
         """
-
-
-@contextmanager
-def guarded(path: Path, expected: str) -> Iterator[None]:
-    """Turn whatever a reader raises on a bad file into one ``SceneFormatError``.
-
-    Args:
-        path: The file.
-        expected: What it should be.
-    """
-    try:
-        yield
-    except (MemoryError, SplatseedError):
-        raise
-    except BaseException as error:  # packages raise errors of many kinds; a panic of Rust is ...
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
-            raise  # ... no Exception, and neither is Ctrl-C
-        found = " ".join(str(error).split())[:160] or type(error).__name__
-        raise SceneFormatError(f"{path} to be {expected}", found=found, fix=COPY_AGAIN) from None
 
 
 def check_size(path: Path, needed: int) -> None:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError, SceneNotFoundError
-from splatseed.io.depth.arrays import KINDS
-from splatseed.io.depth.files import SUFFIXES, DepthFiles
-from splatseed.io.depth.folder import safe_parts
-from splatseed.io.depth.matching import match_by_name
-from splatseed.io.rgbd.tum import find_tum_depths, is_tum
+from splatseed.io.depth_files import KINDS, SUFFIXES
+from splatseed.io.depth_maps import DepthFiles, match_by_name
+from splatseed.io.rgbd import find_tum_depths, is_tum
 from splatseed.scene import Scene
 
 
@@ -37,7 +35,14 @@ def find_depths(
         SceneNotFoundError: There is no such folder, or no image has a map in it.
         SceneFormatError: Two images share a map, or the folder's description is damaged.
     """
-    _check_options(kind, scale)
+    if kind is not None and kind not in KINDS:
+        raise ParameterError(
+            f"a kind of depth: {', '.join(KINDS)}", found=repr(kind), fix="Choose one of them."
+        )
+    if scale is not None and not (math.isfinite(scale) and scale > 0):
+        raise ParameterError(
+            "a scale of depth above 0", found=f"{scale}", fix="Give stored units per scene unit."
+        )
     root = Path(path)
     if not root.is_dir():
         raise SceneNotFoundError(
@@ -47,10 +52,11 @@ def find_depths(
         )
     maps = search_depths(scene, root)
     if maps is None:
-        names = [image.name for image in scene.images[:3]]
+        name = scene.images[0].name if scene.images else ""
         raise SceneNotFoundError(
-            f"depth maps of the scene's images in {root}: {_looked_for(scene)}",
-            found="none" if names else "a scene without images",
+            f"depth maps of the scene's images in {root}"
+            + (f", such as {name}{SUFFIXES[0]} or {Path(name).stem}.png" if name else ""),
+            found="none" if name else "a scene without images",
             fix="Name maps as their images are, with subfolders and another suffix.",
         )
     return replace(maps, kind=kind or maps.kind, scale=scale or maps.scale)
@@ -79,22 +85,3 @@ def search_depths(scene: Scene, root: Path) -> DepthFiles | None:
         return maps
     capture = root.resolve().parent  # perhaps the folder of depth images was named
     return find_tum_depths(scene, capture) if is_tum(capture) else None
-
-
-def _check_options(kind: DepthKind | None, scale: float | None) -> None:
-    if kind is not None and kind not in KINDS:
-        raise ParameterError(
-            f"a kind of depth: {', '.join(KINDS)}", found=repr(kind), fix="Choose one of them."
-        )
-    if scale is not None and not (math.isfinite(scale) and scale > 0):
-        raise ParameterError(
-            "a scale of depth above 0", found=f"{scale}", fix="Give stored units per scene unit."
-        )
-
-
-def _looked_for(scene: Scene) -> str:
-    if not scene.images:
-        return "no names"
-    name = "/".join(safe_parts(scene.images[0].name))
-    stem = str(PurePosixPath(name).with_suffix(""))
-    return f"{name}{SUFFIXES[0]}, {stem}{SUFFIXES[0]}, {stem}_depth{SUFFIXES[0]} or {stem}.png, ..."

@@ -18,15 +18,16 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import numpy as np
+from numpy.lib import format as npy_format
 
-from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.literal import beginning
+from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
+from splatseed.literal import beginning, told
 from splatseed.process.memory import free_memory
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
@@ -155,6 +156,41 @@ def readable(path: Path) -> Iterator[None]:
         ) from None
 
 
+@contextmanager
+def guarded(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[None]:
+    """Turn whatever reading a bad file raises, in a package or here, into one of our errors.
+
+    Args:
+        path: The file.
+        expected: What it should be.
+        fix: What the error advises.
+
+    Raises:
+        SceneFormatError: The block failed, other than by one of our own errors.
+    """
+    try:
+        yield
+    except SplatseedError:
+        raise
+    except MemoryError:
+        found = "more than memory holds"
+    except BaseException as error:
+        # Packages raise errors of many kinds; a panic of Rust is no Exception, as Ctrl-C is none.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        found = told(error)  # type: ignore[arg-type]  # a panic has words, too
+    else:
+        return
+    raise SceneFormatError(f"{path} to be {expected}", found=found, fix=fix)
+
+
+def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, whether column by column, and type of the array at the start of a ``.npy``."""
+    if npy_format.read_magic(file) == (1, 0):
+        return npy_format.read_array_header_1_0(file)
+    return npy_format.read_array_header_2_0(file)
+
+
 def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> Any:
     """The content of a JSON file.
 
@@ -179,15 +215,6 @@ def read_json(path: Path, expected: str = "JSON", *, fix: str = COPY_AGAIN) -> A
     except (ValueError, RecursionError) as error:
         found = str(error)
     raise SceneFormatError(f"{path} to be {expected}", found=found, fix=fix)
-
-
-def write_json(path: Path, content: Mapping[str, object]) -> None:
-    """Write readable JSON; paths and other foreign values become text, NumPy scalars numbers."""
-
-    def plain(value: Any) -> object:
-        return value.item() if isinstance(value, np.generic) else str(value)
-
-    path.write_text(json.dumps(content, indent=2, default=plain) + "\n", encoding="utf-8")
 
 
 class ByteReader:

@@ -8,18 +8,17 @@ becomes a sentence in ``Scene.warnings``, anything else raises one error.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.cloud import clean_scene, cloud_warnings
+from splatseed.io.cleaning import clean_scene, cloud_warnings
 from splatseed.io.colmap.scene import find_model, read_colmap_scene, scene_root
 from splatseed.io.files import is_video, odd_kind, read_text
-from splatseed.io.nerfstudio.blender import is_blender, read_blender
-from splatseed.io.nerfstudio.scene import read_transforms_scene
-from splatseed.io.output.earlier import recall_seeds
+from splatseed.io.nerfstudio import is_blender, read_blender, read_transforms_scene
 from splatseed.io.ply import read_ply, refuse_model
-from splatseed.io.rgbd.tum import is_tum, load_tum
+from splatseed.io.rgbd import is_tum, load_rgbd, load_tum
+from splatseed.io.seeds import recall_seeds
 from splatseed.io.split import follow_lists
 from splatseed.io.staging import MANIFEST, read_manifest
 from splatseed.literal import quoted
@@ -107,11 +106,16 @@ def check_there(path: Path) -> None:
         SceneNotFoundError: There is none.
     """
     if not path.is_file() and not path.is_dir():
-        raise SceneNotFoundError(
-            f"a scene at {path}",
-            found=odd_kind(path) or "no such file or folder",
-            fix="Check the path.",
-        )
+        found = odd_kind(path) or "no such file or folder"
+        raise SceneNotFoundError(f"a scene at {path}", found=found, fix="Check the path.")
+
+
+def is_scene(folder: Path) -> bool:
+    """Whether a folder looks like a scene, by the names in it."""
+    models = (folder / "sparse/0", folder / "sparse", folder, folder / "colmap/sparse/0")
+    if find_model(*models) is not None or is_tum(folder) or is_blender(folder):
+        return True
+    return any((folder / name).is_file() for name in (_TRANSFORMS, "traj.txt"))
 
 
 def _read(path: Path) -> Scene:
@@ -128,68 +132,40 @@ def _read(path: Path) -> Scene:
     nested = find_model(path / "colmap" / "sparse" / "0")
     if nested is not None:
         return read_colmap_scene(nested)
-    return _read_capture(path)
-
-
-def _read_capture(path: Path) -> Scene:
-    """An RGB-D capture."""
-    if (path / "traj.txt").is_file():
-        from splatseed.io.rgbd.replica import load_rgbd  # noqa: PLC0415  (keeps splatseed.io fast)
-
-        return load_rgbd(path)
-    if is_tum(path):
-        return load_tum(path)
-    raise _no_scene(path)
+    if not (path / "traj.txt").is_file() and not is_tum(path):
+        raise _no_scene(path)
+    return load_rgbd(path) if (path / "traj.txt").is_file() else load_tum(path)
 
 
 def _read_file(path: Path) -> Scene:
-    readers: dict[str, Callable[[Path], Scene]] = {
-        ".ply": _read_bare_ply,
-        ".json": read_transforms_scene,
-    }
     refuse_model(path)
-    _refuse_of_output(path)
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        found, fix = _no_reader(path)
-        expected = f"{path} to be a scene folder, a .ply or a .json file"
-        raise SceneFormatError(expected, found=found, fix=fix)
-    return reader(path)
-
-
-def _no_reader(path: Path) -> tuple[str, str]:
-    """What a file is that no scene can be read from, and what to do with it."""
-    kind = path.suffix.lower()
+    kind, suffix = read_manifest(path.parent).get("command"), path.suffix.lower()
+    if kind is not None and suffix == ".json" and not path.name.startswith("transforms"):
+        if kind == "train":
+            raise _is_run(path.parent)
+        if is_scene(path.parent):
+            raise SceneFormatError(
+                f"{path} to be a scene folder, a .ply or a .json file with frames",
+                found=f"notes on what splatseed {kind} wrote",
+                fix=f"Name the scene's folder: {path.parent}",
+            )
+    if suffix == ".ply":
+        return Scene(read_ply(path), source=SceneSource("ply", path.parent, path))
+    if suffix == ".json":
+        return read_transforms_scene(path)
     if is_video(path):
-        return "a video", f"Make a scene of it first: splatseed sfm {quoted(path)} -o SCENE."
-    if find_model(path.parent) is not None:
-        return "one file of a COLMAP model", f"Name the scene's folder: {scene_root(path.parent)}"
-    if kind in _SCANS:
-        seeds = f"splatseed upsample SCENE --cloud {quoted(path)} -o OUT"
-        return f"a {kind} file, a scan", f"Make seeds of it: {seeds}."
-    folder = _scene_above(path)
-    fix = f"Name the scene's folder: {folder}" if folder else "Name the scene's folder."
-    return f"a {path.suffix or 'nameless'} file", fix
-
-
-def _refuse_of_output(path: Path) -> None:
-    """Refuse a ``.json`` that splatseed wrote beside a run or a scene.
-
-    Raises:
-        SceneNotFoundError: It is a run's.
-        SceneFormatError: It is a scene's.
-    """
-    kind = read_manifest(path.parent).get("command")
-    if kind is None or path.suffix != ".json" or path.name.startswith("transforms"):
-        return
-    if kind == "train":
-        raise _is_run(path.parent)
-    if is_scene(path.parent):
-        raise SceneFormatError(
-            f"{path} to be a scene folder, a .ply or a .json file with frames",
-            found=f"notes on what splatseed {kind} wrote",
-            fix=f"Name the scene's folder: {path.parent}",
-        )
+        found, fix = "a video", f"Make a scene of it first: splatseed sfm {quoted(path)} -o SCENE."
+    elif find_model(path.parent) is not None:
+        found = "one file of a COLMAP model"
+        fix = f"Name the scene's folder: {scene_root(path.parent)}"
+    elif suffix in _SCANS:
+        found = f"a {suffix} file, a scan"
+        fix = f"Make seeds of it: splatseed upsample SCENE --cloud {quoted(path)} -o OUT."
+    else:
+        found, folder = f"a {path.suffix or 'nameless'} file", _scene_above(path)
+        fix = f"Name the scene's folder{f': {folder}' if folder else '.'}"
+    expected = f"{path} to be a scene folder, a .ply or a .json file"
+    raise SceneFormatError(expected, found=found, fix=fix)
 
 
 def _scene_above(path: Path) -> Path | None:
@@ -202,21 +178,18 @@ def _scene_above(path: Path) -> Path | None:
 
 def _no_scene(path: Path) -> SceneNotFoundError:
     if read_manifest(path).get("command") == "train":
-        raise _is_run(path)
+        return _is_run(path)
     scenes = [each.name for each in sorted(path.iterdir()) if is_scene(each)]
     files = {each.name for suffix in ("*.json", "*.ply") for each in path.glob(suffix)}
-    near = sorted(files - {MANIFEST})
+    near, above = sorted(files - {MANIFEST}), _scene_above(path)
+    inside = f"only {_some(near)}" if near else "none of them"
+    fix = "Name the scene's folder, or a .ply or .json file itself."
     if scenes:
         inside, fix = f"scenes in it: {_some(scenes)}", f"Name one of them: {path / scenes[0]}"
+    elif above is not None:
+        fix = f"Name the scene's folder: {above}"
     else:
-        inside = f"only {_some(near)}" if near else "none of them"
-        above = _scene_above(path)
-        fix = (
-            "Name the scene's folder, or a .ply or .json file itself. For photographs alone, run:"
-            " splatseed sfm IMAGES -o SCENE."
-            if above is None
-            else f"Name the scene's folder: {above}"
-        )
+        fix += " For photographs alone, run: splatseed sfm IMAGES -o SCENE."
     return SceneNotFoundError(
         f"sparse/0, sparse, colmap/sparse/0, {_TRANSFORMS}, traj.txt or groundtruth.txt in {path}",
         found=inside,
@@ -229,8 +202,7 @@ def _is_run(path: Path) -> SceneNotFoundError:
         scene = json.loads(read_text(path / "config.json"))["scene"]
     except (OSError, ValueError, TypeError, KeyError):
         scene = None
-    named = isinstance(scene, str)
-    run = quoted(path)
+    run, named = quoted(path), isinstance(scene, str)
     return SceneNotFoundError(
         f"a scene at {path}",
         found="a run of splatseed train" + (f" on the scene {scene}" if named else ""),
@@ -238,20 +210,7 @@ def _is_run(path: Path) -> SceneNotFoundError:
     )
 
 
-def is_scene(folder: Path) -> bool:
-    """Whether a folder looks like a scene, by the names in it."""
-    model_dirs = (folder / "sparse/0", folder / "sparse", folder, folder / "colmap/sparse/0")
-    markers = (folder / _TRANSFORMS, folder / "traj.txt")
-    if find_model(*model_dirs) is not None or is_tum(folder) or is_blender(folder):
-        return True
-    return any(each.is_file() for each in markers)
-
-
 def _some(names: Sequence[str]) -> str:
     """The first five names, and how many more there are."""
     more = f" and {len(names) - 5:,} more" if len(names) > 5 else ""
     return ", ".join(names[:5]) + more
-
-
-def _read_bare_ply(path: Path) -> Scene:
-    return Scene(read_ply(path), source=SceneSource("ply", path.parent, path))

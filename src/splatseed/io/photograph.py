@@ -1,13 +1,15 @@
-"""A photograph's file: its bytes, its size, its pixels.
+"""Photographs: a file's bytes, size and pixels; and what is wrong with a scene's, before training.
 
 Promise: pixels are as stored, before any EXIF rotation, because COLMAP counts them so; transparent
 ones are composited over black, the background of renders; 16-bit grey, and floats in [0, 1], are
 rounded to 8 bits, and 16-bit colours keep their upper 8 (Pillow's way); every failure names the
-file.
+file. Checks open only the headers of a few files, and return problems instead of raising them.
 """
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import other_spelling, read_file
-from splatseed.literal import told
-from splatseed.scene import Scene
+from splatseed.io.files import odd_kind, open_file, other_spelling, read_file
+from splatseed.literal import agreeing, told
+from splatseed.scene import Image, Scene
 
 if TYPE_CHECKING:
     from PIL import Image as PilImage
@@ -29,6 +31,7 @@ _WIDE_GREY = ("I", "F")
 _INKS = ("CMYK", "LAB")
 """Pillow's modes that are not RGB or grey; it would convert inks by a rule of thumb."""
 _DECODER_FAILURES = (OSError, ValueError, SyntaxError)
+_MAX_OPENED = 32  # files whose size is compared
 
 
 def photograph_folder(scene: Scene) -> Path:
@@ -75,11 +78,11 @@ def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
     Raises:
         SceneFormatError: It is no image.
     """
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415  (slow to import)
+    from PIL import Image as PilImage, UnidentifiedImageError  # noqa: PLC0415  (slow to import)
 
     try:
-        return Image.open(BytesIO(encoded))
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError) as error:
+        return PilImage.open(BytesIO(encoded))
+    except (UnidentifiedImageError, PilImage.DecompressionBombError, OSError, ValueError) as error:
         raise _unusable(path, told(error)) from None
 
 
@@ -101,7 +104,10 @@ def decode_photograph(path: Path, encoded: bytes) -> PilImage.Image:
         return _eight_bits(path, photograph).convert("RGB")
     try:
         if "A" in photograph.getbands() or "transparency" in photograph.info:
-            return _over_black(photograph.convert("RGBA"))
+            from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
+
+            black = PilImage.new("RGBA", photograph.size, (0, 0, 0, 255))
+            return PilImage.alpha_composite(black, photograph.convert("RGBA")).convert("RGB")
         return photograph.convert("RGB")
     except _DECODER_FAILURES as error:
         raise _damaged(path, error) from None
@@ -126,7 +132,7 @@ def check_photograph(path: Path) -> tuple[int, int]:
 
 def _eight_bits(path: Path, photograph: PilImage.Image) -> PilImage.Image:
     """Grey of 16 bits or of floats, as 8 bits."""
-    from PIL import Image  # noqa: PLC0415  (loads with its use)
+    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
     try:
         values = np.asarray(photograph)
@@ -145,14 +151,7 @@ def _eight_bits(path: Path, photograph: PilImage.Image) -> PilImage.Image:
     transparent = photograph.info.get("transparency")
     if transparent is not None:
         grey[values == transparent] = 0
-    return Image.fromarray(grey)
-
-
-def _over_black(photograph: PilImage.Image) -> PilImage.Image:
-    from PIL import Image  # noqa: PLC0415  (loads with its use)
-
-    black = Image.new("RGBA", photograph.size, (0, 0, 0, 255))
-    return Image.alpha_composite(black, photograph).convert("RGB")
+    return PilImage.fromarray(grey)
 
 
 def _damaged(path: Path, error: Exception) -> SceneFormatError:
@@ -163,3 +162,84 @@ def _unusable(path: Path, found: str) -> SceneFormatError:
     return SceneFormatError(
         f"{path} to be an image", found=found, fix="Copy or export the image again."
     )
+
+
+def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
+    """What is wrong with the image files against their records; only a few headers are opened.
+
+    Args:
+        images: The images.
+        image_dir: The folder their names are relative to, if it exists.
+        root: The scene's folder.
+    """
+    if not images:
+        return []
+    if image_dir is None:
+        return ["The images folder is missing; points can be made, but nothing can be trained."]
+    outside = [im.name for im in images if _leads_out(im.name, image_dir, root)]
+    missing = {im.name: None for im in images if not (image_dir / im.name).is_file()}
+    warnings = []
+    if missing:
+        first, are = next(iter(missing)), agreeing(len(missing), "is", "are")
+        near = other_spelling(image_dir / first)
+        hint = f"; {near} is there, but names must be equal to the letter" if near else ""
+        if kind := odd_kind(image_dir / first):
+            hint = f", which is {kind}"
+        warnings.append(
+            f"{len(missing)} of {len(images)} images {are} missing in {image_dir}, the first is "
+            f"{first}{hint}."
+        )
+    if outside:
+        lie = agreeing(len(outside), "lies", "lie")
+        warnings.append(
+            f"{len(outside)} of {len(images)} images {lie} outside of {root}, the first is "
+            f"{outside[0]}."
+        )
+    present = [im for im in images if im.name not in missing]
+    sample = present[:: -(-len(present) // _MAX_OPENED) or 1]  # evenly spaced, the first among them
+    wrong = [text for im in sample if (text := _size_warning(im, image_dir))]
+    return [*warnings, *wrong[:1]]
+
+
+def _leads_out(name: str, image_dir: Path, root: Path) -> bool:
+    """Whether an image's name leads out of its scene's folder.
+
+    Links, which somebody made on purpose, may lead anywhere.
+    """
+    path, around = (os.path.abspath(each) for each in (image_dir / name, root))  # noqa: PTH100  (without following links)
+    return os.path.commonpath([path, around]) != around
+
+
+def _size_warning(image: Image, image_dir: Path) -> str | None:
+    from PIL import Image as PilImage, UnidentifiedImageError  # noqa: PLC0415  (slow to import)
+
+    try:
+        with open_file(image_dir / image.name) as file, PilImage.open(file) as picture:
+            size = picture.size
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except (OSError, UnidentifiedImageError, PilImage.DecompressionBombError) as error:
+        return f"{image.name} cannot be read: {told(error)}."
+    expected = (image.intrinsics.width, image.intrinsics.height)
+    if size == expected:
+        return None
+    return (
+        f"{image.name} has {size[0]} x {size[1]} pixels, its camera {image.intrinsics.camera_id}"
+        f" {expected[0]} x {expected[1]}; some trainers rescale, others fail."
+    )
+
+
+def warnings_but_lens(scene: Scene) -> list[str]:
+    """What is wrong with a scene for a command that takes lens distortion out."""
+    lens = lens_warnings(scene.images)
+    return [warning for warning in scene.warnings if warning not in lens]
+
+
+def lens_warnings(images: Sequence[Image]) -> list[str]:
+    """A sentence on lens distortion, which not every trainer supports."""
+    models = sorted({im.intrinsics.model for im in images if not im.intrinsics.is_pinhole})
+    if not models:
+        return []
+    lenses = f"Cameras have lens distortion ({', '.join(models)})"
+    trainers = "splatseed train, graphdeco's trainer and OpenSplat need PINHOLE cameras"
+    return [f"{lenses}; {trainers}: undistort the scene with splatseed undistort SCENE -o OUT."]

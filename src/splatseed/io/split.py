@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from splatseed.io.files import read_bytes
-from splatseed.literal import counted
+from splatseed.literal import agreeing, counted
 from splatseed.scene import Scene, Split
 
 ROOT_LISTS = ("train_list.txt", "test_list.txt", "validation_list.txt", "train.txt", "test.txt")
@@ -24,7 +24,7 @@ ROOT_LISTS = ("train_list.txt", "test_list.txt", "validation_list.txt", "train.t
 MODEL_LISTS = ("test.txt",)
 """Lists beside a COLMAP model."""
 _PARTS = ("train", "test", "val")
-SHOWN = 3
+_SHOWN = 3
 """Names that a warning shows."""
 
 
@@ -49,20 +49,17 @@ def follow_lists(scene: Scene) -> Scene:
     for lists in _lists(scene):
         split, unknown = _split(scene, lists)
         if split is not None:
-            if unknown:
-                warnings.append(_unknown_names(lists, unknown))
+            if unknown:  # a slip, or lost by SfM
+                shown = ", ".join(unknown[:_SHOWN]) + (", ..." if len(unknown) > _SHOWN else "")
+                match = (
+                    f"{counted(len(unknown), 'name')} {agreeing(len(unknown), 'matches', 'match')}"
+                )
+                warnings.append(f"{lists.origin}: {match} no image ({shown}).")
             return scene.replace(listed=split, warnings=tuple(warnings))
         warnings.append(
             f"{lists.origin} was ignored: it leaves no images to train on, or none to test."
         )
     return scene.replace(warnings=tuple(warnings))
-
-
-def _unknown_names(lists: _Lists, unknown: Sequence[str]) -> str:
-    """The warning of names that a list has and the scene has not: a slip, or lost by SfM."""
-    shown = ", ".join(unknown[:SHOWN]) + (", ..." if len(unknown) > SHOWN else "")
-    match = "matches" if len(unknown) == 1 else "match"
-    return f"{lists.origin}: {counted(len(unknown), 'name')} {match} no image ({shown})."
 
 
 def split_fields(scene: Scene) -> dict[str, list[str]]:

@@ -5,15 +5,13 @@ Promise: what is read is a rotation, one scale and a translation; anything else 
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
 
-from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import read_bytes
+from splatseed.errors import SceneFormatError
+from splatseed.io.files import read_bytes, read_json
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, similarity_of
 
@@ -37,7 +35,7 @@ def read_cloud_transform(path: Path, scene: Scene) -> Similarity:
         return similarity_in(path, rows.tolist(), scene, _FIX)
     except (UnicodeDecodeError, ValueError):
         pass  # not plain numbers
-    content = read_json(path, _FIX, "a transform, as text or JSON")
+    content = read_json(path, "a transform, as text or JSON", fix=_FIX)
     found = similarity_in(path, content, scene, _FIX)
     return found.inverse if path.name == NERFSTUDIO else found
 
@@ -48,7 +46,8 @@ def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarit
     Args:
         path: The file; nerfstudio's is recognised by its name.
         content: Rows of a matrix, or a mapping with them and a scale.
-        scene: For nerfstudio's file, whose transform begins from COLMAP's own world.
+        scene: For nerfstudio's file, whose transform begins from COLMAP's own world: a scene read
+            from transforms.json is in that file's world, to which ``applied_transform`` leads.
         fix: What errors advise.
 
     Raises:
@@ -61,8 +60,11 @@ def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarit
     try:
         matrix = np.atleast_1d(np.array(rows, np.float64))
         matrix = np.concatenate([matrix[:3] * float(scale), np.eye(4)[3:]])
-        if path.name == NERFSTUDIO:
-            matrix = matrix @ _unapplied(scene, fix)
+        transforms = scene.source.transforms_path if scene.source else None
+        if path.name == NERFSTUDIO and transforms is not None:
+            applied = read_json(transforms, fix=fix).get("applied_transform", np.eye(4)[:3])
+            applied = np.vstack([np.array(applied, np.float64)[:3], np.eye(4)[3:]])
+            matrix = matrix @ np.linalg.inv(applied)
         world = similarity_of(matrix)
     except (TypeError, ValueError):
         world = None
@@ -74,49 +76,3 @@ def similarity_in(path: Path, content: Any, scene: Scene, fix: str) -> Similarit
             fix=fix,
         )
     return world
-
-
-def _unapplied(scene: Scene, fix: str) -> Float64[np.ndarray, "4 4"]:
-    """From the scene's world to the one that nerfstudio's transform begins from, COLMAP's own.
-
-    A scene read from transforms.json is in that file's world, to which ``applied_transform`` leads.
-    """
-    path = None if scene.source is None else scene.source.transforms_path
-    if path is None:
-        return np.eye(4)
-    applied = read_json(path, fix).get("applied_transform", np.eye(4)[:3])
-    return np.linalg.inv(np.vstack([np.array(applied, np.float64)[:3], np.eye(4)[3:]]))
-
-
-def read_json(path: Path, fix: str, expected: str = "JSON") -> Any:
-    """The content of a JSON file.
-
-    Args:
-        path: The file.
-        fix: What errors advise.
-        expected: What errors say that the file should be.
-
-    Raises:
-        SceneNotFoundError: There is no such file.
-        SceneFormatError: It is no JSON.
-    """
-    try:
-        return json.loads(read_bytes(path))
-    except SceneNotFoundError:
-        raise SceneNotFoundError(f"a file {path}", found="none", fix=fix) from None
-    except json.JSONDecodeError as error:
-        found = _where_it_ends(error)
-    except UnicodeDecodeError:
-        found = "bytes that are no text"
-    except (ValueError, RecursionError) as error:
-        found = str(error)
-    raise SceneFormatError(f"{path} to be {expected}", found=found, fix=fix)
-
-
-def _where_it_ends(error: json.JSONDecodeError) -> str:
-    """What stands where a text stops being JSON."""
-    if not error.doc.strip():
-        return "an empty file"
-    rest = error.doc[error.pos :].strip().splitlines()
-    there = repr(rest[0][:40]) if rest else "its end"
-    return f"{there} at line {error.lineno}, column {error.colno}"

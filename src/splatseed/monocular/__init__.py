@@ -22,7 +22,7 @@ from PIL import Image as PilImage
 
 from splatseed.depthmap import ASPECT_SLACK
 from splatseed.errors import ParameterError, SceneFormatError
-from splatseed.io.depth.folder import depth_folder
+from splatseed.io.depth_maps import depth_folder
 from splatseed.io.photograph import (
     check_photograph,
     decode_photograph,

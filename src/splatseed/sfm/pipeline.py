@@ -13,7 +13,7 @@ from pathlib import Path
 from shutil import rmtree
 from typing import TypeAlias
 
-from splatseed.io.output.layouts import write_split
+from splatseed.io.layouts import write_split
 from splatseed.io.staging import MANIFEST, output_folder, write_json
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene

@@ -6,8 +6,8 @@ from pathlib import Path, PurePosixPath
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import write_scene
-from splatseed.io.output.earlier import carry_seeds
-from splatseed.io.output.layouts import write_split
+from splatseed.io.layouts import write_split
+from splatseed.io.seeds import carry_seeds
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.sfm.jobs import Outcome, UndistortJob

@@ -21,7 +21,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import ParameterError, SceneFormatError
-from splatseed.io.transform_file import NERFSTUDIO, read_json, similarity_in
+from splatseed.io.files import read_json
+from splatseed.io.transform_file import NERFSTUDIO, similarity_in
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity, fit_similarity, similarity_of
 from splatseed.splat.gaussians import Gaussians
@@ -147,7 +148,7 @@ def _candidates(path: Path, scene: Scene) -> Iterator[tuple[str, Similarity | No
 
 def _of_file(path: Path, scene: Scene) -> Similarity:
     """A transform from a file: a matrix, nerfstudio's ``transform`` and ``scale``, or cameras."""
-    content = read_json(path, _FIX, "a transform in JSON")
+    content = read_json(path, "a transform in JSON", fix=_FIX)
     if isinstance(content, list) and content and isinstance(content[0], dict):
         return _of_cameras(path, content, scene)
     return similarity_in(path, content, scene, _FIX)

@@ -18,7 +18,7 @@ from PIL import Image as PillowImage
 from splatseed.camera import Camera, Intrinsics, quat_from_rotation
 from splatseed.errors import ParameterError
 from splatseed.io import write_scene
-from splatseed.io.depth.folder import write_description
+from splatseed.io.depth_maps import write_description
 from splatseed.io.staging import output_folder
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Observations, Scene, Tracks

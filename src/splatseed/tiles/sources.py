@@ -16,7 +16,7 @@ from jaxtyping import Bool
 
 from splatseed.errors import OutputError
 from splatseed.io.clouds import CloudChunk, CloudFile
-from splatseed.io.output.earlier import number_of_originals
+from splatseed.io.seeds import number_of_originals
 from splatseed.scene import Scene
 from splatseed.upsample.neighbors import trusted_originals
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from splatseed.errors import ParameterError, SceneFormatError
 from splatseed.io import load_scene
-from splatseed.io.output.earlier import was_upsampled
+from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import atomic_file
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress

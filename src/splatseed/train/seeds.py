@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from splatseed.io.output.earlier import saw_all_photographs, was_upsampled
+from splatseed.io.seeds import saw_all_photographs, was_upsampled
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Scene

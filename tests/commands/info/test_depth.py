@@ -14,7 +14,7 @@ from PIL import Image as PilImage
 from splatseed.commands.depth.next_steps import number_for
 from splatseed.depth.alignment import align
 from splatseed.io import find_depths, load_scene
-from splatseed.io.depth.folder import depth_folder
+from splatseed.io.depth_maps import depth_folder
 from splatseed.synthetic import make_capture, write_capture
 
 ROW = re.compile(r"^(\S+\.\w+) +([\d,]+) +(\S+)(?: +(\S+))? +(\S+%|-)$", re.MULTILINE)

@@ -12,8 +12,8 @@ import pytest
 from splatseed.camera import rotation_from_quat
 from splatseed.commands.upsample.cloud import Brought
 from splatseed.io import load_scene, write_scene
+from splatseed.io.cleaning import recentred
 from splatseed.io.ply import write_ply
-from splatseed.io.recentring import recentred
 from splatseed.io.staging import unlisted_files
 from splatseed.similarity import Similarity
 from splatseed.synthetic import make_capture

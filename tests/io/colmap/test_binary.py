@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import struct
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -224,19 +222,3 @@ def test_images_that_the_form_cannot_hold_are_refused(model, change, tmp_path):
     fields = {name: getattr(image, name) for name in image.__dataclass_fields__} | change
     with pytest.raises(OutputError):
         colmap_binary.write_images(tmp_path / "images.bin", [type(image)(**fields)])
-
-
-def test_numba_is_imported_only_for_tracks(tmp_path):
-    code = """
-import sys
-from pathlib import Path
-import numpy as np
-from splatseed.io.colmap import binary as colmap_binary
-from splatseed.pointcloud import PointCloud
-cloud = PointCloud(np.zeros((2, 3)), np.zeros((2, 3), np.uint8))
-colmap_binary.write_points3d(Path(sys.argv[1]), cloud, None)
-print("numba" in sys.modules)
-"""
-    command = [sys.executable, "-c", code, str(tmp_path / "points3D.bin")]
-    run = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "False"

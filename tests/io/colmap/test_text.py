@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.camera import Intrinsics
-from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.errors import SceneFormatError
 from splatseed.io.colmap import binary as colmap_binary
-from splatseed.pointcloud import PointCloud
 
 from . import text_form
 
@@ -69,17 +68,6 @@ def test_names_may_hold_spaces(tmp_path):
     text = "1 1 0 0 0 0 0 0 1 my photos/a  b.jpg \n\n"
     (image,) = text_form.read_images(_text(tmp_path, text), CAMERAS)
     assert image.name == "my photos/a  b.jpg"
-
-
-def test_new_points_follow_the_tracked_ones(model, tmp_path):
-    path = tmp_path / "points3D.txt"
-    points = PointCloud.concatenate(model.points, model.points.select(slice(2)))
-    text_form.write_points3d(path, points, model.tracks)
-    read, tracks = text_form.read_points3d(path)
-    np.testing.assert_array_equal(read.xyz, points.xyz)
-    assert tracks.point_ids.tolist() == [*model.tracks.point_ids, 31, 32]
-    assert tracks.errors[10:].tolist() == [-1.0, -1.0]
-    assert tracks.lengths.tolist() == [4] * 10 + [0, 0]
 
 
 def test_empty_files_are_empty_models(tmp_path):
@@ -155,10 +143,3 @@ def test_other_encodings_name_the_line(tmp_path):
     path.write_bytes(b"# one\n# caf\xe9\n")
     with pytest.raises(SceneFormatError, match=r"UTF-8 text in .*line 2"):
         text_form.read_cameras(path)
-
-
-def test_missing_files_are_our_errors(tmp_path):
-    with pytest.raises(SceneNotFoundError):
-        text_form.read_points3d(tmp_path / "points3D.txt")
-    with pytest.raises(SceneFormatError, match="readable"):
-        text_form.read_cameras(tmp_path)

@@ -24,7 +24,7 @@ from splatseed.io.dense import (
     write_dense_maps,
     write_dense_workspace,
 )
-from splatseed.io.image_checks import warnings_but_lens
+from splatseed.io.photograph import warnings_but_lens
 from splatseed.io.staging import check_output
 from splatseed.literal import quoted, visible
 from splatseed.scene import Scene

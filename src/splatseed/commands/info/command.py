@@ -22,7 +22,7 @@ from splatseed.console import OUT, StageClock, print_commands, print_pairs, stag
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
-from splatseed.io.output.earlier import was_upsampled
+from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_parents
 from splatseed.literal import quoted, visible
 from splatseed.scene import Scene

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from splatseed.errors import ParameterError
-from splatseed.io.recentring import check_precision, offset_of, recentred
+from splatseed.io.cleaning import check_precision, offset_of, recentred
 from splatseed.io.staging import add_files, write_json
 from splatseed.io.transform_file import read_cloud_transform
 from splatseed.literal import visible

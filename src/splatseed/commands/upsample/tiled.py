@@ -25,7 +25,7 @@ from splatseed.errors import OutputError, ParameterError, PointCloudError, Scene
 from splatseed.io import WriteReport, load_originals, load_scene, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.colmap.scene import find_model
-from splatseed.io.output.point_stream import PointStream
+from splatseed.io.write import PointStream
 from splatseed.literal import counted, visible
 from splatseed.pointcloud import PointCloud
 from splatseed.process.memory import free_memory, option_of, words_of

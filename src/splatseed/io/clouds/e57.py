@@ -24,9 +24,9 @@ from splatseed.io.cloud_file import (
     CloudFile,
     Columns,
     Painter,
-    guarded,
     positions,
 )
+from splatseed.io.files import guarded
 from splatseed.requirements import require
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")

@@ -26,9 +26,9 @@ from splatseed.io.cloud_file import (
     Columns,
     Painter,
     check_size,
-    guarded,
     sample_starts,
 )
+from splatseed.io.files import guarded
 from splatseed.requirements import require
 
 _RGB = ("red", "green", "blue")

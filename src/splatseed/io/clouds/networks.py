@@ -17,11 +17,10 @@ import struct
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
-from numpy.lib import format as npy
 
 from splatseed.camera import rotation_from_quat
 from splatseed.errors import SceneFormatError
@@ -32,10 +31,8 @@ from splatseed.io.cloud_file import (
     RowTable,
     color_bytes,
     full_value,
-    guarded,
 )
-from splatseed.io.files import ARCHIVE_FAILURES, COPY_AGAIN, open_file
-from splatseed.literal import told
+from splatseed.io.files import guarded, open_file, read_npy_header
 from splatseed.process.memory import check_memory
 
 POSITIONS = ("world_points", "pts3d", "points3d", "points", "xyz", "point_map", "pointmap")
@@ -51,6 +48,7 @@ _GLTF = (b"glTF", 2, 0x4E4F534A)
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"VEC3": 3, "VEC4": 4}
 _POINTS, _TRIANGLES = 0, 4
+_WHOLE_NPZ = "an archive of NumPy arrays"
 _WHOLE_GLB = "a complete .glb file with vertices"
 
 
@@ -140,24 +138,15 @@ class NpzCloud(CloudFile):
 def _members(path: Path) -> dict[str, _Member]:
     """The arrays of an archive by name."""
     members = {}
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for name in archive.namelist():
-                if name.endswith(".npy"):
-                    with archive.open(name) as file:
-                        shape, fortran, dtype = _header(file)
-                    if not dtype.hasobject:
-                        key = name.removesuffix(".npy")
-                        members[key] = _Member(key, shape, dtype, fortran and len(shape) > 1)
-    except ARCHIVE_FAILURES as error:
-        raise _damaged(path, error) from None
+    with guarded(path, _WHOLE_NPZ), zipfile.ZipFile(path) as archive:
+        for name in archive.namelist():
+            if name.endswith(".npy"):
+                with archive.open(name) as file:
+                    shape, fortran, dtype = read_npy_header(file)
+                if not dtype.hasobject:
+                    key = name.removesuffix(".npy")
+                    members[key] = _Member(key, shape, dtype, fortran and len(shape) > 1)
     return members
-
-
-def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    version = npy.read_magic(file)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    return read(file)
 
 
 def _parts(path: Path, member: _Member, size: int) -> Iterator[np.ndarray]:
@@ -169,21 +158,14 @@ def _parts(path: Path, member: _Member, size: int) -> Iterator[np.ndarray]:
             straight = values.reshape(member.shape, order="F").ravel()
             yield from (straight[start : start + size] for start in range(0, left, size))
         return
-    try:
-        with zipfile.ZipFile(path) as archive, archive.open(f"{member.name}.npy") as file:
-            _header(file)
-            while left:
-                count = min(size, left)
-                data = file.read(count * member.dtype.itemsize)
-                yield np.frombuffer(data, member.dtype, count)
-                left -= count
-    except ARCHIVE_FAILURES as error:
-        raise _damaged(path, error) from None
-
-
-def _damaged(path: Path, error: Exception) -> SceneFormatError:
-    expected = f"{path} to be an archive of NumPy arrays"
-    return SceneFormatError(expected, found=told(error), fix=COPY_AGAIN)
+    name = f"{member.name}.npy"
+    with guarded(path, _WHOLE_NPZ), zipfile.ZipFile(path) as archive, archive.open(name) as file:
+        read_npy_header(file)
+        while left:
+            count = min(size, left)
+            data = file.read(count * member.dtype.itemsize)
+            yield np.frombuffer(data, member.dtype, count)
+            left -= count
 
 
 class _Part(NamedTuple):

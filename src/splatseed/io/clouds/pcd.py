@@ -28,10 +28,9 @@ from splatseed.io.cloud_file import (
     Painter,
     RowTable,
     TextTable,
-    guarded,
     positions,
 )
-from splatseed.io.files import COPY_AGAIN, open_file
+from splatseed.io.files import COPY_AGAIN, guarded, open_file
 from splatseed.kernels.jit import inline
 from splatseed.process.memory import check_memory
 

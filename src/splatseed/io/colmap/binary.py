@@ -20,9 +20,7 @@ from jaxtyping import Float32, Int64, UInt8
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
 from splatseed.io.colmap.model import (
-    EXPORT_AGAIN,
     UNKNOWN_ERROR,
-    by_camera_id,
     check_names,
     check_unique,
     make_image,
@@ -46,7 +44,6 @@ _OBSERVATION = np.dtype([("image_id", "<u4"), ("point2d_idx", "<u4")])
 # observations of 8 bytes; nothing is aligned.
 _HEAD_BYTES, _PAIR_BYTES = _POINT.itemsize, _OBSERVATION.itemsize
 _LENGTH_AT = 43  # of the track length within a head
-_LENGTH = struct.Struct("<Q")
 _POINTS_AT_ONCE = 1 << 18  # bounds the writer's memory to some tens of megabytes
 
 
@@ -57,7 +54,7 @@ def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
         SceneNotFoundError: There is no such file.
         SceneFormatError: It is unreadable or malformed, or a camera model is unknown.
     """
-    reader = ByteReader(path, EXPORT_AGAIN)
+    reader = ByteReader(path)
     count = reader.count(_CAMERA.size + 3 * 8, "cameras")
     cameras = tuple(_read_camera(reader, i, count) for i in range(count))
     reader.finish()
@@ -89,8 +86,8 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
         SceneFormatError: It is unreadable or malformed, a pose is not finite, or an image names a
             camera that is not there.
     """
-    reader = ByteReader(path, EXPORT_AGAIN)
-    cameras = by_camera_id(intrinsics)
+    reader = ByteReader(path)
+    cameras = {camera.camera_id: camera for camera in intrinsics}
     count = reader.count(_POSE.size + 1 + 8, "images")
     images = tuple(_read_image(reader, cameras, i, count) for i in range(count))
     reader.finish()
@@ -103,23 +100,20 @@ def _read_image(reader: ByteReader, cameras: dict[int, Intrinsics], idx: int, co
     reader.record = f"{_record(idx)} of {count}"
     where = reader.where
     image_id, *pose, camera_id = reader.unpack(_POSE)
+    name = reader.text()
+    features = reader.array(_FEATURE, reader.count(_FEATURE.itemsize, "features"))
+    point_ids = features["point_id"].astype(np.int64)  # COLMAP's "none", 2^64 - 1, becomes -1
+    if (point_ids < NO_POINT).any():
+        raise reader.error("features with point ids below 2^63", "a larger one")
     return make_image(
         where,
         cameras,
         image_id=image_id,
         camera_id=camera_id,
-        name=reader.text(),
+        name=name,
         pose=pose,
-        observations=_read_features(reader),
+        observations=Observations(features["xy"].astype(np.float64), point_ids),
     )
-
-
-def _read_features(reader: ByteReader) -> Observations:
-    features = reader.array(_FEATURE, reader.count(_FEATURE.itemsize, "features"))
-    point_ids = features["point_id"].astype(np.int64)  # COLMAP's "none", 2^64 - 1, becomes -1
-    if (point_ids < NO_POINT).any():
-        raise reader.error("features with point ids below 2^63", "a larger one")
-    return Observations(features["xy"].astype(np.float64), point_ids)
 
 
 def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
@@ -132,23 +126,8 @@ def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
         SceneFormatError: It is unreadable or malformed, or a point id occurs twice or exceeds
             2^63 - 1.
     """
-    reader = ByteReader(path, EXPORT_AGAIN)
+    reader = ByteReader(path)
     count = reader.count(_POINT.itemsize, "points")
-    starts = _scan_points(reader, count)
-    points, observations = _split_points(reader, starts)
-    tracks = Tracks(
-        point_ids=points["id"].astype(np.int64),
-        xyz=points["xyz"].astype(np.float64),
-        errors=points["error"].astype(np.float64),
-        offsets=_track_offsets(starts),
-        image_ids=observations["image_id"].astype(np.uint32),
-        point2d_idx=observations["point2d_idx"].astype(np.uint32),
-    )
-    return make_points(path, _record, points["rgb"].copy(), tracks)
-
-
-def _scan_points(reader: ByteReader, count: int) -> Int64[np.ndarray, " N+1"]:
-    """The byte offset of each point record, then the end of the last; consumes the file."""
     starts = _scan_records(reader.data, reader.offset, count)
     complete = len(starts) - 1
     reader.offset = int(starts[complete])
@@ -156,21 +135,18 @@ def _scan_points(reader: ByteReader, count: int) -> Int64[np.ndarray, " N+1"]:
         reader.record = f"{_record(complete)} of {count}"
         raise reader.error("a whole point record", f"{reader.remaining} bytes to the file's end")
     reader.finish()
-    return starts
-
-
-def _split_points(
-    reader: ByteReader, starts: Int64[np.ndarray, " N+1"]
-) -> tuple[np.ndarray, np.ndarray]:
-    """The heads [N] as ``_POINT`` and the track elements [T] as ``_OBSERVATION``."""
-    heads, pairs = _split_records(np.frombuffer(reader.data, np.uint8), starts)
-    return heads.view(_POINT), pairs.view(_OBSERVATION)
-
-
-def _track_offsets(starts: Int64[np.ndarray, " N+1"]) -> Int64[np.ndarray, " N+1"]:
-    """Offsets into the track elements, from the offsets of the records."""
-    heads = np.arange(len(starts)) * _POINT.itemsize
-    return np.asarray((starts - starts[0] - heads) // _OBSERVATION.itemsize)
+    buffer = np.frombuffer(reader.data, np.uint8)
+    points = _anywhere(buffer, _HEAD_BYTES)[starts[:-1]].view(_POINT)
+    observations = _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)].view(_OBSERVATION)
+    tracks = Tracks(
+        point_ids=points["id"].astype(np.int64),
+        xyz=points["xyz"].astype(np.float64),
+        errors=points["error"].astype(np.float64),
+        offsets=(starts - starts[0] - _HEAD_BYTES * np.arange(len(starts))) // _PAIR_BYTES,
+        image_ids=observations["image_id"].astype(np.uint32),
+        point2d_idx=observations["point2d_idx"].astype(np.uint32),
+    )
+    return make_points(path, _record, points["rgb"].copy(), tracks)
 
 
 def write_cameras(path: Path, intrinsics: Sequence[Intrinsics]) -> None:
@@ -202,8 +178,18 @@ def write_images(path: Path, images: Sequence[Image]) -> None:
             pose = (*image.quat.tolist(), *image.translation.tolist())
             values = (image.image_id, *pose, image.intrinsics.camera_id)
             file.write(_pack(_POSE, f"image {image.name!r}", *values))
-            file.write(_encoded_name(image.name))
-            file.write(_packed_features(image.observations))
+            name = image.name.encode("utf-8", errors="replace")
+            if b"\0" in name or name.decode("utf-8") != image.name:
+                raise OutputError(
+                    "image names in UTF-8 without a zero byte",
+                    found=f"{image.name!r}",
+                    fix="Rename the image.",
+                )
+            features = np.empty(len(image.observations or ()), _FEATURE)
+            if image.observations is not None:
+                features["xy"] = image.observations.xy
+                features["point_id"] = image.observations.point_ids.astype(np.uint64)
+            file.write(name + b"\0" + _COUNT.pack(len(features)) + features.tobytes())
 
 
 def _pack(layout: struct.Struct, where: str, *values: float) -> bytes:
@@ -215,24 +201,6 @@ def _pack(layout: struct.Struct, where: str, *values: float) -> bytes:
             found=f"{values} ({error})",
             fix="Ids and sizes are non-negative, ids below 2^32.",
         ) from None
-
-
-def _encoded_name(name: str) -> bytes:
-    encoded = name.encode("utf-8", errors="replace")
-    if b"\0" in encoded or encoded.decode("utf-8") != name:
-        raise OutputError(
-            "image names in UTF-8 without a zero byte", found=f"{name!r}", fix="Rename the image."
-        )
-    return encoded + b"\0"
-
-
-def _packed_features(observations: Observations | None) -> bytes:
-    if observations is None:
-        return _COUNT.pack(0)
-    features = np.empty(len(observations), _FEATURE)
-    features["xy"] = observations.xy
-    features["point_id"] = observations.point_ids.astype(np.uint64)
-    return _COUNT.pack(len(features)) + features.tobytes()
 
 
 def write_points3d(path: Path, points: PointCloud, tracks: Tracks | None) -> None:
@@ -249,7 +217,11 @@ def write_points3d(path: Path, points: PointCloud, tracks: Tracks | None) -> Non
         PointCloudError: There are more tracks than points.
         OSError: The file cannot be written.
     """
-    heads = _point_heads(points, tracks)
+    heads = np.zeros(len(points), _POINT)
+    heads["id"], heads["xyz"], heads["error"] = point_columns(points, tracks)
+    heads["rgb"] = points.rgb
+    if tracks is not None:
+        heads["length"][: len(tracks)] = tracks.lengths
     num_tracked = len(tracks) if tracks is not None else 0
     with path.open("wb") as file:
         file.write(_COUNT.pack(len(points)))
@@ -286,15 +258,6 @@ def point_rows(
     return heads.view(np.uint8).data
 
 
-def _point_heads(points: PointCloud, tracks: Tracks | None) -> np.ndarray:
-    heads = np.zeros(len(points), _POINT)
-    heads["id"], heads["xyz"], heads["error"] = point_columns(points, tracks)
-    heads["rgb"] = points.rgb
-    if tracks is not None:
-        heads["length"][: len(tracks)] = tracks.lengths
-    return heads
-
-
 def _joined_records(
     heads: np.ndarray, tracks: Tracks, start: int, stop: int
 ) -> UInt8[np.ndarray, " B"]:
@@ -303,9 +266,12 @@ def _joined_records(
     observations = np.empty(last - first, _OBSERVATION)
     observations["image_id"] = tracks.image_ids[first:last]
     observations["point2d_idx"] = tracks.point2d_idx[first:last]
-    record_offsets = (tracks.offsets[start : stop + 1] - first) * _OBSERVATION.itemsize
-    record_offsets += np.arange(len(record_offsets)) * _POINT.itemsize
-    return _join_records(heads.view(np.uint8), observations.view(np.uint8), record_offsets)
+    starts = (tracks.offsets[start : stop + 1] - first) * _PAIR_BYTES
+    starts += np.arange(len(starts)) * _HEAD_BYTES
+    buffer = np.empty(starts[-1], np.uint8)
+    _anywhere(buffer, _HEAD_BYTES)[starts[:-1]] = heads.view(f"V{_HEAD_BYTES}")
+    _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)] = observations.view(f"V{_PAIR_BYTES}")
+    return buffer
 
 
 def _record(idx: int) -> str:
@@ -321,7 +287,7 @@ def _scan_records(data: bytes, first: int, count: int) -> Int64[np.ndarray, " K+
     """
     at, last = first, len(data) - _HEAD_BYTES
     starts = [at]
-    length_at = _LENGTH.unpack_from
+    length_at = _COUNT.unpack_from
     for _ in range(count):  # a record's place is known only from the one before it
         if at > last:
             break
@@ -330,27 +296,6 @@ def _scan_records(data: bytes, first: int, count: int) -> Int64[np.ndarray, " K+
             break
         starts.append(at)
     return np.array(starts, np.int64)
-
-
-def _split_records(
-    buffer: UInt8[np.ndarray, " B"], starts: Int64[np.ndarray, " N+1"]
-) -> tuple[UInt8[np.ndarray, " 51*N"], UInt8[np.ndarray, " 8*T"]]:
-    """The heads and the tracks of scanned records, apart; the inverse of ``_join_records``."""
-    heads = _anywhere(buffer, _HEAD_BYTES)[starts[:-1]]
-    pairs = _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)]
-    return heads.view(np.uint8), pairs.view(np.uint8)
-
-
-def _join_records(
-    heads: UInt8[np.ndarray, " 51*N"],
-    pairs: UInt8[np.ndarray, " 8*T"],
-    starts: Int64[np.ndarray, " N+1"],
-) -> UInt8[np.ndarray, " B"]:
-    """Heads and tracks interleaved, record i at ``starts[i]``."""
-    buffer = np.empty(starts[-1], np.uint8)
-    _anywhere(buffer, _HEAD_BYTES)[starts[:-1]] = heads.view(f"V{_HEAD_BYTES}")
-    _anywhere(buffer, _PAIR_BYTES)[_pair_offsets(starts)] = pairs.view(f"V{_PAIR_BYTES}")
-    return buffer
 
 
 def _anywhere(buffer: UInt8[np.ndarray, " B"], size: int) -> np.ndarray:

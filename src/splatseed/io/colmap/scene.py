@@ -16,7 +16,7 @@ import numpy as np
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneNotFoundError
 from splatseed.io.colmap import binary as colmap_binary, text as colmap_text
-from splatseed.io.image_checks import image_warnings, lens_warnings
+from splatseed.io.photograph import image_warnings, lens_warnings
 from splatseed.io.ply import read_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource, Tracks

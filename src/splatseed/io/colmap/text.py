@@ -18,16 +18,14 @@ import numpy as np
 from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.io.colmap.model import (
-    EXPORT_AGAIN,
     MAX_ID,
-    by_camera_id,
     check_names,
     check_unique,
     make_image,
     make_intrinsics,
     make_points,
 )
-from splatseed.io.files import read_bytes
+from splatseed.io.files import COPY_AGAIN, read_bytes
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import NO_POINT, Image, Observations, Tracks
 
@@ -69,7 +67,7 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
         SceneFormatError: It is unreadable or malformed, a pose is not finite, or an image names a
             camera that is not there.
     """
-    cameras = by_camera_id(intrinsics)
+    cameras = {camera.camera_id: camera for camera in intrinsics}
     lines = _lines(path)
     images, numbers = [], []
     for number, line in lines:
@@ -135,15 +133,13 @@ def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
     for number, row in zip(numbers, rows, strict=True):
         if len(row) < 8 or len(row) % 2:
             raise _bad(path, number, "POINT3D_ID X Y Z R G B ERROR and IMAGE_ID POINT2D_IDX", row)
-    rgb = _integers(path, numbers, [row[4:7] for row in rows], 255).reshape(-1, 3)
-    pairs = (
-        _integers(path, numbers, [row[8:] for row in rows], MAX_ID).reshape(-1, 2).astype(np.uint32)
-    )
+    rgb = _flat(path, numbers, [row[4:7] for row in rows], 255).reshape(-1, 3)
+    pairs = _flat(path, numbers, [row[8:] for row in rows], MAX_ID).reshape(-1, 2).astype(np.uint32)
     lengths = [(len(row) - 8) // 2 for row in rows]
     tracks = Tracks(
-        point_ids=_integers(path, numbers, [row[:1] for row in rows], 2**63 - 1),
-        xyz=_floats(path, numbers, [row[1:4] for row in rows]).reshape(-1, 3),
-        errors=_floats(path, numbers, [row[7:8] for row in rows]),
+        point_ids=_flat(path, numbers, [row[:1] for row in rows], 2**63 - 1),
+        xyz=_flat(path, numbers, [row[1:4] for row in rows]).reshape(-1, 3),
+        errors=_flat(path, numbers, [row[7:8] for row in rows]),
         offsets=np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]).astype(np.int64),
         image_ids=pairs[:, 0].copy(),
         point2d_idx=pairs[:, 1].copy(),
@@ -151,42 +147,30 @@ def read_points3d(path: Path) -> tuple[PointCloud, Tracks]:
     return make_points(path, lambda i: f"line {numbers[i]}", rgb.astype(np.uint8), tracks)
 
 
-def _floats(path: Path, numbers: Sequence[int], columns: Sequence[list[str]]) -> np.ndarray:
-    """The fields of all lines, one after another, as float64."""
-    return _flat(path, numbers, columns, np.float64, "numbers")
-
-
-def _integers(
-    path: Path, numbers: Sequence[int], columns: Sequence[list[str]], largest: int
-) -> np.ndarray:
-    """The fields of all lines, one after another, as int64 from 0 to ``largest``."""
-    expected = f"integers from 0 to {largest}"
-    values = _flat(path, numbers, columns, np.int64, expected)
-    wrong = (values < 0) | (values > largest)
-    if wrong.any():
-        ends = np.cumsum([len(column) for column in columns])
-        i = int(np.searchsorted(ends, wrong.argmax(), side="right"))
-        raise _bad(path, numbers[i], expected, columns[i])
-    return values
-
-
 def _flat(
-    path: Path, numbers: Sequence[int], columns: Sequence[list[str]], dtype: type, expected: str
+    path: Path,
+    numbers: Sequence[int],
+    columns: Sequence[list[str]],
+    largest: int | None = None,
 ) -> np.ndarray:
-    try:
-        return np.array([field for column in columns for field in column], dtype)
-    except (ValueError, OverflowError):
-        # Only a file that is refused anyway pays for locating its first bad line.
-        i = next(i for i, column in enumerate(columns) if not _converts(column, dtype))
-        raise _bad(path, numbers[i], expected, columns[i]) from None
+    """The fields of all lines, one after another, as float64, or as int64 up to ``largest``."""
+    dtype, expected = (np.float64, "numbers") if largest is None else (np.int64, "integers from 0")
 
+    def convert(fields: Sequence[str]) -> np.ndarray | None:
+        try:
+            values = np.array(fields, dtype)
+        except (ValueError, OverflowError):
+            return None
+        wrong = largest is not None and ((values < 0) | (values > largest)).any()
+        return None if wrong else values
 
-def _converts(fields: list[str], dtype: type) -> bool:
-    try:
-        np.array(fields, dtype)
-    except (ValueError, OverflowError):
-        return False
-    return True
+    values = convert([field for column in columns for field in column])
+    if values is None:  # only a file that is refused anyway pays for locating its first bad line
+        i = next(i for i, column in enumerate(columns) if convert(column) is None)
+        raise _bad(
+            path, numbers[i], f"{expected} to {largest}" if largest else expected, columns[i]
+        )
+    return values
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -214,4 +198,4 @@ def _data_rows(path: Path) -> tuple[list[int], list[list[str]]]:
 def _bad(path: Path, number: int, expected: str, row: list[str]) -> SceneFormatError:
     fields = " ".join(row)
     line = repr(fields if len(fields) <= 80 else f"{fields[:77]}...") if row else "an empty line"
-    return SceneFormatError(f"{expected} in {path}, line {number}", found=line, fix=EXPORT_AGAIN)
+    return SceneFormatError(f"{expected} in {path}, line {number}", found=line, fix=COPY_AGAIN)

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image as PilImage
+from scipy.ndimage import map_coordinates
 
 from splatseed.camera import Intrinsics, quat_from_rotation
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io import find_depths, load_scene
-from splatseed.io.depth.lens import Undistortion
-from splatseed.io.rgbd.replica import load_rgbd
-from splatseed.io.rgbd.tum import load_tum
+from splatseed.io.depth_maps import Undistortion
+from splatseed.io.rgbd import load_rgbd, load_tum
 from splatseed.lens import image_points
 from splatseed.scene import SceneSource
 
@@ -92,11 +93,6 @@ def test_camera_of_the_series(capture):
     assert "focal length 525" in scene.warnings[0]
 
 
-@pytest.mark.parametrize("name", ["afr1", "freiburg12", "france1", "freiburg"])
-def test_no_series_in_the_name(capture, name):
-    assert load_tum(capture.rename(capture.with_name(name))).intrinsics[0].params[0] == 525
-
-
 def test_the_folder_of_depth_images_leads_to_its_capture(capture):
     scene = load_tum(capture)
     depths = find_depths(scene, capture / "depth")
@@ -151,19 +147,6 @@ def test_opposite_signs_of_a_quaternion_are_the_same_rotation(capture):
     np.testing.assert_allclose(np.abs(quat @ [w, -x, -y, -z]), 1, atol=1e-12)
 
 
-def test_lost_poses_are_skipped(capture):
-    text = (capture / "groundtruth.txt").read_text()
-    nowhere = f"{START!r} nan nan nan 0 0 0 1\n{START!r} 0 0 0 nan nan nan nan\n"
-    (capture / "groundtruth.txt").write_text(text + nowhere)
-    assert len(load_tum(capture).images) == 4
-
-
-def test_one_pose_is_enough(capture):
-    write_track(capture, [START], [0], [(1, 2, 3)])
-    (image,) = load_tum(capture).images
-    np.testing.assert_allclose(image.camera.center, [1, 2, 3])
-
-
 def test_depth_too_late_is_none(capture):
     times = START + PERIOD * np.arange(4)
     rows = [(f"{t + 0.005:.6f}", f"depth/{t + 0.005:.6f}.png") for t in times]
@@ -178,33 +161,6 @@ def test_capture_without_depth(capture):
     scene = load_tum(capture)
     assert len(scene.images) == 4
     assert scene.depths is None
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "told"),
-    [
-        ("rgb.txt", "1.0 a.png b.png\n", "2 words in .*line 1; found 3"),
-        ("rgb.txt", "# x\n\nnow a.png\n", "numbers in .*line 3"),
-        ("rgb.txt", "1.0 ../a.png\n", "inside the folder"),
-        ("rgb.txt", "1.0 /a.png\n", "inside the folder"),
-        ("rgb.txt", "nan a.png\n", "line 1"),
-        ("depth.txt", "1.0\n", "depth.txt line 1"),
-        ("groundtruth.txt", "1 2 3\n", "8 words"),
-        ("groundtruth.txt", "1 0 0 0 0 0 0 2\n", "quaternion of length 1"),
-        ("groundtruth.txt", "1 0 0 0 0 0 0 0\n", "quaternion of length 1"),
-        ("groundtruth.txt", "1 0 0 0 0 0 0 one\n", "could not convert"),
-    ],
-)
-def test_bad_lists(capture, name, text, told):
-    (capture / name).write_text(text)
-    with pytest.raises(SceneFormatError, match=told):
-        load_tum(capture)
-
-
-def test_lists_that_are_no_text(capture):
-    (capture / "rgb.txt").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(SceneFormatError, match="readable text file"):
-        load_tum(capture)
 
 
 @pytest.mark.parametrize("name", ["rgb.txt", "groundtruth.txt"])
@@ -306,3 +262,183 @@ def test_real_frames_are_the_same_in_both_layouts(replica_as_tum, scenes):
         )
         maps = expected.depths.read(theirs.name), as_tum.depths.read(ours.name)
         np.testing.assert_allclose(maps[1].values, maps[0].values, atol=1.1e-4)
+
+
+CAMERA = {"w": 40, "h": 30, "fx": 35.0, "fy": 36.0, "cx": 19.5, "cy": 14.5, "scale": 1000.0}
+
+
+def pose(angle: float, center: tuple[float, float, float]) -> np.ndarray:
+    """world_from_cam: a turn about z by ``angle`` [rad], then a move to ``center``."""
+    world_from_cam = np.eye(4)
+    world_from_cam[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    world_from_cam[:3, 3] = center
+    return world_from_cam
+
+
+POSES = [pose(0.1 * i, (i, -i, 0.5)) for i in range(3)]
+
+
+def write_poses(folder: Path, poses: list[np.ndarray]) -> None:
+    lines = (" ".join(repr(float(value)) for value in one.ravel()) for one in poses)
+    (folder / "traj.txt").write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    folder = tmp_path / "room"
+    (folder / "results").mkdir(parents=True)
+    for name in ("frame2.jpg", "frame10.jpg", "frame000001.png"):  # in their numbers' order: last
+        PilImage.new("RGB", (40, 30)).save(folder / "results" / name)
+    PilImage.new("I;16", (40, 30)).save(folder / "results" / "depth000001.png")
+    write_poses(folder, POSES)
+    (folder / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
+    return folder
+
+
+def test_frames_are_paired_with_poses_by_number(room: Path) -> None:
+    scene = load_rgbd(room)
+    assert [image.name for image in scene.images] == [
+        "frame000001.png",
+        "frame2.jpg",
+        "frame10.jpg",
+    ]
+    for image, world_from_cam in zip(scene.images, POSES, strict=True):
+        np.testing.assert_allclose(image.camera.world_from_cam, world_from_cam, atol=1e-12)
+    assert len({image.image_id for image in scene.images}) == 3
+    assert len(scene.points) == 0
+    assert scene.source is not None
+    assert scene.source.format == "rgbd"
+    assert scene.source.image_dir == room / "results"
+    assert scene.warnings == ()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_lost_frames_are_left_out_and_told(room: Path, value: float) -> None:
+    lost = POSES[1].copy()
+    lost[0, 3] = value
+    write_poses(room, [POSES[0], lost, POSES[2]])
+    scene = load_rgbd(room)
+    assert [image.name for image in scene.images] == ["frame000001.png", "frame10.jpg"]
+    np.testing.assert_allclose(scene.images[1].camera.world_from_cam, POSES[2], atol=1e-12)
+    assert len(scene.warnings) == 1
+    assert "frame2.jpg" in scene.warnings[0]
+
+
+def test_missing_files(room: Path) -> None:
+    for name in ("cam_params.json", "traj.txt", "results"):
+        (room / name).rename(room / "elsewhere")
+        with pytest.raises(SceneNotFoundError, match=name):
+            load_rgbd(room)
+        (room / "elsewhere").rename(room / name)
+
+
+def test_depth_of_the_frames_comes_along(room: Path) -> None:
+    for number, value in (("000001", 500), ("02", 1000), ("11", 2000)):
+        picture = PilImage.new("I;16", (40, 30), value)
+        picture.save(room / "results" / f"depth{number}.png")
+    depths = load_rgbd(room).depths
+    assert depths is not None
+    assert list(depths) == ["frame000001.png", "frame2.jpg"]
+    assert np.unique(depths.read("frame000001.png").values).tolist() == [0.5]
+    assert np.unique(depths.read("frame2.jpg").values).tolist() == [1.0]
+    for path in (room / "results").glob("depth*.png"):
+        path.unlink()
+    assert load_rgbd(room).depths is None
+
+
+MIRRORED = " ".join(map(str, np.diag([1, 1, -1, 1]).ravel())) + "\n"
+ZEROS = "0 " * 16 + "\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        *(("traj.txt", text) for text in ("1 2 3\n", "\n\n" + "x " * 16, ZEROS, 3 * ZEROS, "")),
+        ("traj.txt", 3 * ("1e308 " * 16 + "\n")),
+        ("traj.txt", 3 * MIRRORED),
+        ("traj.txt", "\N{SNOWMAN}"),
+        ("traj.txt", b"\xff\xfe\x00"),
+        *(("cam_params.json", text) for text in ("", "[]", "{}", '{"camera": 3}')),
+        *(
+            ("cam_params.json", json.dumps({"camera": CAMERA | {key: value}}))
+            for key, value in (
+                *(("fx", "wide"), ("fx", 0), ("w", float("inf")), ("cx", float("nan"))),
+                *(("scale", 0), ("fy", None)),
+            )
+        ),
+    ],
+)
+def test_bad_files_of_a_room_are_named(room: Path, name: str, text: str | bytes) -> None:
+    (room / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(SceneFormatError, match=re.escape(name)):
+        load_rgbd(room)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        *(("rgb.txt", text) for text in ("1.0 a.png b.png\n", "# x\n\nnow a.png\n", "nan a.png\n")),
+        *(("rgb.txt", text) for text in ("1.0 ../a.png\n", "1.0 /a.png\n", b"\xff\xfe\x00")),
+        ("depth.txt", "1.0\n"),
+        *(("groundtruth.txt", text) for text in ("1 2 3\n", "1 0 0 0 0 0 0 one\n")),
+        *(("groundtruth.txt", text) for text in ("1 0 0 0 0 0 0 2\n", "1 0 0 0 0 0 0 0\n")),
+    ],
+)
+def test_bad_files_of_a_capture_are_named(capture: Path, name: str, text: str | bytes) -> None:
+    (capture / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(SceneFormatError, match=re.escape(name)):
+        load_tum(capture)
+
+
+def test_frames_must_fit_the_camera(room: Path) -> None:
+    PilImage.new("RGB", (20, 15)).save(room / "results" / "frame2.jpg")
+    with pytest.raises(SceneFormatError, match=r"frame2\.jpg .* found 20x15"):
+        load_rgbd(room)
+    (room / "results" / "frame2.jpg").write_bytes(b"no image")
+    with pytest.raises(SceneFormatError, match=r"frame2\.jpg to be a readable image"):
+        load_rgbd(room)
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "scale"), [("replica/room0", 20, 6553.5), ("7scenes_redkitchen", 143, 1e3)]
+)
+def test_depth_of_one_real_frame_agrees_with_the_next(
+    scenes: Path, name: str, frames: int, scale: float
+) -> None:
+    """Points unprojected from one frame's depth meet the other's: poses and axes are right."""
+    scene = load_rgbd(scenes / name)
+    assert len(scene.images) == frames
+    assert scene.warnings == ()
+    first, second = scene.images[0].camera, scene.images[1].camera
+
+    def depth_of(number: int) -> np.ndarray:
+        with PilImage.open(scenes / name / "results" / f"depth{number:06d}.png") as image:
+            return np.asarray(image) / scale
+
+    row, column = (a.ravel() for a in np.mgrid[5 : first.height : 20, 5 : first.width : 20])
+    depth = depth_of(0)[row, column]
+    pixels = np.stack([column, row], axis=1)[depth > 0] + 0.5
+    uv, predicted = second.project(first.unproject(pixels, depth[depth > 0]))
+    inside = (uv > 0).all(axis=1) & (uv < [second.width, second.height]).all(axis=1)
+    column, row = uv[inside].astype(int).T
+    measured = depth_of(1)[row, column]
+    error = np.abs(measured - predicted[inside])[measured > 0]
+    assert len(error) > 300
+    assert np.median(error) < 0.02  # metres
+
+
+def test_real_depth_agrees_best_at_the_principal_point(scenes: Path) -> None:
+    scene = load_rgbd(scenes / "replica/room0")
+    first, last = (scene.images[i].camera for i in (0, 19))
+    maps = [np.asarray(scene.depths.read(scene.images[i].name).values, float) for i in (0, 19)]
+    row, column = (a.ravel() for a in np.mgrid[5 : first.height : 10, 5 : first.width : 10])
+    pixels = np.stack([column, row], axis=1) + 0.5
+
+    def error(shift: float) -> float:
+        """Median difference of depths along the same rays, the principal points being shifted."""
+        uv, predicted = last.project(first.unproject(pixels - shift, maps[0][row, column]))
+        measured = map_coordinates(maps[1], (uv + shift - 0.5).T[::-1], order=1, cval=np.nan)
+        return float(np.nanmedian(np.abs(measured - predicted)))
+
+    assert error(0.0) < 0.6 * min(error(-0.5), error(0.5))
+    assert error(0.0) < 1e-4  # metres

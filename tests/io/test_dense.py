@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
+import struct
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings, strategies as st
+from hypothesis.extra import numpy as hnp
 from PIL import Image as PilImage
 
 from splatseed.camera import Camera
@@ -20,13 +21,22 @@ from splatseed.errors import (
     SceneNotFoundError,
 )
 from splatseed.io import find_depths, load_scene
-from splatseed.io.dense import write_dense_maps, write_dense_workspace
+from splatseed.io.dense import (
+    depth_along,
+    write_consistency_graph,
+    write_dense_maps,
+    write_dense_workspace,
+    write_map,
+)
+from splatseed.io.dense_model import scaled_K
+from splatseed.io.depth_files import read_stored
 from splatseed.io.ply import read_ply
+from splatseed.stereo import StereoMap
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.undistortion import undistort
 
-from ...bent import bend
-from ...stereo_maps import true_maps
+from ..bent import bend
+from ..stereo_maps import true_maps
 
 ON_SURFACE = 1e-5
 """Metres: float32 of depths of some metres."""
@@ -139,20 +149,6 @@ def test_graphs_name_images_by_their_place_in_the_model(maps, workspaces):
     assert [scene.images[idx].name for idx in rest[:num]] == expected
 
 
-@pytest.mark.parametrize("factor", [1, 4])
-@pytest.mark.parametrize("tracked", [True, False])
-def test_colmap_fuses_it(factor, tracked, capture, maps, room, tmp_path):
-    if shutil.which("colmap") is None:
-        pytest.skip("colmap is not on the path (Debian: apt install colmap)")
-    scene = room if tracked else room.replace(tracks=None)
-    write_dense_workspace(scene, maps[factor], tmp_path / "w")
-    fused = tmp_path / "fused.ply"
-    words = ("--workspace_path", tmp_path / "w", "--output_path", fused)
-    words += ("--StereoFusion.min_num_pixels", "3")
-    subprocess.run(["colmap", "stereo_fusion", *words], check=True, capture_output=True)
-    _check_fused(fused, capture, factor)
-
-
 def test_pycolmap_fuses_it(capture, workspaces, tmp_path):
     pycolmap = pytest.importorskip("pycolmap", reason="needs splatseed[sfm]")
     options = pycolmap.StereoFusionOptions()
@@ -194,31 +190,12 @@ def test_distorted_photographs_come_without_their_distortion(bent_room, room, ma
         assert error < 0.8 * before  # two interpolations blur
 
 
-def test_a_workspace_of_distorted_photographs_is_fused(bent_room, capture, maps, tmp_path):
-    if shutil.which("colmap") is None:
-        pytest.skip("colmap is not on the path (Debian: apt install colmap)")
-    write_dense_workspace(bent_room, maps[1], tmp_path / "w", undistort=undistort)
-    fused = tmp_path / "fused.ply"
-    words = ("--workspace_path", tmp_path / "w", "--output_path", fused)
-    subprocess.run(["colmap", "stereo_fusion", *words], check=True, capture_output=True)
-    _check_fused(fused, capture, 1)
-
-
 def test_of_mixed_photographs_only_distorted_ones_are_written(bent_room, room, maps, tmp_path):
     mixed = bent_room.replace(images=(*bent_room.images[:2], *room.images[2:]))
     write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort)
     links = [(tmp_path / "w/images" / image.name).is_symlink() for image in mixed.images]
     assert links == [False, False, *[True] * 6]
     write_dense_workspace(mixed, maps[4], tmp_path / "w", undistort=undistort, overwrite=True)
-
-
-def test_a_photograph_that_cannot_be_written_again_is_refused(bent_room, maps, tmp_path):
-    name = "view.psd"
-    images = (replace(bent_room.images[0], name=name), *bent_room.images[1:])
-    with pytest.raises(SceneFormatError, match=name):
-        write_dense_workspace(
-            bent_room.replace(images=images), maps[4], tmp_path / "w", undistort=undistort
-        )
 
 
 def test_cameras_are_those_of_reduced_photographs(capture, maps, tmp_path):
@@ -331,3 +308,92 @@ def test_a_failure_on_the_way_leaves_nothing(maps, room, tmp_path):
     with pytest.raises(ParameterError):
         write_dense_workspace(room, breaking(), tmp_path / "w")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_depth_map_byte_by_byte(tmp_path):
+    values = np.array([[1.5, np.nan, 2.0], [0.25, 3.0, np.nan]], np.float32)
+    write_map(tmp_path / "sub" / "a.bin", values)
+    data = (tmp_path / "sub" / "a.bin").read_bytes()
+    assert data == b"3&2&1&" + struct.pack("<6f", 1.5, 0, 2, 0.25, 3, 0)
+    read = read_stored(tmp_path / "sub" / "a.bin").values
+    np.testing.assert_array_equal(read, np.nan_to_num(values))
+
+
+def test_a_normal_map_keeps_its_channels_apart(tmp_path):
+    values = np.array([[[1, 2, 3], [4, 5, 6]]], np.float32)
+    write_map(tmp_path / "a.bin", values)
+    data = (tmp_path / "a.bin").read_bytes()
+    assert data == b"2&1&3&" + struct.pack("<6f", 1, 4, 2, 5, 3, 6)
+
+
+def test_a_graph_byte_by_byte(tmp_path):
+    agreeing = np.array([[0, 0b11], [0b10, 0]], np.uint8)
+    write_consistency_graph(tmp_path / "a.bin", agreeing, (7, 4))
+    data = (tmp_path / "a.bin").read_bytes()
+    assert data == b"2&2&1&" + struct.pack("<9i", 1, 0, 2, 7, 4, 0, 1, 1, 4)
+
+
+def _records(agreeing, image_idxs):
+    """Literally as COLMAP's patch match lists them."""
+    records = []
+    for row, column in np.ndindex(*agreeing.shape):
+        confirming = [idx for k, idx in enumerate(image_idxs) if agreeing[row, column] >> k & 1]
+        if confirming:
+            records += [column, row, len(confirming), *confirming]
+    return records
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    agreeing=hnp.arrays(np.uint8, hnp.array_shapes(min_dims=2, max_dims=2, max_side=7)),
+    image_idxs=st.lists(st.integers(0, 2**31 - 1), max_size=8),
+)
+def test_graphs_against_the_loop(tmp_path_factory, agreeing, image_idxs):
+    path = tmp_path_factory.mktemp("graph") / "a.bin"
+    write_consistency_graph(path, agreeing, image_idxs)
+    body = path.read_bytes().split(b"&", 3)[3]
+    assert np.frombuffer(body, "<i4").tolist() == _records(agreeing, image_idxs)
+
+
+def planted(normal, distance, *, shape=(12, 16), fov=0.6):
+    """The map of the plane normal . X = -distance, and the function that knows its depth."""
+    height, width = shape
+    K = np.array([[width / fov, 0, width / 2], [0, width / fov, height / 2], [0, 0, 1]])
+    normal = np.array(normal) / np.linalg.norm(normal)
+
+    def true_depth(K, at):
+        rows, columns = np.mgrid[0:height, 0:width] + at
+        rays = np.stack([columns, rows, np.ones(shape)], axis=-1) @ np.linalg.inv(K).T
+        return -distance / (rays @ normal)
+
+    dense = StereoMap(
+        "a.png",
+        Camera(K, width, height, np.eye(4)),
+        true_depth(K, 0.5).astype(np.float32),
+        np.broadcast_to(normal, (*shape, 3)).astype(np.float32),
+        np.ones(shape, np.float32),
+        (),
+        np.zeros(shape, np.uint8),
+    )
+    return dense, true_depth
+
+
+@settings(max_examples=60, deadline=None)
+@given(x=st.floats(-1, 1), y=st.floats(-1, 1), distance=st.floats(0.01, 1000))
+def test_a_plane_stays_where_it_is(x, y, distance):
+    dense, true_depth = planted((x, y, -1), distance)
+    other = scaled_K(dense.camera, 16, 12) + np.array([[0.2, 0, 0.3], [0, -0.2, -0.1], [0, 0, 0]])
+    for K, at in ((dense.camera.K, 0.0), (dense.camera.K, 0.5), (other, 0.0)):
+        np.testing.assert_allclose(depth_along(dense, K, at), true_depth(K, at), rtol=1e-5)
+    np.testing.assert_array_equal(depth_along(dense, dense.camera.K, 0.5), dense.depth)
+
+
+def test_a_plane_seen_edge_on_is_left_out_and_one_without_normal_is_kept():
+    flat, _ = planted((1, 0, -0.02), 1.0)
+    assert np.isnan(depth_along(flat, flat.camera.K, 0.0)).any()
+    dense, _ = planted((0, 0, -1), 2.0)
+    dense.normal[3, 4] = np.nan
+    dense.depth[5, 6] = np.nan
+    moved = depth_along(dense, dense.camera.K, 0.0)
+    assert moved[3, 4] == pytest.approx(2.0)
+    assert np.isnan(moved).sum() == 1

@@ -1,7 +1,8 @@
-"""Cleaning the points of a scene: distinct and finite, with a report of what was left out.
+"""Points that training can use: distinct, finite, and near enough to 0 for single precision.
 
-Notation: a duplicate has the float32 position of an earlier point. Promise: the counts are exact;
-a clean scene is returned unchanged.
+Notation: a duplicate has the float32 position of an earlier point. Promise: counts of what was left
+out are exact, and a clean scene is returned unchanged; scenes in national grids are moved around 0
+in double precision, nothing is turned or scaled.
 """
 
 from __future__ import annotations
@@ -9,17 +10,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 
-from splatseed.io.colmap.ids import without_points
+from splatseed.errors import ParameterError
+from splatseed.io.colmap.model import without_points
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut, Scene
 
-_FAR_OUT = (
-    1e4  # times the inner half of the points: the sky of outdoor scenes is at some hundred times
-)
+_FAR_OUT = 1e4
+"""Times the inner half of the points: the sky of outdoor scenes is at some hundred times."""
 _FEW = 0.01  # of the points at most can be so far
-_RESOLUTION = 1e-4  # float32 steps coarser than this share of the cloud's extent show in renders
+_RESOLUTION = 1e-4
+"""Steps of single precision coarser than this share of the extent show in renders."""
 
 
 def clean_scene(scene: Scene) -> Scene:
@@ -96,3 +98,46 @@ def _is_too_far_out(points: PointCloud) -> bool:
     extent = float((high.astype(np.float64) - low).max())
     step = float(np.spacing(np.abs(xyz).max()))
     return step > _RESOLUTION * extent > 0
+
+
+def offset_of(scene: Scene) -> Float64[np.ndarray, " 3"]:
+    """The middle of the cameras, in whole units."""
+    centers = np.array([image.camera.center for image in scene.images])
+    return np.asarray(np.rint(centers.mean(axis=0)))
+
+
+def recentred(scene: Scene, offset: Float64[np.ndarray, " 3"]) -> Scene:
+    """A scene moved by ``-offset``.
+
+    Files beside the model that hold positions no longer belong to it.
+    """
+    images = tuple(
+        replace(image, translation=image.translation + image.camera.cam_from_world[:3, :3] @ offset)
+        for image in scene.images
+    )
+    xyz, tracks = scene.points.xyz.astype(np.float64), scene.tracks
+    if tracks is not None:
+        xyz[: len(tracks)] = tracks.xyz
+        tracks = replace(tracks, xyz=tracks.xyz - offset)
+    source = scene.source and replace(scene.source, model_dir=None, transforms_path=None)
+    points = scene.points.replace(xyz=(xyz - offset).astype(np.float32))
+    return replace(scene, images=images, points=points, tracks=tracks, source=source)
+
+
+def check_precision(scene: Scene) -> None:
+    """Refuse a scene whose coordinates single precision cannot hold.
+
+    Raises:
+        ParameterError: It is far from 0.
+    """
+    if not scene.images:
+        return
+    centers = np.array([image.camera.center for image in scene.images])
+    spread = float(np.ptp(centers, axis=0).max())
+    step = float(np.spacing(np.float32(np.abs(centers).max())))
+    if step > _RESOLUTION * spread > 0:
+        raise ParameterError(
+            "a scene near 0: seeds are written in single precision",
+            found=f"cameras at {np.abs(centers).max():,.0f}, where it has steps of {step:.2g}",
+            fix="Pass --recenter: it writes scene and cloud around 0, and the offset to a file.",
+        )

@@ -1,1 +1,0 @@
-"""Depth maps in files: every readable format, and folders of maps."""

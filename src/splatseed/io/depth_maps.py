@@ -1,0 +1,394 @@
+"""Folders of depth maps: which map belongs to which image, reading it on demand, writing a folder.
+
+Notation: ``scale`` is stored units per scene unit, by which a file's numbers are divided;
+``depths.json`` beside the maps holds ``{"kind": "z" | "ray" | "inverse", "scale": S}``, both
+optional. A *stem* is a map's path without suffix, relative to the folder. For the image ``a/b.jpg``
+the stems are tried in this order: ``a/b.jpg``, ``a/b.jpg.geometric`` and ``.photometric`` (COLMAP's
+dense stereo), ``a/b``, ``a/b_depth``, ``a/depthN`` for ``a/frameN.jpg`` (NICE-SLAM) and
+``a/X.depth`` for ``a/X.color.png`` (7-Scenes); for each, the suffixes in the order of ``SUFFIXES``.
+Promise: a map is float32 with NaN where unknown; nothing stays in memory, and reading is safe from
+several threads at once; matching depends on names only, never on the order in which a system lists
+files; a written folder appears whole or not at all, with one float32 ``.npy`` per image.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+
+from splatseed.camera import Intrinsics
+from splatseed.depthmap import DepthKind, DepthMap
+from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.io.depth_files import KINDS, SUFFIXES, check_stored, read_stored
+from splatseed.io.files import guarded, read_json
+from splatseed.io.staging import MANIFEST, output_folder, write_json
+from splatseed.lens import image_points
+from splatseed.scene import Scene
+
+CAMERA_FILE = "cam_params.json"
+"""The camera of an RGB-D capture, and the scale of its maps, in its folder or the one above."""
+DESCRIPTION = "depths.json"
+"""The file beside depth maps that describes them."""
+
+_INTEGER_SCALE = 1000.0
+"""Default scale of integer maps: millimetres in a scene in metres."""
+_NOTHING_HIT = 1e9
+"""From this distance on, a value means that a renderer's ray hit nothing; Blender writes 1e10."""
+_SATURATED = 65535
+_FOLDERS = ("", "stereo/depth_maps", "depth_maps", "results", "depths", "depth")
+"""Subfolders searched for maps; the first with a map of any image is used."""
+_FRAME = re.compile(r"frame(\d+)", re.IGNORECASE)
+_CAPTURED = re.compile(r"depth(\d+)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class Undistortion:
+    """Moves the values of a map to where undistorted photographs have them.
+
+    Planar depth belongs to the ray and not to the pixel, so values are moved, never changed; a
+    pixel takes the nearest value, so that no depth between two surfaces is invented.
+
+    Args:
+        lens: The camera that took the maps, in one of COLMAP's models.
+        cameras: The pinhole camera of each photograph, by its name, at the same place.
+    """
+
+    lens: Intrinsics
+    cameras: Mapping[str, Intrinsics]
+
+    def apply(self, name: str, values: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "h w"]:
+        """The map in the pixels of one photograph, at that photograph's size.
+
+        Args:
+            name: The photograph.
+            values: A map that was taken with the lens, of its size or a resized copy.
+
+        Returns:
+            The values, NaN where the lens did not look.
+        """
+        camera = self.cameras[name]
+        height, width = values.shape
+        column, row = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+        uv = image_points(self.lens, np.stack([(column - cx) / fx, (row - cy) / fy], axis=-1))
+        uv *= [width / self.lens.width, height / self.lens.height]
+        inside = np.all((uv >= 0) & (uv < [width, height]), axis=-1)
+        places = np.floor(np.where(inside[..., None], uv, 0)).astype(np.intp)
+        return np.where(inside, values[places[..., 1], places[..., 0]], np.float32(np.nan))
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFiles:
+    """Depth maps in files; what ``Scene.depths`` holds for a scene that was read.
+
+    Args:
+        paths: The file of each image that has one, by the image's name.
+        kind: What the values are; None: what the file itself says, else planar z.
+        scale: Stored units per scene unit; None: 1000 for integers, 1 for floats.
+        lens: Moves the values to the pixels of undistorted photographs; None: no need to.
+    """
+
+    paths: Mapping[str, Path]
+    kind: DepthKind | None = None
+    scale: float | None = None
+    lens: Undistortion | None = None
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is a file for the image of that name."""
+        return name in self.paths
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of the images that have a file, sorted."""
+        return iter(sorted(self.paths))
+
+    def __len__(self) -> int:
+        """How many images have a file."""
+        return len(self.paths)
+
+    def read(self, name: str) -> DepthMap:
+        """The map of an image; safe to call from several threads.
+
+        NaN stands where nothing is known: the file has NaN, an infinity, or 1e9 and more; 0 or less
+        (for inverse depth only integer zeros, since a network may predict 0 for far pixels); or
+        65535 in 16 bits, the end of the sensor's range.
+
+        Raises:
+            SceneNotFoundError: The image has no file, or it is gone.
+            SceneFormatError: The file is not what its format promises.
+            MissingDependencyError: It is an OpenEXR file, and that package is absent.
+        """
+        path = self.paths.get(name)
+        if path is None:
+            raise SceneNotFoundError(
+                f"a depth map of {name}", found="none", fix="Leave this image out."
+            )
+        stored, said = read_stored(path)
+        kind = self.kind or said or "z"
+        is_integer = stored.dtype.kind in "ui"
+        divisor = self.scale or (_INTEGER_SCALE if is_integer else 1.0)
+        with np.errstate(over="ignore", invalid="ignore"):  # becomes infinite, and so NaN
+            values: np.ndarray = (stored / np.float64(divisor)).astype(np.float32)
+            if kind == "inverse":
+                unknown = ~(np.abs(values) < _NOTHING_HIT)
+            else:
+                unknown = ~((values > 0) & (values < _NOTHING_HIT))
+        if is_integer and kind == "inverse":
+            unknown |= stored == 0
+        elif stored.dtype == np.uint16:
+            unknown |= stored == _SATURATED
+        values[unknown] = np.nan
+        return DepthMap(values if self.lens is None else self.lens.apply(name, values), kind)
+
+
+def match_by_name(scene: Scene, root: Path) -> DepthFiles | None:
+    """The depth maps in a folder whose names match a scene's images; None if there are none.
+
+    Raises:
+        SceneFormatError: Two images share a map, or the folder's description is damaged.
+    """
+    for folder in (root / name for name in _FOLDERS):
+        if folder.is_dir() and (paths := _match(scene, folder)):
+            return DepthFiles(paths, *_describe(folder, next(iter(paths.values()))))
+    return None
+
+
+def _match(scene: Scene, folder: Path) -> dict[str, Path]:
+    """The map of each image in one folder.
+
+    Image names may begin with folders that map names lack: as many as needed to match any map are
+    dropped.
+    """
+    parts = {image.name: safe_parts(image.name) for image in scene.images}
+    listing = _Listing(folder, _image_files(scene))
+    for drop in range(max(map(len, parts.values()), default=0)):
+        maps = {name: listing.map_of(each[drop:]) for name, each in sorted(parts.items())}
+        present = {name: path for name, path in maps.items() if path is not None}
+        owners: dict[Path, str] = {}
+        for name, path in present.items():
+            if (other := owners.setdefault(path, name)) != name:
+                raise SceneFormatError(
+                    "a depth map of its own for each image",
+                    found=f"{path} for {other} and for {name}",
+                    fix=f"Name maps in full, with subfolders: {name}.npy or {name}.png.",
+                )
+        if present:
+            return present
+    return {}
+
+
+def _image_files(scene: Scene) -> frozenset[Path]:
+    """The photographs themselves, which are not depth maps even if they lie in the same folder."""
+    folder = scene.source.image_dir if scene.source else None
+    if folder is None:
+        return frozenset()
+    paths = [folder / image.name for image in scene.images]
+    resolved = {parent: parent.resolve() for parent in {path.parent for path in paths}}
+    return frozenset(resolved[path.parent] / path.name for path in paths)
+
+
+class _Listing:
+    """The depth maps of a folder; each subfolder is listed once, on demand."""
+
+    def __init__(self, root: Path, taken: frozenset[Path]) -> None:
+        self._root = root
+        self._taken = taken
+        self._folders: dict[tuple[str, ...], dict[str, Path]] = {}
+
+    def map_of(self, parts: tuple[str, ...]) -> Path | None:
+        """The map of the image with these folders and this file name."""
+        if not parts:
+            return None
+        if parts[:-1] not in self._folders:
+            self._folders[parts[:-1]] = self._list(self._root.joinpath(*parts[:-1]))
+        files = self._folders[parts[:-1]]
+        keys = (stem + suffix for stem in _stems(parts[-1]) for suffix in SUFFIXES)
+        return next((files[key] for key in keys if key in files), None)
+
+    def _list(self, folder: Path) -> dict[str, Path]:
+        """The files of a subfolder by name, suffixes in lower case, numbers also unpadded."""
+        files: dict[str, Path] = {}
+        if not folder.is_dir():
+            return files
+        resolved = folder.resolve()
+        for path in sorted(folder.iterdir(), reverse=True):  # .png before .PNG
+            if path.suffix.lower() in SUFFIXES and resolved / path.name not in self._taken:
+                files.setdefault(path.stem + path.suffix.lower(), path)
+        for key, path in list(files.items()):
+            if number := _CAPTURED.match(key):
+                files.setdefault(f"depth{int(number[1])}{key[number.end() :]}", path)
+        return files
+
+
+def _stems(file_name: str) -> Iterator[str]:
+    """The stems that a map of this image may have, in order of preference."""
+    stem = PurePosixPath(file_name).stem
+    yield from (file_name, f"{file_name}.geometric", f"{file_name}.photometric")
+    yield from (stem, f"{stem}_depth")
+    if number := _FRAME.fullmatch(stem):
+        yield f"depth{int(number[1])}"
+    if stem.endswith(".color"):
+        yield f"{stem.removesuffix('.color')}.depth"
+
+
+class DepthDescription(NamedTuple):
+    """What a folder says about its maps.
+
+    Args:
+        kind: What the values are; None: not said.
+        scale: Stored units per scene unit; None: not said.
+    """
+
+    kind: DepthKind | None = None
+    scale: float | None = None
+
+
+def _describe(folder: Path, example: Path) -> DepthDescription:
+    """What the folder says about its maps: ``depths.json``, or the camera file of a capture."""
+    if (folder / DESCRIPTION).is_file():
+        return read_description(folder / DESCRIPTION)
+    if _CAPTURED.fullmatch(example.stem) and example.suffix.lower() == ".png":
+        for parent in (folder, *folder.resolve().parents[:2]):
+            if (parent / CAMERA_FILE).is_file():
+                return DepthDescription(scale=read_capture_scale(parent / CAMERA_FILE))
+    return DepthDescription()
+
+
+def read_description(path: Path) -> DepthDescription:
+    """Read a ``depths.json``.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It is no such description.
+    """
+    content = _read_object(path)
+    kind = content.get("kind")
+    if kind is not None and kind not in KINDS:
+        raise SceneFormatError(
+            f"kind in {path} to be {', '.join(KINDS)}",
+            found=repr(kind)[:80],
+            fix="Correct it, or leave it out for planar z.",
+        )
+    return DepthDescription(kind, _scale_in(path, content))
+
+
+def read_capture_scale(path: Path) -> float | None:
+    """Stored units per metre that the ``cam_params.json`` of an RGB-D capture gives, if it does.
+
+    Raises:
+        SceneFormatError: It is no such file, or its scale is not a positive number.
+    """
+    camera = _read_object(path).get("camera")
+    return _scale_in(path, camera) if isinstance(camera, dict) else None
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    content = read_json(path, "a JSON object")
+    if isinstance(content, dict):
+        return content
+    found = type(content).__name__
+    raise SceneFormatError(f"{path} to hold a JSON object", found=found, fix="Write it again.")
+
+
+def _scale_in(path: Path, content: Mapping[str, Any]) -> float | None:
+    scale = content.get("scale")
+    if scale is None:
+        return None
+    if isinstance(scale, int | float) and not isinstance(scale, bool) and 0 < scale < 1e300:
+        return float(scale)
+    raise SceneFormatError(
+        f"scale in {path} to be a number above 0", found=repr(scale)[:80], fix="Correct it."
+    )
+
+
+def safe_parts(name: str) -> tuple[str, ...]:
+    """The folders and the file name of an image, without parts that lead out of a folder."""
+    pure = PurePosixPath(name)
+    return tuple(part for part in pure.parts if part not in {"..", pure.anchor})
+
+
+def write_description(
+    folder: Path, kind: DepthKind, scale: float = 1.0, **more: object
+) -> DepthDescription:
+    """Write a ``depths.json`` into a folder of maps.
+
+    Args:
+        folder: Where the maps are.
+        kind: What the values are.
+        scale: Stored units per scene unit.
+        more: How they were made; for people, never read back.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    write_json(folder / DESCRIPTION, {"kind": kind, "scale": scale, **more})
+    return DepthDescription(kind, scale)
+
+
+@dataclass(frozen=True)
+class DepthWriter:
+    """Writes the maps of a folder in the making.
+
+    Args:
+        folder: Where to.
+    """
+
+    folder: Path
+
+    def write(self, name: str, values: Float32[np.ndarray, "H W"]) -> None:
+        """Keep the map of one image; safe to call from several threads.
+
+        Args:
+            name: The image's name.
+            values: NaN where nothing is known.
+
+        Raises:
+            OutputError: Two image names become the same once parts that lead out are dropped.
+        """
+        path = self.folder.joinpath(*safe_parts(f"{name}.npy"))
+        with guarded(path, "a depth map"):
+            check_stored(values.shape, values.dtype)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with path.open("xb") as file:
+                np.save(file, np.ascontiguousarray(values, np.float32))
+        except FileExistsError:
+            raise OutputError(
+                "one depth map per image", found=f"two for {name}", fix="Rename the image."
+            ) from None
+
+
+@contextmanager
+def depth_folder(
+    path: Path,
+    kind: DepthKind,
+    *,
+    overwrite: bool = False,
+    protect: tuple[Path, ...] = (),
+    provenance: Mapping[str, object] | None = None,
+) -> Iterator[DepthWriter]:
+    """A folder of depth maps that appears at ``path`` when the block ends without an error.
+
+    Args:
+        path: Where the maps should be.
+        kind: What their values are.
+        overwrite: Whether a folder that splatseed wrote may be replaced.
+        protect: Inputs that the folder must lie apart from.
+        provenance: How the maps were made, for ``splatseed.json``.
+
+    Yields:
+        The writer of the maps.
+
+    Raises:
+        OutputError: ``path`` is taken or protected, or writing failed.
+    """
+    with output_folder(path, kind="depth", overwrite=overwrite, protect=protect) as partial:
+        yield DepthWriter(partial)
+        write_description(partial, kind)
+        write_json(partial / MANIFEST, dict(provenance or {}))

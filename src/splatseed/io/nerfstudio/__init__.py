@@ -1,1 +1,0 @@
-"""Cameras in ``transforms.json``, as in the data sets of nerfstudio, instant-ngp and Blender."""

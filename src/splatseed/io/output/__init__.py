@@ -1,1 +1,0 @@
-"""Output that trainers load: its layouts, our additions, and writing it whole or not at all."""

@@ -1,1 +1,0 @@
-"""Captures of RGB-D cameras, in the layouts of Replica and TUM."""
