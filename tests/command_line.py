@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import warnings
+from argparse import ArgumentParser
+from typing import Any, NamedTuple
+
+import tyro
 
 from splatseed.cli import main
+from splatseed.commands.options import CONFIG
 
 
 class Run(NamedTuple):
@@ -22,3 +27,16 @@ def exit_code(*words: object) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     return 0
+
+
+def parser_of(kind: type[Any]) -> ArgumentParser:
+    """A dataclass's command line as argparse has it, whose options can be listed."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return tyro.extras.get_parser(kind, config=CONFIG)
+
+
+def options_of(kind: type[Any]) -> list[str]:
+    """All options of a dataclass's command line, such as ``--ratio``; ``-o`` is ``--output``."""
+    names = (each.option_strings[-1:] for each in parser_of(kind)._actions)
+    return [option for each in names for option in each if option != "--help"]

@@ -248,63 +248,6 @@ def _fail_halfway(monkeypatch, error):
     monkeypatch.setattr(colmap_binary, "write_points3d", write)
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["--method", "magic"], "'magic'"),
-        (["--mls.k", "2"], "mls.k of at least 3"),
-        (["--mls.k", "two"], "--mls.k"),
-        (["--mls.frame", "up"], "'up'"),
-        (["--linear.k", "2"], "--linear.k"),
-        (["--profile", "papers"], "'papers'"),
-        (["--ratio", "0.5"], "at least 1"),
-        (["--ratio", "nan"], "nan"),
-        (["--ratio", "1e12"], "4,294,967,296"),
-        (["--ratio", "many"], "'many'"),
-        (["--ratio"], "--ratio"),
-        (["--method", "mls", "--num-points", "10"], "originals"),
-        (["--num-points", "1e6"], "--num-points"),
-        (["--ratio", "2", "--num-points", "5000"], "both"),
-        (["--seed", "-1"], "seed"),
-        (["--format", "nerf"], "'nerf'"),
-        (["--colour", "red"], "--colour"),
-        (["another"], "another"),
-    ],
-)
-def test_bad_words_are_named(words, says, room, tmp_path, splatseed):
-    _assert_refused(splatseed("upsample", room, "-o", tmp_path / "out", *words), says)
-    assert _names(tmp_path) == []
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        ([], "splatseed --help"),
-        (["upsample"], "a scene; found none. splatseed upsample SCENE says"),
-        (["upsample", "somewhere"], "somewhere"),
-        (["info"], "PATH"),
-        (["info", "somewhere", "--bogus"], "--bogus"),
-        (["sfm"], "-o PATH, the scene folder to write; found neither"),
-        (["train", "somewhere"], "expected -o PATH, the folder of the run; found none. Run"),
-        (["info", "--version"], "found unrecognized option --version. Run"),
-        (["sfm", "x", "-o"], "expected a value for -o/--output; found none."),
-        (["sfm", "nowhere", "-o", "out"], "nowhere"),
-        (["sfm", "nowhere", "-o", "out", "--device", "abacus"], "'abacus'"),
-        (["info", "a", "b"], "found a word that belongs to none: b. Run"),
-        (["info", "a", "b", "c"], "found words that belong to none: b, c. Run"),
-        (["bench", "reprot", "B"], "found 'reprot'. Did you mean report? Name scenes with"),
-        (["demo", "--views", "many"], "--views"),
-        (["demo", "--views", "2"], "at least 3 views"),
-        (["Upsample"], "'Upsample'"),
-    ],
-)
-def test_every_verb_names_bad_words(words, says, tmp_path, splatseed, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    run = splatseed(*(words or ["--no-such-verb"]))
-    _assert_refused(run, says)
-    assert _names(tmp_path) == []
-
-
 def test_sfm_output_rules_are_the_same(own_room, splatseed):
     _assert_refused(splatseed("sfm", own_room / "images", "-o", own_room), "apart from the input")
 

@@ -117,7 +117,6 @@ def test_a_config_that_is_no_config_is_refused(run_folder, splatseed, tmp_path):
         (["--test-every", "1"], "--test-every"),
         (["--data-factor", "40"], "smaller --data-factor"),
         (["--lpips-weights", "nowhere"], "nowhere"),
-        (["--lpips-net", "squeeze"], "--lpips-net"),
         (["--backend", "cuda"], "GPU"),
     ],
 )

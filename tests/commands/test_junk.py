@@ -114,7 +114,9 @@ def test_a_full_output(room, splatseed, monkeypatch):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-@pytest.mark.parametrize("words", [["--help"], ["-V"], ["--completion", "bash"], ["info", "-h"]])
+@pytest.mark.parametrize(
+    "words", [["--help"], ["-V"], ["--tyro-print-completion", "bash"], ["info", "-h"]]
+)
 def test_help_into_a_full_output(words):
     program = [sys.executable, "-c", "from splatseed.cli import main; main()", *words]
     with Path("/dev/full").open("w") as full:

@@ -11,12 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from splatseed.cli import VERBS
+from splatseed.cli import COMPLETION, VERBS
 from splatseed.commands.bench.options import parse_plan
 from splatseed.commands.bench.report import CompareOptions, ReportOptions
-from splatseed.commands.options import known_options, parse_options
-from splatseed.commands.upsample.command import HELP_ALL, asks_what_to_do, parse
+from splatseed.commands.options import parse_options
+from splatseed.commands.upsample import full_options
 from splatseed.errors import SceneNotFoundError
+
+from ..command_line import options_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -25,6 +27,14 @@ OWN_METHOD = "jitter"
 OTHERS = {"--max-2D-matches-per-3D-point"}
 """Options of other programs that our pages name."""
 BENCH = {"report": ReportOptions, "compare": CompareOptions}
+
+
+def _kinds(verb):
+    """The options of a verb, and of the words that may follow it."""
+    if verb == "upsample":
+        return [full_options()]
+    kind = import_module(f"splatseed.commands.{verb}").Options
+    return [kind, *(BENCH.values() if verb == "bench" else ())]
 
 
 def _blocks(page):
@@ -46,33 +56,22 @@ def test_whole_commands_are_understood(words, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     verb, *rest = words
     assert verb in VERBS
-    if {"--help", HELP_ALL} & set(rest) or (verb == "upsample" and asks_what_to_do(rest)):
+    if "--help" in rest:
         return
-    if verb == "upsample":
-        parse(rest)
-    elif verb == "bench" and rest[0] in BENCH:
+    if verb == "bench" and rest[0] in BENCH:
         parse_options(BENCH[rest[0]], verb, rest[1:])
     elif verb == "bench":
         with suppress(SceneNotFoundError):  # a plan that the reader has
             parse_plan(rest)
+    elif verb == "train" and "--config" in rest:
+        parse_options(_kinds(verb)[0], verb, ["SCENE", "-o", "RUN", *rest])
     else:
-        parse_options(import_module(f"splatseed.commands.{verb}").Options, verb, rest)
+        parse_options(_kinds(verb)[0], verb, rest)
 
 
 @cache
 def _options(verb):
-    if verb == "upsample":
-        return {HELP_ALL, *known_options(_whole_upsample())}
-    kinds = [import_module(f"splatseed.commands.{verb}").Options]
-    kinds += BENCH.values() if verb == "bench" else ()
-    more = {"--config"} if verb == "train" else set()
-    return {option for kind in kinds for option in known_options(kind)} | more
-
-
-def _whole_upsample():
-    """The options with those of all methods."""
-    options, _ = parse(["SCENE", "-o", "OUT"])
-    return type(options)
+    return {option for kind in _kinds(verb) for option in options_of(kind)}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
@@ -86,5 +85,5 @@ def test_options_in_the_text_are_there(page):
             continue  # another program's
         known = [_options(verb) for verb in ([named[1]] if named else VERBS)]
         for option in re.findall(r"(?<![\w-])--[a-z][\w.-]*", code):
-            everywhere = OTHERS | {"--help", "--version", "--completion"}
+            everywhere = OTHERS | {"--help", "--version", COMPLETION}
             assert any(option in each for each in known) or option in everywhere, code

@@ -79,7 +79,7 @@ def test_what_stereo_holds_beside_photographs(free, scene):
 def test_a_batch_for_a_network(free):
     free(2 * 1000 * monocular.BYTES_A_PIXEL)
     monocular._check_memory((40, 25), 2)
-    with pytest.raises(ParameterError, match="--batch 2"):
+    with pytest.raises(ParameterError, match="--max-size"):
         monocular._check_memory((40, 25), 3)
 
 

@@ -102,7 +102,7 @@ def test_asking_for_what_is_not_known_is_told(points):
     notes: list[str] = []
     unknown = points.replace(sizes=np.full(len(points), np.nan))
     usable_seeds(unknown, TrainSettings(seed_sizes=True, seed_normals=True), notes.append)
-    assert [note.split()[0] for note in notes] == ["--seed-sizes", "--seed-normals"]
+    assert [note.split()[0] for note in notes] == ["seed_sizes", "seed_normals"]
 
 
 def test_a_plain_scene_is_seeded_on_request_and_the_user_told(room):

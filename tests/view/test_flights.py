@@ -191,7 +191,7 @@ def test_a_flight_is_a_video_of_the_scene(run_folder, tmp_path, splatseed):
 
 def test_two_models_are_split_and_odd_sizes_become_even(run_folder, tmp_path, splatseed):
     out = tmp_path / "flight.mp4"
-    words = ("--orbit", "--seconds", 0.1, "--size", "101x75")
+    words = ("--path", "orbit", "--seconds", 0.1, "--size", "101x75")
     ply = run_folder / "point_cloud.ply"
     said = splatseed("flight", run_folder, "-o", out, "--compare", ply, *words)
     assert said.code == 0, said.err
@@ -206,7 +206,7 @@ def test_without_cameras_the_video_circles_and_says_so(run_folder, tmp_path, spl
     said = splatseed(*words, tmp_path / "a.mp4")
     assert said.code == 0, said.err
     assert "circles" in said.out
-    asked = splatseed(*words, tmp_path / "b.mp4", "--orbit")
+    asked = splatseed(*words, tmp_path / "b.mp4", "--path", "orbit")
     assert "circles" not in asked.out
     assert (_frames(tmp_path / "a.mp4")[0] == _frames(tmp_path / "b.mp4")[0]).all()
 

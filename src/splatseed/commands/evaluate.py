@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -28,13 +28,6 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
     from splatseed.scores import EvalResult
     from splatseed.splat.metrics import Lpips
 
-PathOrNone = Annotated[
-    Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
-]
-CountOrNone = Annotated[
-    int | None, tyro.conf.arg(constructor=int, metavar="INT", help_behavior_hint="")
-]
-
 
 @dataclass(frozen=True)
 class Options:
@@ -47,35 +40,23 @@ class Options:
     model: Annotated[Path, tyro.conf.Positional]
     """A run folder of splatseed train, or a file of Gaussians from any trainer: .ply, .spz, .sog,
     .splat."""
-    scene: PathOrNone = None
+    scene: Path | None = None
     """The scene the model belongs to, in the same world; a run knows its own."""
-    data_factor: CountOrNone = None
+    data_factor: int | None = None
     """Factor by which photographs are downsampled; a run's own, else 1."""
-    test_every: CountOrNone = None
+    test_every: int | None = None
     """Score every n-th image, sorted by name; by default as the run was trained, else 8."""
-    transform: Annotated[
-        str | None,
-        tyro.conf.arg(
-            constructor=str,
-            metavar="FILE|gsplat|none",
-            help_behavior_hint="(default: the same world)",
-        ),
-    ] = None
+    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|none")] = None
     """From the scene's world to the model's, if its trainer normalised the scene: a JSON file with
     a matrix, nerfstudio's dataparser_transforms.json, graphdeco's cameras.json, or gsplat for its
-    examples' normalisation; none: score the model where it is, however it looks."""
-    lpips_net: Literal["vgg", "alex"] = "vgg"
-    """The network whose features LPIPS compares."""
-    lpips_weights: PathOrNone = None
-    """The file of that network's weights, or its folder; PyTorch's cache if left out."""
+    examples' normalisation; none: score the model where it is, unchanged."""
+    lpips_weights: Path | None = None
+    """The file of VGG's weights for LPIPS, or its folder; by default PyTorch's cache."""
     backend: Backend = "auto"
     """Where to render; auto takes a GPU if PyTorch sees one."""
-    output: Annotated[
-        Path | None,
-        tyro.conf.arg(aliases=["-o"], constructor=Path, metavar="PATH", help_behavior_hint=""),
-    ] = None
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """A JSON file to write the scores to."""
-    renders: PathOrNone = None
+    renders: Path | None = None
     """A folder for pictures: photograph, render, and error map of each test view."""
     overwrite: bool = False
     """Replace existing files and folders."""
@@ -158,7 +139,7 @@ def _lpips(options: Options) -> tuple[Lpips | None, str]:
     from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (imports PyTorch)
 
     try:
-        return load_lpips(options.lpips_net, options.lpips_weights), ""
+        return load_lpips(weights=options.lpips_weights), ""
     except (MissingDependencyError, SceneNotFoundError) as error:
         if options.lpips_weights is not None:
             raise

@@ -40,10 +40,7 @@ class Options:
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The file to write; its suffix chooses the format: .ply, .compressed.ply, .splat, .spz,
     .sog."""
-    crop: Annotated[
-        str | None,
-        tyro.conf.arg(constructor=str, metavar="x0,y0,z0,x1,y1,z1", help_behavior_hint=""),
-    ] = None
+    crop: Annotated[str | None, tyro.conf.arg(metavar="x0,y0,z0,x1,y1,z1")] = None
     """Keep the Gaussians whose centres lie in this box of the model's world; write --crop=-1,...
     if the first number is negative."""
     min_opacity: float = 0.0

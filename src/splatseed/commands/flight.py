@@ -24,16 +24,12 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
 MOST_SIDE = 1280
 LEAST_SIDE = 16
 MOST_FRAMES = 20_000
+FPS = 30.0
+"""Frames a second, unless a path file states its own."""
+ORBIT = Path("orbit")
 WITHOUT_CAMERAS = (960, 720)
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".mov")
 """All hold H.264."""
-
-PathOrNone = Annotated[
-    Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
-]
-TextOrNone = Annotated[
-    str | None, tyro.conf.arg(constructor=str, metavar="TEXT", help_behavior_hint="")
-]
 
 
 @dataclass(frozen=True)
@@ -44,35 +40,24 @@ class Options:
     """A run folder of splatseed train, or a file of Gaussians."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The video to write: .mp4, .mkv or .mov."""
-    scene: PathOrNone = None
+    scene: Path | None = None
     """The scene a file of Gaussians belongs to, for its cameras; a run knows its own. Without
     cameras, the video circles around the Gaussians."""
-    path: PathOrNone = None
-    """A camera path in nerfstudio's JSON to follow instead, in the model's world or that of
-    --transform."""
-    transform: Annotated[
-        TextOrNone,
-        tyro.conf.arg(metavar="FILE|gsplat|none", help_behavior_hint="(default: the same world)"),
-    ] = None
-    """From the model's world to the path's: the dataparser_transforms.json of nerfstudio's run, or
-    anything else that evaluate --transform takes."""
-    orbit: bool = False
-    """Circle around what the cameras look at instead."""
-    compare: PathOrNone = None
+    path: Annotated[Path | None, tyro.conf.arg(metavar="FILE|orbit")] = None
+    """Instead of past the cameras: a camera path in nerfstudio's JSON, in the model's world or that
+    of --transform; or orbit, to circle around what the cameras look at."""
+    transform: Annotated[str | None, tyro.conf.arg(metavar="FILE|gsplat|none")] = None
+    """From the model's world to the path's, by default the same: the dataparser_transforms.json of
+    nerfstudio's run, or anything else that evaluate --transform takes."""
+    compare: Path | None = None
     """Another run or file of the same scene, shown in the right half; the model is in the left."""
     depth: bool = False
     """Show depth, near bright and far dark, instead of colour."""
     seconds: float = 10.0
     """Length of the video in seconds; a path file states its own."""
-    fps: float = 30.0
-    """Frames per second; a path file states its own."""
-    size: Annotated[
-        TextOrNone,
-        tyro.conf.arg(
-            metavar="WxH", help_behavior_hint="(default: the photographs', at most 1280 a side)"
-        ),
-    ] = None
-    """Size of the video in pixels; odd numbers become even, as H.264 requires."""
+    size: Annotated[str | None, tyro.conf.arg(metavar="WxH")] = None
+    """Size of the video in pixels, by default the photographs', at most 1280 a side; odd numbers
+    become even, as H.264 requires."""
     backend: Backend = "auto"
     """Where to render; auto takes a GPU if PyTorch sees one."""
     overwrite: bool = False
@@ -98,7 +83,7 @@ def run(arguments: list[str]) -> None:
         names = [each.name for each in models]
         frames = flight_frames(renderers, names, views, depth=options.depth, progress=clock)
         write_video(options.output, frames, size, fps)
-    circles_unasked = shown.scene is None and options.path is None and not options.orbit
+    circles_unasked = shown.scene is None and options.path is None
     _summarise(options, views, size, fps, clock, circles_unasked=circles_unasked)
 
 
@@ -115,16 +100,13 @@ def _check(options: Options) -> None:
     if options.output.exists() and not options.overwrite:
         fix = "Pass --overwrite to replace it, or choose another name."
         raise OutputError(f"no file at {options.output}", found="one", fix=fix)
-    if options.path is not None and options.orbit:
-        raise ParameterError("--path or --orbit", found="both", fix="Leave one out.")
-    if options.path is None and options.transform is not None:
+    if options.path in (None, ORBIT) and options.transform is not None:
         raise ParameterError("--path with --transform", found="none", fix="Leave it out.")
-    frames = options.seconds * options.fps
-    if not (options.fps > 0 and 1 <= frames <= MOST_FRAMES):
+    if not 1 <= options.seconds * FPS <= MOST_FRAMES:
         raise ParameterError(
-            f"--seconds and --fps that make 1 to {MOST_FRAMES:,} frames",
-            found=f"{options.seconds:g} s at {options.fps:g}",
-            fix="Try --seconds 10 --fps 30.",
+            f"--seconds from {1 / FPS:.2g} to {MOST_FRAMES / FPS:.0f}",
+            found=f"{options.seconds:g}",
+            fix="Try 10.",
         )
     for each in (options.model, options.compare):
         if each is not None:
@@ -182,18 +164,18 @@ def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Seque
     """The cameras, one per frame, and the frame rate."""
     from splatseed.view.flights import orbit, smooth_path  # noqa: PLC0415  (loads with its use)
 
-    if options.path is not None:
-        return _views_of_file(options.path, options.transform, shown, size, options.fps)
-    frames = max(1, round(options.seconds * options.fps))
+    if options.path not in (None, ORBIT):
+        return _views_of_file(options.path, options.transform, shown, size)
+    frames = max(1, round(options.seconds * FPS))
     cameras = shown.train_views
     assert shown.gaussians is not None  # noqa: S101  (see _open)
-    if options.orbit or len(cameras) < 2:
-        return orbit(cameras, shown.gaussians, frames, size), options.fps
-    return smooth_path(cameras, frames, size), options.fps
+    if options.path == ORBIT or len(cameras) < 2:
+        return orbit(cameras, shown.gaussians, frames, size), FPS
+    return smooth_path(cameras, frames, size), FPS
 
 
 def _views_of_file(
-    path: Path, transform: str | None, shown: Shown, size: tuple[int, int], fps: float
+    path: Path, transform: str | None, shown: Shown, size: tuple[int, int]
 ) -> tuple[Sequence[View], float]:
     """The cameras of a path's file in the model's world, and the frame rate."""
     from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415  (loads with its use)
@@ -208,7 +190,7 @@ def _views_of_file(
     assert shown.gaussians is not None  # noqa: S101  (see _open)
     if transform != NO_TRANSFORM:
         check_path(path, views, shown.gaussians, shown.train_views)
-    return views, named or fps
+    return views, named or FPS
 
 
 def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> list[ModelRenderer]:

@@ -47,7 +47,7 @@ class Planned:
 
             number = max(2, points_within(scene, budget))
         settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
-        flags = "" if budget is None else f"--cap-max {number} "
+        flags = "" if budget is None else f"--budget {number} "
         flags += "" if max_steps == FULL_RUN else f"--max-steps {max_steps} "
         # A trial's photographs are smaller, and so is its number of Gaussians.
         tuning = "" if budget is None else f" --budget {number / pixels:.3g}rho"

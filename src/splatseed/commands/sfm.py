@@ -50,20 +50,13 @@ class Options:
     """The folder of photographs, or a video, from which sharp, evenly spread frames are taken."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
-    poses_from: Annotated[
-        Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
-    ] = None
+    poses_from: Path | None = None
     """A scene whose poses and intrinsics are kept, so that only points are triangulated."""
     refine_poses: bool = False
     """Refine the poses of --poses-from, as a phone's or SLAM's that are off by a degree or two."""
-    matcher: Annotated[
-        MatcherName | None,
-        tyro.conf.arg(
-            metavar="{exhaustive,sequential}",
-            help_behavior_hint="(default: exhaustive; sequential for a video)",
-        ),
-    ] = None
-    """Compare every pair of images, or (for a video) each with its successors."""
+    matcher: MatcherName | None = None
+    """Compare every pair of images (the default for photographs), or each with its successors (for
+    a video)."""
     frames: int = 150
     """Most frames to take from a video."""
     camera_model: str = "OPENCV"
@@ -72,16 +65,12 @@ class Options:
     """One lens for all photographs of a size; not used with --poses-from."""
     device: DeviceName = "auto"
     """Where features are detected and matched; auto takes a GPU if pycolmap can use one."""
-    max_image_size: int = 1600
-    """Longer sides are reduced to this many pixels for feature detection."""
     seed: int = 0
     """Seed of every random choice."""
     threads: int = -1
     """Worker threads; -1 = all cores."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
-    verbose: bool = False
-    """Show pycolmap's own log."""
 
 
 def run(arguments: list[str]) -> None:
@@ -114,7 +103,11 @@ def _check(options: Options) -> None:
             found="none",
             fix="Name a scene with the poses, or leave --refine-poses out to have all poses found.",
         )
-    own = [name for name in OF_LENS if getattr(options, name) != getattr(Options, name)]
+    own = [
+        f"--{name.replace('_', '-')}"
+        for name in OF_LENS
+        if getattr(options, name) != getattr(Options, name)
+    ]
     if options.poses_from is not None and own:
         raise ParameterError(
             "the lens from --poses-from, without options of its own",
@@ -148,11 +141,9 @@ def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport
     common: dict[str, Any] = {
         "matcher": options.matcher or ("sequential" if is_video(options.images) else "exhaustive"),
         "device": options.device,
-        "max_image_size": options.max_image_size,
         "seed": options.seed,
         "threads": options.threads,
         "overwrite": options.overwrite,
-        "verbose": options.verbose,
         "on_progress": clock,
         "on_photos": None if images != options.images else partial(_tell_photographs, images),
     }

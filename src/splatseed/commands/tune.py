@@ -396,7 +396,7 @@ def _commands(study: _Study, said: Verdict) -> list[tuple[str, str]]:
         commands.append(("seeds", seeding))
     source = quoted(scene) if arm.method == SFM else quoted(seeded)
     training = (
-        f"splatseed train {source} --seeds scene --strategy {arm.strategy} --cap-max "
+        f"splatseed train {source} --seeds scene --strategy {arm.strategy} --budget "
         f"{spec.training.cap_max} --max-steps {options.max_steps} --data-factor "
         f"{spec.training.data_factor} -o {quoted(f'run_{seeded}_{arm.strategy}')}"
     )

@@ -27,12 +27,8 @@ class Options:
     """A scene with photographs, in any layout."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write, in COLMAP's layout."""
-    threads: int = -1
-    """Worker threads; -1 = all cores."""
     overwrite: bool = False
     """Replace an output folder that splatseed undistort wrote before."""
-    verbose: bool = False
-    """Show pycolmap's own log."""
 
 
 def run(arguments: list[str]) -> None:
@@ -47,9 +43,7 @@ def run(arguments: list[str]) -> None:
         undistorted = undistort(
             scene,
             options.output,
-            threads=options.threads,
             overwrite=options.overwrite,
-            verbose=options.verbose,
             on_progress=clock,
         )
     rows = [

@@ -35,13 +35,9 @@ class Options:
     what: Annotated[Path, tyro.conf.Positional]
     """A scene, a run folder, a file of Gaussians or points, or a folder that holds several of
     these."""
-    compare: Annotated[
-        Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
-    ] = None
+    compare: Path | None = None
     """Another to show beside it, from the same camera."""
-    scene: Annotated[
-        Path | None, tyro.conf.arg(constructor=Path, metavar="PATH", help_behavior_hint="")
-    ] = None
+    scene: Path | None = None
     """The scene a file of Gaussians belongs to; a run knows its own."""
     host: str = "127.0.0.1"
     """The address to listen on: this machine alone, or 0.0.0.0 for all that can reach it."""

@@ -147,7 +147,7 @@ def _check_memory(largest: Size, batch: int) -> None:
     """Refuse a batch that does not fit into memory, whatever the network itself needs."""
     pixels = largest[0] * largest[1]
     what = f"photographs of {pixels / 1e6:.1f} megapixels at a time"
-    fix = "Pass --batch {most}, or a smaller --max-size."
+    fix = "Pass a smaller --max-size."
     check_memory(batch, pixels * BYTES_A_PIXEL, what, fix=fix)
 
 

@@ -271,7 +271,7 @@ def _failed(error: Exception, values: Float[Tensor, "B 3 h w"]) -> SplatseedErro
         return ParameterError(
             f"enough memory for {batch} images of {width} x {height} at once",
             found=_one_line(error).partition(". ")[0],
-            fix="Pass a smaller --batch or --max-size, or another --device.",
+            fix="Pass a smaller --max-size, or another --device.",
         )
     return SceneFormatError(
         f"a network that takes images of {width} x {height} pixels",

@@ -177,7 +177,7 @@ def advise(
         return Advice(method, reasons, measured)
 
     if not measured.num_points:
-        maps = "Its depth maps can give some, too: --method depth --no-align --num-points N."
+        maps = "Its depth maps can give some, too: --method depth --depth.no-align --num-points N."
         how = ": depth comes from comparing the photographs" if measured.photographs else ""
         none = f"There are no points to begin with{how}."
         return said(DEFAULT_METHOD, none, *([maps] if measured.depth_maps else []))

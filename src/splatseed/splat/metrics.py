@@ -208,7 +208,7 @@ def load_lpips(net: LpipsNet = "vgg", weights: Path | None = None) -> Lpips:
         raise SceneFormatError(
             f"{path} to hold the weights of {net} for LPIPS",
             found=" ".join(f"{type(error).__name__}: {error}".split())[:200],
-            fix="Download the file again, and see that it is for the network named by --lpips-net.",
+            fix="Download the file again.",
         ) from None
     assert package is not None  # noqa: S101  (required above)
     package_dir = Path(package.origin or "").parent

@@ -116,7 +116,7 @@ def known_depths(
     took = "" if stereo else f" ({seconds:.0f} s)"
     note(
         f"Stereo knows the depth of {share:.0%} of the pixels{took}: strategy grow places most of "
-        "what it adds there. --placing none only splits."
+        "what it adds there. placing = none only splits."
     )
     # Stereo's depths are in world units; unknown ones, NaN, become 0.
     return {

@@ -55,7 +55,7 @@ def gpu_memory_told(count: Callable[[], int]) -> Iterator[None]:
         raise PointCloudError(
             "Gaussians and photographs that fit into the GPU's memory",
             found=f"no memory left with {count():,} Gaussians",
-            fix=f"Start again with --cap-max {round(FEWER * count())} or smaller photographs "
+            fix=f"Start again with --budget {round(FEWER * count())} or smaller photographs "
             "(--data-factor), or end other programs on the GPU.",
         ) from error
 
@@ -80,7 +80,7 @@ def check_fits(count: int, device: torch.device) -> None:
         raise PointCloudError(
             f"at most {most:,} points, which the {free / 1e9:.1f} GB of free memory hold",
             found=f"{count:,}",
-            fix=f"Pass --cap-max {most}, upsample less, or free some memory.",
+            fix=f"Pass --budget {most}, upsample less, or free some memory.",
         )
 
 

@@ -133,7 +133,7 @@ def scene_as_read(
     note: Callable[[str], None],
     progress: Progress,
 ) -> Scene:
-    """The scene without its depth maps, and at refined poses, where that is asked for.
+    """The scene, at refined poses if that is asked for.
 
     Args:
         scene: The scene as the user names it.
@@ -151,8 +151,6 @@ def scene_as_read(
         ReconstructionError: The poses drifted, or no point could be triangulated.
         MissingDependencyError: pycolmap is absent.
     """
-    if reading.ignore_depth:
-        scene = scene.replace(depths=None)
     if not reading.refine_poses:
         return scene
     from splatseed.sfm.refining import refined, with_refined  # noqa: PLC0415  (loads with its use)

@@ -142,7 +142,7 @@ def usable_seeds(
     used = {"sizes": settings.seed_sizes, "normals": settings.seed_normals}
     for name, asked in used.items():
         if asked and np.isnan(seeds.attributes.get(name, np.nan)).all():
-            note(f"--seed-{name} has no effect: no seed has known {name}.")
+            note(f"seed_{name} has no effect: no seed has known {name}.")
     return seeds.replace(**dict.fromkeys(n for n in seeds.attributes if not used.get(n)))
 
 

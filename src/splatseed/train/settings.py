@@ -7,7 +7,7 @@ conventions, as gsplat's trainer has them, for comparison with published numbers
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, cast, get_args
+from typing import Literal, cast, get_args
 
 import tyro
 
@@ -41,8 +41,6 @@ class Reading:
 
     refine_poses: bool = False
     """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
-    ignore_depth: bool = False
-    """Without points: compare photographs without looking at the depth maps of an RGB-D capture."""
 
 
 AS_IT_IS = Reading()
@@ -53,8 +51,8 @@ class TrainSettings:
     """How to train.
 
     A setting is declared only here, besides the code that uses it: the options of ``train`` and
-    ``bench``, plans, ledgers and ``config.json`` take these fields, defaults and docstrings as they
-    are.
+    ``bench``, plans and ``config.json`` take these fields, defaults and docstrings as they are.
+    Suppressed ones are no options: a file of ``train --config`` or a plan sets them.
 
     Raises:
         ParameterError: A value is out of its range.
@@ -71,13 +69,9 @@ class TrainSettings:
     """Divide the width and height of the photographs by this whole number."""
     seed: int = 0
     """On the CPU the same seed gives the same bytes."""
-    cap_max: Annotated[
-        int | None,
-        tyro.conf.arg(
-            constructor=int, metavar="INT", help_behavior_hint="(default: 1000000 for grow, mcmc)"
-        ),
-    ] = None
-    """Most Gaussians; if there are more seeds, they are thinned."""
+    cap_max: tyro.conf.Suppress[int | None] = None  # the option is --budget
+    """Most Gaussians, by default 1000000 for grow and mcmc; if there are more seeds, they are
+    thinned."""
     backend: Backend = "auto"
     """Where to train; auto takes a GPU if PyTorch sees one."""
     sh_degree: int = 3
@@ -85,17 +79,17 @@ class TrainSettings:
     3."""
     test_every: int = 8
     """Keep every n-th image, sorted by name, for testing."""
-    placing: Placing = "stereo"
+    placing: tyro.conf.Suppress[Placing] = "stereo"
     """Strategy grow: put most of the new Gaussians on wrong pixels, at the depth that stereo finds
     there (stereo), or only split Gaussians (none)."""
-    opacity_reset: bool = False
+    opacity_reset: tyro.conf.Suppress[bool] = False
     """Lower all opacities from time to time, as 3DGS does (strategy default; gsplat 1.5.3 does
     not)."""
-    seed_sizes: bool = False
+    seed_sizes: tyro.conf.Suppress[bool] = False
     """Start with the sizes in the scene's seeds.npz instead of the gaps between seeds."""
-    seed_normals: bool = False
+    seed_normals: tyro.conf.Suppress[bool] = False
     """Start with flat discs where the scene's seeds.npz has normals."""
-    seed_colors: bool = False
+    seed_colors: tyro.conf.Suppress[bool] = False
     """Start with the colours that the training photographs show for each seed, by direction."""
     seeding: tyro.conf.Suppress[Seeding] = "scene"  # the option is --seeds: its default is "auto"
     """Start from the scene's points as they are, or let method ``auto`` add the points that the

@@ -82,7 +82,7 @@ def smooth_path(views: Sequence[View], frames: int, size: tuple[int, int]) -> li
         raise ParameterError(
             "cameras in at least two places, for a path through them",
             found=counted(len(views), "camera"),
-            fix="Pass --orbit, or --path FILE.",
+            fix="Pass --path orbit, or --path FILE.",
         )
     # Turning by one radian counts as moving by the extent of the cameras.
     steps = np.linalg.norm(np.diff(poses * np.r_[np.ones(3) / reach, np.ones(6)], axis=0), axis=1)

@@ -13,13 +13,13 @@ from splatseed.commands.demo import command as demo
 from splatseed.errors import MissingDependencyError
 from splatseed.scores import CurvePoint, TrainingResult
 
-WORDS = ("demo", "--views", "4", "--ratio", "2", "--no-preview")
+WORDS = ("demo", "--views", "4")
 
 
 def test_the_demo_trains_from_each_set_of_seeds(splatseed, tmp_path):
     pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
     out = tmp_path / "demo"
-    run = splatseed(*WORDS, "--preview", "-o", out, "--train-steps", "44")
+    run = splatseed(*WORDS, "-o", out, "--train-steps", "44")
     assert run.code == 0, run
     seeded = json.loads((out / "scene_auto/splatseed.json").read_text())
     counts = {}

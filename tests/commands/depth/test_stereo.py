@@ -3,8 +3,6 @@ place."""
 
 from __future__ import annotations
 
-import dataclasses
-import inspect
 import json
 import shutil
 import subprocess
@@ -58,9 +56,9 @@ def test_a_plain_folder(room, tmp_path, splatseed, stereo, maps):
 
 
 def test_options_reach_stereo(room, tmp_path, splatseed, stereo):
-    words = ("--stereo", "--max-size", 500, "--grid", 2, "--seed", 7)
+    words = ("--stereo", "--max-size", 500, "--grid", 2)
     assert splatseed("depth", room, *words, "-o", tmp_path / "maps").code == 0
-    assert stereo.calls == [(12, 500, 2, 7)]
+    assert stereo.calls == [(12, 500, 2, 0)]
 
 
 @pytest.mark.usefixtures("stereo")
@@ -111,24 +109,6 @@ def test_an_image_that_nothing_confirms_is_named(room, tmp_path, splatseed, ster
     assert f"no other view confirms any pixel of: {blind.name}" in run.out
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ((), "either --model or --stereo; found neither"),
-        (("--stereo", "--model", "some"), "either --model or --stereo; found both"),
-        (("--stereo", "--batch", 2, "--depth-kind", "z"), "found --batch, --depth-kind"),
-        (("--model", "some", "--colmap"), "found --colmap"),
-        (("--model", "some", "--seed", 1), "add --stereo"),
-    ],
-)
-def test_bad_words_end_in_one_line_and_no_folder(words, said, room, tmp_path, splatseed):
-    run = splatseed("depth", room, *words, "-o", tmp_path / "d")
-    assert run.code == 2
-    assert said in run.err
-    assert run.err.count("\n") == 1
-    assert not (tmp_path / "d").exists()
-
-
 def test_a_missing_photograph_is_found_before_any_work(own_room, tmp_path, splatseed, stereo):
     scene = load_scene(own_room)
     path = scene.source.image_dir / scene.images[-1].name
@@ -137,10 +117,3 @@ def test_a_missing_photograph_is_found_before_any_work(own_room, tmp_path, splat
     assert run.code == 2
     assert path.name in run.err
     assert stereo.calls == []
-
-
-def test_stereo_has_the_options():
-    parameters = inspect.signature(splatseed.stereo.stereo_depths).parameters
-    fields = {field.name for field in dataclasses.fields(splatseed.stereo.StereoSettings)}
-    assert {"seed", "progress"} <= set(parameters)
-    assert {"max_size", "grid"} <= fields

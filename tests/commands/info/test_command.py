@@ -36,7 +36,30 @@ def test_a_colmap_scene(room, splatseed):
     assert rows["reprojection error, px"].startswith(f"mean {scene.tracks.errors.mean():.3f},")
     low = [float(x) for x in rows["bounding box"].split()[:3]]
     np.testing.assert_allclose(low, scene.points.xyz.min(axis=0), rtol=1e-3)
-    assert run.out.splitlines()[-1].strip().startswith("splatseed upsample")
+    assert run.out.partition("\nnext\n")[2].split()[1:3] == ["splatseed", "upsample"]
+
+
+def test_for_scripts_it_is_json_alone(room, splatseed):
+    run = splatseed("info", room, "--json")
+    assert (run.code, run.err) == (0, "")
+    facts = json.loads(run.out)
+    assert (facts["images"], facts["train_images"] + facts["test_images"]) == (12, 12)
+    assert facts["points"]["num_points"] > 400
+    assert len(facts["points"]["spacing"]) == 5
+    assert isinstance(facts["problems"], list)
+
+
+def test_a_full_cloud_is_to_be_left_as_it_is(room, splatseed):
+    out = splatseed("info", room, "--budget", 60, "--max-steps", 500).out
+    assert "leave the points as they are" in out
+    assert "--seeds scene --budget 60 --max-steps 500" in out.partition("\nnext\n")[2]
+
+
+def test_a_sparse_cloud_is_to_be_added_to_and_a_trial_is_of_the_same_plan(room, splatseed):
+    out = splatseed("info", room, "--budget", 5400, "--max-steps", 20000).out
+    assert "add points by method auto" in out
+    assert f"splatseed upsample {room} --budget" in out
+    assert "--minutes 30 --budget 0.5rho --max-steps 20000\n" in out
 
 
 WITHOUT_NUMBA = """

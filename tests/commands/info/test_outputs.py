@@ -50,7 +50,7 @@ def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(seeded, room, spla
 
 def test_the_next_command_keeps_what_was_asked(seeded, splatseed):
     out = splatseed("info", seeded, "--budget", 5000, "--max-steps", 900).out
-    assert out.rstrip().endswith("--cap-max 5000 --max-steps 900 -o RUN")
+    assert out.rstrip().endswith("--budget 5000 --max-steps 900 -o RUN")
 
 
 def test_seeds_without_photographs_are_to_be_looked_at(seeded, splatseed):

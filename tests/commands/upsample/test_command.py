@@ -270,8 +270,8 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(room, tmp_path,
 
 def test_previews_show_something(room, tmp_path, splatseed):
     out = tmp_path / "out"
-    run = splatseed("upsample", room, "-o", out, "--preview", "--preview-methods")
-    for name in ("preview.png", "preview_methods.png", "preview_maps.png"):
+    run = splatseed("upsample", room, "-o", out, "--preview")
+    for name in ("preview.png", "preview_maps.png"):
         assert str(out / name) in run.out
         _assert_drawn(out / name)
 
@@ -358,16 +358,6 @@ def test_odd_names_are_printed_and_quoted(name, room, tmp_path, splatseed):
     assert str(tmp_path / name) in shlex.split(
         splatseed("info", tmp_path / name).out.splitlines()[-1]
     )
-
-
-@pytest.mark.parametrize("words", [["--help-all"], ["x", "--help-all"]])
-def test_help_lists_every_method_with_its_flags(words, splatseed):
-    run = splatseed("upsample", *words)
-    assert (run.code, run.err) == (0, "")
-    for name in METHOD_NAMES:
-        assert f"{name} options" in run.out or name == "random"
-    assert "--mls.k INT" in run.out
-    assert "NoneType" not in run.out
 
 
 def test_photographs_without_points_are_seeded_and_drawn(room, tmp_path, splatseed):

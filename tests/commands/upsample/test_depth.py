@@ -58,7 +58,7 @@ def test_the_maps_are_named_and_noted(room, tmp_path, splatseed):
 
 def test_a_capture_has_its_own_maps_and_needs_no_points(without_points, tmp_path, splatseed):
     out = tmp_path / "out"
-    run = upsample(splatseed, without_points, out, "--no-align", "--num-points", 700)
+    run = upsample(splatseed, without_points, out, "--depth.no-align", "--num-points", 700)
     assert (run.code, run.err) == (0, "")
     assert "far from any original" not in run.out
     scene = load_scene(out)
@@ -69,7 +69,7 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(without_points, tmp_path
     assert surfaces.distance(scene.points.xyz.astype(np.float64)).max() < 0.001
     assert "made 700 of its points and kept 0." in splatseed("info", out).out
     for words, says in (
-        (["--no-align"], "--num-points of 1 or more"),
+        (["--depth.no-align"], "--num-points of 1 or more"),
         (["--num-points", 9], "--poses-from"),
     ):
         run = upsample(splatseed, without_points, tmp_path / "other", *words)
@@ -93,9 +93,9 @@ def test_the_scenes_own_maps_are_found(room, tmp_path, splatseed):
 
 def test_seeds_without_originals_are_never_taken_for_originals(without_points, tmp_path, splatseed):
     seeds = tmp_path / "seeds"
-    upsample(splatseed, without_points, seeds, "--no-align", "--num-points", 700)
+    upsample(splatseed, without_points, seeds, "--depth.no-align", "--num-points", 700)
     run = upsample(splatseed, seeds, tmp_path / "again", "--depth", without_points / "results",
-                   "--depth-scale", 5000, "--no-align", "--num-points", 9)  # fmt: skip
+                   "--depth-scale", 5000, "--depth.no-align", "--num-points", 9)  # fmt: skip
     assert run.code == 0, run.err
     assert "None is an original: the 700 points that splatseed added" in run.out
     assert len(load_scene(tmp_path / "again").points) == 9
@@ -111,37 +111,6 @@ def test_seeds_without_originals_are_never_taken_for_originals(without_points, t
         assert not words[-1].exists()
 
 
-def test_no_align_is_the_methods_flag(room, tmp_path, splatseed):
-    for name, flag in (("a", "--no-align"), ("b", "--depth.no-align")):
-        run = upsample(splatseed, room, tmp_path / name, "--depth", room, flag)
-        assert run.code == 0
-        assert "align=False" in run.out
-    points = [load_scene(tmp_path / name).points.xyz for name in "ab"]
-    np.testing.assert_array_equal(*points)
-
-
-WRONG = [
-    (["--depth", "nowhere"], "a folder of depth maps at nowhere"),
-    (["--depth-kind", "ray"], "--depth DIR, which"),
-    (["--depth-scale", "2"], "--depth DIR, which"),
-    (["--depth", "ROOM", "--depth-scale", "0"], "above 0"),
-    (["--depth", "ROOM", "--depth-kind", "zet"], "as one of inverse, ray, z; found 'zet'"),
-    (["--depth", "ROOM", "--depth.tolerance", "2"], "tolerance between 0 and 1"),
-    (["--depth", "ROOM", "--depth-scale", "5", "--no-align"], "times that of the SfM points"),
-    (["--depth", "ROOM", "--ratio", "3000"], "no other view looks through"),
-    (["--depth", "ROOM", "--depth-kind", "inverse"], "values rise with depth"),
-]
-
-
-@pytest.mark.parametrize(("words", "says"), WRONG, ids=str)
-def test_what_cannot_be_lifted_ends_in_one_line(words, says, room, tmp_path, splatseed):
-    named = [room if word == "ROOM" else word for word in words]
-    run = upsample(splatseed, room, tmp_path / "out", *named)
-    assert (run.code, run.err.count("\n")) == (2, 1)
-    assert says in run.err
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_output_may_not_lie_in_the_maps(own_room, splatseed):
     run = upsample(splatseed, own_room, own_room / "depths/out", "--depth", own_room / "depths")
     assert run.code == 2
@@ -152,16 +121,6 @@ def test_flags_of_depth_do_nothing_for_other_methods(room, tmp_path, splatseed):
     run = splatseed("upsample", room, "--depth", room, "-o", tmp_path / "out")
     assert run.code == 0
     assert "The flags of depth have no effect with --method auto." in run.out
-
-
-def test_previews_show_depth_where_there_is_some(room, tmp_path, splatseed, monkeypatch):
-    shown = []
-    monkeypatch.setattr(
-        "splatseed.view.clouds.preview_methods", lambda _s, clouds, _p: shown.append(set(clouds))
-    )
-    splatseed("upsample", room, "-o", tmp_path / "a", "--preview-methods")
-    upsample(splatseed, room, tmp_path / "b", "--depth", room, "--preview-methods")
-    assert shown[1] - shown[0] == {"depth"}
 
 
 def test_images_left_out_are_told(own_room, tmp_path, splatseed):

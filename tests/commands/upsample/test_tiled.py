@@ -153,7 +153,6 @@ def test_what_cannot_be_is_one_line(words, told, cloud, tmp_path, splatseed):
     [
         (("--method", "stereo"), "found stereo, which needs the whole scene at once."),
         (("--preview",), "found --preview. Leave it out"),
-        (("--preview-methods",), "found --preview-methods. Leave it out"),
         (("--budget", "50"), "found --budget. Leave it out"),
     ],
 )

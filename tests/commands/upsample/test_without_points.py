@@ -32,12 +32,10 @@ def test_it_says_how_depth_is_found_and_how_much(bare, tmp_path, splatseed):
     assert load_scene(tmp_path / "out").points.num_original == 0
 
 
-@pytest.mark.parametrize("ignored", [False, True])
-def test_depth_maps_show_where_to_look_unless_ignored(ignored, rgbd, tmp_path, splatseed):
-    more = ["--ignore-depth"] if ignored else []
-    run = splatseed("upsample", rgbd, "--method", "stereo", *more, "-o", tmp_path / "out")
+def test_depth_maps_show_where_to_look(rgbd, tmp_path, splatseed):
+    run = splatseed("upsample", rgbd, "--method", "stereo", "-o", tmp_path / "out")
     assert run.code == 0
-    assert ("photographs, around its depth maps\n" in run.out) != ignored
+    assert "photographs, around its depth maps\n" in run.out
     assert len(load_scene(tmp_path / "out").points) > 100
 
 

@@ -153,7 +153,7 @@ def test_the_end_of_memory_is_told_and_keeps_the_last_whole_step(
         kept = 5 if during == "render" else 0
         with pytest.raises(PointCloudError, match=f"as of step {kept} is kept") as caught:
             run.train()
-        assert f"--cap-max {round(0.8 * run.count())}" in caught.value.fix
+        assert f"--budget {round(0.8 * run.count())}" in caught.value.fix
         monkeypatch.undo()
         monkeypatch.setattr(trainer, "TESTS", 1)
         again = _begin(room, tmp_path / "run", "default", "cuda", resume=True)
@@ -166,7 +166,7 @@ def test_memory_that_ends_before_the_first_step_leaves_no_folder(room, tmp_path,
         raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
 
     monkeypatch.setattr(trainer, "photometric_loss", fails)
-    with pc.pretended_gpu(), pytest.raises(PointCloudError, match="--cap-max"):
+    with pc.pretended_gpu(), pytest.raises(PointCloudError, match="--budget"):
         _begin(room, tmp_path / "run", "default", "cuda")
     assert not (tmp_path / "run").exists()
 

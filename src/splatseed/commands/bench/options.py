@@ -52,6 +52,9 @@ class PlanTraining(TrainSettings):
 
     strategy: tyro.conf.Suppress[StrategyName] = "default"
     seed: tyro.conf.Suppress[int] = 0
+    cap_max: int | None = None
+    """Most Gaussians, by default 1000000 for grow and mcmc; if there are more seeds, they are
+    thinned."""
 
     @classmethod
     def of(cls, settings: TrainSettings) -> Self:

@@ -19,14 +19,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from splatseed.commands.demo.kernels import TRAINING, KernelsAhead, kernels_ahead, wait
-from splatseed.commands.demo.methods import SHOWN
+from splatseed.commands.demo.methods import SEED, SHOWN
 from splatseed.commands.options import parse_options
 from splatseed.console import print_commands, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import MissingDependencyError, OutputError, ParameterError
 from splatseed.io.staging import MANIFEST, add_files, read_manifest
 from splatseed.literal import quoted
 from splatseed.requirements import require
-from splatseed.upsample import planned_size
 
 if TYPE_CHECKING:  # importing PyTorch takes a while, and it may be absent
     from splatseed.commands.demo.training import TrainedArm
@@ -40,19 +39,13 @@ class Options:
 
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """The folder to write."""
-    ratio: float = 8.0
-    """Points in all, as a multiple of the originals, for methods that interpolate."""
     views: int = 40
     """Photographs of the synthetic room."""
-    seed: int = 0
-    """The same seed gives the same demo."""
     train_steps: int = 500
     """Training steps from each of four sets of seeds; 0 for no training."""
     training: Literal["now", "later", "only"] = "now"
     """When to train: now, at the end; later, while PyTorch is being installed; only, in a
     demo folder that was made with later."""
-    preview: bool = True
-    """Write pictures."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
 
@@ -76,7 +69,6 @@ def run(arguments: list[str]) -> None:
 
 def _check(options: Options) -> None:
     """Refuse early what would fail after a minute's work."""
-    planned_size(1, options.ratio, None)
     if options.train_steps < 0:
         raise ParameterError(
             "--train-steps of 0 or more", found=f"{options.train_steps}", fix="Pass 0 not to train."
@@ -117,14 +109,13 @@ def _train(options: Options, ahead: KernelsAhead) -> bool:
         strategy="default",
         cap_max=seeded["num_points"],
         max_steps=options.train_steps,
-        seed=options.seed,
+        seed=SEED,
     )
     with stage_display() as clock:
         wait(ahead, TRAINING, clock)
-        arms = [*seed_poses_alone(folder, options.seed, clock), *arms]
+        arms = [*seed_poses_alone(folder, SEED, clock), *arms]
         trained = [train_arm(arm, settings, clock) for arm in arms]
-        if options.preview:
-            write_comparison(trained, folder / TRAINED_PICTURE)
+        write_comparison(trained, folder / TRAINED_PICTURE)
     _summarise_training(options, trained)
     return True
 
@@ -140,7 +131,6 @@ def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None
         ("seeds", "Gaussians", "seconds", "PSNR, dB", "SSIM", f"dB after {least:.0f} s"),
         [_row(each, least) for each in trained],
     )
-    pictures = [("pictures", str(options.output / TRAINED_PICTURE))] if options.preview else []
     print_pairs(
         "what this shows",
         [
@@ -150,7 +140,7 @@ def _summarise_training(options: Options, trained: Sequence[TrainedArm]) -> None
             ("", "before the mean that a run ends with is taken"),
             ("limits", "a synthetic room, one run each, no error bars; strategy grow, which"),
             ("", "splatseed train takes for short runs, gains more, and needs seeds less"),
-            *pictures,
+            ("pictures", str(options.output / TRAINED_PICTURE)),
         ],
     )
 

@@ -7,6 +7,9 @@ from splatseed.scene import Scene
 from splatseed.upsample import METHODS, chooses_number, configure, upsample
 
 SHOWN = "auto"
+RATIO = 8.0
+"""Points in all over originals, for methods that interpolate."""
+SEED = 0
 TEST_EVERY = 8
 """Photographs held out for testing: no method uses them."""
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatseed.commands.demo.kernels import KernelsAhead, wait
-from splatseed.commands.demo.methods import SHOWN, upsample_by
+from splatseed.commands.demo.methods import RATIO, SEED, SHOWN, upsample_by
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder
@@ -56,12 +56,12 @@ def _make_first(
         output_folder(options.output, kind="demo", overwrite=options.overwrite) as folder,
     ):
         clock("photograph", 0.0)
-        capture = make_capture(options.seed, options.views)
+        capture = make_capture(SEED, options.views)
         write_capture(capture, folder / "scene")
         scene = _load(folder)
         wait(ahead, SHOWN, clock)
         clock("upsample", 0.0)
-        seeded = upsample_by(SHOWN, scene, options.ratio, options.seed)
+        seeded = upsample_by(SHOWN, scene, RATIO, SEED)
         clock("write", 0.0)
         # Images are copied: a link would point into the folder's temporary place.
         write_scene(
@@ -70,14 +70,12 @@ def _make_first(
             copy_images=True,
             provenance={"method": SHOWN, "seconds": clock.seconds()["upsample"]},
         )
-        if options.preview:
-            clock("pictures", 0.0)
-            preview_pair(scene, seeded, folder / FIRST_PICTURE, title=SHOWN)
-    if options.preview:
-        seconds = sum(clock.seconds().values())
-        print_note(
-            f"the first picture is ready after {seconds:.0f} s: {options.output / FIRST_PICTURE}"
-        )
+        clock("pictures", 0.0)
+        preview_pair(scene, seeded, folder / FIRST_PICTURE, title=SHOWN)
+    seconds = sum(clock.seconds().values())
+    print_note(
+        f"the first picture is ready after {seconds:.0f} s: {options.output / FIRST_PICTURE}"
+    )
     return capture, seeded
 
 
@@ -94,17 +92,15 @@ def _make_rest(
     scene = _load(folder)
     add_files(folder, [TABLE, *METHOD_PICTURES])
     with stage_display(clock):
-        clouds = _upsample_all(options, scene, {SHOWN: seeded}, clock, ahead)
+        clouds = _upsample_all(scene, {SHOWN: seeded}, clock, ahead)
         scores = _measure_all(capture, scene, clouds, clock)
         _write_table(folder / TABLE, scores)
-        if options.preview:
-            _write_pictures(folder, capture, scene, clouds, clock)
+        _write_pictures(folder, capture, scene, clouds, clock)
         seconds = clock.seconds()
     _summarise(options, scene, scores, seconds)
 
 
 def _upsample_all(
-    options: Options,
     scene: Scene,
     done: Mapping[str, PointCloud],
     clock: StageClock,
@@ -117,7 +113,7 @@ def _upsample_all(
         if name not in clouds:
             clock("upsample", len(clouds) / len(methods))
             wait(ahead, name, clock)
-            clouds[name] = upsample_by(name, scene, options.ratio, options.seed)
+            clouds[name] = upsample_by(name, scene, RATIO, SEED)
     clock("upsample", 1.0)
     return {name: clouds[name] for name in methods}
 
@@ -174,7 +170,7 @@ def _summarise(
     seconds: Mapping[str, float],
 ) -> None:
     print_table(
-        f"{len(scene.points):,} points, {options.ratio:g}x where the method has a ratio; distances "
+        f"{len(scene.points):,} points, {RATIO:g}x where the method has a ratio; distances "
         "in units of the originals' spacing, lower is better",
         ("method", "error", "median", "95%", "coverage", "far"),
         [
@@ -186,7 +182,7 @@ def _summarise(
             for name, s in scores.items()
         ],
     )
-    names = [FIRST_PICTURE, *METHOD_PICTURES] if options.preview else []
+    names = [FIRST_PICTURE, *METHOD_PICTURES]
     rows = [
         (
             "error",

@@ -55,7 +55,6 @@ def _run_network(options: Options) -> None:
             scene,
             network,
             options.output,
-            batch=options.batch,
             max_size=max_size,
             overwrite=options.overwrite,
             provenance={**provenance(options, PACKAGES), **_said_by(network)},

@@ -30,7 +30,7 @@ def after_stereo(
     if is_distorted(scene):  # seeds are lifted along the rays of a pinhole camera
         return [look(path, maps)]
     number = number_for(len(scene.points), confirmed, most)
-    aligned = "" if len(scene.points) else "--no-align "
+    aligned = "" if len(scene.points) else "--depth.no-align "
     return [look(path, maps), use(path, maps, aligned + number)]
 
 

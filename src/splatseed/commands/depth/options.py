@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -16,11 +16,6 @@ from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError
 from splatseed.process.torch_device import DeviceName
 from splatseed.stereo.settings import LEAST_SIZE, MOST_GRID
-
-
-def _number(default: str) -> Any:
-    """How an optional number appears in the help."""
-    return tyro.conf.arg(constructor=int, metavar="INT", help_behavior_hint=f"(default: {default})")
 
 
 @dataclass(frozen=True)
@@ -34,9 +29,7 @@ class Options:
     """A scene with photographs."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The folder of maps to write: one float32 .npy per image."""
-    model: Annotated[
-        str | None, tyro.conf.arg(metavar="NAME|PATH", help_behavior_hint="(or --stereo)")
-    ] = None
+    model: Annotated[str | None, tyro.conf.arg(metavar="NAME|PATH")] = None
     """A network: a folder in transformers' format, or an id that Hugging Face's cache holds."""
     stereo: bool = False
     """Match the photographs with each other instead: no network, on the CPU; normals and confidence
@@ -44,31 +37,25 @@ class Options:
     colmap: bool = False
     """With --stereo: write a COLMAP dense workspace, which colmap stereo_fusion turns into a
     cloud."""
-    grid: Annotated[int | None, _number("4")] = None
-    """With --stereo: one pixel of the map per block of GRID x GRID pixels of the photograph."""
-    seed: Annotated[int | None, _number("0")] = None
-    """With --stereo: the same seed gives the same bytes."""
+    grid: int | None = None
+    """With --stereo: one pixel of the map per block of GRID x GRID pixels of the photograph; 4 by
+    default."""
     preview: bool = False
     """With --stereo: also write preview_maps.png, some photographs beside their maps."""
-    batch: int = 1
-    """Photographs per run of the network: more is faster on a GPU, and takes more memory."""
     device: DeviceName = "auto"
-    """Where to run; auto takes a usable GPU if there is one."""
-    max_size: Annotated[int | None, _number("1600; 800 with --stereo")] = None
-    """Photographs with a longer side are reduced to this many pixels, and so are their maps."""
-    depth_kind: Annotated[
-        DepthKind | None,
-        tyro.conf.arg(
-            metavar="{z,ray,inverse}", help_behavior_hint="(default: what config.json says)"
-        ),
-    ] = None
-    """What the network predicts: planar depth, distance along the ray, or inverse depth."""
+    """Where to run the network; auto takes a usable GPU if there is one."""
+    max_size: int | None = None
+    """Photographs with a longer side are reduced to this many pixels, and so are their maps; by
+    default 1600, or 800 with --stereo."""
+    depth_kind: DepthKind | None = None
+    """What the network predicts: planar depth, distance along the ray, or inverse depth; by default
+    what its config.json says."""
     overwrite: bool = False
     """Replace an output folder that splatseed wrote before."""
 
 
-_OF_NETWORK = ("batch", "device", "depth_kind")
-_OF_STEREO = ("colmap", "grid", "seed", "preview")
+_OF_NETWORK = ("device", "depth_kind")
+_OF_STEREO = ("colmap", "grid", "preview")
 
 
 def check_together(options: Options) -> None:
@@ -83,8 +70,7 @@ def check_together(options: Options) -> None:
             found="both" if options.stereo else "neither",
             fix="Name a network with --model, or match the photographs themselves with --stereo.",
         )
-    check_least(options, 0, "seed")
-    check_least(options, 1, "grid", "batch")
+    check_least(options, 1, "grid")
     check_least(options, LEAST_SIZE if options.stereo else 1, "max_size")
     if (options.grid or 1) > MOST_GRID:
         found = f"{options.grid}"

@@ -79,7 +79,7 @@ def _maps(scene: Scene, options: Options, clock: StageClock) -> tuple[StereoMap,
     """The maps, by stereo's own defaults where an option is left out."""
     from splatseed.stereo import stereo_depths  # noqa: PLC0415  (loads little)
 
-    names = ("max_size", "grid", "seed")
+    names = ("max_size", "grid")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     return stereo_depths(scene, progress=clock, **given)
 

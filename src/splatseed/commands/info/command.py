@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
@@ -47,45 +47,28 @@ KINDS_SHOWN = 3
 """Kinds of cameras listed; collections of photographs from the web have one per photograph."""
 
 
-def _path(metavar: str) -> Any:
-    """How an optional path appears in the help."""
-    return tyro.conf.arg(constructor=Path, metavar=metavar, help_behavior_hint="")
-
-
-def _default(stands_in: str, metavar: str) -> Any:
-    """How an optional option appears in the help: with its default in words."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {stands_in})")
-
-
 @dataclass(frozen=True)
 class Options:
     """Show what is in a scene: cameras, images, points, tracks, depth maps, and problems."""
 
     scene: Annotated[Path, tyro.conf.Positional]
     """A COLMAP scene folder, a folder with transforms.json, an RGB-D capture, or a .ply."""
-    depth: Annotated[Path | None, _path("DIR")] = None
+    depth: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """Also compare a folder of depth maps, in any layout of docs/formats.md, with the SfM
     points."""
-    depth_kind: Annotated[
-        DepthKind | None, _default("what the folder says, else z", "{z,ray,inverse}")
-    ] = None
-    """What their values are: planar depth, distance along the ray, or inverse depth."""
-    depth_scale: Annotated[float | None, _default("what the folder says", "FLOAT")] = None
-    """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
-    picture: Annotated[Path | None, _path("FILE")] = None
+    depth_kind: DepthKind | None = None
+    """What their values are: planar depth, distance along the ray, or inverse depth; by default
+    what the folder says, else z."""
+    depth_scale: float | None = None
+    """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default what
+    the folder says."""
+    picture: Path | None = None
     """Write a PNG of depth beside photographs, and of where the two disagree."""
-    budget: Annotated[
-        str | None,
-        tyro.conf.arg(
-            constructor=str, metavar="N|Xrho", help_behavior_hint="(default: as splatseed train's)"
-        ),
-    ] = None
-    """Gaussians that you plan to end with: a number, or per pixel of a photograph. The advice
-    depends on it."""
+    budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
+    """Gaussians that you plan to end with: a number, or per pixel of a photograph; by default as
+    splatseed train's. The advice depends on it."""
     max_steps: int = FULL_RUN
     """Steps that you plan to train; the advice depends on them."""
-    list_all: Annotated[bool, tyro.conf.arg(name="all")] = False
-    """List the depth of all images, not only of the worst."""
     json: bool = False
     """Print one JSON object instead, for scripts."""
 
@@ -119,7 +102,7 @@ def run(arguments: list[str]) -> None:
     if alignments is not None:
         from splatseed.commands.info.depth_numbers import print_depth  # noqa: PLC0415  (loads Numba)
 
-        print_depth(str(options.depth or "depth"), scene, alignments, list_all=options.list_all)
+        print_depth(str(options.depth or "depth"), scene, alignments)
     OUT.print("\nproblems" if problems else "\nno problems found", style="bold" if problems else "")
     for problem in problems:
         OUT.print(f"  - {problem}", soft_wrap=True)
@@ -169,7 +152,7 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
 
 def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
     if alignments and not len(scene.points):
-        unit = "only maps in the scene's unit can be used, with --no-align"
+        unit = "only maps in the scene's unit can be used, with --depth.no-align"
         return [f"there are no points to align the depth maps with: {unit}"]
     unfit = sum(each.rejected is not None for each in alignments.values())
     maps = f"{unfit:,} of {len(alignments):,} depth maps"
@@ -189,9 +172,9 @@ def _next_commands(
     if len(scene.points) or ((poses is None or poses.usable) and scene.has_photographs):
         planned = Planned.of(scene, options.budget, options.max_steps)
         advice = advice_for(scene, planned.most_seeds, strategy=planned.strategy)
-        advised = advice_commands(options.scene, scene, advice, planned, refine=refine)[:1]
+        advised = advice_commands(options.scene, scene, advice, planned, refine=refine)
     if len(scene.points):
-        return [("", advised[0][1])]
+        return advised
     images = scene.source.image_dir if scene.source else None
     photographs = "IMAGES" if images is None else quoted(images)
     points = f"splatseed sfm {photographs} --poses-from {quoted(options.scene)} -o OUT"
@@ -205,7 +188,7 @@ def _from_maps(options: Options, scene: Scene, known: int) -> list[tuple[str, st
     if not known or options.depth is None or is_distorted(scene):
         return []
     most = Planned.of(scene, options.budget, options.max_steps).most_seeds
-    how = f"{_reading(options)}--no-align {number_for(0, known, most)}"
+    how = f"{_reading(options)}--depth.no-align {number_for(0, known, most)}"
     return [("or from the maps", use(options.scene, options.depth, how)[1])]
 
 

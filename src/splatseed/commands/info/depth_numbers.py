@@ -1,7 +1,6 @@
 """What ``splatseed info --depth`` reports about a scene's depth maps, in words and numbers.
 
-Promise: images are listed worst first: those left out, then by residual; all of them only on
-request.
+Promise: images are listed worst first: those left out, then by residual.
 """
 
 from __future__ import annotations
@@ -17,19 +16,16 @@ from splatseed.depthmap import DepthKind, DepthMap, DepthMaps
 from splatseed.scene import Scene
 
 ROWS = 12
-"""Images listed without --all."""
+"""Most images listed."""
 
 
-def print_depth(
-    title: str, scene: Scene, alignments: Mapping[str, Alignment], *, list_all: bool
-) -> None:
+def print_depth(title: str, scene: Scene, alignments: Mapping[str, Alignment]) -> None:
     """Print a summary, a table of images, and why some were left out.
 
     Args:
         title: Heading of the summary.
         scene: A scene with depth maps.
         alignments: The alignments of its images, by name.
-        list_all: Whether to list every image.
     """
     example = _example(scene)
     kind: DepthKind = example.kind if example else "z"
@@ -38,10 +34,10 @@ def print_depth(
         return
     print_pairs(title, _summary(scene, example, alignments))
     ordered = sorted(alignments, key=lambda name: _badness(name, alignments[name]))
-    listed = ordered if list_all else ordered[:ROWS]
+    listed = ordered[:ROWS]
     header = ["image", "points", "scale", *(["shift"] if kind == "inverse" else []), "residual"]
     rows = [_row(name, alignments[name], len(header)) for name in listed]
-    some = "" if len(listed) == len(ordered) else f", the {len(listed)} worst; --all lists all"
+    some = "" if len(listed) == len(ordered) else f", the {len(listed)} worst; --json has all"
     print_table(f"depth against SfM points{some}", header, rows)
     _print_rejections(alignments, listed)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from argparse import ArgumentParser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -21,7 +22,7 @@ from rich.progress import (
 )
 from rich.table import Column
 
-from splatseed.commands.options import known_options, parse_options
+from splatseed.commands.options import parse_options
 from splatseed.commands.train.config import with_config
 from splatseed.commands.train.live import view_port, watched
 from splatseed.console import (
@@ -74,30 +75,16 @@ class Options:
     """The folder of the run."""
     training: Annotated[TrainSettings, tyro.conf.arg(name="")] = BEST_SETTINGS
     """The settings; its fields are options of their own."""
-    budget: Annotated[
-        str | None,
-        tyro.conf.arg(
-            metavar="N|Xrho",
-            help_behavior_hint="(default: 1rho, 1000000 at most, for auto; else --cap-max's)",
-        ),
-    ] = None
+    budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
     """Most Gaussians: a number, or 0.25rho for a quarter of the pixels of a photograph at training
-    size."""
-    long_side: Annotated[
-        int | None,
-        tyro.conf.arg(constructor=int, metavar="INT", help_behavior_hint="(default: none)"),
-    ] = None
+    size; by default 1rho for strategy auto and 1000000 for grow and mcmc. If there are more seeds,
+    they are thinned."""
+    long_side: int | None = None
     """Instead of --data-factor: downsample by the least whole factor that leaves at most this many
     pixels on a photograph's longer side."""
-    seeds: Annotated[
-        Seeding | None,
-        tyro.conf.arg(
-            metavar="{auto,scene}",
-            help_behavior_hint="(default: auto, for points that splatseed has not added to)",
-        ),
-    ] = None
-    """Start from the points that method auto makes of the training photographs, or from the scene's
-    points as they are."""
+    seeds: Seeding | None = None
+    """Start from the points that method auto makes of the training photographs (the default, if
+    splatseed has not added any to the scene), or from the scene's points as they are."""
     reading: Annotated[Reading, tyro.conf.arg(name="")] = AS_IT_IS
     """What to do with the scene before; its fields are options of their own."""
     resume: bool = False
@@ -106,11 +93,7 @@ class Options:
     """Also write a log for TensorBoard."""
     view: bool = False
     """Watch training in the browser; pause it, or stop early and keep the result (extra view)."""
-    view_port: int = 8080
-    """Port of this machine to serve the browser; 0 for any free one."""
-    config: Annotated[
-        Path | None, tyro.conf.arg(constructor=Path, metavar="FILE", help_behavior_hint="")
-    ] = None
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """A .toml with these options, or a run's config.json; the command line takes precedence."""
     overwrite: bool = False
     """Replace an earlier run in the output folder."""
@@ -126,16 +109,23 @@ class Options:
         return replace(self.training, seeding=seeding, strategy=strategy)
 
 
+def parse(arguments: list[str]) -> Options:
+    """The options; those on the command line replace those of a file."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config", type=Path)
+    path = parser.parse_known_args(arguments)[0].config
+    default = None
+    if path is not None:
+        default = with_config(Options(scene=tyro.MISSING, output=tyro.MISSING), path)
+    return parse_options(Options, "train", arguments, default)
+
+
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
-    if any(word.partition("=")[0] == "--config" for word in arguments):
-        arguments = with_config(arguments, known_options(Options))
-    options = parse_options(Options, "train", arguments)
+    options = parse(arguments)
     settings = options.settings
     require("torch", "gsplat")
-    if options.view_port != Options.view_port and not options.view:
-        raise ParameterError("--view with --view-port", found="none", fix="Add it.")
-    port = view_port(options.view_port) if options.view else None
+    port = view_port() if options.view else None
     notes: list[str] = []
     if options.resume and not RunFolder(options.output).is_run:
         notes.append(f"There is no run to resume in {options.output}: a new one begins.")
@@ -195,8 +185,6 @@ def _within_budget(
     options: Options, settings: TrainSettings, scene: Scene, note: Callable[[str], None]
 ) -> TrainSettings:
     """The settings, with the cap that the budget amounts to in this scene."""
-    if options.budget is not None and settings.cap_max is not None:
-        raise ParameterError("--budget or --cap-max", found="both", fix="Leave one out.")
     chosen = settings.strategy == BEST and settings.cap_max is None
     if options.budget is None and not (chosen and scene.images):
         return settings
@@ -224,8 +212,7 @@ def _announce(options: Options, training: TrainingRun, notes: list[str]) -> None
         print_note(note)
     settings, views = training.settings, training.trainer.train_views
     for name in settings.idle:
-        option = f"--{name.replace('_', '-')}"
-        print_note(f"{option} has no effect with strategy {settings.densification}.")
+        print_note(f"{name} has no effect with strategy {settings.densification}.")
     OUT.print(
         f"{visible(options.scene)} ({len(views)} training and {len(training.trainer.test_views)} "
         f"test views of {views[0].width} x {views[0].height}, "
@@ -324,7 +311,7 @@ def _summarise(options: Options, result: TrainingResult) -> None:
     if held := result.held_by_memory_at:
         print_note(
             f"memory held the run at {held:,} Gaussians; results may differ on another machine. "
-            f"Pass --cap-max {held} for the same result everywhere."
+            f"Pass --budget {held} for the same result everywhere."
         )
     print_commands("next", _next_commands(options.output))
 

@@ -1,69 +1,91 @@
-"""``splatseed train --config``: options from a file, a .toml or the config.json of a run.
+"""``splatseed train --config``: settings from a file, a .toml or the config.json of a run.
 
-Promise: the command line takes precedence; a key that is not an option is an error, not ignored,
+Promise: the command line takes precedence; a key that is not a setting is an error, not ignored,
 except for what a run records about itself.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_text
 from splatseed.literal import did_you_mean
 
-NOTES = {"splatseed", "points", "device", "versions"}
-"""What config.json records besides settings."""
-RENAMED = {"seeding": "seeds"}
+Options = TypeVar("Options")
+
+_NOTES = {"splatseed", "points", "device", "versions"}
+"""What config.json records besides options."""
+_RENAMED = {"seeding": "seeds"}
 """Settings whose options have other names."""
+_FIX = "Write lines such as max_steps = 7000."
 
 
-def with_config(words: Sequence[str], known: Sequence[str]) -> list[str]:
-    """A command line with ``--config FILE`` replaced by the options that the file holds.
+def with_config(options: Options, path: Path) -> Options:
+    """Options with those that a file holds, as defaults for the command line.
 
     Args:
-        words: The words after the verb.
-        known: All options, such as ``--max-steps``; both forms of a switch.
+        options: A dataclass; those among its fields that are dataclasses hold options of their own.
+        path: The file.
 
     Raises:
-        ParameterError: ``--config`` has no file.
         SceneNotFoundError: There is no such file.
         SceneFormatError: It cannot be read, or a key or a value is not an option's.
     """
-    rest, path = _without_config(list(words))
-    if path is None:
-        return rest
-    given = {word.partition("=")[0] for word in rest if word.startswith("-")}
-    added: list[str] = []
-    for key, value in _read(path).items():
-        name = RENAMED.get(key, key).replace("_", "-")
-        if key in NOTES or value is None or (name == "seeds" and isinstance(value, dict)):
-            continue
-        if name == "scene":
-            added = [*([] if _has_scene(rest, known) else [str(value)]), *added]
-        elif f"--{name}" not in known:
-            raise _unknown(path, key, known)
-        elif not {f"--{name}", f"--no-{name}", *(["-o"] if name == "output" else [])} & given:
-            added += _words(path, name, value)
-    return [*added, *rest]
+    read = {key: value for key, value in _read(path).items() if not _is_note(key, value)}
+    given = {_RENAMED.get(key, key): value for key, value in read.items()}
+    filled = _filled(options, given, path)
+    if unknown := next(iter(given), None):
+        raise SceneFormatError(
+            f"options of splatseed train in {path}",
+            found=repr(unknown),
+            fix=f"{did_you_mean(unknown, _names(options))}Run splatseed train --help to see them.",
+        )
+    return filled
 
 
-def _without_config(words: list[str]) -> tuple[list[str], Path | None]:
-    for i, word in enumerate(words):
-        if word.startswith("--config="):
-            return words[:i] + words[i + 1 :], Path(word.partition("=")[2])
-        if word == "--config":
-            if i + 1 == len(words):
-                raise ParameterError("a file after --config", found="none", fix="Name a .toml.")
-            return words[:i] + words[i + 2 :], Path(words[i + 1])
-    return words, None
+def _is_note(key: str, value: object) -> bool:
+    return key in _NOTES or value is None or (key == "seeds" and isinstance(value, dict))
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _filled(options: Options, given: dict[str, Any], path: Path) -> Options:
+    """The options with the values given for them, which are taken out."""
+    changes: dict[str, Any] = {}
+    for name, hint in get_type_hints(type(options)).items():
+        if dataclasses.is_dataclass(hint):
+            changes[name] = _filled(getattr(options, name), given, path)
+        elif name in given:
+            changes[name] = _checked(name, given.pop(name), hint, path)
+    return dataclasses.replace(options, **changes)  # type: ignore[type-var]  # it is a dataclass
+
+
+def _names(options: Any) -> list[str]:
+    inner = [getattr(options, each.name) for each in dataclasses.fields(options)]
+    nested = [name for each in inner if dataclasses.is_dataclass(each) for name in _names(each)]
+    return [*nested, *(each.name for each in dataclasses.fields(options))]
+
+
+def _checked(name: str, value: object, hint: Any, path: Path) -> Any:
+    """A value, if it is of the kind that an option's type hint names."""
+    kinds = [hint] if get_origin(hint) is Literal else get_args(hint) or [hint]
+    for kind in kinds:
+        if get_origin(kind) is Literal and value in get_args(kind):
+            return value
+        if kind is Path and isinstance(value, str):
+            return Path(value)
+        if type(value) is kind:  # True is no number
+            return value
+    raise SceneFormatError(
+        f"a value for {name} in {path} that the option takes", found=repr(value)[:80], fix=_FIX
+    )
+
+
+def _read(path: Path) -> Mapping[str, Any]:
     try:
         text = read_text(path)
         content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
@@ -80,40 +102,5 @@ def _unreadable(path: Path, found: str) -> SceneFormatError:
     return SceneFormatError(
         f"{path} to hold options of splatseed train, as TOML or a run's config.json",
         found=found[:160],
-        fix="Write lines such as max_steps = 7000.",
+        fix=_FIX,
     )
-
-
-def _unknown(path: Path, key: str, known: Sequence[str]) -> SceneFormatError:
-    options = {each.removeprefix("--").replace("-", "_") for each in known if len(each) > 2}
-    return SceneFormatError(
-        f"options of splatseed train in {path}",
-        found=repr(key),
-        fix=f"{did_you_mean(key, options)}Run splatseed train --help to see them.",
-    )
-
-
-def _words(path: Path, name: str, value: Any) -> list[str]:
-    if isinstance(value, bool):
-        return [f"--{name}" if value else f"--no-{name}"]
-    if isinstance(value, str | int | float):
-        return [f"--{name}", str(value)]
-    raise SceneFormatError(
-        f"{name.replace('-', '_')} in {path} to be a number, a text or true or false",
-        found=type(value).__name__,
-        fix="Write lines such as max_steps = 7000.",
-    )
-
-
-def _has_scene(words: Sequence[str], known: Sequence[str]) -> bool:
-    """Whether some word is neither an option nor an option's value."""
-    value_follows = False
-    for word in words:
-        if value_follows:
-            value_follows = False
-        elif not word.startswith("-"):
-            return True
-        else:
-            switch = f"--no-{word.removeprefix('--')}" in known or word.startswith("--no-")
-            value_follows = "=" not in word and not switch
-    return False

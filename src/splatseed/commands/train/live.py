@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatseed.console import OUT
+from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.requirements import require
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for i
     from splatseed.view.server import TrainingViewer
 
 HOST = "127.0.0.1"
+PORT = 8080
 
 
 @dataclass(frozen=True)
@@ -43,17 +45,19 @@ class Watch:
         return both
 
 
-def view_port(port: int) -> int:
-    """The port to serve on, checked to be free before any work is done.
+def view_port() -> int:
+    """The port to serve on: the usual one if it is free.
 
     Raises:
         MissingDependencyError: viser is absent.
-        ParameterError: The port is taken.
     """
     require("viser")
     from splatseed.view.server import free_port  # noqa: PLC0415  (imports PyTorch)
 
-    return free_port(HOST, port, "--view-port", "address")
+    try:
+        return free_port(HOST, PORT)
+    except ParameterError:
+        return free_port(HOST, 0)
 
 
 @contextmanager

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Sequence
-from contextlib import suppress
+from argparse import ArgumentParser
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
 import numpy as np
 import tyro
 
-from splatseed.commands.info.advice import ADVICE_OPTIONS, run_advice
-from splatseed.commands.options import known_options, parse_options
+from splatseed.commands.options import parse_options
 from splatseed.commands.upsample.checks import check_options
 from splatseed.commands.upsample.cloud import CLOUD, Bringing, bring_clouds, settle_cloud
-from splatseed.commands.upsample.flags import (
-    budget_flag,
-    cover_flag,
-    default_flag,
-    depth_folder_flag,
-    memory_flag,
-    number_flag,
-    output_flag,
-)
 from splatseed.commands.upsample.output import (
     PICTURES,
     summarise,
-    write_methods_preview,
     write_previews,
 )
 from splatseed.commands.upsample.plan_line import (
@@ -73,10 +62,6 @@ from splatseed.upsample import (
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.method import Cloud, GivenClouds
 
-HELP_ALL = "--help-all"
-OUTPUT = Path("OUT")
-"""Stands for an output where the help is shown."""
-
 
 @dataclass(frozen=True)
 class Options:
@@ -85,73 +70,65 @@ class Options:
     scene: Annotated[Path, tyro.conf.Positional]
     """A COLMAP folder, one with transforms.json, an RGB-D capture, or a cloud (.ply, .las, .laz,
     .e57, .xyz ...)."""
-    output: Annotated[Path, output_flag()]
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The scene folder to write."""
     method: str = DEFAULT_METHOD
-    """The method that makes new points; --method NAME --help shows its flags."""
-    ratio: Annotated[float | None, number_flag(float, "4, unless --num-points is given")] = None
-    """Points in all over originals, for methods that interpolate."""
-    num_points: Annotated[int | None, number_flag(int, "by the ratio")] = None
+    """The method that makes new points; --method NAME --help shows its own options."""
+    ratio: float | None = None
+    """Points in all over originals, for methods that interpolate: 4, unless --num-points says how
+    many."""
+    num_points: int | None = None
     """Points in all, not a ratio."""
-    budget: Annotated[str | None, budget_flag()] = None
+    budget: Annotated[str | None, tyro.conf.arg(metavar="N|Xrho")] = None
     """Most points in all: a number, or 0.25rho for a quarter of a full photograph's pixels."""
-    cover_cell: Annotated[int | None, cover_flag()] = None
-    """Side in pixels of the parts of the photographs that get a seed if no point falls in."""
+    cover_cell: Annotated[int | None, tyro.conf.arg(name="cover")] = None
+    """Side in pixels of the parts of the photographs that get a seed if no point falls in; auto and
+    cover have --auto.cell and --cover.cell instead."""
     verify: bool = False
     """Slide interpolated points to where the photographs agree, and drop those that fit none."""
     seed: int = 0
     """The same seed gives the same bytes."""
     profile: Profile = "default"
-    """Defaults of the methods' flags: improved ones, or those of the paper's text."""
-    depth_maps: Annotated[Path | None, depth_folder_flag()] = None
-    """For --method depth: a folder of maps, as docs/formats.md lists them."""
-    depth_kind: Annotated[
-        DepthKind | None, default_flag("what the folder says, else z", "{z,ray,inverse}")
-    ] = None
-    """What their values are: planar depth, distance along the ray, or inverse depth."""
-    depth_scale: Annotated[float | None, number_flag(float, "what the folder says")] = None
-    """Stored units per unit of depth: 1000 for millimetres in a scene in metres."""
-    refine_poses: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Defaults of the methods' options: improved ones, or those of the paper's text."""
+    depth_maps: Annotated[Path | None, tyro.conf.arg(name="depth", metavar="DIR")] = None
+    """For --method depth: a folder of maps, as docs/formats.md lists them; by default the
+    scene's own."""
+    depth_kind: DepthKind | None = None
+    """What their values are: planar depth, distance along the ray, or inverse depth; by default
+    what the folder says, else z."""
+    depth_scale: float | None = None
+    """Stored units per unit of depth: 1000 for millimetres in a scene in metres; by default what
+    the folder says."""
+    refine_poses: bool = False
     """Refine poses of a phone or SLAM first, and triangulate points; they replace the scene's."""
-    ignore_depth: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Without points: compare photographs without looking at the depth maps of an RGB-D capture."""
-    no_align: tyro.conf.FlagCreatePairsOff[bool] = False
-    """For --method depth: take metric depth and poses as given (--depth.no-align)."""
     cloud_files: Annotated[
         tyro.conf.UseAppendAction[tuple[Path, ...]],
         tyro.conf.arg(name="cloud", metavar="FILE", help_behavior_hint="(repeatable)"),
     ] = ()
     """Seeds from a scan or dense cloud (docs/scans.md), alone or beside
     auto, stereo, cover or depth."""
-    cloud_transform: Annotated[
-        Path | None,
-        tyro.conf.arg(name="transform", constructor=Path, help_behavior_hint="(default: none)"),
-    ] = None
+    cloud_transform: Annotated[Path | None, tyro.conf.arg(name="transform")] = None
     """For --cloud: a 4x4 matrix from its frame to the scene's, as text or JSON, or nerfstudio's
     dataparser_transforms.json."""
-    align: tyro.conf.FlagCreatePairsOff[bool] = False
+    align: bool = False
     """For --cloud: find that matrix, by the scene's own points."""
     recenter: bool = False
     """Write scene and cloud around 0, with the offset in recenter.json: for national grids."""
-    memory: Annotated[str | None, memory_flag()] = None
-    """Most memory: larger clouds are upsampled in tiles on disk; --cloud merges more points."""
-    jobs: Annotated[int | None, number_flag(int, "as many as cores and memory allow")] = None
-    """Tiles at a time, each in a process of its own."""
+    memory: Annotated[str | None, tyro.conf.arg(metavar="BYTES|4G")] = None
+    """Most memory, by default what is free: larger clouds are upsampled in tiles on disk; --cloud
+    merges more points (in at most 4G by default)."""
+    jobs: int | None = None
+    """Tiles at a time, each in a process of its own; by default as many as cores and memory
+    allow."""
     executor: Literal["local", "ray"] = "local"
-    """Who works on tiles: this machine, or a Ray cluster that shares its disk."""
-    address: Annotated[str | None, default_flag("a cluster on this machine", "HOST:PORT|auto")] = (
-        None
-    )
-    """The cluster's address, or auto on one of its nodes."""
-    tile_points: Annotated[int | None, number_flag(int, "by the memory")] = None
-    """Most points in a tile."""
+    """Where tiles run: on this machine, or on a Ray cluster that shares its disk."""
+    address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto")] = None
+    """The cluster's address, or auto on one of its nodes; by default a cluster on this machine."""
+    tile_points: int | None = None
+    """Most points in a tile; by default what the memory allows."""
     preview: bool = False
     """Also write pictures: before and after, origins, cells covered, the method's stereo maps."""
-    preview_methods: bool = False
-    """Also run every other method that fits the scene, and write a picture of all side by side."""
-    gaussians: Annotated[
-        Path | None, tyro.conf.arg(constructor=Path, help_behavior_hint="(default: none)")
-    ] = None
+    gaussians: Path | None = None
     """Also write the initial Gaussians as a 3DGS .ply, for trainers that start from one."""
     format: Literal["auto", "colmap", "transforms"] = "auto"
     """Layout to write: auto is the input's."""
@@ -180,56 +157,36 @@ class Options:
 
 def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
     """The options, and every method with its parameters, from the words of the command line."""
-    if {"-h", "--help"} & set(arguments):
-        _help(arguments)
-    arguments = ["--help" if word == HELP_ALL else word for word in arguments]
-    options = _parse_with({name: configure(name) for name in METHODS}, arguments)
-    if options.profile == "paper":
-        # The profile sets the defaults of other flags, so it is parsed first.
-        options = _parse_with({name: configure(name, "paper") for name in METHODS}, arguments)
-    methods = {name: getattr(options, name) for name in METHODS}
-    if options.no_align:
-        methods["depth"] = dataclasses.replace(methods["depth"], align=False)
-    return settle_cloud(options, arguments), methods
+    profile = _profile_of(arguments)
+    names: Collection[str] = METHODS
+    if {"-h", "--help"} & set(arguments):  # all methods' options would be too much to read
+        names = [name for name in METHODS if {name, f"--method={name}"} & set(arguments)]
+    methods = {name: configure(name, profile) for name in names}
+    options: Any = parse_options(_with_methods(methods), "upsample", arguments)
+    return settle_cloud(options, arguments), {name: getattr(options, name) for name in METHODS}
 
 
-def _help(arguments: list[str]) -> None:
-    """Show the common options, those of the named method, and how to see all."""
-    named = [name for name in METHODS if name in arguments or f"--method={name}" in arguments]
-    with suppress(SystemExit):
-        _parse_with({name: configure(name) for name in named}, ["--help"])
-    OUT.print(
-        f"\nsplatseed upsample {HELP_ALL} shows the flags of all methods,"
-        " --method mls --help those of one method.",
-        soft_wrap=True,
-    )
-    raise SystemExit(0)
+def _profile_of(arguments: Sequence[str]) -> Profile:
+    """The profile, which sets the defaults of the methods' options; parsed before all others."""
+    parser = ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--profile")
+    named = parser.parse_known_args(arguments)[0].profile
+    return named if named in get_args(Profile) else "default"
 
 
-def _parse_with(methods: dict[str, Upsampler], arguments: list[str]) -> Any:
-    """The options, with those of the methods given."""
-    kind = _with_methods(methods, "--help" in arguments)
-    own = [name for name in METHODS if any(word.startswith(f"--{name}.") for word in arguments)]
-    page = f"upsample --method {own[0]}" if own else "upsample"
-    return parse_options(kind, "upsample", arguments, page=page)
-
-
-def full_options() -> type[Any]:
+def full_options() -> type[Options]:
     """The options with those of every method."""
     return _with_methods({name: configure(name) for name in METHODS})
 
 
-def _with_methods(methods: dict[str, Upsampler], asked_for_help: bool = False) -> type[Any]:
+def _with_methods(methods: Mapping[str, Upsampler]) -> type[Options]:
     """The options with one more field per method, whose default is the method given."""
-    names = tuple(METHODS)
     fields: list[Any] = [
         (name, type(method), dataclasses.field(default=method)) for name, method in methods.items()
     ]
-    if asked_for_help:  # with a default, -o is not called required, which it is not alone
-        fields.append(("output", Annotated[Path, output_flag()], dataclasses.field(default=OUTPUT)))
     full = dataclasses.make_dataclass(
         "UpsampleOptions",
-        [("method", Literal[names], dataclasses.field(default=DEFAULT_METHOD)), *fields],
+        [("method", Literal[tuple(METHODS)], dataclasses.field(default=DEFAULT_METHOD)), *fields],
         bases=(Options,),
         frozen=True,
     )
@@ -239,16 +196,6 @@ def _with_methods(methods: dict[str, Upsampler], asked_for_help: bool = False) -
 
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
-    if not arguments:
-        raise ParameterError(
-            "a scene",
-            found="none",
-            fix="splatseed upsample SCENE says whether it needs seeds; with -o OUT it makes them.",
-        )
-    if asks_what_to_do(arguments):
-        _advise(arguments)
-        return
-    _check_asks_for_points(arguments)
     options, methods = parse(arguments)
     check_options(options)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
@@ -264,19 +211,6 @@ def run(arguments: list[str]) -> None:
         run_tiled(options, methods, source, _provenance)
         return
     _run_in_memory(options, methods)
-
-
-def _check_asks_for_points(arguments: Sequence[str]) -> None:
-    """Refuse an option of the advice, whose words ``--help`` does not list."""
-    named = _named(arguments)
-    if {"-h", "--help", HELP_ALL} & set(named):
-        return
-    if "--max-steps" in {word.partition("=")[0] for word in arguments}:
-        raise ParameterError(
-            "--max-steps without -o and --method, where it asks for advice",
-            found=" and ".join(named),
-            fix="Leave it out: it is an option of splatseed train.",
-        )
 
 
 def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
@@ -322,57 +256,11 @@ def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
             write_previews(
                 scene, seeds, options.method, method, options.seed, options.output, clock
             )
-        if options.preview_methods:
-            write_methods_preview(
-                scene, seeds, total, methods, options.method, options.seed, options.output, clock
-            )
         seconds = clock.seconds()
     files = {"alignment": brought.aligned, "pictures": PICTURES}
     summarise(options.scene, scene, seeds, report, seconds, checks, options.output, files)
     for sentence in notes:
         print_note(sentence)
-
-
-def _advise(arguments: list[str]) -> None:
-    """Say what to do with a scene; options of upsampling need an output."""
-    try:
-        run_advice(arguments)
-    except ParameterError as error:
-        given = [word.partition("=")[0] for word in arguments]
-        known = known_options(full_options())
-        if needing := [word for word in given if word in {*known} - {*ADVICE_OPTIONS}]:
-            raise ParameterError(
-                f"-o OUT, the scene folder to write, with {', '.join(needing)}",
-                found="none",
-                fix="Name it; without it, splatseed upsample SCENE only says what to do.",
-            ) from None
-        unknown = any(
-            word.startswith("--") and word not in {*known, *ADVICE_OPTIONS} for word in given
-        )
-        if unknown and "Did you mean" not in error.fix:
-            parse(_without(ADVICE_OPTIONS, arguments))  # knows more options that may be meant
-        raise
-
-
-def _without(options: Collection[str], arguments: Sequence[str]) -> list[str]:
-    """The words without these options and their values."""
-    values = {i + 1 for i, word in enumerate(arguments) if word in options}
-    return [
-        word
-        for i, word in enumerate(arguments)
-        if i not in values and word.partition("=")[0] not in options
-    ]
-
-
-def asks_what_to_do(arguments: Sequence[str]) -> bool:
-    """Whether neither an output nor a method is named, but a scene."""
-    return bool(arguments) and not _named(arguments)
-
-
-def _named(arguments: Sequence[str]) -> list[str]:
-    """The options with which points are added, or help is printed."""
-    names = ("-o", "--output", "--method", "-h", "--help", HELP_ALL)
-    return [name for word in arguments if (name := word.partition("=")[0]) in names]
 
 
 def _settle(options: Options, scene: Scene, notes: list[str]) -> Options:
@@ -421,9 +309,7 @@ def _check(scene: Scene, seeds: PointCloud, method: Upsampler) -> dict[str, floa
 def _read(options: Options, method: Upsampler) -> Scene:
     """The scene's originals, and its depth maps if their folder is named."""
     scene = load_originals(options.scene, require_points="points" in traits_of(method).needs)
-    if options.ignore_depth:
-        scene = scene.replace(depths=None)
-    elif options.method == "depth" and options.depth_maps is None:
+    if options.method == "depth" and options.depth_maps is None:
         scene = with_own_depths(scene)
     if options.depth_maps is not None:
         maps = find_depths(
@@ -469,8 +355,6 @@ def _announce(
 
 def _idle(options: Options, methods: dict[str, Upsampler]) -> list[str]:
     """Methods whose flags were changed although they are not used."""
-    if options.preview_methods:  # which draws all of them
-        return []
     plain = {name: configure(name, options.profile) for name in methods}
     changed = {name for name in methods if methods[name] != plain[name]}
     if options.depth_maps is not None:

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from splatseed.commands.upsample.trainers import tell_training
 from splatseed.console import StageClock, print_note, print_pairs
-from splatseed.errors import PointCloudError, SceneFormatError
 from splatseed.io import WriteReport
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Image, Scene
 from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views
 from splatseed.seeding.upsampling import CELL
-from splatseed.upsample import Upsampler, chooses_number, methods_for, upsample
+from splatseed.upsample import Upsampler
 from splatseed.upsample.registry import origin_name
 
-PAIR, ALL, ORIGINS, CELLS, MAPS = PICTURES = (
+PAIR, ORIGINS, CELLS, MAPS = PICTURES = (
     "preview.png",
-    "preview_methods.png",
     "preview_origins.png",
     "preview_cells.png",
     "preview_maps.png",
@@ -68,46 +65,6 @@ def write_previews(
         maps = method.maps(scene, shown, seed, clock)
         clock("preview", 0.9)
         preview_maps(scene, maps, folder / MAPS)
-    clock("preview", 1.0)
-
-
-def write_methods_preview(
-    scene: Scene,
-    seeds: PointCloud,
-    total: int | None,
-    methods: Mapping[str, Upsampler],
-    method: str,
-    seed: int,
-    folder: Path,
-    clock: StageClock,
-) -> None:
-    """Run the scene's other methods too, and draw all of them side by side.
-
-    Args:
-        scene: The scene, with the originals that were used.
-        seeds: The points that were written.
-        total: Points in all, for methods that take a number; None for their default.
-        methods: All methods, with their parameters.
-        method: The one that made ``seeds``.
-        seed: The seed that was used.
-        folder: Where the picture goes.
-        clock: Told the stages.
-    """
-    from splatseed.view.clouds import preview_methods  # noqa: PLC0415  (Pillow)
-
-    clouds = {}
-    for name in dict.fromkeys((*methods_for(scene), method)):
-        if name == method:
-            clouds[name] = seeds
-            continue
-        number = None if chooses_number(methods[name]) else total
-        # Too few points for a method, or depth that does not fit: show the others.
-        with suppress(PointCloudError, SceneFormatError):
-            clouds[name] = upsample(
-                scene, methods[name], num_points=number, seed=seed, progress=clock
-            )
-    clock("preview", 0.0)
-    preview_methods(scene, clouds, folder / ALL)
     clock("preview", 1.0)
 
 

@@ -54,7 +54,6 @@ WHOLE = (
     "verify",
     "refine_poses",
     "preview",
-    "preview_methods",
     "gaussians",
     "depth_maps",
     "cloud_files",
