@@ -17,7 +17,7 @@ import pytest
 
 import splatseed
 from splatseed.bench.planning.plan_file import read_plan
-from splatseed.commands.train.config import with_config
+from splatseed.commands.train import parse
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import files, load_originals, load_scene, write_scene
 from splatseed.io.colmap import binary as colmap_binary
@@ -71,7 +71,7 @@ def test_notes_beside_a_scene_are_not_read_without_end(kind, odd, scene_dir):
     (scene_dir / "splatseed.json").symlink_to(odd / kind)
     assert load_originals(scene_dir).points.num_original == len(load_scene(scene_dir).points)
     assert read_manifest(scene_dir) == {}
-    for read in (read_plan, lambda path: with_config(["--config", str(path)], [])):
+    for read in (read_plan, lambda path: parse(["--config", str(path)])):
         with pytest.raises(SceneFormatError, match=r"a pipe|a device"):
             read(odd / kind)
 

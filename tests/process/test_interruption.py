@@ -10,9 +10,8 @@ from types import SimpleNamespace
 import pytest
 
 from splatseed.cli import VERBS, main
-from splatseed.commands import view
+from splatseed.commands import train, view
 from splatseed.commands.bench import machine
-from splatseed.commands.train import command as train
 from splatseed.process.interruption import Interruption, exit_code, interruption
 
 

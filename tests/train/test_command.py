@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from splatseed import requirements
-from splatseed.commands.train import Options
-from splatseed.commands.train.command import _next_commands
+from splatseed.commands.train import Options, _next_commands
 from splatseed.errors import MissingDependencyError
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud

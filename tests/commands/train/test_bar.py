@@ -7,7 +7,7 @@ from io import StringIO
 import pytest
 from rich.progress import Progress
 
-from splatseed.commands.train.command import bar_columns
+from splatseed.commands.train import bar_columns
 from splatseed.console import LiteralConsole
 
 LINE = "PSNR 27.31, test 26.05 dB  1,234,567 Gaussians  12.3 steps/s  loss 0.0412"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from splatseed.commands.train.command import parse
+from splatseed.commands.train import parse
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 
 

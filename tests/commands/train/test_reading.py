@@ -14,7 +14,6 @@ from splatseed.sfm.report import Refinement, SfmReport
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
 
-from splatseed.commands.train import live
 from splatseed.view.models import open_shown
 
 SHORT = ("--max-steps", "3", "--data-factor", "2")
@@ -171,7 +170,6 @@ def test_those_who_watch_see_the_refined_cameras(
             pass
 
     monkeypatch.setattr("splatseed.view.server.TrainingViewer", Viewer)
-    monkeypatch.setattr(live, "view_port", lambda: 0)
     words = (*SHORT, "--refine-poses", "--view", "-o", tmp_path / "run")
     assert splatseed("train", bare, *words).code == 0
     assert _poses(watched[0]) == _poses(load_scene(room))

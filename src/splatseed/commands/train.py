@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
+import tomllib
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import tyro
 from rich.progress import (
@@ -23,8 +34,6 @@ from rich.progress import (
 from rich.table import Column
 
 from splatseed.commands.options import parse_options
-from splatseed.commands.train.config import with_config
-from splatseed.commands.train.live import view_port, watched
 from splatseed.console import (
     ERR,
     OUT,
@@ -34,9 +43,10 @@ from splatseed.console import (
     print_pairs,
     stage_display,
 )
-from splatseed.errors import ParameterError
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.literal import quoted, visible
+from splatseed.io.files import read_text
+from splatseed.literal import did_you_mean, quoted, visible
 from splatseed.process.interruption import exit_code
 from splatseed.requirements import require
 from splatseed.scene import Scene
@@ -57,11 +67,18 @@ from splatseed.views.view import poses_of, user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
     from splatseed.train.run import TrainingRun
+    from splatseed.view.server import TrainingViewer
+
+Settings = TypeVar("Settings")
 
 BAR_WIDTH = 12
 DEFAULT = TrainSettings()
 BEST: StrategyName = "auto"
 """The default strategy."""
+HOST, PORT = "127.0.0.1", 8080
+"""Where browsers watch, if the port is free."""
+RUN_NOTES = {"splatseed", "points", "device", "versions"}
+"""What config.json records besides options."""
 BEST_SETTINGS = replace(DEFAULT, strategy=BEST)
 
 
@@ -110,14 +127,78 @@ class Options:
 
 
 def parse(arguments: list[str]) -> Options:
-    """The options; those on the command line replace those of a file."""
+    """The options; those on the command line replace those of a file that --config names.
+
+    Raises:
+        SceneNotFoundError: There is no such file.
+        SceneFormatError: It cannot be read, or a key or a value is not an option's.
+    """
     parser = ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--config", type=Path)
     path = parser.parse_known_args(arguments)[0].config
     default = None
     if path is not None:
-        default = with_config(Options(scene=tyro.MISSING, output=tyro.MISSING), path)
+        given = _read_config(path)
+        default = _filled(Options(scene=tyro.MISSING, output=tyro.MISSING), given, path)
+        for unknown in given:
+            raise SceneFormatError(
+                f"options of splatseed train in {path}",
+                found=repr(unknown),
+                fix=f"{did_you_mean(unknown, _names(Options))}Run splatseed train --help.",
+            )
     return parse_options(Options, "train", arguments, default)
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    """The options in a .toml or in a run's config.json, without what a run notes besides."""
+    try:
+        text = read_text(path)
+        content = json.loads(text) if path.suffix.lower() == ".json" else tomllib.loads(text)
+        if not isinstance(content, dict):
+            raise TypeError(f"a {type(content).__name__}")  # noqa: TRY301  (told as the others)
+    except FileNotFoundError:
+        raise SceneNotFoundError(f"a file {path}", found="none", fix="Check the path.") from None
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise SceneFormatError(
+            f"{path} to hold options of splatseed train, as TOML or a run's config.json",
+            found=" ".join(str(error).split())[:160],
+            fix="Write lines such as max_steps = 7000.",
+        ) from None
+    if isinstance(content.get("seeds"), dict):  # a run's: what its seeds were
+        content["seeds"] = content.pop("seeding", None)
+    return {k: v for k, v in content.items() if k not in RUN_NOTES and v is not None}
+
+
+def _filled(options: Settings, given: dict[str, Any], path: Path) -> Settings:
+    """A dataclass with the values given for its fields and for theirs, which are taken out."""
+    changes: dict[str, Any] = {}
+    for name, hint in get_type_hints(type(options)).items():
+        if is_dataclass(hint):
+            changes[name] = _filled(getattr(options, name), given, path)
+        elif name in given:
+            changes[name] = _checked(name, given.pop(name), hint, path)
+    return replace(options, **changes)  # type: ignore[type-var]  # it is a dataclass
+
+
+def _names(kind: type[Any]) -> list[str]:
+    """The fields of a dataclass and of those among them that are dataclasses."""
+    hints = get_type_hints(kind)
+    inner = [each for each in hints.values() if isinstance(each, type) and is_dataclass(each)]
+    return [*hints, *(name for each in inner for name in _names(each))]
+
+
+def _checked(name: str, value: object, hint: Any, path: Path) -> Any:
+    """A value, if it is of a kind that the type hint names."""
+    for kind in [hint] if get_origin(hint) is Literal else get_args(hint) or [hint]:
+        if kind is Path and isinstance(value, str):
+            return Path(value)
+        if value in get_args(kind) if get_origin(kind) is Literal else type(value) is kind:
+            return value
+    raise SceneFormatError(
+        f"a value for {name} in {path} that the option takes",
+        found=repr(value)[:80],
+        fix="Run splatseed train --help.",
+    )
 
 
 def run(arguments: list[str]) -> None:
@@ -125,16 +206,23 @@ def run(arguments: list[str]) -> None:
     options = parse(arguments)
     settings = options.settings
     require("torch", "gsplat")
-    port = view_port() if options.view else None
+    if options.view:
+        require("viser")
     notes: list[str] = []
     if options.resume and not RunFolder(options.output).is_run:
         notes.append(f"There is no run to resume in {options.output}: a new one begins.")
     with stage_display() as clock:
         training = _prepare(options, settings, notes.append, clock)
     _announce(options, training, notes)
-    with watched(training, options.scene, port) as watch, _training_bar(training) as show:
-        done = training.train(watch.also(show))
-    if not done and not watch.kept:
+    with _watched(options, training) as viewer, _training_bar(training) as show:
+
+        def on_step(step: int) -> None:
+            show(step)
+            if viewer is not None:
+                viewer.on_step(step)
+
+        done = training.train(on_step)
+    if not done and not (viewer and viewer.kept):
         _say_how_to_go_on(options, training)
         sys.exit(exit_code())
     with stage_display(clock):
@@ -228,6 +316,30 @@ def _strategy(settings: TrainSettings) -> str:
     if settings.strategy == BEST:
         return f"strategy {settings.densification} ({BEST})"
     return f"strategy {settings.strategy}"
+
+
+@contextmanager
+def _watched(options: Options, training: TrainingRun) -> Iterator[TrainingViewer | None]:
+    """Serve the run to browsers while the block runs, if that is asked for."""
+    if not options.view:
+        yield None
+        return
+    from splatseed.view.server import TrainingViewer, free_port  # noqa: PLC0415  (imports PyTorch)
+
+    posed = training.folder.scene  # there is one if poses were refined
+    scene = load_scene(posed if posed.is_dir() else options.scene, require_points=False)
+    try:
+        port = free_port(HOST, PORT)
+    except ParameterError:  # it is taken
+        port = free_port(HOST, 0)
+    name = options.scene.name or str(options.scene)
+    viewer = TrainingViewer(training, scene, name, HOST, port)
+    OUT.print(f"  -> watch it at http://localhost:{port}")
+    OUT.file.flush()
+    try:
+        yield viewer
+    finally:
+        viewer.close()
 
 
 @contextmanager
