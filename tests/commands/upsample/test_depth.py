@@ -111,6 +111,16 @@ def test_seeds_without_originals_are_never_taken_for_originals(without_points, t
         assert not words[-1].exists()
 
 
+@pytest.mark.parametrize(
+    "words",
+    [("--depth-scale", 5, "--depth.no-align"), ("--depth-kind", "inverse"), ("--ratio", 3000)],
+)
+def test_maps_that_do_not_fit_are_refused(words, room, tmp_path, splatseed):
+    run = upsample(splatseed, room, tmp_path / "out", "--depth", room, *words)
+    assert (run.code, run.err.count("\n")) == (2, 1)
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_output_may_not_lie_in_the_maps(own_room, splatseed):
     run = upsample(splatseed, own_room, own_room / "depths/out", "--depth", own_room / "depths")
     assert run.code == 2
