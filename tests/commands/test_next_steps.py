@@ -82,15 +82,12 @@ def follow(out: str, splatseed) -> list[str]:
     [
         ("room", ["upsample", "train", "tune"]),
         ("bent", ["undistort", "upsample", "train", "tune"]),
-        ("capture", ["undistort", "upsample", "train", "sfm"]),  # tune needs points
     ],
 )
 def test_what_info_advises_works(kind, verbs, request, tmp_path, monkeypatch, splatseed):
     pytest.importorskip("torch", reason="trains")
     pytest.importorskip("pycolmap", reason="undistorts")
     scene = shutil.copytree(request.getfixturevalue(kind), tmp_path / "my scene", symlinks=True)
-    if kind == "capture":  # by its folder's name the reader knows the camera
-        scene = scene.rename(tmp_path / "rgbd_dataset_freiburg1_room")
     monkeypatch.chdir(tmp_path)
     run = splatseed("info", scene)
     assert run.code == 0, run.err

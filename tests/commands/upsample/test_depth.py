@@ -69,7 +69,7 @@ def test_a_capture_has_its_own_maps_and_needs_no_points(without_points, tmp_path
     assert surfaces.distance(scene.points.xyz.astype(np.float64)).max() < 0.001
     assert "made 700 of its points and kept 0." in splatseed("info", out).out
     for words, says in (
-        (["--depth.no-align"], "--num-points of 1 or more"),
+        (["--depth.no-align"], "num_points of 1 or more"),
         (["--num-points", 9], "--poses-from"),
     ):
         run = upsample(splatseed, without_points, tmp_path / "other", *words)

@@ -18,7 +18,14 @@ from splatseed.commands.info.as_json import print_json
 from splatseed.commands.info.poses import Poses, look_at_poses
 from splatseed.commands.options import parse_options
 from splatseed.commands.planned import Planned
-from splatseed.console import OUT, StageClock, print_commands, print_pairs, stage_display
+from splatseed.console import (
+    OUT,
+    StageClock,
+    print_commands,
+    print_note,
+    print_pairs,
+    stage_display,
+)
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError
 from splatseed.io import find_depths, load_scene
@@ -37,6 +44,7 @@ from splatseed.seeding.diagnostics import (
     find_problems,
     is_distorted,
     track_statistics,
+    untrainable,
 )
 from splatseed.train.schedule import FULL_RUN
 
@@ -109,6 +117,8 @@ def run(arguments: list[str]) -> None:
     if options.picture is not None:
         print_pairs("picture", [("of depth", str(options.picture))])
     if len(scene.points) or scene.images:
+        if missing := untrainable(scene):
+            print_note(missing)
         print_commands("next", _next_commands(options, usable, known, poses))
 
 
