@@ -81,7 +81,7 @@ READ_WHOLE = {
     "bench/running/environment.py",  # the system's own files
     "bench/report/html.py", "bench/analysis/paper.py", "kernels/sources.py",  # the package's own
     "sfm/worker.py", "sfm/orientation.py", "bench/running/child.py", "bench/report/clouds.py",
-    "bench/running/ray_cluster.py", "commands/demo/command.py",  # written by this very command
+    "bench/running/ray_cluster.py",  # written by this very command
     "io/rgbd.py",  # after is_file
 }  # fmt: skip
 

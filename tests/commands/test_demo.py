@@ -1,0 +1,132 @@
+"""``splatseed demo`` goes the whole way, and says what its numbers do not show."""
+
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image as PilImage
+
+from splatseed.commands import demo
+from splatseed.errors import MissingDependencyError
+from splatseed.io import load_scene
+from splatseed.kernels.compilation import tell
+from splatseed.scores import CurvePoint, TrainingResult
+from splatseed.upsample import METHODS
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(demo, "RATIO", 2.0)
+
+
+@pytest.mark.slow
+def test_the_demo_leaves_a_scene_scores_pictures_and_runs(tmp_path, splatseed):
+    pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
+    out = tmp_path / "demo"
+    run = splatseed("demo", "--views", 6, "--train-steps", 44, "-o", out)
+    assert run.code == 0, run
+    for name in ("preview.png", "preview_methods.png", "preview_errors.png", "preview_trained.png"):
+        assert str(out / name) in run.out
+        with PilImage.open(out / name) as picture:
+            assert np.ptp(np.asarray(picture.convert("RGB")), axis=2).max() > 50
+    with (out / "geometry.csv").open(newline="", encoding="utf-8") as file:
+        scores = {row.pop("method"): row for row in csv.DictReader(file)}
+    assert set(scores) == {"originals", *METHODS} - {"cloud"}  # which needs a scan
+    # What any upsampling is for, and what strewing points at random does not give.
+    assert float(scores["mls"]["coverage_h"]) < float(scores["originals"]["coverage_h"])
+    assert float(scores["mls"]["error_h"]) < float(scores["random"]["error_h"])
+    assert pycolmap.Reconstruction(out / "scene/sparse/0").num_images() == 6
+    before, after = load_scene(out / "scene"), load_scene(out / "scene_auto")
+    assert len(after.points) > 2 * len(before.points)
+    assert not before.warnings
+    assert after.points.num_original == len(before.points)
+    metrics = {}
+    for name in ("random", "poses_auto", "sfm", "auto"):
+        metrics[name] = json.loads((out / f"run_{name}/metrics.json").read_text())
+        config = json.loads((out / f"run_{name}/config.json").read_text())
+        assert (metrics[name]["steps"], config["strategy"]) == (44, "default")
+        assert config["cap_max"] == len(after.points)
+        assert f"{metrics[name]['psnr']:.2f}" in run.out
+    assert metrics["auto"]["num_gaussians"] == len(after.points)
+    alone = load_scene(out / "scene_poses_auto").points
+    assert not alone.num_original  # no point of the scene was known
+    assert len(load_scene(out / "scene_random").points) == 100_000
+    # What the demo says to run next works: its runs know their scenes by where they lie now.
+    again = splatseed("evaluate", out / "run_auto")
+    assert again.code == 0, again
+    assert f"{metrics['auto']['psnr']:.2f}" in again.out
+    refused = splatseed("demo", "--views", 6, "-o", out)
+    assert (refused.code, "--overwrite" in refused.err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    "words", [["--views", 2], ["--train-steps", -1], ["--training", "only"]], ids=str
+)
+def test_a_demo_that_cannot_be_leaves_nothing(words, tmp_path, splatseed):
+    run = splatseed("demo", "-o", tmp_path / "demo", *words)
+    assert (run.code, run.err.count("\n")) == (2, 1)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("seconds", "psnr"), [(2.4, None), (2.5, 20.0), (9.9, 22.0)])
+def test_psnr_after_some_seconds_counts_those_of_the_seeds(seconds, psnr):
+    tests = ((10, 0.5, 20.0), (20, 1.0, 22.0), (30, 1.5, 25.0))  # the last is of the mean
+    curve = tuple(CurvePoint(*test, 100) for test in tests)
+    result = TrainingResult(None, curve, steps=30, train_seconds=1.5, num_seeds=100)
+    each = demo._Trained(demo._Arm("auto", None, None, seconds=2.0), result, ())
+    assert each.psnr_after(seconds) == psnr
+    assert each.seconds == 3.5
+
+
+def test_without_pytorch_the_demo_says_what_to_install(splatseed, tmp_path, monkeypatch):
+    def absent(*_):
+        raise MissingDependencyError("the packages", found="no torch", fix="Install them.")
+
+    monkeypatch.setattr(demo, "require", absent)
+    monkeypatch.setattr(demo, "methods_for", lambda _: ("auto", "linear"))
+    run = splatseed("demo", "--views", 4, "-o", tmp_path / "demo")
+    assert run.code == 0, run
+    assert "not trained: no torch installed" in run.out
+    assert "splatseed evaluate" not in run.out
+    assert not (tmp_path / "demo" / "run_sfm").exists()
+    assert (tmp_path / "demo" / "geometry.csv").is_file()
+
+
+def test_what_compiles_ahead_starts_with_the_first_compilation_and_ends(monkeypatch):
+    children = []
+
+    class Child(demo.Child):
+        def __init__(self, **options):
+            super().__init__(**options)
+            children.append(self)
+
+    monkeypatch.setattr(demo, "Child", Child)
+    with demo.compiled_ahead([]) as finish:
+        assert not children
+        for begins in (True, False, True):
+            tell(begins)
+        (child,) = children
+        finish()  # a small capture is made, and nothing else
+        assert child.process.poll() is None
+    assert child.process.poll() is not None
+
+
+def test_what_compiles_ahead_is_a_small_demo(tmp_path, monkeypatch):
+    """A failure there would go unseen: the demo would compile by itself, and be slow."""
+    pytest.importorskip("gsplat", reason="training needs PyTorch and gsplat's strategies")
+    real, failed = demo._compile, []
+
+    def compile_part(part, scene, folder):
+        try:
+            real(part, scene, folder)
+        except Exception as error:
+            failed.append(error)
+            raise
+
+    monkeypatch.setattr(demo, "_compile", compile_part)
+    demo.compile_ahead(demo.AHEAD)
+    assert not failed
