@@ -120,22 +120,6 @@ def test_depth_at_pixel_centres_is_read_back(factor, capture, maps, workspaces):
         np.testing.assert_allclose(stored.values[both], truth.depth[both], rtol=0.2)
 
 
-def test_both_passes_graphs_and_lists_are_there(room, maps, workspaces):
-    stereo = workspaces[4] / "stereo"
-    names = [image.name for image in room.images]
-    for name in names:
-        for folder in ("depth_maps", "normal_maps", "consistency_graphs"):
-            first, second = (
-                (stereo / folder / f"{name}.{kind}.bin").read_bytes()
-                for kind in ("photometric", "geometric")
-            )
-            assert first == second
-    assert (stereo / "fusion.cfg").read_text().splitlines() == names
-    lines = (stereo / "patch-match.cfg").read_text().splitlines()
-    assert lines[::2] == names
-    assert lines[1] == ", ".join(maps[4][0].sources)
-
-
 def test_graphs_name_images_by_their_place_in_the_model(maps, workspaces):
     truth = maps[4][2]
     scene = load_scene(workspaces[4])
@@ -215,14 +199,6 @@ def test_cameras_are_those_of_reduced_photographs(capture, maps, tmp_path):
     xyz, _ = _fused_points(tmp_path / "w", small.images[0])
     assert np.median(np.abs(capture.surfaces.distance(xyz))) < ON_SURFACE
     assert (tmp_path / "w/stereo/fusion.cfg").read_text().count("\n") == 2
-
-
-def test_points_that_were_added_are_left_out(maps, room, tmp_path):
-    more = room.points.concatenate(room.points, room.points.select(slice(0, 50)))
-    write_dense_workspace(room.replace(points=more, tracks=room.tracks), maps[4], tmp_path / "w")
-    again = load_scene(tmp_path / "w")
-    np.testing.assert_array_equal(again.points.xyz, room.points.xyz)
-    np.testing.assert_array_equal(again.tracks.offsets, room.tracks.offsets)
 
 
 def test_a_plain_folder_and_the_rest_beside_it(maps, room, tmp_path):
@@ -317,13 +293,6 @@ def test_a_depth_map_byte_by_byte(tmp_path):
     assert data == b"3&2&1&" + struct.pack("<6f", 1.5, 0, 2, 0.25, 3, 0)
     read = read_stored(tmp_path / "sub" / "a.bin").values
     np.testing.assert_array_equal(read, np.nan_to_num(values))
-
-
-def test_a_normal_map_keeps_its_channels_apart(tmp_path):
-    values = np.array([[[1, 2, 3], [4, 5, 6]]], np.float32)
-    write_map(tmp_path / "a.bin", values)
-    data = (tmp_path / "a.bin").read_bytes()
-    assert data == b"2&1&3&" + struct.pack("<6f", 1, 4, 2, 5, 3, 6)
 
 
 def test_a_graph_byte_by_byte(tmp_path):

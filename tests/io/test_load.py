@@ -19,8 +19,6 @@ from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import LeftOut
 
-from .colmap import text_form
-
 
 def rewrite_points(scene_dir, xyz):
     rgb = np.zeros((len(xyz), 3), np.uint8)
@@ -62,8 +60,8 @@ def test_model_named_relatively_finds_its_images(scene_dir, monkeypatch):
 
 def test_binary_goes_before_text_and_text_before_ply(scene_dir, model):
     folder = scene_dir / "sparse/0"
-    text_points = model.points.replace(rgb=np.full((10, 3), 7, np.uint8))
-    text_form.write_points3d(folder / "points3D.txt", text_points, model.tracks)
+    lines = "".join(f"{i} 0 {i} 1 7 7 7 0.5\n" for i in range(10))
+    (folder / "points3D.txt").write_text(lines)
     write_ply(folder / "points3D.ply", model.points.replace(rgb=np.full((10, 3), 9, np.uint8)))
     assert load_scene(scene_dir).source.points_path.suffix == ".bin"
     shutil.copytree(folder, scene_dir / "sparse/1")

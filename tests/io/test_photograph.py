@@ -137,13 +137,6 @@ def test_numbers_of_unknown_range_are_refused(array, tmp_path):
         _saved(tmp_path, array)
 
 
-def test_a_damaged_grey_of_16_bits_is_said(tmp_path):
-    whole = _png16(ALL16[..., None])
-    (tmp_path / "a.png").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(SceneFormatError, match="cut short or damaged"):
-        _decoded(tmp_path / "a.png")
-
-
 def test_grey_of_8_bits_and_palettes_are_as_they_are(rng, tmp_path):
     grey = rng.integers(0, 256, (9, 7), np.uint8)
     assert np.array_equal(_saved(tmp_path, grey, "a.png")[..., 2], grey)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import struct
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -177,11 +176,3 @@ def test_lichtfeld_finds_no_trailing_bytes(colmap_out):
 def test_lichtfeld_finds_its_sibling_ply(nerfstudio_out):
     ply = (nerfstudio_out / "pointcloud.ply").read_bytes()
     assert ply == (nerfstudio_out / "sparse_pc.ply").read_bytes()
-
-
-def test_new_points_come_after_the_originals(colmap_out, scene):
-    heads = [head for head, _ in points_of(colmap_out / "sparse/0")[0]]
-    lengths = [head[-1] for head in heads]
-    assert lengths == [4] * 10 + [0] * 30
-    assert all(b - a == 1 for a, b in pairwise(head[0] for head in heads))
-    np.testing.assert_array_equal(np.array([head[1:4] for head in heads[:10]]), scene.tracks.xyz)

@@ -183,14 +183,6 @@ def test_scene_without_images_opens_and_says_what_to_do_with_it(scene_dir, tmp_p
         write_scene(bare, tmp_path / "json", format="transforms")
 
 
-def test_scene_made_in_memory(tmp_path, model):
-    scene = Scene(model.points, model.images, tracks=model.tracks)
-    report = write_scene(scene, tmp_path / "out")
-    check_consistent(tmp_path / "out", scene, 10)
-    assert "images" not in report.files
-    assert json.loads((tmp_path / "out/splatseed.json").read_text())["source"] is None
-
-
 def test_points_that_replace_the_originals_lose_the_tracks(scene_dir, tmp_path):
     scene = load_scene(scene_dir)
     moved = scene.replace(points=scene.points.replace(xyz=scene.points.xyz + 1))

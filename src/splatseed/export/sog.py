@@ -1,8 +1,10 @@
 """PlayCanvas's SOG, version 2: a .zip of lossless WebP pictures and ``meta.json``.
 
 Notation: each picture has one pixel per Gaussian; a *codebook* is 256 numbers that bytes stand for,
-a *palette* a table of coefficients that Gaussians share. Source: the format's specification by
-PlayCanvas.
+a *palette* K vectors of coefficients that Gaussians share, and a *label* says which of them stands
+for each. Nothing is random: equal Gaussians give equal bytes.
+
+Source: the format's specification by PlayCanvas.
 """
 
 from __future__ import annotations
@@ -18,36 +20,39 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from splatseed.errors import SceneFormatError
-from splatseed.export.codebook import codebook, codes, palette
-from splatseed.export.formats import CONVERTER
 from splatseed.export.packing import (
     SH_COUNTS,
     from_smallest_three,
     morton_order,
     opacity_bytes,
     opacity_logits,
+    rounded_bytes,
     smallest_three,
 )
-from splatseed.io.files import ARCHIVE_FAILURES, read_bytes
-from splatseed.literal import told
+from splatseed.io.files import guarded, read_bytes
 from splatseed.progress import Progress, silent
 from splatseed.splat.gaussians import Gaussians
 
-Pixels = UInt8[np.ndarray, "N 4"]
+CONVERTER = "npx @playcanvas/splat-transform"
+"""The converter by the authors of SOG and compressed PLY."""
 
-VERSION = 2
-META = "meta.json"
-PER_ROW = 64
+_VERSION = 2
+_META = "meta.json"
+_PER_ROW = 64
 """Palette entries per row of the centroid picture."""
-MOST_LEVELS, LEAST_LEVELS = 16, 10
+_MOST_LEVELS, _LEAST_LEVELS = 16, 10
 """The palette grows with the number of Gaussians, from 2^10 to 2^16 entries at most."""
-MOST_BYTES = 2**31
-MOST_META = 1 << 24
+_MOST_BYTES = 2**31
+_MOST_META = 1 << 24
 """Larger parts of an archive are refused unread; meta.json takes some kilobytes."""
-QUAT_MARK = 252
+_QUAT_MARK = 252
 """Alpha of a rotation whose largest component is the first; SOG's marker."""
-FIX = "Copy the file again, or export it again."
-STAMP = (1980, 1, 1, 0, 0, 0)
+_CODES = 256
+_LLOYD_STEPS = 20
+"""Alternations of assigning values to codes and moving codes to the means."""
+_POWER_STEPS = 3
+"""Steps of power iteration: a rough principal direction is enough to halve a group."""
+_STAMP = (1980, 1, 1, 0, 0, 0)
 """The timestamp of each picture in the zip, fixed so that equal Gaussians give equal bytes."""
 
 
@@ -57,7 +62,9 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> bytes:
     low, high, positions = _encoded_positions(gaussians.means[order])
     largest, three = smallest_three(gaussians.quats[order])
     # The three smaller components in RGB, 252 + the index of the largest in A.
-    quats = np.column_stack([_byte(three * np.sqrt(0.5) * 255 + 127.5), QUAT_MARK + largest])
+    quats = np.column_stack(
+        [rounded_bytes(three * np.sqrt(0.5) * 255 + 127.5), _QUAT_MARK + largest]
+    )
     scales, sh0 = codebook(gaussians.scales), codebook(gaussians.sh0)
     colors = codes(gaussians.sh0[order, 0], sh0)
     opacity = opacity_bytes(gaussians.opacities[order])
@@ -69,7 +76,7 @@ def encode(gaussians: Gaussians, progress: Progress = silent) -> bytes:
         "sh0.webp": _grid(np.column_stack([colors, opacity])),
     }
     meta: dict[str, Any] = {
-        "version": VERSION,
+        "version": _VERSION,
         "asset": {"generator": "splatseed"},
         "count": len(order),
         "means": {"mins": low, "maxs": high, "files": ["means_l.webp", "means_u.webp"]},
@@ -90,31 +97,32 @@ def decode(path: Path) -> Gaussians:
         SceneNotFoundError: There is no such file, or a picture beside its ``meta.json`` is missing.
         SceneFormatError: It is damaged, or of another version.
     """
-    try:
+    with guarded(path, "a whole SOG"):
         return _decoded(path, _opened(path))
-    except ARCHIVE_FAILURES as error:
-        raise _damaged(path, told(error)) from None
 
 
 def _decoded(path: Path, content: Callable[[str], bytes]) -> Gaussians:
-    meta = json.loads(content(META))
+    meta = json.loads(content(_META))
     if "means" not in meta:  # of every version; a run's metrics.json has none
-        raise _damaged(path, "JSON that describes no Gaussians")
-    if meta.get("version") != VERSION:
+        raise ValueError("JSON that describes no Gaussians")
+    if meta.get("version") != _VERSION:
         raise SceneFormatError(
-            f"{path} to be a SOG of version {VERSION}",
+            f"{path} to be a SOG of version {_VERSION}",
             found=f"version {meta.get('version', 1)}",
             fix=f"Convert it: {CONVERTER} IN OUT.sog.",
         )
     count = int(meta["count"])
     if count < 1:
-        raise _damaged(path, f"{count} Gaussians")
+        raise ValueError(f"{count} Gaussians")
+
+    from PIL import Image  # noqa: PLC0415  (slow to import)
 
     def pixels(part: str, which: int = 0, least: int = count) -> UInt8[np.ndarray, "P 4"]:
         name = meta[part]["files"][which]
-        rows = _picture(content(name)).reshape(-1, 4)
+        with Image.open(io.BytesIO(content(name))) as picture:
+            rows = np.asarray(picture.convert("RGBA")).reshape(-1, 4)
         if len(rows) < least:
-            raise _damaged(path, f"{len(rows):,} pixels in {name}, of {least:,}")
+            raise ValueError(f"{len(rows):,} pixels in {name}, of {least:,}")
         return rows[:least]
 
     low, high = (pixels("means", i)[:, :3].astype(np.uint16) for i in (0, 1))
@@ -124,7 +132,7 @@ def _decoded(path: Path, content: Callable[[str], bytes]) -> Gaussians:
         means=_decoded_positions(low | high << 8, meta["means"]),
         scales=centers["scales"][pixels("scales")[:, :3]],
         quats=from_smallest_three(
-            np.clip(quats[:, 3].astype(np.int64) - QUAT_MARK, 0, 3),
+            np.clip(quats[:, 3].astype(np.int64) - _QUAT_MARK, 0, 3),
             ((quats[:, :3] / 255 - 0.5) * np.sqrt(2)).astype(np.float32),
         ),
         opacities=opacity_logits(sh0[:, 3]),
@@ -155,17 +163,17 @@ def _decoded_positions(
 
 def _encoded_harmonics(
     shN: Float32[np.ndarray, "N K 3"], progress: Progress
-) -> tuple[dict[str, Any], dict[str, Pixels]]:
+) -> tuple[dict[str, Any], dict[str, UInt8[np.ndarray, "H W 4"]]]:
     count, rest, _ = shN.shape
-    levels = int(np.clip(np.log2(count), 0, MOST_LEVELS))
-    if count >= 2**LEAST_LEVELS:  # as in PlayCanvas's writer: 1024 for each 1024 Gaussians
-        levels = int(np.clip(np.log2(count), LEAST_LEVELS, MOST_LEVELS))
+    levels = int(np.clip(np.log2(count), 0, _MOST_LEVELS))
+    if count >= 2**_LEAST_LEVELS:  # as in PlayCanvas's writer: 1024 for each 1024 Gaussians
+        levels = int(np.clip(np.log2(count), _LEAST_LEVELS, _MOST_LEVELS))
     entries, labels = palette(shN.reshape(count, -1), levels, progress)
     centers = codebook(entries)
     table = codes(entries, centers).reshape(len(entries), rest, 3)
     # Entries are bytes of a third codebook, 64 entries per row.
-    rows = -(-len(entries) // PER_ROW)
-    picture = np.full((rows * PER_ROW, rest, 4), 255, np.uint8)
+    rows = -(-len(entries) // _PER_ROW)
+    picture = np.full((rows * _PER_ROW, rest, 4), 255, np.uint8)
     picture[: len(table), :, :3] = table
     low_high = np.column_stack([labels & 255, labels >> 8, np.zeros(count, np.int64)])
     meta = {
@@ -175,7 +183,7 @@ def _encoded_harmonics(
         "files": ["shN_centroids.webp", "shN_labels.webp"],
     }
     pictures = {
-        "shN_centroids.webp": picture.reshape(rows, PER_ROW * rest, 4),
+        "shN_centroids.webp": picture.reshape(rows, _PER_ROW * rest, 4),
         "shN_labels.webp": _grid(low_high),
     }
     return meta, pictures
@@ -191,10 +199,6 @@ def _decoded_harmonics(
     return np.asarray(table[labels].reshape(count, rest, 3))
 
 
-def _byte(values: Float64[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
-    return np.asarray(np.clip(np.rint(values), 0, 255), np.uint8)
-
-
 def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
     """One pixel per row of 3 or 4 bytes, in a near-square picture; sides are multiples of 4."""
     width = 4 * int(np.ceil(np.sqrt(len(values)) / 4))
@@ -205,43 +209,102 @@ def _grid(values: np.ndarray) -> UInt8[np.ndarray, "H W 4"]:
     return pixels.reshape(height, width, 4)
 
 
-def _zipped(meta: dict[str, Any], pictures: dict[str, Pixels]) -> bytes:
+def _zipped(meta: dict[str, Any], pictures: dict[str, UInt8[np.ndarray, "H W 4"]]) -> bytes:
     from PIL import Image  # noqa: PLC0415  (slow to import)
 
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        archive.writestr(zipfile.ZipInfo(META, STAMP), json.dumps(meta))
+        archive.writestr(zipfile.ZipInfo(_META, _STAMP), json.dumps(meta))
         for name, pixels in pictures.items():
             picture = io.BytesIO()
             # exact keeps colours where alpha is 0, which opacities and quaternions need.
             Image.fromarray(pixels).save(picture, "WEBP", lossless=True, exact=True, quality=75)
-            archive.writestr(zipfile.ZipInfo(name, STAMP), picture.getvalue())
+            archive.writestr(zipfile.ZipInfo(name, _STAMP), picture.getvalue())
     return file.getvalue()
 
 
 def _opened(path: Path) -> Callable[[str], bytes]:
     """A function that returns the content of a named part."""
     if path.name.lower().endswith(".json"):
-        return lambda name: read_bytes(path if name == META else path.parent / Path(name).name)
+        return lambda name: read_bytes(path if name == _META else path.parent / Path(name).name)
     archive = zipfile.ZipFile(io.BytesIO(read_bytes(path)))
 
     def content(name: str) -> bytes:
-        if archive.getinfo(name).file_size > (MOST_META if name == META else MOST_BYTES):
-            raise _damaged(path, f"{name} of {archive.getinfo(name).file_size:,} bytes")
+        if archive.getinfo(name).file_size > (_MOST_META if name == _META else _MOST_BYTES):
+            raise ValueError(f"{name} of {archive.getinfo(name).file_size:,} bytes")
         return archive.read(name)
 
     return content
 
 
-def _picture(data: bytes) -> UInt8[np.ndarray, "H W 4"]:
-    from PIL import Image  # noqa: PLC0415  (slow to import)
+def codebook(values: Float32[np.ndarray, "..."]) -> Float64[np.ndarray, " 256"]:
+    """The 256 numbers, ascending, that quantise values with small square error (1D Lloyd).
 
-    try:
-        with Image.open(io.BytesIO(data)) as picture:
-            return np.asarray(picture.convert("RGBA"))
-    except (OSError, SyntaxError, Image.DecompressionBombError) as error:
-        raise ValueError(error) from None
+    Args:
+        values: At least one, finite.
+    """
+    ordered = np.sort(values.reshape(-1).astype(np.float64))
+    sums = np.concatenate([[0.0], np.cumsum(ordered)])
+    # Half of the codes start evenly spaced, half at even ranks: both the tails and the middle get
+    # some.
+    ranks = np.quantile(ordered, (np.arange(_CODES // 2) + 0.5) / (_CODES // 2))
+    centers = np.sort(np.concatenate([ranks, np.linspace(ordered[0], ordered[-1], _CODES // 2)]))
+    for _ in range(_LLOYD_STEPS):
+        edges = np.searchsorted(ordered, (centers[1:] + centers[:-1]) / 2)
+        bounds = np.concatenate([[0], edges, [len(ordered)]])
+        counts = np.diff(bounds)
+        means = np.diff(sums[bounds]) / np.maximum(counts, 1)
+        centers = np.sort(np.where(counts > 0, means, centers))
+    return centers
 
 
-def _damaged(path: Path, found: str) -> SceneFormatError:
-    return SceneFormatError(f"{path} to be a whole SOG", found=found[:200], fix=FIX)
+def codes(
+    values: Float32[np.ndarray, "..."], centers: Float64[np.ndarray, " 256"]
+) -> UInt8[np.ndarray, "..."]:
+    """The index of the codebook number nearest to each value."""
+    return np.searchsorted((centers[1:] + centers[:-1]) / 2, values).astype(np.uint8)
+
+
+def palette(
+    vectors: Float32[np.ndarray, "N D"], levels: int, progress: Progress = silent
+) -> tuple[Float32[np.ndarray, "K D"], Int64[np.ndarray, " N"]]:
+    """2^levels vectors that stand for N: groups are halved repeatedly where they vary most.
+
+    Args:
+        vectors: Finite; N is at least 2^levels.
+        levels: How often to halve.
+        progress: Called with the stage and the fraction done.
+    """
+    count = 2**levels
+    size = -(-len(vectors) // count)
+    # Groups keep one size, so that a level is a few array operations; to fill up, the first are
+    # repeated.
+    order = np.resize(np.arange(len(vectors)), size * count)[None]
+    for level in range(levels):
+        progress("encode", level / levels)
+        along = _spread(vectors, order)
+        order = np.take_along_axis(order, np.argsort(along, axis=1, kind="stable"), axis=1)
+        order = order.reshape(2 * len(order), -1)
+    labels = np.empty(len(vectors), np.int64)
+    labels[order] = np.arange(count)[:, None]
+    sums = np.zeros((count, vectors.shape[1]))
+    np.add.at(sums, labels, vectors)
+    members = np.bincount(labels, minlength=count)
+    return (sums / np.maximum(members, 1)[:, None]).astype(np.float32), labels
+
+
+def _spread(
+    vectors: Float32[np.ndarray, "N D"], order: Int64[np.ndarray, "G M"]
+) -> Float32[np.ndarray, "G M"]:
+    """Where each vector lies along the principal direction of its group (power iteration)."""
+    along = np.empty(order.shape, np.float32)
+    step = max(1, 2**20 // order.shape[1])
+    for first in range(0, len(order), step):
+        part = vectors[order[first : first + step]]
+        part = part - part.mean(axis=1, keepdims=True)
+        axis = part[np.arange(len(part)), np.argmax((part**2).sum(axis=2), axis=1)]
+        for _ in range(_POWER_STEPS):
+            axis = np.einsum("gm,gmd->gd", np.einsum("gmd,gd->gm", part, axis), part)
+            axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-20)
+        along[first : first + step] = np.einsum("gmd,gd->gm", part, axis)
+    return along

@@ -60,37 +60,30 @@ class DenseMap(Protocol):
     @property
     def name(self) -> str:
         """The image's name."""
-        ...
 
     @property
     def camera(self) -> Camera:
         """The camera, in pixels of this map."""
-        ...
 
     @property
     def depth(self) -> Float32[np.ndarray, "H W"]:
         """Planar z-depth in scene units; NaN where unknown."""
-        ...
 
     @property
     def normal(self) -> Float32[np.ndarray, "H W 3"]:
         """Unit normals in camera axes, facing the camera; NaN where unknown."""
-        ...
 
     @property
     def confidence(self) -> Float32[np.ndarray, "H W"]:
         """Confidence, 0 to 1; 0 where depth is NaN."""
-        ...
 
     @property
     def sources(self) -> tuple[str, ...]:
         """Names of the views that it was compared with."""
-        ...
 
     @property
     def agreeing(self) -> UInt8[np.ndarray, "H W"]:
         """Bit k is set where source k confirms the pixel."""
-        ...
 
 
 @dataclass(frozen=True)

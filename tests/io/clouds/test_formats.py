@@ -54,21 +54,6 @@ def test_las_of_a_national_grid_in_8_and_16_bits(tmp_path, points, suffix, facto
     np.testing.assert_allclose(cloud.bounds, [xyz.min(axis=0), xyz.max(axis=0)], atol=1e-6)
 
 
-def test_las_with_intensity_alone_is_grey(tmp_path, points):
-    laspy = pytest.importorskip("laspy")
-    las = laspy.LasData(laspy.LasHeader(point_format=1, version="1.2"))
-    las.x, las.y, las.z = points[0].T
-    las.intensity = np.linspace(100, 60000, NUM).astype(np.uint16)
-    path = tmp_path / "scan.las"
-    las.write(path)
-    grey = whole(path)[1]
-    assert open_cloud(path).colors == "intensity"
-    assert (grey == grey[:, :1]).all()
-    assert grey[0, 0] == 0
-    assert grey[-1, 0] == 255
-    assert (np.diff(grey[:, 0].astype(int)) >= 0).all()
-
-
 def test_las_points_that_are_withheld_are_left_out(tmp_path, points):
     laspy = pytest.importorskip("laspy")
     las = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))

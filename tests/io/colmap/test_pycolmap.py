@@ -7,22 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatseed.io.colmap import binary as colmap_binary
+from splatseed.io.colmap import binary as colmap_binary, text as colmap_text
 from splatseed.pointcloud import PointCloud
-
-from . import text_form
 
 pycolmap = pytest.importorskip("pycolmap")
 
-forms = pytest.mark.parametrize(
-    ("form", "suffix"), [(colmap_binary, "bin"), (text_form, "txt")], ids=["bin", "txt"]
-)
 
-
-def _write(form, suffix, folder, model):
-    form.write_cameras(folder / f"cameras.{suffix}", model.intrinsics)
-    form.write_images(folder / f"images.{suffix}", model.images)
-    form.write_points3d(folder / f"points3D.{suffix}", model.points, model.tracks)
+def _write(folder, model):
+    colmap_binary.write_cameras(folder / "cameras.bin", model.intrinsics)
+    colmap_binary.write_images(folder / "images.bin", model.images)
+    colmap_binary.write_points3d(folder / "points3D.bin", model.points, model.tracks)
 
 
 def _read(form, suffix, folder):
@@ -70,19 +64,17 @@ def _assert_points_agree(reconstruction, points, tracks):
         assert elements == [(int(a), int(b)) for a, b in ours]
 
 
-@forms
-def test_pycolmap_reads_what_we_write(form, suffix, model, tmp_path):
-    _write(form, suffix, tmp_path, model)
+def test_pycolmap_reads_what_we_write(model, tmp_path):
+    _write(tmp_path, model)
     reconstruction = pycolmap.Reconstruction(tmp_path)
     _assert_cameras_agree(reconstruction, model.intrinsics)
     _assert_images_agree(reconstruction, model.images)
     _assert_points_agree(reconstruction, model.points, model.tracks)
 
 
-@forms
-def test_pycolmap_takes_new_points_without_tracks(form, suffix, model, tmp_path):
+def test_pycolmap_takes_new_points_without_tracks(model, tmp_path):
     grown = PointCloud.concatenate(model.points, model.points)
-    _write(form, suffix, tmp_path, model._replace(points=grown))
+    _write(tmp_path, model._replace(points=grown))
     reconstruction = pycolmap.Reconstruction(tmp_path)
     new = [p for p in reconstruction.points3D.values() if not p.track.length()]
     assert len(reconstruction.points3D) == 20
@@ -90,20 +82,19 @@ def test_pycolmap_takes_new_points_without_tracks(form, suffix, model, tmp_path)
     assert {p.error for p in new} == {pycolmap.Point3D().error}
 
 
-@forms
-def test_images_without_features_are_images(form, suffix, model, tmp_path):
+def test_images_without_features_are_images(model, tmp_path):
     images = tuple(replace(image, observations=None) for image in model.images)
-    _write(form, suffix, tmp_path, model._replace(images=images))
-    form.write_points3d(tmp_path / f"points3D.{suffix}", model.points, None)
+    _write(tmp_path, model._replace(images=images))
+    colmap_binary.write_points3d(tmp_path / "points3D.bin", model.points, None)
     theirs = pycolmap.Reconstruction(tmp_path).images
     assert {image.name for image in theirs.values()} == {image.name for image in images}
-    ours = form.read_images(tmp_path / f"images.{suffix}", model.intrinsics)
+    ours = colmap_binary.read_images(tmp_path / "images.bin", model.intrinsics)
     assert [len(image.observations) for image in ours] == [0] * 4
 
 
-@forms
+@pytest.mark.parametrize(("form", "suffix"), [(colmap_binary, "bin"), (colmap_text, "txt")])
 def test_we_read_what_pycolmap_writes(form, suffix, model, tmp_path):
-    _write(colmap_binary, "bin", tmp_path, model)
+    _write(tmp_path, model)
     reconstruction = pycolmap.Reconstruction(tmp_path)
     out = tmp_path / "theirs"
     out.mkdir()
@@ -119,7 +110,7 @@ def test_both_forms_of_a_real_model_agree(scenes, tmp_path, assert_same_images, 
     reconstruction.write_binary(tmp_path)
     reconstruction.write_text(tmp_path)
     cameras, images, *points = _read(colmap_binary, "bin", tmp_path)
-    text_cameras, text_images, *text_points = _read(text_form, "txt", tmp_path)
+    text_cameras, text_images, *text_points = _read(colmap_text, "txt", tmp_path)
     assert text_cameras == cameras
     assert_same_images(text_images, images)
     assert_same_points(text_points, points)

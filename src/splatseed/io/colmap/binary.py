@@ -21,7 +21,6 @@ from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import OutputError
 from splatseed.io.colmap.model import (
     UNKNOWN_ERROR,
-    check_names,
     check_unique,
     make_image,
     make_intrinsics,
@@ -59,7 +58,7 @@ def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
     cameras = tuple(_read_camera(reader, i, count) for i in range(count))
     reader.finish()
     ids = np.array([camera.camera_id for camera in cameras], np.int64)
-    check_unique("camera", ids, path, _record)
+    check_unique("camera id", ids, path, _record)
     return cameras
 
 
@@ -91,8 +90,8 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
     count = reader.count(_POSE.size + 1 + 8, "images")
     images = tuple(_read_image(reader, cameras, i, count) for i in range(count))
     reader.finish()
-    check_unique("image", np.array([im.image_id for im in images], np.int64), path, _record)
-    check_names(images, path, _record)
+    check_unique("image id", np.array([im.image_id for im in images], np.int64), path, _record)
+    check_unique("image name", np.array([im.name for im in images], str), path, _record)
     return images
 
 

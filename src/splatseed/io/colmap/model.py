@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64, Int64, Shaped
 
 from splatseed.camera import CAMERA_MODELS, Intrinsics
 from splatseed.errors import PointCloudError, SceneFormatError
@@ -113,40 +113,27 @@ def make_points(
     if negative.any():
         where = f"{path}, {place(int(negative.argmax()))}"
         raise _bad(f"a point id from 0 to {2**63 - 1}", where, "one outside")
-    check_unique("point", tracks.point_ids, path, place)
+    check_unique("point id", tracks.point_ids, path, place)
     with np.errstate(over="ignore"):
         xyz = tracks.xyz.astype(np.float32)
     return PointCloud(xyz, rgb), tracks
 
 
 def check_unique(
-    what: str, ids: Int64[np.ndarray, " N"], path: Path, place: Callable[[int], str]
+    what: str, values: Shaped[np.ndarray, " N"], path: Path, place: Callable[[int], str]
 ) -> None:
-    """Check that no two records of a file share an id.
+    """Check that no two records of a file share an id or a name.
 
     Raises:
         SceneFormatError: Two do; the second is named.
     """
-    if bool((np.diff(ids) > 0).all()):  # the usual order needs no sort
+    if bool((values[1:] > values[:-1]).all()):  # the usual order needs no sort
         return
-    order = np.argsort(ids, kind="stable")
-    again = order[1:][np.diff(ids[order]) == 0]
+    order = np.argsort(values, kind="stable")
+    again = order[1:][values[order[1:]] == values[order[:-1]]]
     if len(again):
         i = int(again.min())
-        raise _bad(f"each {what} id once", f"{path}, {place(i)}", f"{ids[i]} a second time")
-
-
-def check_names(images: Sequence[Image], path: Path, place: Callable[[int], str]) -> None:
-    """Check that no two records of a file are of one image: one of the poses would be wrong.
-
-    Raises:
-        SceneFormatError: Two are; the second is named.
-    """
-    first: dict[str, int] = {}
-    for i, image in enumerate(images):
-        if first.setdefault(image.name, i) != i:
-            found = f"{image.name!r} a second time, after {place(first[image.name])}"
-            raise _bad("each image name once", f"{path}, {place(i)}", found)
+        raise _bad(f"each {what} once", f"{path}, {place(i)}", f"{values[i]} a second time")
 
 
 def point_columns(

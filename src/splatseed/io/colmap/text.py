@@ -19,7 +19,6 @@ from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError
 from splatseed.io.colmap.model import (
     MAX_ID,
-    check_names,
     check_unique,
     make_image,
     make_intrinsics,
@@ -40,7 +39,7 @@ def read_cameras(path: Path) -> tuple[Intrinsics, ...]:
     numbers, rows = _data_rows(path)
     cameras = tuple(_parse_camera(path, *numbered) for numbered in zip(numbers, rows, strict=True))
     ids = np.array([camera.camera_id for camera in cameras], np.int64)
-    check_unique("camera", ids, path, lambda i: f"line {numbers[i]}")
+    check_unique("camera id", ids, path, lambda i: f"line {numbers[i]}")
     return cameras
 
 
@@ -78,8 +77,9 @@ def read_images(path: Path, intrinsics: Sequence[Intrinsics]) -> tuple[Image, ..
             images.append(_parse_image(path, number, line, cameras, observations))
             numbers.append(number)
     ids = np.array([image.image_id for image in images], np.int64)
-    check_unique("image", ids, path, lambda i: f"line {numbers[i]}")
-    check_names(images, path, lambda i: f"line {numbers[i]}")
+    check_unique("image id", ids, path, lambda i: f"line {numbers[i]}")
+    names = np.array([image.name for image in images], str)
+    check_unique("image name", names, path, lambda i: f"line {numbers[i]}")
     return tuple(images)
 
 
