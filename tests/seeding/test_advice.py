@@ -12,8 +12,8 @@ from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene
 from splatseed.seeding.advice import AS_IT_IS, Measured, advise, camera_layout, measure
 
-FERN = Measured(6_009, 20, 120_000, empty=0.4)
-BONSAI = Measured(108_040, 292, 106_400, empty=0.1)
+FERN = Measured(6_009, 120_000, empty=0.4)
+BONSAI = Measured(108_040, 106_400, empty=0.1)
 
 
 def test_points_that_fill_the_budget_are_left_as_they_are():

@@ -22,7 +22,7 @@ import numpy as np
 
 from splatseed.io.seeds import was_upsampled
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress, silent
+from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.upsample import Upsampler
 
@@ -60,7 +60,6 @@ class Measured:
 
     Args:
         num_points: Distinct points.
-        num_images: Images with a pose.
         pixels: Pixels of one photograph.
         empty: Share of the photographs' cells in which no point is seen, 0 to 1; None if unknown.
         layout: Layout of its cameras; None for fewer than three.
@@ -70,28 +69,12 @@ class Measured:
     """
 
     num_points: int
-    num_images: int
     pixels: float
     empty: float | None = None
     layout: Layout | None = None
     photographs: bool = True
     depth_maps: bool = False
     agreement: float | None = None
-
-    @property
-    def points_per_pixel(self) -> float:
-        """Points of the scene per pixel of one photograph."""
-        return self.num_points / self.pixels if self.pixels else 0.0
-
-
-def _share(value: float) -> str:
-    """A number with two decimals, or with one significant digit if it is smaller.
-
-    Example:
-        >>> _share(0.148), _share(0.00287), _share(0)
-        ('0.15', '0.003', '0.00')
-    """
-    return f"{value:.2f}" if value >= 0.01 or not value else f"{value:.1g}"
 
 
 @dataclass(frozen=True)
@@ -144,7 +127,7 @@ def advice_for(
         return Advice(SEEDED if scene.has_photographs else AS_IT_IS, (made,), measured)
     said = advise(measured, most_seeds, strategy=strategy)
     if progress is not None and said.method == DEFAULT_METHOD and measured.num_points:
-        measured = replace(measured, agreement=stereo_agreement(scene, progress=progress))
+        measured = replace(measured, agreement=_stereo_agreement(scene, progress))
         said = advise(measured, most_seeds, strategy=strategy)
     return said
 
@@ -184,7 +167,9 @@ def advise(
     if not measured.photographs:
         return said(FALLBACK, "Without photographs and their poses, points are interpolated.")
     has = most_seeds / measured.num_points
-    per_pixel = f"{measured.num_points:,} points, {_share(measured.points_per_pixel)} per pixel"
+    share = measured.num_points / measured.pixels if measured.pixels else 0.0
+    share_said = f"{share:.2f}" if share >= 0.01 or not share else f"{share:.1g}"
+    per_pixel = f"{measured.num_points:,} points, {share_said} per pixel"
     if has < room or strategy == "grow":
         full = (
             f"Training begins with {most_seeds:,} at most, so there is no room for more: adding "
@@ -206,20 +191,13 @@ def advise(
     return said(DEFAULT_METHOD, *reasons)
 
 
-def measure(scene: Scene, empty: float | None = None, pixels: float | None = None) -> Measured:
-    """Measure a scene without looking at its photographs.
-
-    Args:
-        scene: The scene.
-        empty: Share of the photographs' cells without points, if known.
-        pixels: Pixels of a photograph at the training size; the median camera's by default.
-    """
+def measure(scene: Scene, empty: float | None = None) -> Measured:
+    """Measure a scene without looking at its photographs; ``empty`` as in ``advice_for``."""
     points = scene.points.originals
     sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
     return Measured(
         num_points=int(np.count_nonzero(points.distinct)),
-        num_images=len(scene.images),
-        pixels=float(np.median(sizes)) if pixels is None and sizes else pixels or 0.0,
+        pixels=float(np.median(sizes)) if sizes else 0.0,
         empty=empty,
         layout=camera_layout(scene),
         photographs=scene.has_photographs,
@@ -246,22 +224,12 @@ def camera_layout(scene: Scene) -> Layout | None:
     return "around something" if inward.mean() > INWARD else "through a place"
 
 
-def stereo_agreement(scene: Scene, seed: int = 0, progress: Progress = silent) -> float:
-    """The share of pixels in a few views whose stereo depth other views confirm, 0 to 1.
-
-    Args:
-        scene: With photographs.
-        seed: The same seed gives the same bytes.
-        progress: Told how much is done.
-
-    Raises:
-        SceneNotFoundError: There are no photographs.
-        SceneFormatError: One is damaged.
-    """
+def _stereo_agreement(scene: Scene, progress: Progress) -> float:
+    """The share of pixels in a few views whose stereo depth other views confirm, 0 to 1."""
     from splatseed.seeding.photographs import Stereo, photographed  # noqa: PLC0415  (Numba with use)
 
     count = len(photographed(scene))
     some = min(VIEWS_LOOKED_AT, count)
     only = [(2 * i + 1) * count // (2 * some) for i in range(some)]
-    maps = Stereo(max_size=SIDE_LOOKED_AT).maps(scene, only, seed, progress)
+    maps = Stereo(max_size=SIDE_LOOKED_AT).maps(scene, only, 0, progress)
     return float(np.mean([np.isfinite(each.depth).mean() for each in maps]))

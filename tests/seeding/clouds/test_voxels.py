@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from splatseed.seeding.clouds.judging import find_support
-from splatseed.seeding.clouds.voxels import ASIDE, EvenVoxels, Voxels
+from splatseed.seeding.clouds.voxels import ASIDE, Voxels
 from splatseed.views.view import View
 
 
@@ -51,7 +51,7 @@ def points(rng):
 
 def test_voxels_hold_the_means_of_their_points(points):
     xyz, rgb = points
-    voxels = Voxels(VIEWS, 3.0, 4096)
+    voxels = Voxels(4096, VIEWS, 3.0)
     voxels.add(xyz, rgb)
     mean, color, count = reference(xyz, rgb, 3.0)
     assert len(voxels) == len(mean)
@@ -68,7 +68,7 @@ def test_chunks_do_not_matter_and_no_point_is_lost(size, capacity):
     rng = np.random.default_rng(1)
     xyz = rng.uniform((-1, -1, 1), (1, 1, 6), (2000, 3))
     rgb = rng.integers(0, 256, (2000, 3), np.uint8)
-    whole, parts = Voxels(VIEWS, 2.0, capacity), Voxels(VIEWS, 2.0, capacity)
+    whole, parts = Voxels(capacity, VIEWS, 2.0), Voxels(capacity, VIEWS, 2.0)
     whole.add(xyz, rgb)
     for start in range(0, len(xyz), size):
         parts.add(xyz[start : start + size], rgb[start : start + size])
@@ -81,11 +81,11 @@ def test_chunks_do_not_matter_and_no_point_is_lost(size, capacity):
 def test_even_voxels_fit_their_capacity_at_the_smallest_side(rng):
     xyz = rng.uniform(-5, 5, (20000, 3))
     xyz[:, 2] = 0
-    voxels = EvenVoxels(1000)
+    voxels = Voxels(1000)
     voxels.add(xyz[:10])
     voxels.add(xyz[10:])
     assert 250 <= len(voxels) <= 1000
-    cells = np.floor((voxels.xyz + ASIDE) / voxels.spacing)
+    cells = np.floor((voxels.xyz + ASIDE) / voxels.side[0])
     assert len(np.unique(cells, axis=0)) == len(cells)
 
 

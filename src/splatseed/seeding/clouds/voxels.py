@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int16, Int32, UInt8
+from jaxtyping import Float32, Float64, Int16, Int32, UInt8, UInt64
 from scipy.spatial import cKDTree
 
 from splatseed.errors import ParameterError, PointCloudError
@@ -43,154 +43,97 @@ FINEST = 20
 """Halvings of the first points' extent that make the first side of even voxels."""
 
 
-class _Growing:
-    """Voxels that grow when they are all filled.
+class _Table(NamedTuple):
+    """Voxels in the order in which they were first filled, and a hash table to find them."""
 
-    Attributes:
-        coarser: s, how often they did.
-    """
+    keys: UInt64[np.ndarray, " C"]
+    mean: Float32[np.ndarray, "C 3"]
+    color: Float32[np.ndarray, "C 3"]
+    counts: Int32[np.ndarray, " C"]
+    level: Int16[np.ndarray, " C"]
+    slots: Int32[np.ndarray, " S"]
 
-    def __init__(self, capacity: int) -> None:
-        self._entries = _Entries(capacity)
-        self.coarser = 0
-
-    def __len__(self) -> int:
-        return self._entries.num
-
-    @property
-    def xyz(self) -> Float32[np.ndarray, "N 3"]:
-        """Mean positions."""
-        return self._entries.mean[: len(self)]
-
-    @property
-    def rgb(self) -> UInt8[np.ndarray, "N 3"]:
-        """Mean colours."""
-        return np.asarray(np.rint(self._entries.color[: len(self)]).astype(np.uint8))
-
-    def _fill(
-        self,
-        xyz: Float64[np.ndarray, "n 3"],
-        rgb: UInt8[np.ndarray, "n 3"],
-        levels: Int16[np.ndarray, " n"],
-    ) -> None:
-        """Merge points into voxels, which grow when none is free."""
-        at = 0
-        while at < len(xyz):
-            at = self._entries.fill(at, xyz, rgb, levels, self.coarser)
-            while at < len(xyz) and self._entries.num == self._entries.capacity:
-                self.coarser += 1
-                self._entries = self._entries.merged(self.coarser)
+    @classmethod
+    def of(cls, capacity: int) -> _Table:
+        """An empty one: pages of memory that are not written are not taken."""
+        mean, color = np.empty((capacity, 3), np.float32), np.empty((capacity, 3), np.float32)
+        count, level = np.empty(capacity, np.int32), np.empty(capacity, np.int16)
+        slots = np.zeros(1 << (2 * capacity - 1).bit_length(), np.int32)
+        return cls(np.empty(capacity, np.uint64), mean, color, count, level, slots)
 
 
-class Voxels(_Growing):
-    """Points merged as they come.
+class Voxels:
+    """Points merged as they come, in voxels that all double in side when none is free.
 
     Args:
-        views: The views; only their cameras and sizes matter.
-        pixels: Side of a voxel in pixels of the view that sees it most closely.
         capacity: Most voxels.
+        views: Only their cameras and sizes matter. Without any, all voxels have one side, the
+            smallest that ``capacity`` allows.
+        pixels: Side of a voxel in pixels of the view that sees it most closely.
 
     Attributes:
+        coarser: s, how often they grew.
         total: Points given.
         unseen: Of these, those that fall in no frame.
     """
 
-    def __init__(self, views: Sequence[View], pixels: float, capacity: int) -> None:
-        super().__init__(capacity)
-        matrices = np.stack([grid_from_world(view, 1) for view in views])
-        focals = [np.sqrt(abs(view.K[0, 0] * view.K[1, 1])) for view in views]
-        self._matrices = matrices.astype(np.float32)
-        self._sides = (pixels / np.array(focals)).astype(np.float32)
-        self._sizes = np.array([[view.width, view.height] for view in views], np.float32)
-        self.total = self.unseen = 0
+    def __init__(self, capacity: int, views: Sequence[View] = (), pixels: float = 2.0) -> None:
+        self._capacity, self._num, self._table = capacity, 0, _Table.of(capacity)
+        self._views, self._even = len(views), 0
+        self.coarser = self.total = self.unseen = 0
+        if views:
+            matrices = np.stack([grid_from_world(view, 1) for view in views])
+            focals = [np.sqrt(abs(view.K[0, 0] * view.K[1, 1])) for view in views]
+            self._matrices = matrices.astype(np.float32)
+            self._sides = (pixels / np.array(focals)).astype(np.float32)
+            self._sizes = np.array([[view.width, view.height] for view in views], np.float32)
+
+    def __len__(self) -> int:
+        return self._num
+
+    @property
+    def xyz(self) -> Float32[np.ndarray, "N 3"]:
+        """Mean positions."""
+        return self._table.mean[: self._num]
+
+    @property
+    def rgb(self) -> UInt8[np.ndarray, "N 3"]:
+        """Mean colours."""
+        return np.asarray(np.rint(self._table.color[: self._num]).astype(np.uint8))
 
     @property
     def count(self) -> Int32[np.ndarray, " N"]:
         """How many points each holds."""
-        return self._entries.count[: len(self)]
+        return self._table.counts[: self._num]
 
     @property
     def side(self) -> Float32[np.ndarray, " N"]:
         """The side of each, scene units."""
-        return np.exp2(self._entries.level[: len(self)].astype(np.float32) + self.coarser)
+        return np.exp2(self._table.level[: self._num].astype(np.float32) + self.coarser)
 
     def add(
         self, xyz: Float64[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"] | None = None
     ) -> None:
         """Merge points, finite, in the world; without colours they count as black."""
-        levels = np.full(len(xyz), UNSEEN, np.int16)
-        _find_levels(xyz, self._matrices, self._sides, self._sizes, levels)
+        xyz, levels = np.ascontiguousarray(xyz), np.full(len(xyz), UNSEEN, np.int16)
+        if self._views:
+            _find_levels(xyz, self._matrices, self._sides, self._sizes, levels)
+        else:
+            if not self._num:
+                extent = max(float(np.ptp(xyz, axis=0).max()), float(np.finfo(np.float32).tiny))
+                self._even = int(np.floor(np.log2(extent))) - FINEST
+            levels[:] = self._even
         colors = np.zeros((1, 3), np.uint8) if rgb is None else np.ascontiguousarray(rgb)
         self.total += len(xyz)
         self.unseen += int(np.count_nonzero(levels == UNSEEN))
-        self._fill(xyz, colors, levels)
-
-
-class EvenVoxels(_Growing):
-    """Points merged in voxels of one side, which doubles until ``capacity`` suffice."""
-
-    def __init__(self, capacity: int) -> None:
-        super().__init__(capacity)
-        self._level = 0
-
-    @property
-    def spacing(self) -> float:
-        """The side of the voxels."""
-        return float(np.exp2(float(self._level + self.coarser)))
-
-    def add(
-        self, xyz: Float64[np.ndarray, "n 3"], rgb: UInt8[np.ndarray, "n 3"] | None = None
-    ) -> None:
-        """Merge points, finite."""
-        if not len(self):
-            extent = max(float(np.ptp(xyz, axis=0).max()), float(np.finfo(np.float32).tiny))
-            self._level = int(np.floor(np.log2(extent))) - FINEST
-        levels = np.full(len(xyz), self._level, np.int16)
-        colors = np.zeros((1, 3), np.uint8) if rgb is None else np.ascontiguousarray(rgb)
-        self._fill(np.ascontiguousarray(xyz), colors, levels)
-
-
-class _Entries:
-    """Voxels in the order in which they were first filled, and a hash table to find them.
-
-    Pages of memory that are not written are not taken: nothing is filled in advance.
-    """
-
-    def __init__(self, capacity: int) -> None:
-        self.capacity, self.num = capacity, 0
-        self.keys = np.empty(capacity, np.uint64)
-        self.mean = np.empty((capacity, 3), np.float32)
-        self.color = np.empty((capacity, 3), np.float32)
-        self.count = np.empty(capacity, np.int32)
-        self.level = np.empty(capacity, np.int16)
-        self.table = np.zeros(1 << (2 * capacity - 1).bit_length(), np.int32)
-
-    def fill(
-        self,
-        start: int,
-        xyz: Float64[np.ndarray, "n 3"],
-        rgb: UInt8[np.ndarray, "n 3"],
-        levels: Int16[np.ndarray, " n"],
-        coarser: int,
-    ) -> int:
-        """Merge points from ``start`` on; returns the first for which no voxel was free."""
-        at, num = _fill(
-            start, xyz, rgb, levels, coarser, self.keys, self.mean, self.color, self.count,
-            self.level, self.table, self.num,
-        )  # fmt: skip
-        self.num = int(num)
-        return int(at)
-
-    def merged(self, coarser: int) -> _Entries:
-        """The same in voxels of a greater side."""
-        new = _Entries(self.capacity)
-        new.num = int(
-            _merge(
-                self.mean, self.color, self.count, self.level, self.num, coarser,
-                new.keys, new.mean, new.color, new.count, new.level, new.table,
-            )
-        )  # fmt: skip
-        return new
+        at = 0
+        while at < len(xyz):
+            at, num = _fill(at, xyz, colors, levels, self.coarser, *self._table, self._num)
+            self._num = int(num)
+            while at < len(xyz) and self._num == self._capacity:
+                self.coarser += 1
+                old, self._table = self._table, _Table.of(self._capacity)
+                self._num = int(_merge(*old[1:5], self._num, self.coarser, *self._table))
 
 
 @kernel
@@ -401,7 +344,7 @@ def stream(
     """
     files = tuple(open_cloud(path) for path in paths)
     painted = all(file.colors != "none" for file in files)
-    voxels = Voxels(views, pixels, capacity)
+    voxels = Voxels(capacity, views, pixels)
     low, high, bad = np.full(3, np.inf), np.full(3, -np.inf), 0
     for file in files:
         before = voxels.total
@@ -412,7 +355,7 @@ def stream(
             xyz = good.xyz if scene_from_cloud is None else scene_from_cloud.points(good.xyz)
             if len(xyz):
                 low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
-                voxels.add(np.ascontiguousarray(xyz), good.rgb if painted else None)
+                voxels.add(xyz, good.rgb if painted else None)
             progress(f"read {file.path.name}", done)
         if voxels.total == before:
             raise PointCloudError(
@@ -447,7 +390,7 @@ def sample_cloud(paths: Sequence[Path], progress: Progress) -> CloudSample:
     """
     files = [open_cloud(path) for path in paths]
     painted = all(file.has_color for file in files)
-    voxels, offset = EvenVoxels(SAMPLE), None
+    voxels, offset = Voxels(SAMPLE), None
     for file in files:
         for done, chunk in _read(file, progress, "look at"):
             finite = chunk.select(chunk.finite)

@@ -120,7 +120,7 @@ def _facts(study: Study, strategy: StrategyName, scene: str) -> _Facts:
     base = next(r for r in rows if study.variant_of_key[r.spec.key] == BASELINE)
     assert base.result is not None  # noqa: S101  (checked by the caller)
     most = base.spec.most_seeds or base.result.num_gaussians
-    return _Facts(Measured(base.result.num_seeds, 0, 0.0), most, strategy)
+    return _Facts(Measured(base.result.num_seeds, 0.0), most, strategy)
 
 
 def _fitted(others: Sequence[tuple[_Facts, Mapping[str, float]]]) -> float:
