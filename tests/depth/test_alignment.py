@@ -184,17 +184,6 @@ def test_depth_given_for_its_inverse_is_refused(exact, make_maps):
     assert np.median([a.residual for a in alignments]) > 10 * np.median([a.residual for a in good])
 
 
-def test_duplicates_and_new_points_have_no_say(exact):
-    points = exact.points
-    more = points.replace(xyz=points.xyz + 1, source=np.full(len(points), 4, np.uint8))
-    cloud = type(points).concatenate(points, points, more)
-    twice = exact.replace(points=cloud)
-    assert twice.tracks is not None
-    assert align(twice) == align(exact)
-    none = exact.replace(tracks=None)
-    assert align(twice.replace(tracks=None)) == align(none)
-
-
 def test_of_points_that_hide_each_other_the_nearest_counts(exact):
     image = exact.images[0]
     camera = image.camera

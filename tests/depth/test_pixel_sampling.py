@@ -77,18 +77,6 @@ def test_pixels_keep_off_the_jumps_of_depth(radius, rng):
     assert ((plain >= 40 - radius) & (plain < 40 + radius)).any()
 
 
-def test_a_slanted_plane_has_no_jumps_and_a_step_within_tolerance_is_none(rng):
-    values = slanted(rng, holes=0.0)
-    assert np.nanmax(np.abs(np.diff(values, axis=1) / values[:, 1:])) > 0.005
-    settings = Settings(placement="uniform", edge_tolerance=0.001)
-    num = values.size
-    assert not sample_pixels(values, num, NOWHERE, settings, rng).edge.any()
-    values[:, 40:] *= 1.02
-    for tolerance, jumps in ((0.03, False), (0.01, True)):
-        settings = Settings(placement="uniform", edge_tolerance=tolerance)
-        assert sample_pixels(values, num, NOWHERE, settings, rng).edge.any() == jumps
-
-
 def test_what_is_mostly_unknown_around_comes_last(rng):
     values = slanted(rng, holes=0.0)
     values[:, 40:] = np.nan

@@ -56,13 +56,6 @@ def test_exactly_so_many_come_out(num, rng):
     assert (np.diff(chosen) > 0).all()
 
 
-def test_originals_keep_their_surroundings(rng):
-    xyz = sheet(rng, 20_000)
-    originals = xyz[xyz[:, 0] < 0.5][::4]
-    chosen = xyz[spread(xyz, 500, rng, originals)]
-    assert (chosen[:, 0] < 0.5).mean() < 0.1
-
-
 def test_many_candidates_are_estimated_from_some(rng):
     xyz = rng.random((100_000, 3)).astype(np.float32)
     every = np.ones(100_000, bool)

@@ -128,13 +128,3 @@ def test_the_isolated_rule_finds_outliers_and_spares_the_rest():
     lonely[cloud.rank] = sound_bases(cloud, cloud.neighbors(16)) == 0
     assert lonely[NUM:].mean() > 0.5
     assert lonely[:NUM].mean() < 0.01
-
-
-def test_a_sparse_background_is_not_taken_for_outliers(rng):
-    near = rng.uniform(-1.0, 1.0, (1500, 3)) * [1, 1, 0]
-    background = rng.uniform(-40.0, 40.0, (300, 3)) * [1, 1, 0] + [0, 0, 60]
-    xyz = np.concatenate([near, background]).astype(np.float32)
-    cloud = prepare(ss.PointCloud(xyz, np.zeros(xyz.shape, np.uint8)))
-    lonely = np.empty(len(cloud), bool)
-    lonely[cloud.rank] = sound_bases(cloud, cloud.neighbors(16)) == 0
-    assert lonely.mean() < 0.01

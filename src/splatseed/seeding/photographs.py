@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 
 from splatseed.errors import PointCloudError, SceneNotFoundError
-from splatseed.pointcloud import ATTRIBUTES, PointCloud
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
 from splatseed.stereo.settings import MOST_GRID, TOO_FEW
+from splatseed.upsample import as_cloud
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
@@ -287,9 +288,7 @@ def with_cover(
     """The points, plus a seed in each cell of the views that they leave empty."""
     code = source_code("cover")
     new = cover_cloud(views, points, cell, np.random.default_rng([seed, code]), progress)
-    source = np.full(len(new.xyz), code, np.uint8)
-    known = {name: getattr(new, name) for name in ATTRIBUTES}
-    return PointCloud.concatenate(points, PointCloud(new.xyz, new.rgb, source, **known))
+    return PointCloud.concatenate(points, as_cloud(new, len(new.xyz), code))
 
 
 def _found(scene: Scene, stereo: StereoResult, seconds: float) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from splatseed.errors import ParameterError
-from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
+from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
@@ -251,9 +251,7 @@ def add_verified(
     checked = verify(views, images, find_visibility(scene), new, progress)
     for sentence in checked.notes:
         note(sentence)
-    known = {name: getattr(checked, name) for name in ATTRIBUTES}
-    assert checked.source is not None  # noqa: S101  (it was given)
-    kept = PointCloud(checked.xyz, checked.rgb, checked.source, **known)
+    kept = as_cloud(checked, len(checked.xyz), 0)  # their sources are known
     return PointCloud.concatenate(cloud.select(~guessed), kept)
 
 

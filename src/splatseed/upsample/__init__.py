@@ -218,20 +218,14 @@ def planned_size(num_original: int, ratio: float | None, num_points: int | None)
         if not isinstance(ratio, Real) or not 1 <= ratio < np.inf:
             raise ParameterError(
                 "ratio of at least 1 (points in all, per original)",
-                found=f"{ratio:g}" if isinstance(ratio, Real) else repr(ratio),
+                found=repr(ratio),
                 fix="A ratio of 8 makes eight times as many points.",
             )
-        if ratio * num_original > MAX_POINTS:
-            raise ParameterError(
-                f"a ratio for a number of points of {MAX_POINTS:,} at most",
-                found=f"{ratio:g} for {num_original:,} originals",
-                fix="Ask for fewer.",
-            )
-        num_points = round(ratio * num_original)
+        num_points = round(min(float(ratio) * num_original, MAX_POINTS + 1))
     if not isinstance(num_points, (int, np.integer)) or num_points > MAX_POINTS:
         raise ParameterError(
             f"a whole number of points, {MAX_POINTS:,} at most",
-            found=f"{num_points:,}" if isinstance(num_points, (int, float)) else repr(num_points),
+            found=repr(num_points),
             fix="Ask for fewer.",
         )
     if num_points < num_original:
