@@ -203,17 +203,11 @@ def lift_pixels(
     out: Float32[np.ndarray, "C 3"],
     factor: float = 1.0,
 ) -> Float32[np.ndarray, "C 3"]:
-    """Write the world positions of pixels into ``out`` [C, 3], and return it.
+    """Write the world positions of pixels (row * W + column) into ``out`` [C, 3], and return it.
 
     Equation 9: P = c + z v, where v is the ray through the pixel's centre, with unit z in camera
-    axes; the text's P = c + s d v / |v| is the same with z = s d / |v|.
-
-    Args:
-        pixel: Numbers row * W + column, [C].
-        z: Their planar depth, scene units, [C].
-        camera: The camera whose pixels they are.
-        out: The output array.
-        factor: Multiplies depth.
+    axes; the text's P = c + s d v / |v| is the same with z = s d / |v|. ``factor`` multiplies
+    depth.
     """
     world_from_pixel = camera.cam_from_world[:3, :3].T @ np.linalg.inv(camera.K)
     _lift(pixel, z, camera.width, world_from_pixel, camera.center, factor, out)
@@ -317,15 +311,7 @@ def align(
 def align_map(
     depth: DepthMap, camera: Camera, points: SeenPoints, fit: Fit, min_points: int
 ) -> Alignment:
-    """Align one map with the SfM points that its image sees.
-
-    Args:
-        depth: The map.
-        camera: The image's camera in pixels of the map (``DepthMap.camera``).
-        points: The points that the image sees, in pixels of the map.
-        fit: As in ``align``.
-        min_points: As in ``align``.
-    """
+    """Align one map, whose camera is in its own pixels, with the SfM points that its image sees."""
     value, z = values_at(depth, camera, points)
     known = depth.values[np.isfinite(depth.values)]
     refused = None
@@ -343,13 +329,7 @@ def align_map(
 
 
 def trust_units(depth: DepthMap, camera: Camera, points: SeenPoints) -> Alignment:
-    """Take a map as being in scene units, and check it against the SfM points if there are any.
-
-    Args:
-        depth: The map.
-        camera: The image's camera in pixels of the map.
-        points: The points that the image sees, in pixels of the map.
-    """
+    """Take a map as being in scene units, checked against the SfM points if there are any."""
     value, z = values_at(depth, camera, points)
     plain = Alignment(1.0, 0.0, len(value), np.nan)
     if not np.isfinite(depth.values).any():

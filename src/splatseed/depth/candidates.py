@@ -118,15 +118,7 @@ def choose(
     rng: np.random.Generator,
     progress: Progress,
 ) -> Int64[np.ndarray, " num"]:
-    """Choose exactly ``num`` candidates, ascending indices.
-
-    Args:
-        candidates: The candidates to choose from.
-        originals: Points that exist already.
-        num: How many.
-        settings: Whether they are spread in space, or each image gives the same number.
-        rng: Draws where nothing else distinguishes candidates.
-        progress: Called with the stage and the fraction done.
+    """Choose exactly ``num`` candidates, ascending indices, beside originals that exist already.
 
     Raises:
         PointCloudError: There are too few that may be used.
@@ -216,15 +208,9 @@ def thin_by_voxels(
     num: int,
     rng: np.random.Generator,
 ) -> Bool[np.ndarray, " C"]:
-    """Mark ``num`` of the candidates, one per cube.
+    """Mark ``num`` of the eligible candidates, one per cube, the finest; none beside an original.
 
-    Args:
-        xyz: The candidates, [C, 3].
-        footprint: Size of a pixel at each: the finer of two is better.
-        eligible: Which may be chosen: at least ``num``.
-        originals: Points that exist already.
-        num: How many.
-        rng: Draws which of a small surplus are dropped, and fills up where candidates coincide.
+    ``rng`` draws which of a small surplus are dropped, and fills up where candidates coincide.
     """
     cubes = _Cubes(xyz, footprint, eligible, originals)
     side = _largest_side(cubes, num)

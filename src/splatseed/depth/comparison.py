@@ -59,12 +59,9 @@ PIECE = 8
 def choose_neighbors(
     views: Sequence[DepthView], num: int, progress: Progress
 ) -> Int64[np.ndarray, "V num"]:
-    """The ``num`` views to ask about each view's points, best first, int64 [V, num]; -1 = no more.
+    """The views to ask about each view's points, best first, int64 [V, num]; -1 = no more.
 
-    Args:
-        views: All views; those without a reduced copy neither ask nor answer.
-        num: How many.
-        progress: Called with the stage and the fraction done.
+    Views without a reduced copy neither ask nor answer.
     """
     chosen = np.full((len(views), num), -1)
     usable = np.array([i for i, v in enumerate(views) if v.reduced is not None and len(v)], int)
@@ -202,13 +199,7 @@ CONVERGED = 1e-4
 def synchronize_scales(
     views: Sequence[DepthView], neighbors: Int64[np.ndarray, "V num"], progress: Progress
 ) -> Float64[np.ndarray, " V"]:
-    """The factor by which to multiply the depth of each view, [V].
-
-    Args:
-        views: Views with reduced copies.
-        neighbors: Which views to compare each with, -1 = none.
-        progress: Called with the stage and the fraction done.
-    """
+    """The factor by which to multiply the depth of each view, [V]."""
     residuals = np.array([view.alignment.residual for view in views])
     sigma = np.maximum(np.where(np.isfinite(residuals), residuals, OTHER_SURFACE), LEAST_RESIDUAL)
     g = np.zeros(len(views))
@@ -317,14 +308,7 @@ class Support(NamedTuple):
 def find_support(
     xyz: Float32[np.ndarray, "C 3"], own: Reduced, others: Sequence[Reduced], settings: Settings
 ) -> Support:
-    """Compare candidates with other views.
-
-    Args:
-        xyz: The candidates of one view, in the world.
-        own: That view's reduced copy.
-        others: The reduced copies of the views to ask.
-        settings: How many must confirm, and the tolerances.
-    """
+    """Compare the candidates of a view, whose reduced copy is ``own``, with other views."""
     agreeing = np.zeros(len(xyz), np.uint8)
     seen_through = np.zeros(len(xyz), np.bool_)
     # The sum over three channels of 8 bits.

@@ -168,11 +168,7 @@ def _read_all(
 def _leave_out(
     images: Sequence[Image], views: Sequence[DepthView], max_ratio: float | None
 ) -> tuple[list[Image], list[DepthView], tuple[str, ...]]:
-    """The images and views whose maps are aligned, and notes on the others.
-
-    Raises:
-        SceneFormatError: No map is aligned.
-    """
+    """The images and views whose maps are aligned, and notes on the others."""
     alignments = reject_outliers(
         {image.name: view.alignment for image, view in zip(images, views, strict=True)}, max_ratio
     )

@@ -94,12 +94,7 @@ class DepthView:
         return len(self.pixel)
 
     def samples(self, num: int, factor: float = 1.0) -> Float32[np.ndarray, "num 3"]:
-        """The positions of up to ``num`` candidates (one at least) spread evenly over the image.
-
-        Args:
-            num: How many.
-            factor: Multiplies depth.
-        """
+        """The positions of up to ``num`` candidates (one at least) spread evenly over the image."""
         num = min(num, len(self))
         # Pixels come roughly row by row, so even numbers are spread over the image.
         which = ((np.arange(num) + 0.5) * (len(self) / num)).astype(np.int64)
@@ -245,12 +240,7 @@ def sample_pixels(
 ) -> Drawn:
     """Draw ``num`` distinct pixels with depth, or a few more; fewer if the map has fewer.
 
-    Args:
-        values: The map: positive where known, else NaN.
-        num: How many.
-        points: Where SfM points are, in pixels of the map.
-        settings: Region, placement and edges.
-        rng: Draws them.
+    ``values`` are positive where known, else NaN; ``points`` are where SfM points lie, in pixels.
     """
     box = _region(values.shape, settings.region)
     step = -(-max(values.shape) // CELLS)

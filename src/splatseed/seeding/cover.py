@@ -315,11 +315,7 @@ def _check_size(what: str, view: View, size: tuple[int, ...]) -> None:
 
 
 def _typical_depth(witnesses: Witnesses, num: int) -> np.float32:
-    """The median depth of all covered cells, for views that see none.
-
-    Raises:
-        PointCloudError: There are no covered cells.
-    """
+    """The median depth of all covered cells, for views that see none."""
     depths = witnesses.depths[np.isfinite(witnesses.depths)]
     if not len(depths):
         raise PointCloudError(

@@ -65,13 +65,7 @@ def survey(
     xyz: Float32[np.ndarray, "M 3"],
     progress: Progress = silent,
 ) -> Surroundings:
-    """The surroundings of each new point.
-
-    Args:
-        originals: Distinct finite positions, at least 2.
-        xyz: The new points' positions.
-        progress: Called with the stage and the fraction done.
-    """
+    """The surroundings of each new point, from at least 2 distinct finite originals."""
     nothing = np.zeros((len(originals), 3), np.uint8)
     cloud = prepare(PointCloud(originals.astype(np.float32), nothing), progress=progress)
     neighbors = cloud.neighbors(NEIGHBORS)
@@ -136,15 +130,9 @@ def choose_reference_views(
     num_originals: int,
     sources: Int64[np.ndarray, "V K"],
 ) -> Int64[np.ndarray, "M J"]:
-    """The views that judge each point, best first, int64 [M, JUDGES]; -1 where there is none.
+    """The views that judge each point, best first, int64 [M, REFERENCE_VIEWS]; -1 for none.
 
-    Args:
-        xyz: New points, world positions.
-        around: Their bases and normals.
-        views: The views.
-        seen: The originals that each view sees.
-        num_originals: The number of originals.
-        sources: The views that each is compared with; -1 = none.
+    ``seen`` are the originals that each view sees, ``sources`` the views it is compared with.
     """
     order, offsets = views_of_points(seen, num_originals)
     poses = np.stack([view.cam_from_world for view in views])

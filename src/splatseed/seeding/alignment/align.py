@@ -190,11 +190,7 @@ def _candidates(
     marks: Float64[np.ndarray, "M 3"],
     progress: Progress,
 ) -> list[_Candidate]:
-    """Alignments, best first.
-
-    Raises:
-        PointCloudError: None holds.
-    """
+    """Alignments, best first; refused if none holds."""
     starts = find_starts(surface.xyz, marks, ROUNDS[0][0], progress)
     rows = zip(starts.scale, starts.rotation, starts.shift, strict=True)
     waiting = [Similarity(float(scale), rotation, shift) for scale, rotation, shift in rows]
@@ -274,11 +270,7 @@ def _error(fitted: Fitted, marks: Float64[np.ndarray, "M 3"]) -> float:
 
 
 def _check(best: _Candidate, rival: _Candidate | None, error: float) -> None:
-    """Refuse what is not sure.
-
-    Raises:
-        PointCloudError: Too few marks lie on the cloud, a rival is nearly as good, or it slides.
-    """
+    """Refuse an alignment of too few marks, with a rival nearly as good, or one that slides."""
     if best.share < SHARE:
         raise _unsure(
             f"at best {best.share:.0%} of the scene's points on the cloud: it is of another place, "

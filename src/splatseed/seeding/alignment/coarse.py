@@ -90,14 +90,7 @@ def find_starts(
     num: int,
     progress: Progress = silent,
 ) -> Starts:
-    """The best starts, one for each orientation.
-
-    Args:
-        cloud: Its points, at unit size.
-        marks: The scene's points, at unit size.
-        num: How many starts.
-        progress: Told how far it is.
-    """
+    """The ``num`` best starts, one for each orientation, of points at unit size."""
     distances, some = _distances(cloud), even(marks, EVEN)
     fields = [rfftn(np.maximum(FAR - distances / scale, 0).astype(np.float32)) for scale in SCALES]
     spread = spread_rotations(ROTATIONS)

@@ -88,19 +88,10 @@ def fit(
     least: float,
     shrink: float,
 ) -> Fitted | None:
-    """Refine an alignment.
+    """Refine an alignment; None where too few marks are within reach, or nothing holds them.
 
-    Args:
-        surface: The cloud.
-        marks: The scene's points.
-        start: ``cloud_from_scene`` to begin with.
-        far: The first reach, in the scene's units.
-        rounds: How many rounds.
-        least: The least reach, in the scene's units.
-        shrink: Factor of the reach from round to round.
-
-    Returns:
-        The alignment; None where too few marks are within reach, or nothing holds them.
+    From ``start``, in ``rounds`` whose reach falls from ``far`` to ``least`` by the factor
+    ``shrink``, in the scene's units.
     """
     similarity, reach = start, far
     for _ in range(rounds):
@@ -260,14 +251,8 @@ class _Problem(NamedTuple):
 def polish(surface: Surface, marks: Marks, start: Similarity, reach: float) -> Polished | None:
     """Make an alignment that is nearly right as exact as the marks allow.
 
-    Args:
-        surface: The cloud.
-        marks: In the frame of the alignment, with their root mean square distance as unit.
-        start: ``cloud_from_scene``, right to a part of the reach.
-        reach: Residuals beyond it do not count, in the scene's units.
-
-    Returns:
-        The alignment; None where too few marks lie on flat parts of the cloud.
+    The marks' root mean square distance is the unit; residuals beyond ``reach`` do not count. None
+    where too few marks lie on flat parts of the cloud.
     """
     similarity = start
     for _ in range(ROUNDS):
@@ -341,14 +326,7 @@ def clustered_covariance(
 ) -> Float64[np.ndarray, "k k"]:
     """Covariance of weighted least squares whose errors are alike within cells only.
 
-    Args:
-        A: Rows of the unknowns.
-        weight: Of each row.
-        off: Residuals.
-        cells: The cell of each row, from 0.
-
-    Raises:
-        numpy.linalg.LinAlgError: The rows do not hold the unknowns.
+    Raises ``LinAlgError`` if the rows do not hold the unknowns.
     """
     scores = np.zeros((int(cells.max()) + 1, A.shape[1]))
     np.add.at(scores, cells, A * (weight * off)[:, None])

@@ -91,12 +91,7 @@ def triangulation(
 ) -> tuple[Float64[np.ndarray, "N 3 3"], Float64[np.ndarray, "N 3 2"]]:
     """Covariance and sensitivity of triangulated points, in scene units (squared) and per pixel.
 
-    Args:
-        tracks: The points.
-        images: Those that observed them; observations in others do not count.
-
-    Returns:
-        Float64 [N, 3, 3], NaN where fewer than two images remain; float64 [N, 3, 2].
+    Float64 [N, 3, 3], NaN where fewer than two of the images observed a point; float64 [N, 3, 2].
     """
     point, jacobian = _jacobians(tracks, images)
     information, pull = np.zeros((len(tracks), 3, 3)), np.zeros((len(tracks), 3, 2))
@@ -140,11 +135,7 @@ def pixel_noise(
 
     The mean length of L residuals is sigma sqrt(pi / 2) sqrt((2 L - 3) / (2 L)), as the point took
     three of their 2 L degrees of freedom. Short tracks say little, so each variance is drawn
-    towards the median's, as by an inverse chi-squared prior.
-
-    Args:
-        errors: Mean reprojection errors, pixels; negative where unknown.
-        lengths: Observations of each.
+    towards the median's, as by an inverse chi-squared prior. Errors are negative where unknown.
     """
     free = np.maximum(2.0 * lengths - 3, 1)
     sigma = np.where(errors >= 0, errors, np.nan) * np.sqrt(2 / np.pi * 2 * lengths / free)

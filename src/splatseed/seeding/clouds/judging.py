@@ -38,13 +38,7 @@ from splatseed.views.view import View
 def find_support(
     xyz: Float32[np.ndarray, "N 3"], side: Float32[np.ndarray, " N"], count: Int32[np.ndarray, " N"]
 ) -> Int64[np.ndarray, " N"]:
-    """The support of each voxel.
-
-    Args:
-        xyz: Positions.
-        side: Sides, powers of two.
-        count: Points that each holds.
-    """
+    """The support of each voxel; sides are powers of two."""
     slots = 1 << int(2 * max(len(xyz), 1)).bit_length()
     keys, sums = np.zeros(slots, np.uint64), np.zeros(slots, np.int64)
     _count(xyz, side, count, keys, sums)
@@ -119,13 +113,7 @@ class FreeRays:
         seen: Sequence[Float64[np.ndarray, "M 3"]],
         depths: Sequence[Surface] | None = None,
     ) -> FreeRays:
-        """The free rays of some views.
-
-        Args:
-            views: The views.
-            seen: The points that each sees for certain, world.
-            depths: What stereo knows of each, infinite where it knows nothing.
-        """
+        """The free rays of views, from points that each sees for certain and stereo's depths."""
         if depths is None:
             shapes = [(-(-v.height // RAY_CELL), -(-v.width // RAY_CELL)) for v in views]
             depths = [np.full(shape, np.inf, np.float32) for shape in shapes]
@@ -183,15 +171,9 @@ def find_evidence(
     rays: FreeRays | None,
     progress: Progress,
 ) -> Evidence:
-    """Hold points against the photographs.
+    """Hold points against photographs; ``surfaces`` and ``cell`` are those of ``find_surfaces``.
 
-    Args:
-        views: The views; those without pixels give no colours.
-        xyz: The points.
-        surfaces: Of each view, from ``find_surfaces``.
-        cell: The side of their cells, in pixels.
-        rays: Where rays are known to be free.
-        progress: Told how far it is.
+    Views without pixels give no colours; ``rays`` are known to be free.
     """
     num = len(xyz)
     evidence = Evidence(
@@ -225,16 +207,10 @@ def find_evidence(
 def surface_agreement(
     views: Sequence[View], surfaces: Sequence[Surface], seen: Sequence[Float64[np.ndarray, "M 3"]]
 ) -> tuple[float, int]:
-    """How well a scene's own points fit the surfaces of a cloud.
+    """How well a scene's own points, seen by each view, fit the surfaces of a cloud.
 
-    Args:
-        views: The views.
-        surfaces: Of each.
-        seen: The points of the scene that each view sees, world.
-
-    Returns:
-        Of the points that are seen where the cloud has a surface, the share that lies within
-        ``FITS`` of its depth; and the number of these points.
+    Of those that are seen where the cloud has a surface, the share within ``FITS`` of its depth;
+    and their number.
     """
     close = total = 0
     for view, surface, xyz in zip(views, surfaces, seen, strict=True):
@@ -390,14 +366,8 @@ def judge(
 ) -> Judged:
     """Judge the voxels of a cloud.
 
-    Args:
-        views: The photographs; without pixels only their frames count.
-        seen: The scene's own points that each view sees, world.
-        voxels: The cloud.
-        colors: Its own colours, where it has some.
-        progress: Told how far it is.
-        clean: Whether contradicted voxels go, or only hidden ones.
-        rays: Where rays are known to be free.
+    ``seen`` are the scene's own points that each view sees, ``colors`` the cloud's own; without
+    ``clean`` only hidden voxels go.
 
     Raises:
         PointCloudError: No photograph sees any voxel.

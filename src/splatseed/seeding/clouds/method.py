@@ -219,11 +219,7 @@ def _free_rays(
 
 
 def _check_in_view(streamed: Streamed, scene: Scene) -> None:
-    """Refuse clouds of which no point falls in any photograph.
-
-    Raises:
-        PointCloudError: They are elsewhere.
-    """
+    """Refuse clouds of which no point falls in any photograph."""
     if len(streamed.voxels):
         return
     centers = np.array([image.camera.center for image in scene.images])
@@ -249,11 +245,7 @@ def _span(low: Float64[np.ndarray, " 3"], high: Float64[np.ndarray, " 3"]) -> st
 
 
 def _check_fit(judged: Judged) -> tuple[str, ...]:
-    """Refuse a cloud that does not lie where the scene's own points do.
-
-    Raises:
-        PointCloudError: It is of another place, or in another frame.
-    """
+    """Refuse a cloud that does not lie where the scene's own points do."""
     if judged.asked < ENOUGH:
         return ()
     share = f"{judged.fit:.0%} of the scene's own points seen there"

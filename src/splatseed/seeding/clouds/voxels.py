@@ -294,11 +294,9 @@ class CloudSample(NamedTuple):
 
 
 def plan_memory(most: int | None, views: Sequence[View]) -> MemoryPlan:
-    """How many voxels fit into memory, beside photographs.
+    """How many voxels fit into ``most`` bytes of memory, beside photographs.
 
-    Args:
-        most: Most bytes; ``DEFAULT`` when None. Never more than is free.
-        views: The views.
+    ``DEFAULT`` when None; never more than is free.
 
     Raises:
         ParameterError: The program, the photographs and the fewest voxels do not fit.
@@ -327,15 +325,7 @@ def stream(
     capacity: int,
     progress: Progress,
 ) -> Streamed:
-    """Read clouds into voxels.
-
-    Args:
-        paths: The files.
-        scene_from_cloud: From their frame to the scene's; the same frame when None.
-        views: The views that determine the voxels' sides.
-        pixels: Side of a voxel in pixels.
-        capacity: Most voxels.
-        progress: Told how far it is.
+    """Read clouds of one frame into voxels of so many pixels of the views.
 
     Raises:
         SceneNotFoundError: A file is missing.
@@ -377,11 +367,7 @@ def _read(file: CloudFile, progress: Progress, stage: str) -> Iterator[tuple[flo
 
 
 def sample_cloud(paths: Sequence[Path], progress: Progress) -> CloudSample:
-    """Read clouds, keeping an even sample.
-
-    Args:
-        paths: The files, in one frame.
-        progress: Told how far it is.
+    """Read clouds of one frame, keeping an even sample.
 
     Raises:
         SceneNotFoundError: A file is missing.
