@@ -23,10 +23,10 @@ import numpy as np
 
 import splatseed as ss
 from splatseed.cli import main
+from splatseed.depth.stereo import stereo_depths
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.stereo import stereo_depths
 
 METHODS = ("linear", "triangle", "spline", "mls", "voronoi", "random")
 STRATEGIES = ("default", "grow", "mcmc", "none", "default-3dgs", "mcmc-3dgs", "none-3dgs")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from splatseed.camera import Camera
-from splatseed.stereo import StereoMap
+from splatseed.depth.stereo import StereoMap
 from splatseed.synthetic.room import pixel_rays, visible
 
 NUM_SOURCES = 4

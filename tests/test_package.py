@@ -42,7 +42,6 @@ ORDER = (
     "io",
     "views",
     "depth",
-    "stereo",
     "upsample",
     "tiles",
     "seeding",
@@ -157,9 +156,9 @@ def test_rooms_of_a_part_import_each_other_in_no_circle(part):
     TopologicalSorter(rooms).prepare()  # raises CycleError, which names the circle
 
 
-@pytest.mark.parametrize("part", ["views", "depth", "stereo", "upsample", "seeding"])
+@pytest.mark.parametrize("part", ["views", "depth", "upsample", "seeding"])
 def test_what_makes_seeds_needs_little(part):
-    more = {"views": {"PIL"}, "depth": {"PIL"}, "stereo": {"llvmlite"}}.get(part, set())
+    more = {"views": {"PIL"}, "depth": {"PIL", "llvmlite"}}.get(part, set())
     allowed = {"splatseed", *more, *LIGHT}
     for path in _files(part):
         tops = {name.split(".")[0] for name in _imports(path)}

@@ -1,15 +1,15 @@
 """The photometric cost of planes as a scalar Numba loop: pixels, planes, views and samples.
 
-Notation: as in ``splatseed.stereo.cost``. Promise: the same cost up to rounding. It is given what
-costs nothing to give: weights and likeness of a window are computed once a pixel, not once a plane.
+Notation: as in ``splatseed.depth.stereo.cost``. Promise: the same cost up to rounding. It is
+given what costs nothing to give: weights and likeness of a window are computed once a pixel, not
+once a plane.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from splatseed.kernels.jit import inline
-from splatseed.stereo.cost import (
+from splatseed.depth.stereo.cost import (
     LEAST,
     NOISE,
     RADIUS,
@@ -20,6 +20,7 @@ from splatseed.stereo.cost import (
     STRIDE,
     UNSEEN,
 )
+from splatseed.kernels.jit import inline
 
 __all__ = ["costs_of_planes"]
 

@@ -16,9 +16,9 @@ import numpy as np
 from benchmarks.common.clouds import find_scenes
 
 import splatseed as ss
-from splatseed.stereo.depths import find_stereo
-from splatseed.stereo.result import StereoResult
-from splatseed.stereo.settings import StereoSettings
+from splatseed.depth.stereo.depths import find_stereo
+from splatseed.depth.stereo.maps import StereoResult
+from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.views.view import data_factor, load_views
 from splatseed.views.visibility import Visibility, find_visibility
 

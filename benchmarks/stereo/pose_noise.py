@@ -29,13 +29,13 @@ from scipy.spatial.transform import Rotation
 
 import splatseed as ss
 from splatseed.camera import quat_from_rotation
+from splatseed.depth.stereo.maps import stereo_depths
 from splatseed.errors import ReconstructionError, SplatseedError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.poses import pose_error
 from splatseed.sfm.refining import refined
 from splatseed.similarity import fit_similarity
-from splatseed.stereo.of_scene import stereo_depths
 from splatseed.views.view import user_cache_dir
 
 __all__: list[str] = []

@@ -21,9 +21,9 @@ from benchmarks.seeds.depth import CAPTURES, HELD_OUT, Truth
 from benchmarks.stereo.truth import MADE_STEP, Score, first, load, reached, relative_error
 from jaxtyping import Float, Int, UInt8
 
+from splatseed.depth.stereo.depths import known_visibility
+from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.scene import Scene
-from splatseed.stereo.settings import StereoSettings
-from splatseed.stereo.without_points import known_visibility
 from splatseed.views.pairs import choose_sources
 from splatseed.views.view import View, data_factor, load_views
 

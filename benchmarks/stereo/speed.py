@@ -18,12 +18,12 @@ from benchmarks.common.memory import status_bytes
 from benchmarks.stereo.peer import costs_of_planes
 
 import splatseed as ss
+from splatseed.depth.stereo.cost import make_quads
+from splatseed.depth.stereo.depths import find_stereo
+from splatseed.depth.stereo.fusion import fuse
+from splatseed.depth.stereo.patchmatch import QuadImages, begin, sweep
+from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.pointcloud import PointCloud
-from splatseed.stereo.depths import find_stereo
-from splatseed.stereo.fusion import fuse
-from splatseed.stereo.patchmatch import QuadImages, begin, sweep
-from splatseed.stereo.quads import make_quads
-from splatseed.stereo.settings import StereoSettings
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.texture import value_noise
 from splatseed.views.view import load_views

@@ -19,14 +19,13 @@ from benchmarks.seeds.depth import CAPTURES, FAR, HELD_OUT, Truth, query, triang
 from scipy.spatial import cKDTree
 
 import splatseed as ss
+from splatseed.depth.stereo.depths import find_stereo, known_visibility
+from splatseed.depth.stereo.fusion import fuse
+from splatseed.depth.stereo.maps import StereoResult
+from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.io import find_depths
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
-from splatseed.stereo.depths import find_stereo
-from splatseed.stereo.fusion import fuse
-from splatseed.stereo.result import StereoResult
-from splatseed.stereo.settings import StereoSettings
-from splatseed.stereo.without_points import known_visibility
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.synthetic.room import Room, render_views
 from splatseed.synthetic.texture import Plain

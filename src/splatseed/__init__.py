@@ -6,12 +6,12 @@
 """
 
 from splatseed.camera import Camera
+from splatseed.depth.stereo import stereo_depths
 from splatseed.errors import SplatseedError
 from splatseed.io import load_scene, write_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.upsampling import add_cover as cover, upsample
-from splatseed.stereo import stereo_depths
 from splatseed.upsample import METHODS, upsample_points
 
 __all__ = [

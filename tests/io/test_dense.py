@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image as PilImage
 
 from splatseed.camera import Camera
+from splatseed.depth.stereo import StereoMap
 from splatseed.errors import (
     InputError,
     OutputError,
@@ -31,7 +32,6 @@ from splatseed.io.dense import (
 from splatseed.io.dense_model import scaled_K
 from splatseed.io.depth_files import read_stored
 from splatseed.io.ply import read_ply
-from splatseed.stereo import StereoMap
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.views.undistortion import undistort
 

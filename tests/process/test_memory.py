@@ -9,12 +9,12 @@ import pytest
 
 from splatseed import monocular
 from splatseed.commands.bench.machine import Machine, check_machine
+from splatseed.depth.stereo import StereoSettings, stereo_depths
+from splatseed.depth.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
 from splatseed.process import memory
-from splatseed.stereo import StereoSettings, stereo_depths
-from splatseed.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.device import BYTES_EACH as BYTES_TRAINED
 from splatseed.upsample import BYTES_EACH, number_of_new, upsample

@@ -20,7 +20,7 @@ from splatseed.upsample.method import NewPoints
 from splatseed.views.view import View
 from splatseed.views.visibility import Visibility
 
-from ..stereo.made import DOWN, STONE, arc, tilted_plane
+from ..depth.stereo.made import DOWN, STONE, arc, tilted_plane
 
 STEP = 0.12
 ALONG = np.array([np.cos(np.pi / 6), 0.0, np.sin(np.pi / 6)])

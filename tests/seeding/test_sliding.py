@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from splatseed.depth.stereo.cost import make_quads
+from splatseed.depth.stereo.patchmatch import QuadImages
 from splatseed.seeding.sliding import FLOOR, OFFSETS, REACH, REFINEMENTS, slide
 from splatseed.seeding.verify import TEXTURE
-from splatseed.stereo.patchmatch import QuadImages
-from splatseed.stereo.quads import make_quads
 
-from ..stereo.references import (
+from ..depth.stereo.references import (
     OFFSETS as WINDOW,
     best_of,
     bilinear,

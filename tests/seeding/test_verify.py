@@ -21,7 +21,7 @@ from splatseed.seeding.verify import (
     _Trials,
 )
 
-from ..stereo.made import WIDTH
+from ..depth.stereo.made import WIDTH
 from .planted import (
     NORMAL,
     constant,

@@ -10,11 +10,11 @@ import torch
 from hypothesis import given, strategies as st
 
 from splatseed.camera import Intrinsics
+from splatseed.depth.stereo.depths import find_stereo
 from splatseed.io import load_scene
 from splatseed.progress import silent
 from splatseed.scene import Image
 from splatseed.splat.gaussians import TrainingFrame
-from splatseed.stereo.depths import find_stereo
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.depths import PER_RENDERED, known_depths, stereo_size
 from splatseed.train.run import prepare_run
@@ -81,7 +81,7 @@ def test_photographs_are_compared_once_for_seeds_and_growth(scene, tmp_path, mon
         calls.append(1)
         return find_stereo(*arguments, **options)
 
-    monkeypatch.setattr("splatseed.stereo.depths.find_stereo", counted)
+    monkeypatch.setattr("splatseed.depth.stereo.depths.find_stereo", counted)
     settings = TrainSettings(strategy="grow", max_steps=60, data_factor=2, seeding="auto")
     run = prepare_run(scene, tmp_path / "run", settings)
     assert len(calls) == 1

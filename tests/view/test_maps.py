@@ -7,9 +7,9 @@ import pytest
 from PIL import Image as PillowImage
 
 from splatseed.camera import Camera, Intrinsics
+from splatseed.depth.stereo import StereoMap
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
-from splatseed.stereo import StereoMap
 from splatseed.view.maps import depth_picture, map_tiles, normal_picture, preview_maps
 from splatseed.view.page import UNKNOWN
 

@@ -55,7 +55,7 @@ _KINDS = ("photometric", "geometric")
 
 
 class DenseMap(Protocol):
-    """Depth, normals and confidence of one image; ``splatseed.stereo.StereoMap`` is one."""
+    """Depth, normals and confidence of one image; ``splatseed.depth.stereo.StereoMap`` is one."""
 
     @property
     def name(self) -> str:

@@ -16,18 +16,17 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from splatseed.depth.stereo.settings import MOST_GRID, TOO_FEW
 from splatseed.errors import PointCloudError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress
 from splatseed.scene import Image, Scene
-from splatseed.stereo.settings import MOST_GRID, TOO_FEW
 from splatseed.upsample import as_cloud
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
-    from splatseed.stereo.maps import StereoMap
-    from splatseed.stereo.result import StereoResult
+    from splatseed.depth.stereo.maps import StereoMap, StereoResult
     from splatseed.views.view import View
 
 MAX_SIZE = 800
@@ -114,7 +113,7 @@ class Stereo(PhotographMethod):
 
         Without points, the scene's poses are checked first.
         """
-        from splatseed.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
+        from splatseed.depth.stereo.fusion import fuse  # noqa: PLC0415  (kernels load with use)
 
         images = photographed(scene, self.hold_out)
         warnings: tuple[str, ...] = ()
@@ -146,9 +145,8 @@ class Stereo(PhotographMethod):
         only: Sequence[int] | None = None,
     ) -> StereoResult:
         """Compare the photographs, or what some of them need."""
-        from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
-        from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
-        from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415  (loads with its use)
+        from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
+        from splatseed.depth.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
 
         settings, seed = StereoSettings(grid=self.grid), int(rng.integers(1 << 32))
         return find_stereo(views, images, known_visibility(scene), settings, seed, progress, only)
@@ -208,7 +206,7 @@ def has_points(scene: Scene) -> bool:
 
 def begins_from_points(scene: Scene) -> bool:
     """Whether there are enough points for stereo to search around; else photographs must do."""
-    from splatseed.stereo.without_points import enough_points  # noqa: PLC0415  (kernels load with use)
+    from splatseed.depth.stereo.depths import enough_points  # noqa: PLC0415  (kernels load with use)
     from splatseed.views.visibility import find_visibility  # noqa: PLC0415  (loads with its use)
 
     return enough_points(find_visibility(scene), scene.images)

@@ -25,14 +25,14 @@ from jaxtyping import Bool, Float64
 from scipy.ndimage import gaussian_filter, map_coordinates, maximum_filter, sobel, uniform_filter
 from scipy.signal import correlate
 
+from splatseed.depth.stereo.depths import any_depth
+from splatseed.depth.stereo.matching import match_views
+from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.literal import quoted
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.stereo.matching import match_views
-from splatseed.stereo.settings import StereoSettings
-from splatseed.stereo.without_points import any_depth
 from splatseed.views.pairs import choose_by_pose
 from splatseed.views.view import View, data_factor, load_views, poses_of
 

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from splatseed.depth.stereo.cost import NOISE, SAMPLES, best_cost, prepare_window
 from splatseed.kernels.jit import always_inline, inline
 from splatseed.kernels.simd import LANES
-from splatseed.stereo.cost import NOISE, SAMPLES, best_cost, prepare_window
 
 REACH = 1.5
 """How far a point may move, in spacings."""

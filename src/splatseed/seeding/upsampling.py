@@ -28,7 +28,7 @@ from splatseed.upsample.registry import source_code
 from splatseed.views.view import View, data_factor, poses_of
 
 if TYPE_CHECKING:
-    from splatseed.stereo.result import StereoResult
+    from splatseed.depth.stereo.maps import StereoResult
 
 RHO = "rho"
 """The unit of Gaussians per pixel of a photograph."""

@@ -20,13 +20,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
+from splatseed.depth.stereo.cost import grey_image
+from splatseed.depth.stereo.matching import make_quad_images
 from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
 from splatseed.scene import Image
 from splatseed.seeding.sliding import slide
-from splatseed.stereo.matching import make_quad_images
-from splatseed.stereo.quads import grey_image
 from splatseed.upsample.method import NewPoints
 from splatseed.upsample.neighbors import Neighbors, PreparedCloud, prepare
 from splatseed.upsample.patches import local_frames

@@ -18,13 +18,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from splatseed.depth.stereo.maps import StereoResult, stereo_depths
+from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import atomic_file
 from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.stereo.of_scene import stereo_depths
-from splatseed.stereo.result import StereoResult
-from splatseed.stereo.settings import StereoSettings
 from splatseed.train.settings import TrainSettings
 
 PER_RENDERED: Mapping[str, float] = MappingProxyType({"cpu": 0.13, "cuda": 0.01})

@@ -30,7 +30,7 @@ from splatseed.train.settings import AS_3DGS, TrainSettings
 from splatseed.views.view import View
 
 if TYPE_CHECKING:
-    from splatseed.stereo.result import StereoResult
+    from splatseed.depth.stereo.maps import StereoResult
 
 SEEDS_SHARE: Mapping[str, float] = MappingProxyType({"default": 0.7, "mcmc": 0.7})
 """Most seeds as a fraction of the cap, for strategies that add Gaussians; others may use it all."""

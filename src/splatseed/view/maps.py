@@ -17,8 +17,8 @@ from PIL import Image as PillowImage, ImageDraw
 
 from splatseed.camera import Camera
 from splatseed.depth.alignment import Alignment, PlanarDepth, map_camera
+from splatseed.depth.stereo import StereoMap
 from splatseed.scene import Image, Scene
-from splatseed.stereo import StereoMap
 from splatseed.view.page import (
     UNKNOWN,
     Tile,

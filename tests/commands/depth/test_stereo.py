@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import splatseed.stereo
+import splatseed.depth.stereo
 from splatseed.io import find_depths, load_scene
 from splatseed.synthetic import make_capture, write_capture
 
@@ -36,7 +36,7 @@ def stereo(monkeypatch, maps):
         progress("stereo", 1.0)
         return known.maps
 
-    monkeypatch.setattr(splatseed.stereo, "stereo_depths", stereo_depths, raising=False)
+    monkeypatch.setattr(splatseed.depth.stereo, "stereo_depths", stereo_depths, raising=False)
     return known
 
 

@@ -12,10 +12,10 @@ from typing import Annotated
 import tyro
 
 from splatseed.commands.options import check_least
+from splatseed.depth.stereo.settings import LEAST_SIZE, MOST_GRID
 from splatseed.depthmap import DepthKind
 from splatseed.errors import ParameterError
 from splatseed.process.torch_device import DeviceName
-from splatseed.stereo.settings import LEAST_SIZE, MOST_GRID
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from splatseed.seeding.diagnostics import is_distorted
 from splatseed.train.schedule import FULL_RUN
 
 if TYPE_CHECKING:
-    from splatseed.stereo import StereoMap
+    from splatseed.depth.stereo import StereoMap
 
 NAMES_SHOWN = 5
 PICTURE = "preview_maps.png"
@@ -77,7 +77,7 @@ def provenance(options: Options, packages: Sequence[str]) -> dict[str, object]:
 
 def _maps(scene: Scene, options: Options, clock: StageClock) -> tuple[StereoMap, ...]:
     """The maps, by stereo's own defaults where an option is left out."""
-    from splatseed.stereo import stereo_depths  # noqa: PLC0415  (loads little)
+    from splatseed.depth.stereo import stereo_depths  # noqa: PLC0415  (loads little)
 
     names = ("max_size", "grid")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}

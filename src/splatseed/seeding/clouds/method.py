@@ -208,9 +208,8 @@ def _free_rays(
     certain = seen if scene.tracks is not None else [np.empty((0, 3))] * len(views)
     if not scene.has_photographs or len(views) < 2:
         return FreeRays.of(views, certain) if scene.tracks is not None else None
-    from splatseed.stereo.depths import find_stereo  # noqa: PLC0415  (kernels load with use)
-    from splatseed.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
-    from splatseed.stereo.without_points import known_visibility  # noqa: PLC0415  (loads with its use)
+    from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
+    from splatseed.depth.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
 
     seed, visibility = int(rng.integers(1 << 32)), known_visibility(scene)
     stereo = find_stereo(views, images, visibility, StereoSettings(), seed, progress)

@@ -8,12 +8,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from splatseed.depth.stereo import depths as without_points, stereo_depths
+from splatseed.depth.stereo.depths import SAMPLES, coarse_stereo, known_visibility
 from splatseed.depthmap import DepthMap
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.scene import Scene
-from splatseed.stereo import stereo_depths, without_points
-from splatseed.stereo.without_points import SAMPLES, coarse_stereo, known_visibility
 from splatseed.views.pairs import choose_by_pose
 from splatseed.views.view import load_views
 from splatseed.views.visibility import find_visibility

@@ -5,9 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from splatseed.depth.stereo.cost import (
+    NOISE,
+    SAMPLES,
+    UNSEEN,
+    best_cost,
+    make_quads,
+    prepare_window,
+)
 from splatseed.kernels.simd import LANES
-from splatseed.stereo.cost import NOISE, SAMPLES, UNSEEN, best_cost, prepare_window
-from splatseed.stereo.quads import make_quads
 
 from .references import OFFSETS, best_of, bilinear, cost_in, window_weights
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numba import njit
 
+from splatseed.depth.stereo.cost import grey_image, make_quads, sample
 from splatseed.kernels.simd import LANES, load, store
-from splatseed.stereo.quads import grey_image, make_quads, sample
 
 from .references import bilinear
 

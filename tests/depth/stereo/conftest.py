@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from splatseed.depth.stereo.depths import StereoResult, find_stereo
+from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.scene import Scene
-from splatseed.stereo.depths import StereoResult, find_stereo
-from splatseed.stereo.settings import StereoSettings
 from splatseed.synthetic.surfaces import Union
 from splatseed.views.view import load_views
 from splatseed.views.visibility import find_visibility

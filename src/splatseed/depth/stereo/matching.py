@@ -1,26 +1,166 @@
 """Planes for every view, by comparing it with others, and which views confirm them.
 
-Notation: as in ``result``. Promise: a view's planes depend only on the photographs, its hints and
-the seed: threads take whole views.
+*Start.* A view sees M Structure-from-Motion points at pixels uv [M, 2] with inverse depth w [M];
+the grid has h x w points. There are K guesses per grid point, finite and positive; if a view sees
+too few points, they are inverse depths drawn uniformly between the bounds.
+
+*Confirmation.* View i has planes [3, h, w] on its grid; point X at one of its grid points falls on
+the grid of view j at (column, row), where j's own plane at the nearest grid point says inverse
+depth w_j. Both *agree* if |z_ij w_j - 1| <= tolerance, z_ij the depth of X in j. Every pair is
+compared in one direction at a time, so the order of views is irrelevant.
+Promise: a view's planes depend only on the photographs, its hints and the seed: threads take whole
+views.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
+from scipy.spatial import cKDTree
 
+from splatseed.depth.stereo.cost import grey_image, make_quads
+from splatseed.depth.stereo.maps import StereoResult
+from splatseed.depth.stereo.patchmatch import QuadImages, begin, sweep
+from splatseed.depth.stereo.settings import StereoSettings
+from splatseed.kernels.jit import inline
 from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, in_threads
-from splatseed.stereo.consistency import confirm
-from splatseed.stereo.patchmatch import QuadImages, begin, sweep
-from splatseed.stereo.quads import grey_image, make_quads
-from splatseed.stereo.result import StereoResult
-from splatseed.stereo.settings import StereoSettings
-from splatseed.stereo.start import Hints, first_planes
 from splatseed.views.view import View
+
+NEAREST = 3
+"""Points whose depth is tried as a fronto-parallel plane."""
+FITTED = 8
+"""Points that a plane is fitted through."""
+RANDOM = 16
+"""Guesses where nothing is known."""
+MARGIN = 1.3
+"""Bounds reach this many times beyond the nearest and the farthest point."""
+RIDGE = 1e-3
+"""Shrinks slopes, relative to the spread of the points: a few in a line do not determine them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hints:
+    """What is known about the depth in a view before stereo.
+
+    Args:
+        uv: Pixels of points that it sees, float64 [M, 2].
+        w: Their inverse depths, float64 [M].
+        bounds: Smallest and largest inverse depth that is searched, float32 [2].
+    """
+
+    uv: Float64[np.ndarray, "M 2"]
+    w: Float64[np.ndarray, " M"]
+    bounds: Float32[np.ndarray, " 2"]
+
+
+def hints_from(uv: Float64[np.ndarray, "M 2"], w: Float64[np.ndarray, " M"]) -> Hints:
+    """Hints from at least one point: planes are searched a little beyond the points."""
+    # Percentiles, as a few of SfM's points float in front of the cameras.
+    low, high = np.percentile(w, [0.5, 99.5])
+    return Hints(uv, w, np.array([low / MARGIN, high * MARGIN], np.float32))
+
+
+def first_planes(
+    hints: Hints, shape: tuple[int, int], grid: int, rng: np.random.Generator
+) -> Float32[np.ndarray, "K 3 h w"]:
+    """The planes to try first at each grid point.
+
+    Args:
+        hints: The view's hints.
+        shape: Rows and columns of the grid, neither 0.
+        grid: Pixels between grid points.
+        rng: For guesses where too few points are seen.
+    """
+    rows, columns = shape
+    w = hints.w
+    if len(w) < FITTED:
+        guesses = np.zeros((RANDOM, 3, rows, columns), np.float32)
+        guesses[:, 0] = rng.uniform(hints.bounds[0], hints.bounds[1], (RANDOM, rows, columns))
+        return guesses
+    place = (np.indices(shape)[::-1].reshape(2, -1).T + 0.5) * grid
+    nearest = cKDTree(hints.uv).query(place, FITTED)[1]
+    guesses = np.zeros((NEAREST + 1, 3, rows * columns), np.float32)
+    guesses[:NEAREST, 0] = w[nearest[:, :NEAREST]].T
+    guesses[NEAREST] = _fit(hints.uv[nearest] - place[:, None], w[nearest])
+    return np.ascontiguousarray(guesses.reshape(-1, 3, rows, columns))
+
+
+def _fit(
+    apart: Float64[np.ndarray, "G K 2"], w: Float64[np.ndarray, "G K"]
+) -> Float64[np.ndarray, "3 G"]:
+    """Least-squares w + gx du + gy dv through K points each, slopes shrunk a little to 0."""
+    design = np.concatenate([np.ones((*w.shape, 1)), apart], axis=2)
+    normal = np.swapaxes(design, 1, 2) @ design
+    spread = np.trace(normal[:, 1:, 1:], axis1=1, axis2=2)
+    # Normal equations of w0 + gx du + gy dv; only the slopes are shrunk.
+    normal[:, [1, 2], [1, 2]] += RIDGE * (1.0 + spread)[:, None]
+    right = np.swapaxes(design, 1, 2) @ w[..., None]
+    fitted = np.linalg.solve(normal, right)[..., 0].T
+    low, high = w.min(axis=1), w.max(axis=1)
+    # Extrapolated planes can leave the points' depths, or end behind the camera.
+    outside = (fitted[0] < low / MARGIN) | (fitted[0] > high * MARGIN)
+    fitted[:, outside] = [w[outside].mean(axis=1), np.zeros(outside.sum()), np.zeros(outside.sum())]
+    return np.asarray(fitted)
+
+
+@inline
+def confirm(  # type: ignore[no-untyped-def]  # Numba\'s types
+    planes, costs, max_cost, grid, j_from_i, other_planes, other_costs, tolerance, bit, out
+):
+    """Set a bit where another view's map agrees with a view's.
+
+    Args:
+        planes: The view's planes, float32 [3, h, w].
+        costs: The view's costs, float32 [h, w].
+        max_cost: Planes of higher cost neither ask nor answer.
+        grid: Pixels between grid points.
+        j_from_i: Maps pixels of the view times depth, and 1, to the other's times its depth; [3,
+            4].
+        other_planes: The other view's planes, float32 [3, p, q].
+        other_costs: The other view's costs, float32 [p, q].
+        tolerance: Relative difference of depth.
+        bit: The bit to set, uint8.
+        out: The bits of each grid point, uint8 [h, w].
+    """
+    height, width = costs.shape
+    m = j_from_i
+    for row in range(height):
+        for column in range(width):
+            if costs[row, column] > max_cost:
+                continue
+            # X at depth z on the pixel's ray, and its depth and pixel in the other view.
+            z = 1.0 / planes[0, row, column]
+            u, v = (column + 0.5) * grid * z, (row + 0.5) * grid * z
+            depth = m[2, 0] * u + m[2, 1] * v + m[2, 2] * z + m[2, 3]
+            if not depth > 0.0:
+                continue
+            x = (m[0, 0] * u + m[0, 1] * v + m[0, 2] * z + m[0, 3]) / depth
+            y = (m[1, 0] * u + m[1, 1] * v + m[1, 2] * z + m[1, 3]) / depth
+            if _agrees(x, y, depth, grid, other_planes, other_costs, max_cost, tolerance):
+                out[row, column] |= bit
+
+
+@inline
+def _agrees(x, y, depth, grid, planes, costs, max_cost, tolerance):  # type: ignore[no-untyped-def]  # Numba's types
+    """Whether a map has this depth at pixel (x, y)."""
+    rows, columns = costs.shape
+    if not (0.0 <= x < columns * grid and 0.0 <= y < rows * grid):
+        return False
+    # The nearest grid point: (p, q) lies at pixel ((q + 0.5) g, (p + 0.5) g).
+    q, p = int(x / grid), int(y / grid)
+    if costs[p, q] > max_cost:
+        return False
+    # w(u, v) = w0 + gx (u - u0) + gy (v - v0)
+    across, down = x - (q + 0.5) * grid, y - (p + 0.5) * grid
+    w = planes[0, p, q] + planes[1, p, q] * across + planes[2, p, q] * down
+    # |z_ij w_j - 1|: a relative difference of depth, with one multiplication.
+    return abs(depth * w - 1.0) <= tolerance
+
 
 BYTES_A_DEPTH = 3 * 4 + 4 + 1
 """A view's planes, costs, and agreement bits."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.stereo.consistency import confirm
+from splatseed.depth.stereo.matching import confirm
 
 from .references import agrees
 

@@ -9,11 +9,11 @@ import numba
 import numpy as np
 import pytest
 
+from splatseed.depth.stereo import depths as without_points, stereo_depths
+from splatseed.depth.stereo.depths import find_stereo
+from splatseed.depth.stereo.settings import StereoSettings
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.pointcloud import PointCloud
-from splatseed.stereo import stereo_depths, without_points
-from splatseed.stereo.depths import find_stereo
-from splatseed.stereo.settings import StereoSettings
 from splatseed.views.view import load_views
 from splatseed.views.visibility import find_visibility
 

@@ -14,9 +14,9 @@ import numpy as np
 from PIL import Image as PillowImage
 
 from splatseed.camera import Camera, Intrinsics, quat_from_rotation
+from splatseed.depth.stereo.maps import StereoMap
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Image, Scene, SceneSource
-from splatseed.stereo.maps import StereoMap
 from splatseed.synthetic.room import Room, pixel_rays, render_view
 from splatseed.synthetic.surfaces import Rectangle, Sphere, Surface, Union
 from splatseed.synthetic.texture import Mottled, Plain, Texture

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatseed.stereo.patchmatch import STEEPEST, QuadImages, begin, sweep
-from splatseed.stereo.quads import make_quads
+from splatseed.depth.stereo.cost import make_quads
+from splatseed.depth.stereo.patchmatch import STEEPEST, QuadImages, begin, sweep
 
 from .references import best_of, cost_in
 

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
+from splatseed.depth.stereo.maps import StereoResult
+from splatseed.depth.stereo.matching import other_from_view
 from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, silent
-from splatseed.stereo.matching import other_from_view
-from splatseed.stereo.result import StereoResult
 
 SAME = 0.03
 """Relative difference of depth up to which two seeds in a cell count as one."""

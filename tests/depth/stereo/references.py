@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from splatseed.stereo.cost import BEST, NOISE, RADIUS, SIGMA_GREY, SIGMA_PLACE, STRIDE, UNSEEN
+from splatseed.depth.stereo.cost import BEST, NOISE, RADIUS, SIGMA_GREY, SIGMA_PLACE, STRIDE, UNSEEN
 
 OFFSETS = [
     (STRIDE * i, STRIDE * j) for j in range(-RADIUS, RADIUS + 1) for i in range(-RADIUS, RADIUS + 1)
