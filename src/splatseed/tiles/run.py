@@ -140,8 +140,8 @@ def check_tileable(name: str, method: object, in_memory: str = "work in memory")
     way_out = ""
     if not isinstance(method, NearestMethod):
         reason = f"{name}, which needs the whole scene at once"
-    elif method.whole:
-        reason = f"{name} with {method.whole}, which needs all points at once"
+    elif method.untileable_reason:
+        reason = f"{name} with {method.untileable_reason}, which needs all points at once"
         way_out = f", or {name} with --profile default"
     else:
         return

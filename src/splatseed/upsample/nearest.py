@@ -70,7 +70,7 @@ class NearestMethod(ABC):
         """Neighbours that points are made from."""
 
     @property
-    def whole(self) -> str:
+    def untileable_reason(self) -> str:
         """What the method computes from all points at once; empty if it computes nothing so."""
         return ""
 

@@ -74,7 +74,7 @@ class Voronoi(NearestMethod):
         return self.k
 
     @property
-    def whole(self) -> str:
+    def untileable_reason(self) -> str:
         """Cells in the bounding box are those of one diagram of all points."""
         return "the cells of Qhull's diagram in the bounding box" if self.cells == "box" else ""
 
