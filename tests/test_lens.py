@@ -65,13 +65,6 @@ def test_without_coefficients_a_lens_is_a_pinhole(model, rng, rays):
     assert lens.has_distortion == (zeros > 0)
 
 
-def test_a_fisheye_without_coefficients_still_bends_lines(rays):
-    lens = Intrinsics(1, "RADIAL_FISHEYE", 64, 48, (50.0, 32.0, 24.0, 0.0, 0.0))
-    assert lens.has_distortion
-    radius = np.linalg.norm(distort(lens, rays), axis=-1)
-    np.testing.assert_allclose(radius, np.arctan(np.linalg.norm(rays, axis=-1)), atol=1e-12)
-
-
 def test_a_lens_folds_where_its_radius_is_largest():
     """r (1 + k r^2) turns back at r = sqrt(-1 / 3k)."""
     lens = Intrinsics(1, "SIMPLE_RADIAL", 64, 48, (50.0, 32.0, 24.0, -0.3))

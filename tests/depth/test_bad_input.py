@@ -11,7 +11,6 @@ import pytest
 import splatseed as ss
 from splatseed.camera import Intrinsics
 from splatseed.errors import (
-    ParameterError,
     SceneFormatError,
     SceneNotFoundError,
 )
@@ -93,13 +92,3 @@ def test_infinities_zeros_and_negatives_are_never_lifted(exact, make_maps):
         seeds = upsample(exact.replace(depths=make_maps("z", change)), profile=profile)
         assert seeds.finite.all()
         assert np.abs(seeds.xyz).max() < 10
-
-
-def test_a_parameter_is_checked_before_anything_is_read(exact):
-    class Untouchable(dict):
-        def read(self, name):
-            raise AssertionError(name)
-
-    scene = exact.replace(depths=Untouchable(exact.depths))
-    with pytest.raises(ParameterError, match="tolerance"):
-        upsample(scene, tolerance=2.0)

@@ -48,16 +48,6 @@ def test_a_point_that_hangs_before_a_surface_does_not_hide_it(rng):
     np.testing.assert_allclose(depths, 4.0, rtol=1e-5)
 
 
-def test_only_finite_points_before_the_camera_count(rng):
-    view = slow.make_view(rng, eye=(0, -1, 0))
-    center = np.linalg.inv(view.cam_from_world)[:3, 3]
-    ahead = view.cam_from_world[2, :3]
-    bad = [center, center - ahead, [np.inf, 0, 0], [np.nan, 0, 0]]
-    assert covered_share([view], np.float32(bad)) == 0.0
-    assert covered_share([view], np.float32([center + ahead])) == 1 / 20
-    assert covered_share([view], np.empty((0, 3), np.float32)) == 0.0
-
-
 def test_bad_input_is_refused(rng):
     view, xyz = slow.make_view(rng), np.zeros((1, 3), np.float32)
     with pytest.raises(ParameterError, match="at least one view"):

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numba
 import numpy as np
 import pytest
 
 import splatseed as ss
-from splatseed.errors import ParameterError, SceneNotFoundError
+from splatseed.errors import ParameterError
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import silent
 from splatseed.seeding.upsampling import parse_budget, share_covered, thin_to
@@ -80,13 +78,6 @@ def test_without_photographs_mls_stands_in_and_says_so(room):
     assert len(seeds) == 4 * len(room.points)
     assert set(seeds.source) == {0, SOURCE_CODES["mls"]}
     assert any("photographs" in note and "mls" in note for note in notes)
-
-
-@pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)
-def test_methods_that_look_say_what_they_lack(method, room):
-    bare = dataclasses.replace(room, source=None)
-    with pytest.raises(SceneNotFoundError, match="photographs"):
-        ss.upsample(bare, ss.METHODS[method](hold_out=8) if method != "auto" else "stereo")
 
 
 @pytest.mark.parametrize("method", PHOTOGRAPH_METHODS)

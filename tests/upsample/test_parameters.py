@@ -12,7 +12,6 @@ from splatseed.upsample import configure
 from splatseed.upsample.method import NewPoints
 
 from .contract import METHOD_NAMES, PHOTOGRAPH_METHODS, Copies
-from .surroundings import scene_around
 
 BUILT_IN = [name for name in METHOD_NAMES if name != "copies"]
 
@@ -98,21 +97,6 @@ def test_nothing_to_add_gives_the_originals(method, size, wavy):
     seeds = ss.upsample(wavy, method, **size)
     np.testing.assert_array_equal(seeds.xyz, wavy.xyz)
     np.testing.assert_array_equal(seeds.rgb, wavy.rgb)
-
-
-@pytest.mark.parametrize("method", BUILT_IN)
-def test_an_instance_and_its_name_do_the_same(method, wavy):
-    scene = scene_around(wavy)
-    by_name = ss.upsample(scene, method, seed=3, profile="paper")
-    by_instance = ss.upsample(scene, configure(method, "paper"), seed=3)
-    np.testing.assert_array_equal(by_name.xyz, by_instance.xyz)
-
-
-def test_arrays_and_clouds_give_the_same(wavy):
-    xyz, rgb = ss.upsample_points(wavy.xyz, wavy.rgb, "mls", ratio=2, k=12)
-    seeds = ss.upsample(wavy, "mls", ratio=2, k=12)
-    np.testing.assert_array_equal(xyz, seeds.xyz)
-    np.testing.assert_array_equal(rgb, seeds.rgb)
 
 
 PAPER_VALUES = [
