@@ -98,6 +98,19 @@ def test_bytes_follow_from_the_seed_whatever_the_threads(profile, exact, monkeyp
     assert lifted(exact, 3000, profile, seed=4).xyz.tobytes() not in results[0]
 
 
+def test_held_out_images_are_not_even_read(exact):
+    class Watched(dict):
+        def read(self, name):
+            names.add(name)
+            return self[name]
+
+    names = set()
+    scene = exact.replace(depths=Watched(exact.depths))
+    lifted(scene, 200, hold_out=8)
+    test_names = {image.name for image in scene.split(8)[1]}
+    assert names == {image.name for image in scene.images} - test_names
+
+
 def test_a_second_reading_comes_when_the_first_was_not_enough(exact, make_maps, monkeypatch):
     """Each map is off by its own tenth, unaligned: hardly a candidate is confirmed."""
     reads = []

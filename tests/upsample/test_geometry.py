@@ -85,6 +85,12 @@ def wall(tilt):
     return ss.PointCloud(xyz.astype(np.float32), np.full((NUM, 3), 128, np.uint8))
 
 
+@pytest.mark.parametrize("method", ["mls", "spline"])
+@pytest.mark.parametrize("tilt", [0, 45, 90])
+def test_walls_are_as_good_as_floors(method, tilt):
+    assert far_share(wall(tilt), method=method) < 0.01
+
+
 def test_the_papers_spline_flies_off_walls():
     assert far_share(wall(90), method="spline", profile="paper") > 0.05
     assert far_share(wall(90), method="spline", profile="paper") > 3 * far_share(
