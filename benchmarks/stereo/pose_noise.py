@@ -34,7 +34,7 @@ from splatseed.errors import ReconstructionError, SplatseedError
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene
 from splatseed.seeding.poses import pose_error
-from splatseed.sfm.refining import refined
+from splatseed.sfm import refined
 from splatseed.similarity import fit_similarity
 from splatseed.views.view import user_cache_dir
 

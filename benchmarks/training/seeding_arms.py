@@ -20,7 +20,7 @@ from splatseed.evaluate import evaluate_views
 from splatseed.pointcloud import PointCloud
 from splatseed.scene import Scene, Split
 from splatseed.seeding.poses import random_start
-from splatseed.sfm.refining import refined
+from splatseed.sfm import refined
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.seeds import SEEDS_SHARE
 from splatseed.upsample import configure

@@ -72,39 +72,25 @@ def _says(run, *texts):
         assert str(text) in run.err
 
 
-def test_a_ply_needs_its_scene(model, splatseed):
+def test_what_cannot_be_scored_is_refused(model, room, run_folder, splatseed, tmp_path):
     _says(splatseed("evaluate", model), "--scene")
-
-
-def test_seeds_are_not_gaussians(room, splatseed, tmp_path):
-    write_ply(tmp_path / "seeds.ply", load_scene(room).points)
-    _says(splatseed("evaluate", tmp_path / "seeds.ply", "--scene", room), "trained Gaussians")
-
-
-@pytest.mark.parametrize("name", ["nothing", "folder"])
-def test_what_is_no_run_is_refused(name, room, splatseed, tmp_path):
-    (tmp_path / "folder").mkdir()
-    _says(splatseed("evaluate", tmp_path / name, "--scene", room), tmp_path / name, ".ply")
-
-
-def test_a_file_about_a_run_leads_to_the_run(run_folder, splatseed):
     for name in ("config.json", "metrics.json", "curve.csv"):
-        _says(splatseed("evaluate", run_folder / name), f"Name the run: {run_folder}")
+        _says(splatseed("evaluate", run_folder / name), run_folder)
+    _says(splatseed("evaluate", room), f"splatseed train {room} ")
+    write_ply(tmp_path / "seeds.ply", load_scene(room).points)
+    gaussians = initial_gaussians(load_scene(room).points)
+    gaussians.means[3] = np.nan
+    write_gaussians(tmp_path / "nan.ply", gaussians)
+    (tmp_path / "folder").mkdir()
+    for name in ("nothing", "folder", "seeds.ply", "nan.ply"):
+        _says(splatseed("evaluate", tmp_path / name, "--scene", room), tmp_path / name)
 
 
-def test_a_run_that_has_not_finished_is_refused(run_folder, splatseed, tmp_path):
+def test_a_run_that_is_not_whole_is_refused(run_folder, splatseed, tmp_path):
     for name in ("config.json", "splatseed.json"):
         (tmp_path / name).write_bytes((run_folder / name).read_bytes())
-    _says(splatseed("evaluate", tmp_path), "has not finished", f"-o {tmp_path} --resume")
-
-
-def test_a_scene_is_to_be_trained_first(room, splatseed):
-    _says(splatseed("evaluate", room), f"found a scene. Train it first: splatseed train {room} ")
-
-
-def test_a_config_that_is_no_config_is_refused(run_folder, splatseed, tmp_path):
-    for name in ("config.json", "splatseed.json", "point_cloud.ply"):
-        (tmp_path / name).write_bytes((run_folder / name).read_bytes())
+    _says(splatseed("evaluate", tmp_path), f"-o {tmp_path} --resume")
+    (tmp_path / "point_cloud.ply").write_bytes((run_folder / "point_cloud.ply").read_bytes())
     for content in ("[]", "{", '{"scene": 7}', '{"scene": "x", "data_factor": "two"}'):
         (tmp_path / "config.json").write_text(content)
         _says(splatseed("evaluate", tmp_path))
@@ -138,10 +124,3 @@ def test_outputs_are_not_overwritten_unless_told_to(model, room, splatseed, tmp_
     assert splatseed(*words, "--overwrite").code == 0
     names = [s["name"] for s in json.loads(scores.read_text())["per_image"]]
     assert names == [s["name"] for s in json.loads(before)["per_image"]]
-
-
-def test_a_model_that_is_not_finite_is_refused(room, splatseed, tmp_path):
-    gaussians = initial_gaussians(load_scene(room).points)
-    gaussians.means[3] = np.nan
-    write_gaussians(tmp_path / "model.ply", gaussians)
-    _says(splatseed("evaluate", tmp_path / "model.ply", "--scene", room), "finite")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
@@ -160,15 +159,6 @@ def test_the_scene_is_not_written_into(room_path, network):
         with pytest.raises(OutputError):
             estimate_depths(load_scene(room_path), network, room_path / name)
     assert not network.asked
-
-
-def test_an_earlier_folder_is_replaced_only_when_asked(room_path, network, tmp_path):
-    scene = load_scene(room_path)
-    estimate_depths(scene, network, tmp_path / "maps", provenance={"model": "a"})
-    assert json.loads((tmp_path / "maps" / "splatseed.json").read_text())["model"] == "a"
-    with pytest.raises(OutputError, match="--overwrite"):
-        estimate_depths(scene, network, tmp_path / "maps")
-    estimate_depths(scene, network, tmp_path / "maps", overwrite=True)
 
 
 def test_what_cannot_be_done_is_refused(own_path, network, tmp_path):

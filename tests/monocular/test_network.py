@@ -128,18 +128,6 @@ def test_a_batch_gives_what_its_images_give_alone(saved, photographs):
         np.testing.assert_allclose(network([image])[0], depth, atol=1e-5)
 
 
-def test_threads_change_no_more_than_rounding(saved, photographs):
-    network, threads = load_network(str(saved("dpt")), device="cpu"), torch.get_num_threads()
-    try:
-        maps = []
-        for count in (1, 2):
-            torch.set_num_threads(count)
-            maps.append(np.stack(network(photographs)))
-    finally:
-        torch.set_num_threads(threads)
-    np.testing.assert_allclose(*maps, atol=1e-5)
-
-
 def test_depth_pro_leaves_its_maps_to_its_processor():
     """Its scale depends on the field of view that it predicts, as its own post-processing knows."""
 
@@ -184,18 +172,14 @@ def _copy(saved, tmp_path, name="depth_anything"):
 )
 def test_a_damaged_folder_is_one_error(file, content, saved, tmp_path):
     folder = _copy(saved, tmp_path)
+    with pytest.raises(SceneFormatError, match="a file"):
+        load_network(str(folder / file))
     (folder / file).unlink()
     if content is not None:
         (folder / file).write_bytes(content)
     with pytest.raises(SceneFormatError, match=str(folder)) as caught:
         load_network(str(folder), device="cpu")
     assert "\n" not in str(caught.value)
-
-
-def test_a_file_is_no_network(tmp_path):
-    (tmp_path / "weights.pth").write_bytes(b"x")
-    with pytest.raises(SceneFormatError, match=r"weights\.pth"):
-        load_network(str(tmp_path / "weights.pth"))
 
 
 def test_a_network_with_random_weights_is_refused(saved, tmp_path):
@@ -263,34 +247,24 @@ def test_a_processor_that_needs_torchvision_says_so(saved, tmp_path):
         load_network(str(folder), device="cpu")
 
 
-def test_an_image_that_the_network_cannot_take_is_one_error(saved, tmp_path):
-    folder = _copy(saved, tmp_path, "dpt_on_dinov2")
-    processor = json.loads((folder / "preprocessor_config.json").read_text())
-    processor["do_pad"] = False
-    (folder / "preprocessor_config.json").write_text(json.dumps(processor))
-    with pytest.raises(SceneFormatError, match="images of 10 x 9 pixels"):
-        load_network(str(folder), device="cpu")([np.zeros((9, 10, 3), np.uint8)])
-
-
 @pytest.mark.parametrize(
-    "error",
+    ("error", "raised", "said"),
     [
-        torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB."),
-        RuntimeError(
-            "[enforce fail] DefaultCPUAllocator: can't allocate memory: you tried 9 bytes"
-        ),
+        (torch.cuda.OutOfMemoryError("CUDA out of memory."), ParameterError, "--batch"),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), ParameterError, "--batch"),
+        (RuntimeError("sizes of tensors must match"), SceneFormatError, "tensors must match"),
     ],
 )
-def test_too_little_memory_names_the_flags(error, saved, ramp):
-    class Greedy(torch.nn.Module):
+def test_a_network_that_fails_is_one_error(error, raised, said, saved, ramp):
+    class Failing(torch.nn.Module):
         config = transformers.AutoConfig.from_pretrained(saved("dpt"))
 
         def forward(self, **_):
             raise error
 
     processor = transformers.AutoImageProcessor.from_pretrained(saved("dpt"), backend="pil")
-    network = DepthNetwork(processor, Greedy(), Meaning("z", "made"), torch.device("cpu"))
-    with pytest.raises(ParameterError, match=r"for 2 images of 32 x 32.*smaller --batch"):
+    network = DepthNetwork(processor, Failing(), Meaning("z", "made"), torch.device("cpu"))
+    with pytest.raises(raised, match=said):
         network([ramp, ramp])
 
 

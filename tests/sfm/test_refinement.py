@@ -13,33 +13,35 @@ from PIL import Image as PilImage
 from scipy.spatial.transform import Rotation
 
 from splatseed.camera import quat_from_rotation
-from splatseed.commands import sfm
 from splatseed.errors import ReconstructionError
 from splatseed.io import load_scene
 from splatseed.progress import silent
 from splatseed.scene import Image, Scene
-from splatseed.sfm import Refinement, SfmReport, triangulate
-from splatseed.sfm.cameras import known_cameras
-from splatseed.sfm.features import Run, find_features, match_features, write_database
+from splatseed.sfm import Refinement, triangulate
+from splatseed.sfm.features import (
+    Run,
+    Settings,
+    known_cameras,
+    match_photographs,
+    require_pycolmap,
+)
 from splatseed.sfm.photos import find_photos, match_poses
-from splatseed.sfm.settings import Settings, require_pycolmap
-from splatseed.sfm.solving.poses import Poses, align, poses_of, shifts, spread, turns, with_poses
-from splatseed.sfm.solving.refinement import GAIN, refine
-from splatseed.sfm.stages import Stages
-from splatseed.synthetic import make_capture, write_capture
+from splatseed.sfm.refinement import (
+    Poses,
+    align,
+    poses_of,
+    refine,
+    shifts,
+    spread,
+    turns,
+    with_poses,
+)
 
 pycolmap = pytest.importorskip("pycolmap")
 
 VIEWS = 12
 EXTENT = 3.2
 """The cameras' extent in units of their spread."""
-
-
-@pytest.fixture(scope="module")
-def room(tmp_path_factory) -> Scene:
-    """The room in 12 views of 320 x 240 with its true poses."""
-    capture = make_capture(0, num_views=VIEWS, width=320, height=240)
-    return load_scene(write_capture(capture, tmp_path_factory.mktemp("refined") / "room"))
 
 
 @dataclass(frozen=True)
@@ -57,14 +59,10 @@ class Matched:
 @pytest.fixture(scope="module")
 def matched(room: Scene, tmp_path_factory) -> Matched:
     folder = room.source.image_dir
-    photos, _ = find_photos(folder, at_least=2)
-    settings = Settings("exhaustive", "cpu", 1600, 0, threads=1)
-    stages = Stages(require_pycolmap(), 0, silent)
-    run = Run(stages, settings, folder, tmp_path_factory.mktemp("matches"))
-    cameras, images = known_cameras(run, match_poses(photos, room, folder))
-    write_database(run, cameras, images)
-    find_features(run, [photo.name for photo in photos])
-    match_features(run)
+    settings = Settings(device="cpu", threads=1)
+    run = Run(require_pycolmap(), settings, folder, tmp_path_factory.mktemp("matches"), silent)
+    cameras, images = known_cameras(run, match_poses(find_photos(folder)[0], room, folder))
+    match_photographs(run, cameras, images)
     return Matched(run, cameras, images)
 
 
@@ -108,15 +106,6 @@ def test_true_poses_stay_exactly(room: Scene, matched: Matched) -> None:
     assert refinement.error_before == refinement.error_after < 0.25
 
 
-def test_a_small_gain_moves_little(room: Scene, matched: Matched) -> None:
-    given = with_noise(room.images, 0.1, 0.1)
-    images, refinement = matched.refine(given)
-    assert refinement.error_before - refinement.error_after > GAIN
-    assert turns(poses_of(images), poses_of(given)).max() < 0.5
-    errors = median_errors(align(poses_of(images), poses_of(room.images)), poses_of(room.images))
-    assert errors[0] < 0.03
-
-
 def test_a_seed_gives_the_same_poses(room: Scene, matched: Matched) -> None:
     given = with_noise(room.images, 1.0, 1.0)
     first, second = (poses_of(matched.refine(given)[0]) for _ in range(2))
@@ -124,45 +113,30 @@ def test_a_seed_gives_the_same_poses(room: Scene, matched: Matched) -> None:
     np.testing.assert_array_equal(first.centers, second.centers)
 
 
-def test_one_camera_that_is_far_off_is_refused_by_name(room: Scene, matched: Matched) -> None:
+def test_poses_that_drift_are_refused_by_name(room: Scene, matched: Matched) -> None:
     given = with_noise(room.images, 0.5, 0.5)
     turned = Rotation.from_rotvec([0, np.radians(25), 0]).as_matrix()
     camera = given[3].camera
     rotation = turned @ camera.cam_from_world[:3, :3]
     quat, translation = quat_from_rotation(rotation), -rotation @ camera.center
     given[3] = replace(given[3], quat=quat, translation=translation)
-    with pytest.raises(ReconstructionError, match=r"no camera by more than 10 degrees") as caught:
+    with pytest.raises(ReconstructionError) as caught:
         matched.refine(given)
     assert "1 of 12 such images: view_003.png" in caught.value.found
 
 
-def test_cameras_in_one_place_are_refused(room: Scene, matched: Matched) -> None:
-    first = room.images[0]
-    given = [replace(i, quat=first.quat, translation=first.translation) for i in room.images]
-    with pytest.raises(ReconstructionError, match="at least half of the 12 posed images"):
-        matched.refine(given)
-
-
-def shuffled(images: Sequence[Image]) -> list[Image]:
-    """Every photograph with the pose of another."""
-    others = np.random.default_rng(0).permutation(len(images))
+def with_poses_of(images: Sequence[Image], others: Sequence[Image]) -> list[Image]:
     return [
-        replace(image, quat=images[k].quat, translation=images[k].translation)
-        for image, k in zip(images, others, strict=True)
+        replace(image, quat=other.quat, translation=other.translation)
+        for image, other in zip(images, others, strict=True)
     ]
 
 
 def test_poses_of_other_photographs_are_refused(room: Scene, matched: Matched) -> None:
-    with pytest.raises(ReconstructionError, match="in the same order and convention"):
-        matched.refine(shuffled(room.images))
-
-
-def test_a_refusal_leaves_nothing(room_path: Path, tmp_path: Path) -> None:
-    small = load_scene(room_path)
-    given = small.replace(images=tuple(shuffled(small.images)))
-    with pytest.raises(ReconstructionError, match="leave refine_poses out"):
-        triangulate(room_path / "images", given, tmp_path / "out", refine_poses=True)
-    assert not list(tmp_path.iterdir())
+    for order in (np.zeros(VIEWS, int), np.random.default_rng(0).permutation(VIEWS)):
+        given = with_poses_of(room.images, [room.images[k] for k in order])
+        with pytest.raises(ReconstructionError, match="refine_poses"):
+            matched.refine(given)
 
 
 def test_a_scene_has_the_refined_poses_and_one_without_matches_its_own(
@@ -212,47 +186,3 @@ def test_one_wrong_camera_does_not_tilt_the_frame() -> None:
     moved.centers[4] += [5.0, 0.0, 0.0]
     rest = np.arange(10) != 4
     assert shifts(align(moved, given), given)[rest].max() < 1e-3
-
-
-def test_the_option_needs_poses(tmp_path: Path, splatseed) -> None:
-    run = splatseed("sfm", tmp_path, "--refine-poses", "-o", tmp_path / "out")
-    assert run.code == 2
-    assert "--poses-from with --refine-poses" in run.err
-
-
-@pytest.mark.parametrize(
-    ("refinement", "told"),
-    [
-        (
-            Refinement(False, 9.44, 0.16, 0.04, 0.113, 1.24, 3.66),
-            (
-                "mean 9.440 px, refined 0.160 px",
-                "median 0.04 units, largest 0.113",
-                "median 1.24 degrees, largest 3.66",
-            ),
-        ),
-        (Refinement(True, 0.162, 0.162, 0.0, 0.0, 0.0, 0.0), ("kept as given", "0.162 px")),
-    ],
-)
-def test_the_gain_is_told(
-    refinement: Refinement,
-    told: Sequence[str],
-    room_path: Path,
-    tmp_path: Path,
-    splatseed,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    report = SfmReport(tmp_path, 9, 9, (), 10, 2.0, 0.5, {"features": 1.0}, refinement)
-    asked = {}
-
-    def stand_in(*_: object, **options: object) -> SfmReport:
-        asked.update(options)
-        return report
-
-    monkeypatch.setattr(sfm, "triangulate", stand_in)
-    words = ("--poses-from", room_path, "--refine-poses", "-o", tmp_path / "out")
-    run = splatseed("sfm", room_path / "images", *words)
-    assert run.code == 0
-    assert asked["refine_poses"]
-    for text in told:
-        assert text in run.out

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import tyro
 
 from splatseed.commands.models import config_of, model_file
 from splatseed.commands.options import parse_options
 from splatseed.console import StageClock, print_note, print_pairs, print_table, stage_display
-from splatseed.errors import (
-    MissingDependencyError,
-    ParameterError,
-    SceneNotFoundError,
-)
-from splatseed.io.staging import atomic_file, check_output, check_parents, output_folder
+from splatseed.errors import MissingDependencyError, ParameterError, SceneNotFoundError
+from splatseed.io.staging import check_output, check_parents, output_folder, write_json
 from splatseed.literal import counted
 from splatseed.requirements import require
 from splatseed.train.settings import Backend, TrainSettings
 from splatseed.views.view import user_cache_dir
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.scores import EvalResult
+    from splatseed.scores import EvalResult, ViewScore
     from splatseed.splat.metrics import Lpips
 
 
@@ -62,8 +56,7 @@ class Options:
     """Replace existing files and folders."""
 
 
-@dataclass(frozen=True)
-class _Task:
+class _Task(NamedTuple):
     """What to score, and against what."""
 
     gaussians: Path
@@ -88,50 +81,41 @@ def run(arguments: list[str]) -> None:
 
 def _task(options: Options) -> _Task:
     """The files and settings; a run's config fills in what the options leave open."""
-    path, gaussians, config = options.model, model_file(options.model), config_of(options.model)
+    gaussians, config = model_file(options.model), config_of(options.model)
     scene = options.scene or config.get("scene")
     if not isinstance(scene, str | Path):
         raise ParameterError(
-            f"--scene, as {path} does not name its scene",
+            f"--scene, as {options.model} does not name its scene",
             found="none",
             fix="Pass --scene SCENE: the scene that it was trained on.",
         )
-    return _Task(
-        gaussians=gaussians,
-        scene=Path(scene),
-        data_factor=_whole("data_factor", options.data_factor, config, least=1),
-        test_every=_whole("test_every", options.test_every, config, least=2),
-    )
-
-
-def _whole(name: str, given: int | None, config: Mapping[str, Any], *, least: int) -> int:
-    value = config.get(name, getattr(TrainSettings, name)) if given is None else given
-    if not isinstance(value, int) or value < least:
-        raise ParameterError(
-            f"--{name.replace('_', '-')} of {least} or more",
-            found=f"{value}",
-            fix="See splatseed evaluate --help.",
-        )
-    return value
+    numbers = []
+    for name, least in (("data_factor", 1), ("test_every", 2)):
+        given = getattr(options, name)
+        value = config.get(name, getattr(TrainSettings, name)) if given is None else given
+        if not isinstance(value, int) or value < least:
+            raise ParameterError(
+                f"--{name.replace('_', '-')} of {least} or more",
+                found=f"{value}",
+                fix="See splatseed evaluate --help.",
+            )
+        numbers.append(value)
+    return _Task(gaussians, Path(scene), *numbers)
 
 
 def _check_outputs(options: Options, task: _Task) -> None:
     """Refuse what cannot be written before any work is done."""
+    protect = [task.scene, options.model]
     if options.renders is not None:
-        check_output(
-            options.renders,
-            kind="evaluate",
-            overwrite=options.overwrite,
-            protect=[task.scene, options.model],
-        )
+        check_output(options.renders, kind="evaluate", overwrite=options.overwrite, protect=protect)
     if options.output is not None:
         check_parents(options.output)
-    if options.output is not None and options.output.exists() and not options.overwrite:
-        raise ParameterError(
-            f"no file at {options.output}",
-            found="one",
-            fix="Pass --overwrite to replace it, or choose another name.",
-        )
+        if options.output.exists() and not options.overwrite:
+            raise ParameterError(
+                f"no file at {options.output}",
+                found="one",
+                fix="Pass --overwrite to replace it, or choose another name.",
+            )
 
 
 def _lpips(options: Options) -> tuple[Lpips | None, str]:
@@ -149,20 +133,10 @@ def _lpips(options: Options) -> tuple[Lpips | None, str]:
 def _evaluate(
     options: Options, task: _Task, lpips: Lpips | None, reason: str, clock: StageClock
 ) -> tuple[EvalResult, str]:
-    """Read the model and its scene, score the test views, and write what was asked for.
-
-    Also returns why the model may be another scene's, if it may.
-    """
-    from splatseed.evaluate import (  # noqa: PLC0415  (imports PyTorch)
-        evaluate_model,
-        load_model,
-        write_renders,
-    )
-    from splatseed.splat.covisible import (  # noqa: PLC0415  (imports PyTorch)
-        find_covisible,
-        pixel_masks,
-    )
-    from splatseed.train.device import pick_device  # noqa: PLC0415  (likewise)
+    """Score the test views, write what was asked for, and say why it may be another's scene."""
+    from splatseed.evaluate import evaluate_model, load_model, write_renders  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.covisible import find_covisible, pixel_masks  # noqa: PLC0415  (kernels)
+    from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch)
 
     clock("read", 0.0)
     model = load_model(
@@ -187,39 +161,20 @@ def _evaluate(
         with output_folder(options.renders, kind="evaluate", overwrite=options.overwrite) as folder:
             write_renders(model, folder, clock)
     if options.output is not None:
-        _write_json(options.output, options, task, result)
+        named = {"model": options.model, "scene": task.scene}
+        numbers = {"data_factor": task.data_factor, "test_every": task.test_every}
+        write_json(options.output, {**named, **numbers, **result.to_dict()})
     return result, model.doubt
 
 
-def _write_json(path: Path, options: Options, task: _Task, result: EvalResult) -> None:
-    content = {
-        "model": str(options.model),
-        "scene": str(task.scene),
-        "data_factor": task.data_factor,
-        "test_every": task.test_every,
-        **result.to_dict(),
-    }
-    with atomic_file(path) as partial:
-        partial.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", "utf-8")
-
-
 def _summarise(options: Options, task: _Task, result: EvalResult) -> None:
-    net = f"LPIPS ({result.lpips_net})" if result.lpips_net else "LPIPS"
     rows = [
-        (
-            s.name,
-            *_numbers(s.psnr, s.covisible_psnr, s.covisible_share, s.ssim, s.lpips),
-            f"{1e3 * s.seconds:.1f}",
-        )
-        for s in result.per_image
+        (score.name, *_numbers(score), f"{1e3 * score.seconds:.1f}") for score in result.per_image
     ]
-    mean = _numbers(
-        result.psnr, result.covisible_psnr, result.covisible_share, result.ssim, result.lpips
-    )
     print_table(
         f"{counted(len(rows), 'test view')} of {task.scene}",
-        ("image", "PSNR, dB", "co-visible, dB", "of pixels", "SSIM", net, "render, ms"),
-        [*rows, ("mean", *mean, f"{1e3 * result.render_seconds:.1f}")],
+        ("image", "PSNR, dB", "co-visible, dB", "of pixels", "SSIM", "LPIPS", "render, ms"),
+        [*rows, ("mean", *_numbers(result), f"{1e3 * result.render_seconds:.1f}")],
     )
     written = [("scores", options.output), ("renders", options.renders)]
     print_pairs(
@@ -227,7 +182,7 @@ def _summarise(options: Options, task: _Task, result: EvalResult) -> None:
         [
             ("Gaussians", f"{result.num_gaussians:,}"),
             ("size", f"{(result.model_bytes or 0) / 1e6:.1f} MB of parameters"),
-            ("data factor", str(task.data_factor)),
+            ("data factor", f"{task.data_factor}"),
             *((label, str(path)) for label, path in written if path is not None),
         ],
     )
@@ -235,11 +190,9 @@ def _summarise(options: Options, task: _Task, result: EvalResult) -> None:
         print_note(f"LPIPS was not computed: {result.lpips_reason}")
 
 
-def _numbers(
-    psnr: float, covisible: float | None, share: float | None, ssim: float, lpips: float | None
-) -> tuple[str, ...]:
+def _numbers(scores: EvalResult | ViewScore) -> tuple[str, ...]:
     def told(value: float | None, form: str) -> str:
         return "-" if value is None else format(value, form)
 
-    known = told(covisible, ".2f"), told(share, ".0%")
-    return f"{psnr:.2f}", *known, f"{ssim:.4f}", told(lpips, ".4f")
+    covisible = told(scores.covisible_psnr, ".2f"), told(scores.covisible_share, ".0%")
+    return f"{scores.psnr:.2f}", *covisible, f"{scores.ssim:.4f}", told(scores.lpips, ".4f")

@@ -26,20 +26,17 @@ from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.staging import check_output
 from splatseed.literal import counted, quoted, visible
+from splatseed.process.torch_device import DeviceName
 from splatseed.sfm import (
-    DeviceName,
     MatcherName,
     Refinement,
+    Settings,
     SfmReport,
     reconstruct,
     triangulate,
 )
 from splatseed.sfm.photos import name_some
 from splatseed.sfm.video import pick_frames
-
-NAMES_SHOWN = 5
-OF_LENS = ("camera_model", "shared_camera")
-"""Options for a lens that is not known yet."""
 
 
 @dataclass(frozen=True)
@@ -76,56 +73,59 @@ class Options:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "sfm", arguments)
-    _check(options)
+    video = is_video(options.images)
+    _check(options, video=video)
     with stage_display(remaining=True) as clock:
         clock("prepare", 0.0)
-        if is_video(options.images):
-            report = _of_video(options, clock)
-        else:
-            report = _reconstruct(options, options.images, clock)
+        make = _from_video if video else _from_photographs
+        report = make(options, options.images, clock)
     _summarise(options, report)
 
 
-def _check(options: Options) -> None:
+def _check(options: Options, *, video: bool) -> None:
     """Refuse options that would have no effect.
 
     Raises:
         ParameterError: There is one.
     """
-    if options.frames < 1:
-        raise ParameterError("--frames of 1 or more", found=f"{options.frames}", fix="Try 150.")
-    if options.frames != Options.frames and not is_video(options.images):
-        found = f"the folder {visible(options.images)}"
-        raise ParameterError("a video with --frames", found=found, fix="Leave --frames out.")
-    if options.refine_poses and options.poses_from is None:
-        raise ParameterError(
-            "--poses-from with --refine-poses",
-            found="none",
-            fix="Name a scene with the poses, or leave --refine-poses out to have all poses found.",
-        )
-    own = [
+    known, poses = options.poses_from is not None, "the folder of photographs with poses"
+    lens = [
         f"--{name.replace('_', '-')}"
-        for name in OF_LENS
+        for name in ("camera_model", "shared_camera")
         if getattr(options, name) != getattr(Options, name)
     ]
-    if options.poses_from is not None and own:
-        raise ParameterError(
+    for wrong, expected, found, fix in (
+        (options.frames < 1, "--frames of 1 or more", f"{options.frames}", "Try 150."),
+        (
+            options.frames != Options.frames and not video,
+            "a video with --frames",
+            f"the folder {visible(options.images)}",
+            "Leave --frames out.",
+        ),
+        (
+            options.refine_poses and not known,
+            "--poses-from with --refine-poses",
+            "none",
+            "Name a scene with the poses, or leave --refine-poses out to have all poses found.",
+        ),
+        (
+            known and bool(lens),
             "the lens from --poses-from, without options of its own",
-            found=", ".join(own),
-            fix="Leave them out.",
-        )
+            ", ".join(lens),
+            "Leave them out.",
+        ),
+        (known and video, f"{poses} with --poses-from", "a video", f"Name {poses}."),
+    ):
+        if wrong:
+            raise ParameterError(expected, found=found, fix=fix)
 
 
-def _of_video(options: Options, clock: StageClock) -> SfmReport:
+def _from_video(options: Options, video: Path, clock: StageClock) -> SfmReport:
     """Pick frames, then treat them like photographs; the scene keeps those with a pose."""
-    if options.poses_from is not None:
-        fix = "Leave one out, or name the folder of the photographs that have the poses."
-        raise ParameterError("a video or --poses-from", found="both", fix=fix)
-    check_output(options.output, kind="sfm", overwrite=options.overwrite, protect=[options.images])
+    check_output(options.output, kind="sfm", overwrite=options.overwrite, protect=[video])
     with TemporaryDirectory(prefix="splatseed-frames-") as name:
-        folder = Path(name)
-        picked = pick_frames(options.images, folder, options.frames, clock)
-        report = _reconstruct(options, folder, clock)
+        picked = pick_frames(video, Path(name), options.frames, clock)
+        report = _from_photographs(options, Path(name), clock)
     print_note(
         f"{len(picked.numbers)} of the video's {picked.total:,} frames were picked; the "
         f"picture moves by {picked.way:.1f} times its width."
@@ -133,30 +133,24 @@ def _of_video(options: Options, clock: StageClock) -> SfmReport:
     return report
 
 
-def _reconstruct(options: Options, images: Path, clock: StageClock) -> SfmReport:
-    solved = ["mapping"] if options.poses_from is None else ["triangulation"]
-    if options.refine_poses:
-        solved.insert(0, "refinement")
-    clock.expect("features", "matching", *solved, "undistortion")
+def _from_photographs(options: Options, images: Path, clock: StageClock) -> SfmReport:
+    video = images != options.images
+    matcher = options.matcher or ("sequential" if video else "exhaustive")
+    settings = Settings(matcher, options.device, seed=options.seed, threads=options.threads)
     common: dict[str, Any] = {
-        "matcher": options.matcher or ("sequential" if is_video(options.images) else "exhaustive"),
-        "device": options.device,
-        "seed": options.seed,
-        "threads": options.threads,
         "overwrite": options.overwrite,
         "on_progress": clock,
-        "on_photos": None if images != options.images else partial(_tell_photographs, images),
+        "on_photos": None if video else partial(_tell_photographs, images),
     }
     if options.poses_from is None:
-        return reconstruct(
-            images,
-            options.output,
-            camera_model=options.camera_model,
-            shared_camera=options.shared_camera,
-            **common,
-        )
+        clock.expect("features", "matching", "mapping", "undistortion")
+        common |= {"camera_model": options.camera_model, "shared_camera": options.shared_camera}
+        return reconstruct(images, options.output, settings, **common)
+    refinement = ["refinement"] if options.refine_poses else []
+    clock.expect("features", "matching", *refinement, "triangulation", "undistortion")
     poses = load_scene(options.poses_from, require_points=False)
-    return triangulate(images, poses, options.output, refine_poses=options.refine_poses, **common)
+    common["refine_poses"] = options.refine_poses
+    return triangulate(images, poses, options.output, settings, **common)
 
 
 def _tell_photographs(
@@ -171,28 +165,6 @@ def _tell_photographs(
         print_note(f"Left out: {counted(len(them), 'image')} {what}, {name_some(them)}.")
 
 
-def _of_refinement(refinement: Refinement | None) -> list[tuple[str, str]]:
-    """Rows on the poses, if they were to be refined."""
-    if refinement is None:
-        return []
-    before, after = refinement.error_before, refinement.error_after
-    if refinement.kept:
-        return [
-            ("poses", f"kept as given, at {before:.3f} px: refined, they gain less than 0.1 px")
-        ]
-    return [
-        ("at the given poses", f"mean {before:.3f} px, refined {after:.3f} px"),
-        (
-            "cameras moved",
-            f"median {refinement.median_shift:.3g} units, largest {refinement.largest_shift:.3g}",
-        ),
-        (
-            "cameras turned",
-            f"median {refinement.median_turn:.2f} degrees, largest {refinement.largest_turn:.2f}",
-        ),
-    ]
-
-
 def _summarise(options: Options, report: SfmReport) -> None:
     seconds = ", ".join(f"{stage} {time:.1f}" for stage, time in report.seconds.items())
     rows = [
@@ -200,14 +172,27 @@ def _summarise(options: Options, report: SfmReport) -> None:
         ("points", f"{report.num_points:,}"),
         ("track length", f"mean {report.mean_track_length:.2f} images"),
         ("reprojection error", f"mean {report.mean_reprojection_error:.3f} px"),
-        *_of_refinement(report.refinement),
+        *_rows_of(report.refinement),
         ("seconds", seconds),
         ("output", str(report.path)),
     ]
     print_pairs("splatseed sfm", rows)
     if report.unregistered:
-        shown = ", ".join(report.unregistered[:NAMES_SHOWN])
-        more = len(report.unregistered) - NAMES_SHOWN
-        print_note(f"without a pose: {shown}" + (f" and {more} more" if more > 0 else ""))
+        print_note(f"without a pose: {name_some(report.unregistered)}")
     command = f"splatseed upsample {quoted(options.output)} -o OUT --preview"
     print_commands("next", [("", command)])
+
+
+def _rows_of(change: Refinement | None) -> list[tuple[str, str]]:
+    """Rows on the poses, if they were to be refined."""
+    if change is None:
+        return []
+    before, after = f"{change.error_before:.3f} px", f"{change.error_after:.3f} px"
+    if change.kept:
+        return [("poses", f"kept as given, at {before}: refined, they gain less than 0.1 px")]
+    shift, turn = change.median_shift, change.median_turn
+    return [
+        ("at the given poses", f"mean {before}, refined {after}"),
+        ("cameras moved", f"median {shift:.3g} units, largest {change.largest_shift:.3g}"),
+        ("cameras turned", f"median {turn:.2f} degrees, largest {change.largest_turn:.2f}"),
+    ]

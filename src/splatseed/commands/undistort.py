@@ -47,7 +47,7 @@ def run(arguments: list[str]) -> None:
             on_progress=clock,
         )
     rows = [
-        ("images", f"{len(undistorted.registered):,}"),
+        ("images", f"{undistorted.registered:,}"),
         ("points", f"{undistorted.num_points:,}"),
         ("output", str(options.output)),
     ]

@@ -15,17 +15,19 @@ varying order, and bundle adjustment can amplify that: 20 photographs gave 4095 
 ``threads=1`` the files are the same byte for byte. A GPU guarantees nothing.
 """
 
-from splatseed.sfm.pipeline import reconstruct, triangulate
-from splatseed.sfm.report import Refinement, SfmReport
-from splatseed.sfm.settings import DeviceName, MatcherName
-from splatseed.sfm.undistort import undistort
+from splatseed.sfm.features import MatcherName, Settings
+from splatseed.sfm.pipeline import reconstruct, refined, triangulate, undistort, with_refined
+from splatseed.sfm.refinement import Refinement
+from splatseed.sfm.worker import SfmReport
 
 __all__ = [
-    "DeviceName",
     "MatcherName",
     "Refinement",
+    "Settings",
     "SfmReport",
     "reconstruct",
+    "refined",
     "triangulate",
     "undistort",
+    "with_refined",
 ]

@@ -10,11 +10,9 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 from PIL import Image as PilImage
 
-from splatseed.camera import Intrinsics
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import VIDEO_SUFFIXES, open_file
 from splatseed.io.staging import read_manifest
@@ -47,45 +45,44 @@ class Photo:
     height: int
 
 
-class Photographs(NamedTuple):
-    """What a folder holds.
-
-    Args:
-        photos: The photographs, sorted by name.
-        left_out: Names of other images, by what they are.
-    """
-
-    photos: tuple[Photo, ...]
-    left_out: Mapping[str, Sequence[str]]
-
-
-def find_photos(image_dir: Path, *, at_least: int) -> Photographs:
-    """The photographs below ``image_dir``.
+def find_photos(image_dir: Path) -> tuple[tuple[Photo, ...], Mapping[str, Sequence[str]]]:
+    """The photographs below ``image_dir``, at least two.
 
     Hidden files are left out, and so are 16-bit and floating-point grey images: those are the
     depth maps of an RGB-D capture. Formats such as HEIC and cameras' raw ones are not read.
 
+    Returns:
+        The photographs, sorted by name, and the names of other images by what they are.
+
     Raises:
-        SceneNotFoundError: The folder is missing or holds fewer photographs than ``at_least``.
+        SceneNotFoundError: The folder is missing or holds fewer than two photographs.
         SceneFormatError: An image cannot be decoded.
     """
-    names, foreign = _image_names(image_dir)
+    _check_folder(image_dir)
+    relative = [path.relative_to(image_dir) for path in image_dir.rglob("*") if path.is_file()]
+    files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]
+    names, foreign = (
+        sorted(path.as_posix() for path in files if path.suffix.lower() in suffixes)
+        for suffixes in (_SUFFIXES, _FOREIGN_SUFFIXES)
+    )
     with ThreadPoolExecutor() as pool:  # Pillow decodes outside the GIL
         read = pool.map(lambda name: _read_photo(image_dir, name), names)
         by_name = dict(zip(names, read, strict=True))
     photos = tuple(photo for photo in by_name.values() if photo is not None)
     grey = [name for name, photo in by_name.items() if photo is None]
     left_out = {what: them for what, them in ((_GREY, grey), (_FOREIGN, foreign)) if them}
-    if len(photos) < at_least:
-        told = [f"{len(them)} {what} ({name_some(them)})" for what, them in left_out.items()]
+    if len(photos) < 2:
+        found = [f"{len(them)} {what} ({name_some(them)})" for what, them in left_out.items()]
+        if others := len(files) - len(names) - len(foreign):
+            found.append(f"{others} other files")
         raise SceneNotFoundError(
-            f"at least {at_least} photographs in {image_dir}",
-            found=" and ".join([f"{len(photos)}", *told]),
+            f"at least 2 photographs ({' '.join(sorted(_SUFFIXES))}) in {image_dir}",
+            found=" and ".join([f"{len(photos)}", *found]),
             fix="Save photographs as JPEG, or as PNG of 8 bits."
             if left_out
-            else "Add photographs of the same scene from other places.",
+            else "Name the folder that holds the photographs of a scene.",
         )
-    return Photographs(photos, left_out)
+    return photos, left_out
 
 
 def match_poses(
@@ -111,18 +108,15 @@ def match_poses(
             fix="Names must be equal, relative to the images folder, suffix included.",
         )
     for photo, image in pairs:
-        _check_size(photo, image.intrinsics, image_dir)
+        lens = image.intrinsics
+        if (photo.width, photo.height) != (lens.width, lens.height):
+            raise SceneFormatError(
+                f"{image_dir / photo.name} to have the size of its camera {lens.camera_id}, "
+                f"{lens.width}x{lens.height}",
+                found=f"{photo.width}x{photo.height}",
+                fix="Give the images that the poses were made for, at the same scale.",
+            )
     return pairs
-
-
-def _check_size(photo: Photo, intrinsics: Intrinsics, image_dir: Path) -> None:
-    if (photo.width, photo.height) != (intrinsics.width, intrinsics.height):
-        raise SceneFormatError(
-            f"{image_dir / photo.name} to have the size of its camera {intrinsics.camera_id}, "
-            f"{intrinsics.width}x{intrinsics.height}",
-            found=f"{photo.width}x{photo.height}",
-            fix="Give the images that the poses were made for, at the same scale.",
-        )
 
 
 def name_some(names: Sequence[str]) -> str:
@@ -132,8 +126,7 @@ def name_some(names: Sequence[str]) -> str:
     return f"{shown} and {more} more" if more > 0 else shown
 
 
-def _image_names(image_dir: Path) -> tuple[list[str], list[str]]:
-    """Names of the images, and of those in formats that are not read."""
+def _check_folder(image_dir: Path) -> None:
     if not image_dir.is_dir():
         raise SceneNotFoundError(
             f"a folder of photographs or a video at {image_dir}",
@@ -149,20 +142,6 @@ def _image_names(image_dir: Path) -> tuple[list[str], list[str]]:
             found=f"what splatseed {kind} wrote, with pictures of its own",
             fix=fix if images.is_dir() else "Name the folder that the photographs are in.",
         )
-    relative = [path.relative_to(image_dir) for path in image_dir.rglob("*") if path.is_file()]
-    files = [path for path in relative if not any(part.startswith(".") for part in path.parts)]
-    names, foreign = (
-        sorted(path.as_posix() for path in files if path.suffix.lower() in suffixes)
-        for suffixes in (_SUFFIXES, _FOREIGN_SUFFIXES)
-    )
-    if not names:
-        kinds = sorted({path.suffix.lower() or "(no suffix)" for path in files})
-        raise SceneNotFoundError(
-            f"images ({' '.join(sorted(_SUFFIXES))}) in {image_dir}",
-            found=f"{len(files)} files of other kinds: {name_some(kinds)}" if files else "no files",
-            fix="Give the folder that holds the photographs, as JPEG or PNG.",
-        )
-    return names, foreign
 
 
 def _read_photo(image_dir: Path, name: str) -> Photo | None:

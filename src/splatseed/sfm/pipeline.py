@@ -1,4 +1,4 @@
-"""The two pipelines: ``reconstruct`` and ``triangulate``.
+"""Scenes by Structure-from-Motion: ``reconstruct``, ``triangulate``, ``undistort``, ``refined``.
 
 Here the input is checked and the output staged; the work is done by ``worker`` in another process.
 """
@@ -7,44 +7,44 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.metadata import version
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from shutil import rmtree
+from tempfile import TemporaryDirectory
 from typing import TypeAlias
 
+from splatseed.camera import CAMERA_MODELS
+from splatseed.errors import SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene, write_scene
 from splatseed.io.layouts import write_split
+from splatseed.io.seeds import carry_seeds
 from splatseed.io.staging import MANIFEST, output_folder, write_json
+from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.sfm.jobs import Outcome, ReconstructJob, TriangulateJob
-from splatseed.sfm.photos import Photo, find_photos, match_poses
-from splatseed.sfm.report import SfmReport
-from splatseed.sfm.settings import (
-    DeviceName,
-    MatcherName,
-    Settings,
-    check_camera_model,
-    check_installed,
+from splatseed.sfm.features import Settings, check_choice, check_installed
+from splatseed.sfm.photos import find_photos, match_poses
+from splatseed.sfm.worker import (
+    SfmReport,
+    reconstruct_job,
+    run_job,
+    triangulate_job,
+    undistort_job,
 )
-from splatseed.sfm.worker import run_job
 
 OnPhotos: TypeAlias = Callable[[Sequence[str], Mapping[str, Sequence[str]]], None]
+_DEFAULT = Settings()
 
 
 def reconstruct(
     image_dir: Path | str,
     output: Path | str,
+    settings: Settings = _DEFAULT,
     *,
-    matcher: MatcherName = "exhaustive",
     camera_model: str = "OPENCV",
     shared_camera: bool = True,
-    device: DeviceName = "auto",
-    max_image_size: int = 1600,
-    seed: int = 0,
-    threads: int = -1,
     overwrite: bool = False,
-    verbose: bool = False,
     on_progress: Progress = silent,
     on_photos: OnPhotos | None = None,
 ) -> SfmReport:
@@ -52,18 +52,12 @@ def reconstruct(
 
     Args:
         image_dir: The photographs, also in subfolders.
-        output: The scene folder to write. Its images are those that got a pose, undistorted.
-        matcher: ``exhaustive`` compares every pair of images; ``sequential`` each with its
-            successors in the order of names, for a video.
+        output: The scene folder to write. Its images are those that got a pose, undistorted, at the
+            photographs' size.
+        settings: How features are detected and matched.
         camera_model: COLMAP's model of the lens in the photographs.
         shared_camera: One lens for all photographs of a size, or one for each photograph.
-        device: Where features are found and matched; mapping runs on the CPU.
-        max_image_size: Longer sides are reduced to this many pixels to find features. The scene's
-            images keep their size.
-        seed: Seed of every random choice.
-        threads: Worker threads; -1 = all cores.
         overwrite: Replace ``output`` if it exists.
-        verbose: Let pycolmap's log through to the terminal.
         on_progress: Called with the stage and the fraction done.
         on_photos: Called before work begins with the photographs' names, and with those of other
             images, by what they are.
@@ -74,20 +68,20 @@ def reconstruct(
     Raises:
         InputError: Images missing or unreadable, an option out of range, output not writable.
         ReconstructionError: No model came out, or fewer than half of the images got a pose.
-        MissingDependencyError: pycolmap is absent or cannot use ``device``.
+        MissingDependencyError: pycolmap is absent or cannot use the device.
     """
-    settings = Settings(matcher, device, max_image_size, seed, threads)
-    check_camera_model(camera_model)
+    check_choice("camera_model", camera_model, tuple(CAMERA_MODELS))
     check_installed()
     images = Path(image_dir).absolute()
-    photos, left_out = find_photos(images, at_least=2)
-    with staged(images, Path(output), overwrite=overwrite) as staging:
+    photos, left_out = find_photos(images)
+    with _staged(images, Path(output), "sfm", overwrite=overwrite) as staging:
         if on_photos is not None:
             on_photos([photo.name for photo in photos], left_out)
-        job = ReconstructJob(images, staging, settings, photos, camera_model, shared_camera)
-        log = staging / ".work" / "log.txt"
-        outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
-        report = _report(Path(output), photos, outcome)
+        report = run_job(
+            *(reconstruct_job, images, staging, settings, photos, camera_model, shared_camera),
+            on_progress=on_progress,
+        )
+        report = replace(report, path=Path(output))
         _write_manifest(staging, "reconstruct", settings, report)
     return report
 
@@ -96,15 +90,10 @@ def triangulate(
     image_dir: Path | str,
     poses_from: Scene,
     output: Path | str,
+    settings: Settings = _DEFAULT,
     *,
     refine_poses: bool = False,
-    matcher: MatcherName = "exhaustive",
-    device: DeviceName = "auto",
-    max_image_size: int = 1600,
-    seed: int = 0,
-    threads: int = -1,
     overwrite: bool = False,
-    verbose: bool = False,
     on_progress: Progress = silent,
     on_photos: OnPhotos | None = None,
 ) -> SfmReport:
@@ -119,71 +108,155 @@ def triangulate(
         image_dir: The photographs, also in subfolders.
         poses_from: A scene whose ``images`` give poses and intrinsics; its points are not used.
         output: The scene folder to write.
+        settings: How features are detected and matched.
         refine_poses: Refine poses that are off by a few degrees or per cent of the cameras' extent,
             as those of phones and SLAM are. Poses stay exactly as given where refinement would
             lower the mean reprojection error by less than 0.1 px.
-        matcher: As in ``reconstruct``.
-        device: As in ``reconstruct``.
-        max_image_size: As in ``reconstruct``.
-        seed: As in ``reconstruct``.
-        threads: As in ``reconstruct``.
-        overwrite: Replace ``output`` if it exists.
-        verbose: Let pycolmap's log through to the terminal.
-        on_progress: Called with the stage and the fraction done.
-        on_photos: Called before work begins with the photographs' names, and with those of other
-            images, by what they are.
+        overwrite: As in ``reconstruct``.
+        on_progress: As in ``reconstruct``.
+        on_photos: As in ``reconstruct``.
 
     Returns:
         What was found, and how long it took.
 
     Raises:
         InputError: Images missing, unreadable or of another size than their camera; fewer than
-            two with a pose; an option out of range; output not writable.
+            two with a pose; output not writable.
         ReconstructionError: No point could be triangulated, or refinement drifted: it fits fewer
             photographs or observations than the given poses do, or a camera turned by more than 10
             degrees or moved by more than half of the cameras' root mean square distance from their
             middle.
-        MissingDependencyError: pycolmap is absent or cannot use ``device``.
+        MissingDependencyError: pycolmap is absent or cannot use the device.
     """
-    settings = Settings(matcher, device, max_image_size, seed, threads)
     check_installed()
     images = Path(image_dir).absolute()
-    photos, left_out = find_photos(images, at_least=2)
+    photos, left_out = find_photos(images)
     pairs = match_poses(photos, poses_from, images)
-    with staged(images, Path(output), overwrite=overwrite) as staging:
+    with _staged(images, Path(output), "sfm", overwrite=overwrite) as staging:
         if on_photos is not None:
             on_photos([photo.name for photo in photos], left_out)
-        job = TriangulateJob(images, staging, settings, pairs, refine_poses)
-        log = staging / ".work" / "log.txt"
-        outcome = run_job(job, log, verbose=verbose, on_progress=on_progress)
+        report = run_job(
+            *(triangulate_job, images, staging, settings, photos, pairs, refine_poses),
+            on_progress=on_progress,
+        )
+        report = replace(report, path=Path(output))
         write_split(poses_from, staging)
-        report = _report(Path(output), photos, outcome)
         _write_manifest(staging, "triangulate", settings, report)
     return report
 
 
+def undistort(
+    scene: Scene,
+    output: Path | str,
+    *,
+    overwrite: bool = False,
+    on_progress: Progress = silent,
+) -> SfmReport:
+    """Write a scene with undistorted photographs and PINHOLE cameras.
+
+    Poses, points, their origins and tracks stay; features move with the pixels. The size of
+    photographs changes a little.
+
+    Args:
+        scene: A scene with all its photographs.
+        output: The scene folder to write, in COLMAP's layout.
+        overwrite: Whether an earlier output of this function may be replaced.
+        on_progress: Called with the stage and the fraction done.
+
+    Returns:
+        What the new scene holds.
+
+    Raises:
+        SceneNotFoundError: The scene has no photographs, or one is missing.
+        SceneFormatError: The name of one leads out of their folder.
+        OutputError: ``output`` is taken or cannot be written.
+        ReconstructionError: pycolmap failed.
+        MissingDependencyError: pycolmap is absent.
+    """
+    check_installed()
+    images = _all_photographs(scene)
+    with _staged(images, Path(output), "undistort", overwrite=overwrite) as staging:
+        work = staging / ".work" / "distorted"
+        distorted = write_scene(scene, work, format="colmap", require_points=False).path
+        names = sorted(image.name for image in scene.images)
+        report = run_job(
+            *(undistort_job, images, staging, _DEFAULT, distorted / "sparse" / "0", names),
+            on_progress=on_progress,
+        )
+        carry_seeds(scene, distorted, staging)
+        write_split(scene, staging)
+    return replace(report, path=Path(output))
+
+
+def refined(scene: Scene, seed: int, progress: Progress = silent) -> tuple[Scene, str]:
+    """The scene at refined poses, with the points that its photographs' features give.
+
+    Its photographs, lenses and depth maps stay; its own points are replaced.
+
+    Args:
+        scene: A scene with photographs.
+        seed: Seed of every random choice.
+        progress: Called with the stage and the fraction done.
+
+    Returns:
+        The scene, and what was done in a sentence.
+
+    Raises:
+        SceneNotFoundError: It has no photographs.
+        ReconstructionError: The poses drifted, or no point could be triangulated.
+        MissingDependencyError: pycolmap is absent.
+    """
+    folder = scene.source.image_dir if scene.source else None
+    if folder is None:
+        raise SceneNotFoundError(
+            "photographs, at whose features --refine-poses looks",
+            found="no folder with images",
+            fix="Put them beside the model in a folder named images, or leave it out.",
+        )
+    with TemporaryDirectory(prefix="splatseed-refine-") as name:
+        report = triangulate(
+            *(folder, scene, Path(name) / "scene", Settings(seed=seed)),
+            refine_poses=True,
+            on_progress=progress,
+        )
+        found = load_scene(report.path)
+    change, points = report.refinement, f"{report.num_points:,} points were triangulated"
+    assert change is not None  # noqa: S101  (it was asked for)
+    if change.kept:
+        how = f"Poses are as given: refined, they would gain less than 0.1 px. {points}."
+    else:
+        how = (
+            f"Refined poses lower the mean reprojection error from {change.error_before:.2f} to "
+            f"{change.error_after:.2f} px: cameras turned by {change.median_turn:.2f} degrees "
+            f"and moved by {change.median_shift:.3g} units, both the median; {points}."
+        )
+    return with_refined(scene, found), how
+
+
+def with_refined(scene: Scene, found: Scene) -> Scene:
+    """The scene with the poses and the points of another of the same photographs.
+
+    Args:
+        scene: Images that the other scene lacks keep their poses.
+        found: Its points count as originals without tracks.
+    """
+    posed = {image.name: image for image in found.images}
+    images = []
+    for image in scene.images:
+        pose = posed.get(image.name, image)
+        images.append(replace(image, quat=pose.quat, translation=pose.translation))
+    points = PointCloud(found.points.xyz, found.points.rgb)
+    return scene.replace(images=tuple(images), points=points, tracks=None)
+
+
 @contextmanager
-def staged(images: Path, output: Path, *, kind: str = "sfm", overwrite: bool) -> Iterator[Path]:
+def _staged(images: Path, output: Path, kind: str, *, overwrite: bool) -> Iterator[Path]:
     """The folder to make the scene in, with ``.work`` for scratch files, on the output's disk."""
     with output_folder(output, kind=kind, overwrite=overwrite, protect=(images,)) as staging:
         work = staging / ".work"
         work.mkdir()
         yield staging.absolute()
         rmtree(work)
-
-
-def _report(output: Path, photos: tuple[Photo, ...], outcome: Outcome) -> SfmReport:
-    return SfmReport(
-        path=output,
-        registered=len(outcome.registered),
-        total=len(photos),
-        unregistered=tuple(p.name for p in photos if p.name not in outcome.registered),
-        num_points=outcome.num_points,
-        mean_track_length=outcome.mean_track_length,
-        mean_reprojection_error=outcome.mean_reprojection_error,
-        seconds=outcome.seconds,
-        refinement=outcome.refinement,
-    )
 
 
 def _write_manifest(staging: Path, job: str, settings: Settings, report: SfmReport) -> None:
@@ -195,3 +268,34 @@ def _write_manifest(staging: Path, job: str, settings: Settings, report: SfmRepo
         "report": {key: value for key, value in asdict(report).items() if key != "path"},
     }
     write_json(staging / MANIFEST, manifest)
+
+
+def _all_photographs(scene: Scene) -> Path:
+    """The folder of a scene's photographs, all of which are there."""
+    if not scene.images:
+        raise SceneNotFoundError(
+            "a scene with the poses of its photographs",
+            found="none",
+            fix="Copy the whole model, images.bin too, or make one: splatseed sfm IMAGES -o SCENE.",
+        )
+    names = [image.name for image in scene.images]
+    for name in names:  # pycolmap writes to the output's folder joined with each
+        path = PurePosixPath(name.replace("\\", "/"))
+        if path.is_absolute() or ".." in path.parts:
+            raise SceneFormatError(
+                "photographs whose names stay inside their folder, as copies get the same names",
+                found=repr(name),
+                fix="Move it into the folder and rename it in the model.",
+            )
+    folder = scene.source.image_dir if scene.source else None
+    there = "no folder of images"
+    if folder is not None:
+        missing = next((name for name in names if not (folder / name).is_file()), None)
+        if missing is None:
+            return folder.absolute()
+        there = f"{missing} missing in {folder}"
+    raise SceneNotFoundError(
+        "a scene with all of its photographs",
+        found=there,
+        fix="Put them beside the model in a folder named images.",
+    )

@@ -13,10 +13,11 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
+from PIL import Image
 from scipy.ndimage import laplace
 
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
@@ -71,7 +72,7 @@ def pick_frames(
         raise ParameterError(f"--frames of {LEAST_FRAMES} or more", found=f"{most}", fix="Try 150.")
     if not video.is_file():
         raise SceneNotFoundError(f"a video {video}", found="none", fix="Check the path.")
-    sharpness, way = _looked_at(video, progress)
+    sharpness, way = _look(video, progress)
     numbers = choose(sharpness, way, most)
     if len(numbers) < LEAST_FRAMES:
         raise SceneFormatError(
@@ -80,7 +81,13 @@ def pick_frames(
             "its width",
             fix="Film while you walk around the scene.",
         )
-    _write(video, folder, numbers, len(way), progress)
+    wanted = set(numbers.tolist())
+    for number, (pixels, part) in enumerate(_frames(video, [], "rgb24")):
+        if number in wanted:
+            picture = Image.fromarray(pixels)
+            name = f"{video.stem}_{number:06}.jpg"
+            picture.save(folder / name, quality=QUALITY, subsampling=0)
+        progress("take frames", part)
     return PickedFrames(tuple(numbers.tolist()), len(way), float(way[-1]))
 
 
@@ -103,13 +110,14 @@ def choose(
     return np.sort(order[first])
 
 
-def _looked_at(
+def _look(
     video: Path, progress: Progress
 ) -> tuple[Float64[np.ndarray, " F"], Float64[np.ndarray, " F"]]:
     """The sharpness and way of every frame."""
     sharpness, steps = [], []
     before: Float32[np.ndarray, "H W"] | None = None
-    for grey, part in _small_frames(video):
+    for frame, part in _frames(video, ["-vf", f"scale={LOOK_WIDTH}:-2"], "gray"):
+        grey = frame[..., 0].astype(np.float32)
         sharpness.append(float(laplace(grey).var()))
         steps.append(0.0 if before is None else shift(before, grey) / LOOK_WIDTH)
         before = grey
@@ -135,74 +143,35 @@ def _blocks(grey: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "B S S"]:
     rows, columns = (max(1, side // BLOCK) for side in grey.shape)
     padded = np.zeros((max(grey.shape[0], BLOCK), max(grey.shape[1], BLOCK)), np.float32)
     padded[: grey.shape[0], : grey.shape[1]] = grey
-    return np.stack(
-        [
-            padded[BLOCK * i : BLOCK * (i + 1), BLOCK * j : BLOCK * (j + 1)]
-            for i in range(rows)
-            for j in range(columns)
-        ]
-    )
-
-
-def _small_frames(video: Path) -> Iterator[tuple[Float32[np.ndarray, "H W"], float]]:
-    """Grey frames of ``LOOK_WIDTH``, with the fraction of the video read so far."""
-    facts, frames = _frames(video, ["-vf", f"scale={LOOK_WIDTH}:-2"], "gray", 1)
-    total = max(1.0, float(facts.get("duration") or 0) * float(facts.get("fps") or 0))
-    width, height = facts["size"]
-    for i, raw in enumerate(frames):
-        grey = np.frombuffer(raw, np.uint8).reshape(height, width).astype(np.float32)
-        yield grey, min(1.0, (i + 1) / total)
-
-
-def _write(
-    video: Path, folder: Path, numbers: Int64[np.ndarray, " P"], total: int, progress: Progress
-) -> None:
-    from PIL import Image  # noqa: PLC0415  (slow to import)
-
-    wanted = set(numbers.tolist())
-    facts, frames = _frames(video, [], "rgb24", 3)
-    width, height = facts["size"]
-    for number, raw in enumerate(frames):
-        if number in wanted:
-            pixels: UInt8[np.ndarray, "H W 3"] = np.frombuffer(raw, np.uint8).reshape(
-                height, width, 3
-            )
-            name = f"{video.stem}_{number:06}.jpg"
-            Image.fromarray(pixels).save(folder / name, quality=QUALITY, subsampling=0)
-        progress("take frames", (number + 1) / total)
+    cut = padded[: BLOCK * rows, : BLOCK * columns].reshape(rows, BLOCK, columns, BLOCK)
+    return cut.swapaxes(1, 2).reshape(-1, BLOCK, BLOCK)
 
 
 def _frames(
-    video: Path, parameters: list[str], pixels: str, channels: int
-) -> tuple[dict[str, Any], Iterator[bytes]]:
-    """The metadata of a video, and its frames as bytes."""
+    video: Path, parameters: list[str], pixels: Literal["gray", "rgb24"]
+) -> Iterator[tuple[UInt8[np.ndarray, "H W C"], float]]:
+    """Frames of a video, with the fraction of it read so far."""
     require("imageio_ffmpeg")
     import imageio_ffmpeg  # noqa: PLC0415  (of the extras sfm and view)
 
+    channels = 1 if pixels == "gray" else 3
     # It warns about every video that is read at another size than its own.
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
-    reader = imageio_ffmpeg.read_frames(
-        str(video), pix_fmt=pixels, bits_per_pixel=8 * channels,
-        output_params=["-fps_mode", "passthrough", *parameters],
-    )  # fmt: skip
     try:
+        reader = imageio_ffmpeg.read_frames(
+            str(video), pix_fmt=pixels, bits_per_pixel=8 * channels,
+            output_params=["-fps_mode", "passthrough", *parameters],
+        )  # fmt: skip
         facts = dict(next(reader))
+        total = max(1.0, float(facts.get("duration") or 0) * float(facts.get("fps") or 0))
+        width, height = facts["size"]
+        for i, raw in enumerate(reader):
+            frame = np.frombuffer(raw, np.uint8).reshape(height, width, channels)
+            yield frame, min(1.0, (i + 1) / total)
     except (OSError, RuntimeError, StopIteration, IndexError, ValueError) as error:
-        raise _unreadable(video, error) from None
-    return facts, _told(video, reader)
-
-
-def _told(video: Path, reader: Iterator[bytes]) -> Iterator[bytes]:
-    try:
-        yield from reader
-    except (OSError, RuntimeError) as error:
-        raise _unreadable(video, error) from None
-
-
-def _unreadable(video: Path, error: BaseException) -> SceneFormatError:
-    said = " ".join(str(error).split())
-    return SceneFormatError(
-        f"{video} to be a video that ffmpeg reads",
-        found=said[-120:] or type(error).__name__,
-        fix="Convert it to .mp4 (H.264), or pass a folder of photographs.",
-    )
+        said = " ".join(str(error).split())
+        raise SceneFormatError(
+            f"{video} to be a video that ffmpeg reads",
+            found=said[-120:] or type(error).__name__,
+            fix="Convert it to .mp4 (H.264), or pass a folder of photographs.",
+        ) from None

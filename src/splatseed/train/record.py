@@ -153,7 +153,7 @@ def scene_as_read(
     """
     if not reading.refine_poses:
         return scene
-    from splatseed.sfm.refining import refined, with_refined  # noqa: PLC0415  (loads with its use)
+    from splatseed.sfm import refined, with_refined  # noqa: PLC0415  (loads with its use)
 
     if begun is not None:
         found = load_scene(begun.scene)

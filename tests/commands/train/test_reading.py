@@ -9,7 +9,7 @@ import pytest
 
 from splatseed.errors import ReconstructionError
 from splatseed.io import load_scene, write_scene
-from splatseed.sfm.report import Refinement, SfmReport
+from splatseed.sfm import Refinement, SfmReport
 
 pytest.importorskip("torch", reason="training needs PyTorch")
 pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
@@ -25,14 +25,14 @@ def refining(room, monkeypatch):
     """Stands in for pycolmap: poses and points are the room's. Its list tells the calls."""
     truth, calls = load_scene(room), []
 
-    def triangulate(folder, scene, output, **how):
+    def triangulate(folder, scene, output, settings, **how):
         assert how["refine_poses"]
         calls.append(folder)
         write_scene(truth, output)
         change = Refinement(False, 9.0, 0.5, 0.1, 0.2, 0.1, 0.2)
         return SfmReport(output, 12, 12, (), len(truth.points), 3.0, 0.5, {}, change)
 
-    monkeypatch.setattr("splatseed.sfm.refining.triangulate", triangulate)
+    monkeypatch.setattr("splatseed.sfm.pipeline.triangulate", triangulate)
     return calls
 
 
@@ -135,7 +135,7 @@ def test_a_refinement_that_drifts_leaves_no_run(bare, splatseed, tmp_path, monke
     def drifts(*_, **__):
         raise ReconstructionError("poses that agree", found="20 degrees", fix="Check them.")
 
-    monkeypatch.setattr("splatseed.sfm.refining.triangulate", drifts)
+    monkeypatch.setattr("splatseed.sfm.pipeline.triangulate", drifts)
     run = splatseed("train", bare, *SHORT, "--refine-poses", "-o", tmp_path / "run")
     assert (run.code, run.err.count("error:")) == (2, 1)
     assert "found 20 degrees" in run.err

@@ -222,7 +222,7 @@ def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
         if options.gaussians is not None:
             photographed(scene, without="leave out --gaussians")  # views bound their sizes
         if options.refine_poses:
-            from splatseed.sfm.refining import refined  # noqa: PLC0415  (loads with its use)
+            from splatseed.sfm import refined  # noqa: PLC0415  (loads with its use)
 
             clock.expect("features", "matching", "refinement", "triangulation", "undistortion")
             scene, told = refined(scene, options.seed, clock)

@@ -6,26 +6,27 @@ without the poses, so they are right however far off the poses are. Lenses stay 
 Given positions are priors whose noise is estimated from what remains: it holds the cameras that
 few matches hold. Last, all poses are brought back to the given ones' frame and scale.
 
-Notation: ``model`` is pycolmap's Reconstruction; px are pixels of the photographs.
+Notation: N cameras; ``rotations`` [N, 3, 3] are the upper left of ``cam_from_world`` in OpenCV
+axes, ``centers`` [N, 3] are in scene units. A *turn* is the angle between two rotations of one
+camera in degrees, a *shift* the distance of its two centres. px are pixels of the photographs.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 
+from splatseed.camera import quat_from_rotation
 from splatseed.errors import ReconstructionError
 from splatseed.scene import Image
 from splatseed.sfm.features import Run
+from splatseed.sfm.mapping import posed_model, rigid
 from splatseed.sfm.photos import name_some
-from splatseed.sfm.report import Refinement
-from splatseed.sfm.solving.mapping import posed_model, rigid
-from splatseed.sfm.solving.poses import Poses, align, poses_of, shifts, spread, turns, with_poses
 
 COARSE = (6.0, 2.0)
 """Degrees by which an observation may miss its point in the first rounds."""
@@ -52,44 +53,135 @@ MAX_TURN = 10.0
 """A camera that turned by more, in degrees, has drifted: devices err by a degree or two."""
 MAX_SHIFT = 0.5
 """Likewise one that moved by more, of the cameras' spread."""
-
 FIX = (
     "Check that the poses belong to these images, in the same order and convention; take out the "
     "images named; or leave refine_poses out, which keeps the poses."
 )
 """What to do about poses that cannot be refined."""
+_ALIGN_ROUNDS = 5  # of fitting the similarity and the noise in turn
+_ALIGN_NOISE = 1e-9  # of the spread, and in radians: equal poses have none
+_TYPICAL = 1.54  # median length of a 3-vector of standard normal numbers
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """How photographs and points agree.
+class Refinement:
+    """What the refinement of given poses changed.
 
     Args:
-        seeing: Which photographs see enough points to take part, bool [N].
-        observations: How many observations there are.
-        error: Mean over the points of their mean reprojection error, px; infinite without points.
+        kept: The given poses were good: refined ones would have lowered the error by less than
+            0.1 px, so none was changed.
+        error_before: Mean over points of their mean reprojection error at the given poses, px of
+            the photographs, for the observations that fit refined poses.
+        error_after: The same at the scene's poses.
+        median_shift: Median over the cameras of how far each moved, scene units.
+        largest_shift: The largest, scene units.
+        median_turn: Median over the cameras of the angle by which each turned, degrees.
+        largest_turn: The largest, degrees.
     """
 
-    seeing: Bool[np.ndarray, " N"]
-    observations: int
-    error: float
+    kept: bool
+    error_before: float
+    error_after: float
+    median_shift: float = 0.0
+    largest_shift: float = 0.0
+    median_turn: float = 0.0
+    largest_turn: float = 0.0
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """What the rounds came to.
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of N cameras.
 
     Args:
-        poses: In the given frame.
-        strict: The fit of what can be triangulated at the given poses.
-        after: The fit at ``poses``.
-        before: The fit of the same observations at the given poses.
+        rotations: cam_from_world, float64 [N, 3, 3].
+        centers: In the world, scene units, float64 [N, 3].
     """
 
-    poses: Poses
-    strict: _Fit
-    after: _Fit
-    before: _Fit
+    rotations: Float64[np.ndarray, "N 3 3"]
+    centers: Float64[np.ndarray, "N 3"]
+
+
+def poses_of(images: Sequence[Image]) -> Poses:
+    """The poses of ``images``, in their order."""
+    cameras = [image.camera for image in images]
+    return Poses(
+        np.array([camera.cam_from_world[:3, :3] for camera in cameras]),
+        np.array([camera.center for camera in cameras]),
+    )
+
+
+def with_poses(images: Sequence[Image], poses: Poses) -> list[Image]:
+    """The ``images`` with other poses."""
+    return [
+        replace(image, quat=quat_from_rotation(rotation), translation=-rotation @ center)
+        for image, rotation, center in zip(images, poses.rotations, poses.centers, strict=True)
+    ]
+
+
+def turns(a: Poses, b: Poses) -> Float64[np.ndarray, " N"]:
+    """Angle between ``a`` and ``b`` of each camera in degrees, float64 [N]."""
+    vectors = _turn_vectors(a.rotations, b.rotations)
+    return np.asarray(np.degrees(np.linalg.norm(vectors, axis=1)))
+
+
+def shifts(a: Poses, b: Poses) -> Float64[np.ndarray, " N"]:
+    """Distance between ``a`` and ``b`` of each camera in scene units, float64 [N]."""
+    return np.asarray(np.linalg.norm(a.centers - b.centers, axis=1))
+
+
+def spread(poses: Poses) -> float:
+    """Root mean square distance of the cameras from their middle, in scene units."""
+    return float(np.sqrt(np.square(poses.centers - poses.centers.mean(axis=0)).sum(axis=1).mean()))
+
+
+def align(moved: Poses, given: Poses) -> Poses:
+    """``moved`` in the world frame of ``given``, by one rotation, scale and translation.
+
+    Rotations count as well as centres: cameras along a line say nothing of the roll about it.
+    Each is weighed by its noise, which is estimated from the residuals, and a camera far from its
+    given pose counts little.
+
+    Args:
+        moved: Poses in a frame of their own.
+        given: The same cameras' poses in the wanted frame, not all in one place.
+    """
+    from scipy.optimize import least_squares  # noqa: PLC0415  (slow to import)
+
+    size = spread(given)
+
+    def residuals(x: Float64[np.ndarray, " 7"], noise: tuple[float, float]) -> Any:
+        new = _moved_by(x, moved, given, size)
+        shift = (new.centers - given.centers) / (size * noise[0])
+        return np.stack([shift, _turn_vectors(new.rotations, given.rotations) / noise[1]])
+
+    x, noise = np.zeros(7), (0.02, 0.02)
+    for _ in range(_ALIGN_ROUNDS):
+        x = least_squares(lambda x: residuals(x, noise).ravel(), x, loss="soft_l1").x  # noqa: B023
+        lengths = np.median(np.linalg.norm(residuals(x, (1.0, 1.0)), axis=2), axis=1) / _TYPICAL
+        noise = (max(float(lengths[0]), _ALIGN_NOISE), max(float(lengths[1]), _ALIGN_NOISE))
+    return _moved_by(x, moved, given, size)
+
+
+def _moved_by(x: Float64[np.ndarray, " 7"], moved: Poses, given: Poses, size: float) -> Poses:
+    """``moved`` after the similarity ``x``: a turn, a shift and the logarithm of a scale.
+
+    At zero it brings the mean rotation and the middle of the cameras to ``given``'s.
+    """
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
+
+    mean = Rotation.from_matrix(given.rotations.transpose(0, 2, 1) @ moved.rotations).mean()
+    new_from_old = (Rotation.from_rotvec(x[:3]) * mean).as_matrix()
+    centered = (moved.centers - moved.centers.mean(axis=0)) @ new_from_old.T
+    middle = given.centers.mean(axis=0) + x[3:6] * size
+    return Poses(moved.rotations @ new_from_old.T, np.exp(x[6]) * centered + middle)
+
+
+def _turn_vectors(
+    a: Float64[np.ndarray, "N 3 3"], b: Float64[np.ndarray, "N 3 3"]
+) -> Float64[np.ndarray, "N 3"]:
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  (slow to import)
+
+    return np.asarray(Rotation.from_matrix(a @ b.transpose(0, 2, 1)).as_rotvec())
 
 
 def refine(
@@ -106,9 +198,6 @@ def refine(
         images: The images of the database.
         given: Their poses, in the same order.
 
-    Returns:
-        The images with their new poses, and what changed.
-
     Raises:
         ReconstructionError: Fewer than half of the photographs see points, or the poses drifted:
             fewer photographs or observations fit than before, a camera turned by more than 10
@@ -116,15 +205,24 @@ def refine(
             middle.
     """
     solver = _Solver(run, cameras, images, given)
-    solution = run.stages.run("refinement", solver.solve, lambda: solver.rounds, MAX_ROUNDS)
+    solution = run.stage("refinement", solver.solve, lambda: solver.rounds, MAX_ROUNDS)
     names = [image.name for image in given]
-    _check_seeing(solution, names)
+    seeing = solution.after.seeing
+    if not _enough(seeing):
+        blind = [name for name, sees in zip(names, seeing, strict=True) if not sees]
+        raise ReconstructionError(
+            f"at least half of the {len(names)} posed images to see {LEAST_POINTS} points or more, "
+            "so that their poses can be refined",
+            found=f"{seeing.sum()}; too few in {name_some(blind)}",
+            fix=FIX,
+        )
     before, after = solution.before.error, solution.after.error
     if before - after < GAIN:
-        return list(given), Refinement(True, before, before, 0.0, 0.0, 0.0, 0.0)
+        return list(given), Refinement(True, before, before)
     old = poses_of(given)
-    _check_drift(solution, old, names)
     shift, turn = shifts(solution.poses, old), turns(solution.poses, old)
+    _check_fit(solution, names)
+    _check_drift(shift, turn, MAX_SHIFT * spread(old), names)
     return with_poses(given, solution.poses), Refinement(
         kept=False,
         error_before=before,
@@ -136,30 +234,40 @@ def refine(
     )
 
 
+class _Fit(NamedTuple):
+    """How photographs and points agree."""
+
+    seeing: Bool[np.ndarray, " N"]
+    """Which photographs see enough points to take part."""
+    observations: int
+    error: float
+    """Mean over the points of their mean reprojection error, px; infinite without points."""
+
+
+class _Solution(NamedTuple):
+    """What the rounds came to."""
+
+    poses: Poses
+    """In the given frame."""
+    strict: _Fit
+    """The fit of what can be triangulated at the given poses."""
+    after: _Fit
+    """The fit at ``poses``."""
+    before: _Fit
+    """The fit of the same observations at the given poses."""
+
+
 def _enough(seeing: Bool[np.ndarray, " N"]) -> bool:
     """Whether half of the photographs take part."""
     return bool(2 * seeing.sum() >= len(seeing) and seeing.sum() >= 2)
 
 
-def _check_seeing(solution: _Solution, names: Sequence[str]) -> None:
-    """Refuse a refinement in which fewer than half of the photographs take part."""
-    seeing = solution.after.seeing
-    if _enough(seeing):
-        return
-    blind = [name for name, sees in zip(names, seeing, strict=True) if not sees]
-    raise ReconstructionError(
-        f"at least half of the {len(names)} posed images to see {LEAST_POINTS} points or more, so "
-        "that their poses can be refined",
-        found=f"{seeing.sum()}; too few in {name_some(blind)}",
-        fix=FIX,
-    )
-
-
-def _check_drift(solution: _Solution, given: Poses, names: Sequence[str]) -> None:
-    """Refuse poses that have drifted."""
+def _check_fit(solution: _Solution, names: Sequence[str]) -> None:
+    """Refuse poses that fit fewer photographs or observations than the given ones."""
     strict, after = solution.strict, solution.after
-    lost = [name for name, gone in zip(names, strict.seeing & ~after.seeing, strict=True) if gone]
     if after.seeing.sum() < strict.seeing.sum():
+        gone = strict.seeing & ~after.seeing
+        lost = [name for name, each in zip(names, gone, strict=True) if each]
         raise ReconstructionError(
             f"refined poses to fit the {strict.seeing.sum()} images that the given poses fit",
             found=f"{after.seeing.sum()}, without {name_some(lost)}",
@@ -171,8 +279,15 @@ def _check_drift(solution: _Solution, given: Poses, names: Sequence[str]) -> Non
             found=f"{after.observations:,}",
             fix=FIX,
         )
-    turn, shift = turns(solution.poses, given), shifts(solution.poses, given)
-    limit = MAX_SHIFT * spread(given)
+
+
+def _check_drift(
+    shift: Float64[np.ndarray, " N"],
+    turn: Float64[np.ndarray, " N"],
+    limit: float,
+    names: Sequence[str],
+) -> None:
+    """Refuse poses that are too far from the given ones."""
     drifted = np.flatnonzero((turn > MAX_TURN) | (shift > limit))
     if len(drifted):
         worst = int(drifted[np.argmax(turn[drifted] / MAX_TURN + shift[drifted] / limit)])
@@ -187,20 +302,14 @@ def _check_drift(solution: _Solution, given: Poses, names: Sequence[str]) -> Non
 
 
 class _Solver:
-    """Rounds of triangulation and bundle adjustment.
-
-    Args:
-        run: The run.
-        cameras: The cameras of the database.
-        images: The images of the database.
-        given: Their poses, in the same order.
-    """
+    """Rounds of triangulation and bundle adjustment; arguments as ``refine`` has them."""
 
     def __init__(
         self, run: Run, cameras: Sequence[Any], images: Sequence[Any], given: Sequence[Image]
     ) -> None:
         self.rounds = 0
-        self._run = run
+        self._settings = run.settings
+        self._database = run.database
         self._pycolmap = run.pycolmap
         self._ids = [image.image_id for image in images]
         self._given = poses_of(given)
@@ -210,30 +319,27 @@ class _Solver:
 
     def solve(self) -> _Solution:
         """Refine until the poses rest."""
-        pycolmap = self._pycolmap
-        with pycolmap.Database.open(self._run.database) as database:
+        pycolmap, size = self._pycolmap, spread(self._given)
+        with pycolmap.Database.open(self._database) as database:
             cache = pycolmap.DatabaseCache.create(database, pycolmap.DatabaseCacheOptions())
         mapper = pycolmap.IncrementalMapper(cache)
         mapper.begin_reconstruction(self._model)
-        strict = self._fit_at_given(mapper)
-        noise, poses = FIRST_NOISE * spread(self._given), self._given
+        strict = self._round(mapper, FINE[-1], None)
+        noise, poses = FIRST_NOISE * size, self._given
         for pixels in self._limits():
-            self._triangulate(mapper, pixels)
-            self._adjust(pixels, noise)
-            self._filter(mapper, pixels)
-            fit = self._fit()
+            fit = self._round(mapper, pixels, noise)
             if not _enough(fit.seeing):
                 break
-            old, poses = poses, self._aligned()
-            least = LEAST_NOISE * spread(self._given)
+            old, poses = poses, self._aligned(fit.seeing)
             # A little too large on purpose: a prior too tight would prove itself right
-            noise = max(float(np.median(shifts(poses, self._given))), least)
+            noise = max(float(np.median(shifts(poses, self._given))), LEAST_NOISE * size)
             noise /= max(fit.error, LEAST_ERROR)  # adjustment takes features' noise for 1 px
             self.rounds += 1
             if pixels == FINE[-1] and np.radians(turns(poses, old).max()) * self._focal < STILL:
                 break
         after = self._fit()
-        self._restore()
+        for image_id, image in zip(self._ids, self._images, strict=True):
+            self._model.image(image_id).frame.rig_from_world = rigid(pycolmap, image)
         self._adjust(FINE[-1], None)
         mapper.observation_manager.filter_observations_with_negative_depth()
         return _Solution(poses, strict, after, self._fit())
@@ -244,10 +350,12 @@ class _Solver:
         limits = [max(pixels, FINE[0]) for pixels in coarse] + list(FINE)
         return limits + [FINE[-1]] * (MAX_ROUNDS - len(limits))
 
-    def _fit_at_given(self, mapper: Any) -> _Fit:
-        self._triangulate(mapper, FINE[-1])
-        self._adjust(FINE[-1], None)
-        self._filter(mapper, FINE[-1])
+    def _round(self, mapper: Any, pixels: float, noise: float | None) -> _Fit:
+        """Triangulate, adjust, and drop what misses its point by more than ``pixels``."""
+        self._triangulate(mapper, pixels)
+        self._adjust(pixels, noise)
+        least = self._pycolmap.IncrementalMapperOptions().filter_min_tri_angle
+        mapper.observation_manager.filter_all_points3D(pixels, least)
         return self._fit()
 
     def _triangulate(self, mapper: Any, pixels: float) -> None:
@@ -257,15 +365,11 @@ class _Solver:
             setattr(options, name, max(degrees, getattr(options, name)))
         options.merge_max_reproj_error = options.complete_max_reproj_error = pixels
         options.max_extra_param = math.inf  # a known lens is trusted
-        options.random_seed = self._run.settings.seed
+        options.random_seed = self._settings.seed
         for image_id in self._ids:
             mapper.triangulate_image(options, image_id)
         mapper.complete_and_merge_tracks(options)
         mapper.retriangulate(options)
-
-    def _filter(self, mapper: Any, pixels: float) -> None:
-        least = self._pycolmap.IncrementalMapperOptions().filter_min_tri_angle
-        mapper.observation_manager.filter_all_points3D(pixels, least)
 
     def _adjust(self, pixels: float, noise: float | None) -> None:
         """Adjust points, and poses too if the ``noise`` of given positions is told."""
@@ -280,7 +384,7 @@ class _Solver:
         options.ceres.loss_function_scale = pixels / 4
         options.ceres.solver_options.function_tolerance = 1e-6
         options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
-        options.ceres.solver_options.num_threads = self._run.settings.threads
+        options.ceres.solver_options.num_threads = self._settings.threads
         config = pycolmap.BundleAdjustmentConfig()
         for image_id in self._ids:
             config.add_image(image_id)
@@ -291,33 +395,32 @@ class _Solver:
             return
         of_priors = pycolmap.PosePriorBundleAdjustmentOptions()
         of_priors.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        of_priors.alignment_ransac.random_seed = self._run.settings.seed
-        priors = [self._prior(*each, noise) for each in enumerate(self._ids)]
+        of_priors.alignment_ransac.random_seed = self._settings.seed
+        centers = zip(self._ids, self._given.centers, strict=True)
+        priors = [self._prior(image_id, center, noise) for image_id, center in centers]
         pycolmap.create_pose_prior_bundle_adjuster(
             options, of_priors, config, priors, self._model
         ).solve()
 
-    def _prior(self, index: int, image_id: int, noise: float) -> Any:
+    def _prior(self, image_id: int, center: Float64[np.ndarray, " 3"], noise: float) -> Any:
         prior = self._pycolmap.PosePrior(pose_prior_id=image_id)
         prior.corr_data_id = self._model.image(image_id).data_id
-        prior.position = self._given.centers[index]
+        prior.position = center
         prior.position_covariance = noise**2 * np.eye(3)
         prior.coordinate_system = self._pycolmap.PosePriorCoordinateSystem.CARTESIAN
         return prior
 
-    def _aligned(self) -> Poses:
+    def _aligned(self, seeing: Bool[np.ndarray, " N"]) -> Poses:
         """The model's poses in the given frame; given ones where a photograph sees no point."""
         matrices = [self._model.image(i).cam_from_world().matrix() for i in self._ids]
-        rotations = np.array([matrix[:, :3] for matrix in matrices])
-        centers = np.array([-matrix[:, :3].T @ matrix[:, 3] for matrix in matrices])
-        found, seeing = Poses(rotations, centers), self._fit().seeing
-        aligned = align(found.only(seeing), self._given.only(seeing))
-        return self._given.with_new(seeing, aligned)
-
-    def _restore(self) -> None:
-        """Put the given poses back."""
-        for image_id, image in zip(self._ids, self._images, strict=True):
-            self._model.image(image_id).frame.rig_from_world = rigid(self._pycolmap, image)
+        found = Poses(
+            np.array([matrix[:, :3] for matrix in matrices])[seeing],
+            np.array([-matrix[:, :3].T @ matrix[:, 3] for matrix in matrices])[seeing],
+        )
+        rotations, centers = self._given.rotations.copy(), self._given.centers.copy()
+        aligned = align(found, Poses(rotations[seeing], centers[seeing]))
+        rotations[seeing], centers[seeing] = aligned.rotations, aligned.centers
+        return Poses(rotations, centers)
 
     def _fit(self) -> _Fit:
         self._model.update_point_3d_errors()

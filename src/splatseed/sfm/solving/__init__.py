@@ -1,1 +1,0 @@
-"""Poses and points from verified matches: mapping, triangulation, refinement of given poses."""

@@ -1,0 +1,97 @@
+"""``splatseed sfm``: that the words reach the reconstruction, and its report the user.
+
+What the reconstruction does is tested in tests/sfm.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from splatseed.commands import sfm
+from splatseed.sfm import Refinement, Settings, SfmReport
+
+LOST = tuple(f"lost{i}.jpg" for i in range(10))
+FACTS = (1234, 5.5, 0.61, {"features": 1.0})
+
+
+@pytest.fixture
+def called(monkeypatch, tmp_path):
+    """What the two reconstructions were called with, in place of running them."""
+    calls = {}
+    changes = [
+        Refinement(True, 0.162, 0.162),
+        Refinement(False, 9.44, 0.16, 0.04, 0.113, 1.24, 3.66),
+    ]
+
+    def reconstruct(*args, **kwargs):
+        calls["reconstruct"] = (args, kwargs)
+        return SfmReport(tmp_path / "out", 13, 20, LOST, *FACTS)
+
+    def triangulate(*args, **kwargs):
+        calls["triangulate"] = (args, kwargs)
+        change = changes.pop() if kwargs["refine_poses"] else None
+        return SfmReport(tmp_path / "out", 13, 13, (), *FACTS, change)
+
+    monkeypatch.setattr(sfm, "reconstruct", reconstruct)
+    monkeypatch.setattr(sfm, "triangulate", triangulate)
+    return calls
+
+
+def test_words_reach_the_reconstruction_and_its_report_the_user(called, tmp_path, splatseed):
+    words = ["--matcher", "sequential", "--threads", 2, "--overwrite", "--seed", 3]
+    run = splatseed("sfm", tmp_path, "-o", tmp_path / "out", "--no-shared-camera", *words)
+    assert (run.code, run.err) == (0, "")
+    args, kwargs = called["reconstruct"]
+    assert args == (tmp_path, tmp_path / "out", Settings("sequential", seed=3, threads=2))
+    assert not kwargs["shared_camera"]
+    assert kwargs["overwrite"]
+    for text in ("13 of 20", "1,234", "mean 5.50 images", "mean 0.610 px", "and 2 more"):
+        assert text in run.out
+    assert f"splatseed upsample {tmp_path / 'out'} " in run.out
+
+
+def test_the_photographs_are_counted_by_folder_first(called, tmp_path, splatseed, capsys):
+    splatseed("sfm", tmp_path, "-o", tmp_path / "out")
+    tell = called["reconstruct"][1]["on_photos"]
+    tell(["a.png", "b.png"], {})
+    tell(["scene/images/a.png", "run/render.png", "scene/images/b.png"], {"of grey": ["run/d.png"]})
+    told = capsys.readouterr()
+    assert told.out == "note: Left out: 1 image of grey, run/d.png.\n"
+    assert told.err.splitlines() == [
+        f"2 photographs in {tmp_path}",
+        f"3 photographs in {tmp_path}: 2 in scene/images, 1 in run",
+    ]
+
+
+def test_known_poses_are_triangulated_and_refined_when_asked(called, room, tmp_path, splatseed):
+    words = ("sfm", room / "images", "--poses-from", room, "-o", tmp_path / "out")
+    assert splatseed(*words).code == 0
+    (_, poses, *_), _ = called["triangulate"]
+    assert len(poses.images) == 12
+    assert "reconstruct" not in called
+    moved = splatseed(*words, "--refine-poses").out
+    for text in ("9.440 px", "0.160 px", "0.04 units", "0.113", "1.24 degrees", "3.66"):
+        assert text in moved
+    assert "kept as given" in splatseed(*words, "--refine-poses").out
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("{room}/images", "--refine-poses"), "--poses-from"),
+        (("{room}/images", "--frames", 0), "--frames"),
+        (("{room}/images", "--frames", 20), "--frames"),
+        (("{room}/images", "--poses-from", "{room}", "--no-shared-camera"), "shared"),
+        (("{film}", "--poses-from", "{room}"), "--poses-from"),
+        (("{film}",), "film.mp4"),
+    ],
+)
+def test_bad_words_end_in_one_line_and_no_folder(words, named, room, tmp_path, splatseed):
+    pytest.importorskip("imageio_ffmpeg", reason="videos need imageio-ffmpeg (extra sfm)")
+    film = tmp_path / "film.mp4"
+    film.write_bytes(b"\0" * 999)
+    words = [str(word).format(room=room, film=film) for word in words]
+    run = splatseed("sfm", *words, "-o", tmp_path / "out")
+    assert (run.code, run.err.count("\n")) == (2, 1), run
+    assert named in run.err
+    assert list(tmp_path.iterdir()) == [film]
