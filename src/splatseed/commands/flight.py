@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,14 +10,16 @@ import tyro
 
 from splatseed.commands.models import model_file
 from splatseed.commands.options import parse_options
-from splatseed.console import StageClock, print_note, print_pairs, stage_display
+from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.errors import OutputError, ParameterError
 from splatseed.io.staging import check_parents
+from splatseed.pointcloud import PointCloud
 from splatseed.requirements import require
+from splatseed.scene import Scene
 from splatseed.train.settings import Backend
 
 if TYPE_CHECKING:  # importing PyTorch takes a while: --help must not wait for it
-    from splatseed.view.models import ModelRenderer, Shown
+    from splatseed.view.models import Shown
     from splatseed.views.view import View
 
 MOST_SIDE = 1280
@@ -69,22 +70,31 @@ def run(arguments: list[str]) -> None:
     options = parse_options(Options, "flight", arguments)
     _check(options)
     require("torch", "imageio_ffmpeg")
-    from splatseed.view.flights import flight_frames, write_video  # noqa: PLC0415  (imports PyTorch)
+    # These import PyTorch.
+    from splatseed.train.device import pick_device  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.flights import flight_frames, write_video  # noqa: PLC0415  (likewise)
+    from splatseed.view.models import ModelRenderer, stage_frame  # noqa: PLC0415  (likewise)
 
     with stage_display() as clock:
         clock("read", 0.0)
-        shown = _open(options, options.model)
-        models = [shown]
-        if options.compare is not None:
-            models.append(_compared(options, options.compare, shown))
-        size = _size(options, shown)
-        views, fps = _views(options, shown, size)
-        renderers = _renderers(options, models, clock)
+        models = _opened(options)
+        size = _size(options, models[0])
+        views, fps = _path(options, models[0], size)
+        clock("prepare", 0.0)
+        device, frame = pick_device(options.backend, clock), stage_frame(models[0])
+        renderers = [ModelRenderer(each.model, frame, device) for each in models]
         names = [each.name for each in models]
         frames = flight_frames(renderers, names, views, depth=options.depth, progress=clock)
         write_video(options.output, frames, size, fps)
-    circles_unasked = shown.scene is None and options.path is None
-    _summarise(options, views, size, fps, clock, circles_unasked=circles_unasked)
+    seconds = clock.seconds().get("render", 0.0)
+    rows = [
+        ("frames", f"{len(views):,} of {size[0]} x {size[1]}, {fps:g} a second"),
+        ("rendering", f"{seconds:.1f} s, {1e3 * seconds / len(views):.0f} ms a frame"),
+        ("video", f"{options.output}, {options.output.stat().st_size / 1e6:.1f} MB"),
+    ]
+    print_pairs("splatseed flight", rows)
+    if models[0].scene is None and options.path is None:
+        print_note("No cameras are known, so the video circles; --scene SCENE names the scene's.")
 
 
 def _check(options: Options) -> None:
@@ -113,37 +123,31 @@ def _check(options: Options) -> None:
             model_file(each)
 
 
-def _open(options: Options, path: Path) -> Shown:
-    from splatseed.view.models import open_shown  # noqa: PLC0415  (loads with its use)
+def _opened(options: Options) -> list[Shown]:
+    """The model, and the one that is compared with it, which the same cameras see."""
+    from splatseed.view.models import open_shown, share_a_world  # noqa: PLC0415  (imports PyTorch)
 
-    shown = open_shown(path, options.scene)
-    if shown.gaussians is None:
-        raise ParameterError(
-            f"{path} to be a trained model",
-            found="a scene or points",
-            fix="Train it first (splatseed train), or look at it with splatseed view.",
-        )
-    return shown
-
-
-def _compared(options: Options, path: Path, first: Shown) -> Shown:
-    """The model beside the first, which the same cameras see."""
-    from splatseed.view.models import share_a_world  # noqa: PLC0415  (loads with its use)
-
-    shown = _open(options, path)
-    if not share_a_world(first, shown):
+    paths = [path for path in (options.model, options.compare) if path is not None]
+    models = [open_shown(path, options.scene) for path in paths]
+    for path, shown in zip(paths, models, strict=True):
+        if shown.gaussians is None:
+            raise ParameterError(
+                f"{path} to be a trained model",
+                found="a scene or points",
+                fix="Train it first (splatseed train), or look at it with splatseed view.",
+            )
+    if not share_a_world(models[0], models[-1]):
         raise ParameterError(
             f"a model of the same scene as {options.model}, for --compare",
-            found=f"{path}, whose scene has no photograph with a pose of that scene",
+            found=f"{options.compare}, whose scene has no photograph with a pose of that scene",
             fix="Compare runs of one scene; if these are, name it with --scene.",
         )
-    return shown
+    return models
 
 
 def _size(options: Options, shown: Shown) -> tuple[int, int]:
     """Width and height of the video."""
     from splatseed.view.flights import even_size  # noqa: PLC0415  (loads with its use)
-    from splatseed.views.view import poses_of  # noqa: PLC0415  (loads with its use)
 
     if options.size is not None:
         words = options.size.lower().split("x")
@@ -154,74 +158,30 @@ def _size(options: Options, shown: Shown) -> tuple[int, int]:
                 fix="Try --size 960x540.",
             )
         return even_size(int(words[0]), int(words[1]))
-    if shown.scene is None or not shown.scene.images:
-        return WITHOUT_CAMERAS
-    first = poses_of(shown.scene.images, shown.data_factor)[0]
-    return even_size(first.width, first.height, MOST_SIDE)
+    for view in shown.train_views[:1]:
+        return even_size(view.width, view.height, MOST_SIDE)
+    return WITHOUT_CAMERAS
 
 
-def _views(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[Sequence[View], float]:
+def _path(options: Options, shown: Shown, size: tuple[int, int]) -> tuple[list[View], float]:
     """The cameras, one per frame, and the frame rate."""
-    from splatseed.view.flights import orbit, smooth_path  # noqa: PLC0415  (loads with its use)
-
-    if options.path not in (None, ORBIT):
-        return _views_of_file(options.path, options.transform, shown, size)
-    frames = max(1, round(options.seconds * FPS))
-    cameras = shown.train_views
-    assert shown.gaussians is not None  # noqa: S101  (see _open)
-    if options.path == ORBIT or len(cameras) < 2:
-        return orbit(cameras, shown.gaussians, frames, size), FPS
-    return smooth_path(cameras, frames, size), FPS
-
-
-def _views_of_file(
-    path: Path, transform: str | None, shown: Shown, size: tuple[int, int]
-) -> tuple[Sequence[View], float]:
-    """The cameras of a path's file in the model's world, and the frame rate."""
-    from splatseed.io.colmap.scene import empty_cloud  # noqa: PLC0415  (loads with its use)
-    from splatseed.scene import Scene  # noqa: PLC0415  (loads with its use)
     from splatseed.splat.world import NO_TRANSFORM, find_transform  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.view.flights import check_path, path_of_file  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.flights import (  # noqa: PLC0415  (likewise)
+        check_path,
+        orbit,
+        path_of_file,
+        smooth_path,
+    )
 
-    world = None
-    if transform is not None:
-        world = find_transform(transform, shown.scene or Scene(empty_cloud()))
-    views, named = path_of_file(path, size, world)
-    assert shown.gaussians is not None  # noqa: S101  (see _open)
-    if transform != NO_TRANSFORM:
-        check_path(path, views, shown.gaussians, shown.train_views)
-    return views, named or FPS
-
-
-def _renderers(options: Options, models: Sequence[Shown], clock: StageClock) -> list[ModelRenderer]:
-    """The renderers of the models, all on the first one's stage."""
-    from splatseed.train.device import pick_device  # noqa: PLC0415  (imports PyTorch)
-    from splatseed.view.models import ModelRenderer, stage_frame  # noqa: PLC0415  (loads with its use)
-
-    clock("prepare", 0.0)
-    device, frame = pick_device(options.backend, clock), stage_frame(models[0])
-    return [
-        ModelRenderer(each.gaussians, frame, device)
-        for each in models
-        if each.gaussians is not None
-    ]
-
-
-def _summarise(
-    options: Options,
-    views: Sequence[View],
-    size: tuple[int, int],
-    fps: float,
-    clock: StageClock,
-    *,
-    circles_unasked: bool,
-) -> None:
-    seconds = clock.seconds().get("render", 0.0)
-    rows = [
-        ("frames", f"{len(views):,} of {size[0]} x {size[1]}, {fps:g} a second"),
-        ("rendering", f"{seconds:.1f} s, {1e3 * seconds / len(views):.0f} ms a frame"),
-        ("video", f"{options.output}, {options.output.stat().st_size / 1e6:.1f} MB"),
-    ]
-    print_pairs("splatseed flight", rows)
-    if circles_unasked:
-        print_note("No cameras are known, so the video circles; --scene SCENE names the scene's.")
+    cameras, frames = shown.train_views, max(1, round(options.seconds * FPS))
+    if options.path is not None and options.path != ORBIT:
+        world = None
+        if options.transform is not None:
+            world = find_transform(options.transform, shown.scene or Scene(PointCloud.empty()))
+        views, fps = path_of_file(options.path, size, world)
+        if options.transform != NO_TRANSFORM:
+            check_path(options.path, views, shown.model, cameras)
+        return views, fps or FPS
+    if options.path == ORBIT or len(cameras) < 2:
+        return orbit(cameras, shown.model, frames, size), FPS
+    return smooth_path(cameras, frames, size), FPS

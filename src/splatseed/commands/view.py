@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,8 +13,8 @@ import tyro
 
 from splatseed.commands.options import parse_options
 from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
-from splatseed.errors import SceneNotFoundError, SplatseedError
-from splatseed.io.load import check_there
+from splatseed.export import SUFFIXES
+from splatseed.io.load import check_there, is_scene
 from splatseed.literal import counted, visible
 from splatseed.process.interruption import Termination, exit_code
 from splatseed.requirements import require
@@ -82,9 +82,7 @@ def run(arguments: list[str]) -> None:
 
 def _opened(options: Options) -> tuple[list[Shown], int | None]:
     """What to show, under names that tell them apart; and which is compared with the first."""
-    from dataclasses import replace  # noqa: PLC0415  (loads with its use)
-
-    from splatseed.view.models import open_shown  # noqa: PLC0415  (loads with its use)
+    from splatseed.view.models import open_shown  # noqa: PLC0415  (imports PyTorch)
 
     paths = _within(options.what)
     beside = None if options.compare is None else len(paths)
@@ -99,43 +97,24 @@ def _opened(options: Options) -> tuple[list[Shown], int | None]:
 
 
 def _within(path: Path) -> list[Path]:
-    """The path itself, or the runs and scenes in a folder that is neither."""
-    from splatseed.io import load_scene  # noqa: PLC0415  (loads with its use)
-
-    if not path.is_dir() or RunFolder(path).is_run:
+    """The path itself, or the finished runs, scenes and models in a folder that is neither."""
+    if not path.is_dir() or RunFolder(path).is_run or is_scene(path):
         return [path]
-    try:
-        load_scene(path, require_points=False)
-    except SceneNotFoundError as error:
-        shown = [each for each in sorted(path.iterdir()) if _is_shown(each)]
-        if len(shown) > MOST_OPENED:
-            print_note(
-                f"{visible(path)} holds {len(shown)}; shown are the first {MOST_OPENED} by name. "
-                "To see others, give their paths."
-            )
-        if shown:
-            return shown[:MOST_OPENED]
-        raise SceneNotFoundError(
-            f"{path} to be a scene, a run or a folder of these", found=error.found, fix=error.fix
-        ) from None
-    return [path]
+    shown = [each for each in sorted(path.iterdir()) if _is_shown(each)]
+    if len(shown) > MOST_OPENED:
+        print_note(
+            f"{visible(path)} holds {len(shown)}; shown are the first {MOST_OPENED} by name. "
+            "To see others, give their paths."
+        )
+    return shown[:MOST_OPENED] or [path]
 
 
 def _is_shown(path: Path) -> bool:
     """Whether something in a folder is a finished run, a scene or a model."""
-    from splatseed.export import SUFFIXES  # noqa: PLC0415  (loads with its use)
-    from splatseed.io import load_scene  # noqa: PLC0415  (loads with its use)
-
     if path.is_file():
-        return any(path.name.lower().endswith(suffix) for suffix in SUFFIXES)
+        return path.name.lower().endswith(tuple(SUFFIXES))
     folder = RunFolder(path)
-    if folder.is_run:
-        return folder.gaussians.is_file()
-    try:
-        load_scene(path, require_points=False)
-    except SplatseedError:
-        return False
-    return True
+    return folder.gaussians.is_file() if folder.is_run else is_scene(path)
 
 
 def _announce(options: Options, port: int, opened: list[Shown], beside: int | None) -> None:

@@ -59,6 +59,12 @@ class Shown:
     test_every: int = 8
 
     @property
+    def model(self) -> Gaussians:
+        """The Gaussians, where there are some."""
+        assert self.gaussians is not None  # noqa: S101  (whoever asks has checked)
+        return self.gaussians
+
+    @property
     def train_views(self) -> tuple[View, ...]:
         """The training cameras, as large as the run's photographs; none without a scene."""
         images = self.scene.split(self.test_every)[0] if self.scene else ()

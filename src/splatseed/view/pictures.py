@@ -167,8 +167,7 @@ class Entry:
     @cached_property
     def renderer(self) -> ModelRenderer:
         """The renderer of the whole model."""
-        assert self.shown.gaussians is not None  # noqa: S101  (kinds says so)
-        return ModelRenderer(self.shown.gaussians, self.frame, self._device)
+        return ModelRenderer(self.shown.model, self.frame, self._device)
 
     @cached_property
     def quick_renderer(self) -> ModelRenderer:

@@ -156,8 +156,7 @@ class Viewer:
             if not entry.has_model:  # its cameras are shown too
                 position = position - STEP_BACK * ahead
         else:
-            assert entry.shown.gaussians is not None  # noqa: S101  (nothing else is shown)
-            (view,) = orbit([], entry.shown.gaussians, 1, (600, 400))
+            (view,) = orbit([], entry.shown.model, 1, (600, 400))
             pose = view.cam_from_world
             up, ahead, fov = np.array([0.0, -1.0, 0.0]), pose[2, :3], 0.9
             position = (-pose[:3, :3].T @ pose[:3, 3] - frame.origin) * frame.scale
