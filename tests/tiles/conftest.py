@@ -23,8 +23,8 @@ class Tiles:
         scene = cloud if isinstance(cloud, Scene) else Scene(cloud)
         source, request = SceneSource(scene), Request(name, method, ratio, None, seed)
         plan = TilePlan(most, at_once, None, None, 0)
-        with open_work(self.path, request.job(source)) as (work, self.resumed):
-            self.tiled = make_tiled(work, source, request, plan, tasks or HereTasks(), silent)
+        with open_work(self.path, request.job(source)) as self.resumed:
+            self.tiled = make_tiled(self.path, source, request, plan, tasks or HereTasks(), silent)
             pieces = list(self.tiled.all(silent))
         return tuple(np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
 

