@@ -117,52 +117,37 @@ def test_a_survey_far_from_zero_is_moved_and_says_so(tmp_path, splatseed):
     assert json.loads((out / "splatseed.json").read_text())["origin"] == [564010, 5932010, 90]
 
 
+SCAN = "with splatseed upsample SCENE --cloud SCAN."
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("--memory", "100M"), r"at least .* MB of memory for 1 process; found 100 MB"),
-        (("--memory", "much"), r"an amount of memory such as 4G or 500M; found 'much'"),
-        (
-            ("--tile-points", "99", "--budget", "50"),
-            r"looks at all .* found --budget\. Leave it .*--num-points",
-        ),
-        (
-            ("--tile-points", "99", "--method", "stereo"),
-            r"a method that works tile by tile .* or bring .* upsample SCENE --cloud SCAN\.",
-        ),
-        (
-            ("--jobs", "2", "--memory", "1G", "--verify"),
-            r"found --verify\. Leave it out .*, or leave out --jobs, --memory to work in memory\.",
-        ),
+        (("--memory", "100M"), "at least"),
+        (("--memory", "much"), "'much'"),
+        (("--tile-points", "99", "--budget", "50"), "--budget"),
+        (("--tile-points", "99", "--method", "stereo"), SCAN),
+        (("--jobs", "2", "--memory", "1G", "--verify"), "--verify"),
         (
             ("--tile-points", "99", "--method", "voronoi", "--profile", "paper"),
-            r"or voronoi with --profile default, or leave out --tile-points to work in memory\.",
+            "leave out --memory",
         ),
     ],
 )
-def test_what_cannot_be_is_one_line(words, told, cloud, tmp_path, splatseed):
+def test_what_cannot_be_is_refused(words, told, cloud, tmp_path, splatseed):
     method = () if "--method" in words else ("--method", "linear")
     run = splatseed("upsample", cloud, "-o", tmp_path / "out", *method, *words)
-    assert run.code == 2
-    assert re.search(told, run.err.replace("\n", " "))
+    assert (run.code, told in " ".join(run.err.split())) == (2, True)
     assert not list(tmp_path.glob("out*"))
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("--method", "stereo"), "found stereo, which needs the whole scene at once."),
-        (("--preview",), "found --preview. Leave it out"),
-        (("--budget", "50"), "found --budget. Leave it out"),
-    ],
+    "words", [("--method", "stereo"), ("--method", "mls", "--preview", "--budget", "50")]
 )
-def test_a_lone_scan_is_led_to_its_photographs(words, told, cloud, tmp_path, splatseed):
-    method = () if "--method" in words else ("--method", "mls")
-    run = splatseed("upsample", npz(cloud), "-o", tmp_path / "out", *method, *words)
+def test_a_lone_scan_is_led_to_its_photographs(words, cloud, tmp_path, splatseed):
+    run = splatseed("upsample", npz(cloud), "-o", tmp_path / "out", *words)
     assert run.code == 2
-    message = " ".join(run.err.split())
-    assert told in message
-    assert message.endswith("with splatseed upsample SCENE --cloud SCAN.")
+    assert " ".join(run.err.split()).endswith(SCAN)
 
 
 def test_what_the_machine_alone_cuts_into_tiles_is_told_what_it_takes(

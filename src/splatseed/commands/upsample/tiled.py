@@ -146,13 +146,17 @@ def _check_model(path: Path, bound: int | None) -> None:
 
 def _is_large(options: Options, method: Upsampler, count: int) -> bool:
     """Whether the whole cloud takes more memory than it may."""
+    bound = options.tiling.bound
+    return bound is not None and _needed(options, method, count) > bound
+
+
+def _needed(options: Options, method: Upsampler, count: int) -> int:
+    """Bytes that the whole cloud takes in memory."""
     from splatseed.upsample.nearest import NearestMethod  # noqa: PLC0415  (SciPy, Numba)
 
     total = planned_size(count, options.ratio, options.num_points)
     neighbors = method.num_queried if isinstance(method, NearestMethod) else 16
-    needed = PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
-    bound = options.tiling.bound
-    return bound is not None and needed > bound
+    return PROCESS + total * BYTES_EACH + count * (PER_POINT + PER_NEIGHBOR * neighbors)
 
 
 def run_tiled(
@@ -182,7 +186,7 @@ def run_tiled(
             options, method=str(method_for(scene or PointCloud.empty(), note=print_note))
         )
     method = methods[options.method]
-    _check_tileable(options, method, scene)
+    _check_tileable(options, method, scene, source.count)
     request = tiles.Request(options.method, method, options.ratio, options.num_points, options.seed)
     points = "unknown" if source.count is None else f"{source.count:,}"
     path, clock, tiling = tiles.work_path(options.output), StageClock(), options.tiling
@@ -216,7 +220,9 @@ def run_tiled(
     _summarise(options, tiled, report, clock.seconds())
 
 
-def _check_tileable(options: Options, method: Upsampler, scene: Scene | None) -> None:
+def _check_tileable(
+    options: Options, method: Upsampler, scene: Scene | None, count: int | None
+) -> None:
     """Refuse what needs all points in memory, before any work."""
     from splatseed.tiles import check_tileable  # noqa: PLC0415  (Numba)
 
@@ -224,7 +230,8 @@ def _check_tileable(options: Options, method: Upsampler, scene: Scene | None) ->
     if scene is None and (options.scene.suffix.lower() in CLOUDS or _looks(method)):
         in_memory = "bring the scan to its photographs with splatseed upsample SCENE --cloud SCAN"
     elif not options.tiling.asked and options.tiling.memory is None:
-        in_memory = "use a machine with more memory, to hold all points at once"
+        needed = words_of(_needed(options, method, count or 0), up=True)
+        in_memory = f"use a machine with {needed} of free memory"
     if given := [flag for name, flag in NOT_IN_TILES.items() if getattr(options, name)]:
         raise ParameterError(
             "no option that looks at all points at once while a cloud is worked on in tiles",
