@@ -1,4 +1,4 @@
-"""A scene's photographs through a network: what is written, in which batches, and what stops it."""
+"""A scene's photographs through a network: what is written, and what stops it."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Brightness:
     meaning: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(kind="inverse"))
     asked: list = field(default_factory=list)
 
-    def __call__(self, images):
-        self.asked.append([image.shape[:2] for image in images])
-        return [image.mean(axis=2).astype(np.float32) + 1 for image in images]
+    def __call__(self, image):
+        self.asked.append(image.shape[:2])
+        return image.mean(axis=2).astype(np.float32) + 1
 
 
 @pytest.fixture(scope="module")
@@ -68,31 +68,15 @@ def test_every_image_gets_a_map_that_the_reader_finds(room_path, network, tmp_pa
     assert stages[-1] == ("predict depth", 1.0)
 
 
-def test_the_batch_changes_no_byte(room_path, tmp_path):
-    scene = load_scene(room_path)
-    for batch in (1, 2, 9):
-        estimate_depths(scene, Brightness(), tmp_path / str(batch), batch=batch)
-    assert _tree(tmp_path / "1") == _tree(tmp_path / "2") == _tree(tmp_path / "9")
-    assert len(_tree(tmp_path / "1")) == 5
-
-
-def test_a_batch_holds_images_of_one_size_and_no_more_than_asked(own_path, network, tmp_path):
+def test_large_images_are_reduced_and_small_ones_left(own_path, network, tmp_path):
     scene = load_scene(own_path)
-    for image in scene.images[::2]:
-        path = scene.source.image_dir / image.name
-        with PilImage.open(path) as picture:
-            smaller = picture.resize((40, 30))
-        smaller.save(path)
-    report = estimate_depths(scene, network, tmp_path / "maps", batch=2)
-    assert sorted(map(len, network.asked)) == [1, 2, 2]
-    assert all(len(set(batch)) == 1 for batch in network.asked)
-    assert report.sizes == ((40, 30), (80, 60))
-
-
-def test_large_images_are_reduced_and_small_ones_left(room_path, network, tmp_path):
-    scene = load_scene(room_path)
-    estimate_depths(scene, network, tmp_path / "maps", max_size=48)
-    assert {shape for batch in network.asked for shape in batch} == {(36, 48)}
+    path = scene.source.image_dir / scene.images[1].name
+    with PilImage.open(path) as picture:
+        smaller = picture.resize((40, 30))
+    smaller.save(path)
+    report = estimate_depths(scene, network, tmp_path / "maps", max_size=48)
+    assert set(network.asked) == {(36, 48), (30, 40)}
+    assert report.sizes == ((40, 30), (48, 36))
     depth_map = find_depths(scene, tmp_path / "maps").read(scene.images[0].name)
     assert depth_map.camera(scene.images[0].camera).width == 48
 
@@ -111,13 +95,13 @@ def test_subfolders_and_foreign_suffixes_keep_their_names(own_path, network, tmp
 
 def test_a_network_that_fails_on_an_image_is_told_of(room_path, tmp_path):
     class Failing(Brightness):
-        def __call__(self, images):
-            maps = super().__call__(images)
-            maps[0] = np.full_like(maps[0], 7 if len(self.asked) == 1 else np.inf)
-            return maps
+        def __call__(self, image):
+            values = super().__call__(image)
+            failing = {1: 7.0, 4: np.inf}.get(len(self.asked))
+            return values if failing is None else np.full_like(values, failing)
 
     scene = load_scene(room_path)
-    report = estimate_depths(scene, Failing(), tmp_path / "maps", batch=3)
+    report = estimate_depths(scene, Failing(), tmp_path / "maps")
     names = sorted(image.name for image in scene.images)
     assert report.flat == (names[0], names[3])
     values = find_depths(scene, tmp_path / "maps").read(names[3]).values
@@ -144,10 +128,10 @@ def test_a_bad_photograph_stops_before_the_network_is_run(damage, own_path, netw
 
 def test_a_failure_on_the_way_leaves_nothing(room_path, tmp_path):
     class Broken(Brightness):
-        def __call__(self, images):
+        def __call__(self, image):
             if len(self.asked) == 3:
                 raise ParameterError("memory", found="none", fix="Buy some.")
-            return super().__call__(images)
+            return super().__call__(image)
 
     with pytest.raises(ParameterError):
         estimate_depths(load_scene(room_path), Broken(), tmp_path / "out" / "maps")
@@ -163,9 +147,8 @@ def test_the_scene_is_not_written_into(room_path, network):
 
 def test_what_cannot_be_done_is_refused(own_path, network, tmp_path):
     scene = load_scene(own_path)
-    for number in ({"batch": 0}, {"max_size": -5}):
-        with pytest.raises(ParameterError, match=next(iter(number)).replace("_", "-")):
-            estimate_depths(scene, network, tmp_path / "maps", **number)
+    with pytest.raises(ParameterError, match="--max-size"):
+        estimate_depths(scene, network, tmp_path / "maps", max_size=-5)
     with pytest.raises(SceneNotFoundError):
         estimate_depths(scene.replace(images=()), network, tmp_path / "maps")
     shutil.rmtree(own_path / "images")

@@ -7,7 +7,6 @@ import os
 import numpy as np
 import pytest
 
-from splatseed import monocular
 from splatseed.commands.bench.machine import Machine, check_machine
 from splatseed.depth.stereo import StereoSettings, stereo_depths
 from splatseed.depth.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
@@ -74,13 +73,6 @@ def test_what_stereo_holds_beside_photographs(free, scene):
     with pytest.raises(ParameterError, match="at a grid of 1"):
         stereo_depths(scene, grid=1)
     check_stereo_memory(views, StereoSettings(grid=4))
-
-
-def test_a_batch_for_a_network(free):
-    free(2 * 1000 * monocular.BYTES_A_PIXEL)
-    monocular._check_memory((40, 25), 2)
-    with pytest.raises(ParameterError, match="--max-size"):
-        monocular._check_memory((40, 25), 3)
 
 
 def test_the_runs_of_a_benchmark(free):

@@ -19,12 +19,10 @@ def model_file(path: Path) -> Path:
     Raises:
         SceneNotFoundError: There is none.
     """
-    if path.is_file():
-        _refuse_note(path)
-        return path
     folder = RunFolder(path)
-    if path.is_dir() and folder.gaussians.is_file():
-        return folder.gaussians
+    for file in (path, folder.gaussians):
+        if file.is_file():
+            return file
     found, fix = odd_kind(path) or "nothing there", "Check the path."
     if folder.is_run:
         found = "a run that has not finished"
@@ -40,16 +38,6 @@ def model_file(path: Path) -> Path:
     )
 
 
-def _refuse_note(path: Path) -> None:
-    """Refuse the notes and the curve of a run, which are named by mistake for the run."""
-    if path.suffix in {".json", ".csv"} and RunFolder(path.parent).is_run:
-        raise SceneNotFoundError(
-            f"a run of splatseed train, or a file of Gaussians (.ply, .spz, ...), at {path}",
-            found="a file about a run",
-            fix=f"Name the run: {path.parent}",
-        )
-
-
 def config_of(path: Path) -> Mapping[str, Any]:
     """The config of a run, named by its folder or its result; empty for what belongs to no run.
 
@@ -59,8 +47,7 @@ def config_of(path: Path) -> Mapping[str, Any]:
         SceneFormatError: It cannot be read.
     """
     folder = RunFolder(path if path.is_dir() else path.parent)
-    named = path.is_dir() or path == folder.gaussians
-    if not (named and folder.is_run):
+    if path not in (folder.path, folder.gaussians) or not folder.is_run:
         return {}
     config = folder.read_config()
     return {**config, "scene": folder.scene_of(config)}

@@ -2,17 +2,16 @@
 
 ``splatseed.monocular.network.load_network`` takes a network that is on this machine, and
 ``estimate_depths`` runs it on every photograph. Promise: nothing is downloaded; every photograph is
-read to its last byte before the network runs on the first; one batch is in memory at a time; the
-folder of maps appears whole or not at all.
+read to its last byte before the network runs on the first; the folder of maps appears whole or not
+at all.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +29,6 @@ from splatseed.io.photograph import (
     photograph_folder,
 )
 from splatseed.io.staging import check_output
-from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 
@@ -39,8 +37,6 @@ if TYPE_CHECKING:  # PyTorch is imported only where a network is loaded
 
 __all__ = ["DepthReport", "estimate_depths"]
 
-BYTES_A_PIXEL = 3 + 4 * 3 + 4
-"""Bytes per pixel of a photograph in a network: its colours, these as floats, and its depth."""
 Size = tuple[int, int]
 """Width and height in pixels."""
 
@@ -69,7 +65,6 @@ def estimate_depths(
     network: DepthNetwork,
     output: Path,
     *,
-    batch: int = 1,
     max_size: int = 1600,
     overwrite: bool = False,
     provenance: Mapping[str, object] | None = None,
@@ -81,7 +76,6 @@ def estimate_depths(
         scene: A scene with photographs.
         network: The network.
         output: The folder to write, with one float32 ``.npy`` per image.
-        batch: Photographs per run of the network.
         max_size: A photograph whose longer side has more pixels is reduced to this before the
             network sees it, and its map has that size.
         overwrite: Whether an earlier folder of maps may be replaced.
@@ -95,31 +89,27 @@ def estimate_depths(
             ratio.
         OutputError: The folder cannot be written.
     """
-    for name, number in (("batch", batch), ("max-size", max_size)):
-        if number < 1:
-            raise ParameterError(f"--{name} of 1 or more", found=f"{number}", fix="Raise it.")
+    if max_size < 1:
+        raise ParameterError("--max-size of 1 or more", found=f"{max_size}", fix="Raise it.")
     folder = photograph_folder(scene)
     protect = (folder,) if scene.source is None else scene.source.inputs
     check_output(output, kind="depth", overwrite=overwrite, protect=protect)
     sizes = _sizes(scene, folder, max_size, progress)
-    ordered = sorted(sizes.values(), key=lambda size: size[0] * size[1])
-    _check_memory(ordered[-1], min(batch, len(sizes)))
-    start, flat, done = time.perf_counter(), [], 0
+    start, flat = time.perf_counter(), []
     with depth_folder(
         output, network.meaning.kind, overwrite=overwrite, protect=protect, provenance=provenance
     ) as writer:
         progress("predict depth", 0.0)
-        for names, size in _batches(sizes, batch):
-            maps = network([_load(folder / name, size) for name in names])
-            for name, values in zip(names, maps, strict=True):
-                finite = np.isfinite(values)
-                writer.write(name, np.where(finite, values, np.float32(np.nan)))
-                if not finite.any() or np.ptp(values[finite]) == 0:
-                    flat.append(name)
-            done += len(names)
+        for done, (name, size) in enumerate(sizes.items(), 1):
+            values = network(_load(folder / name, size))
+            finite = np.isfinite(values)
+            writer.write(name, np.where(finite, values, np.float32(np.nan)))
+            if not finite.any() or np.ptp(values[finite]) == 0:
+                flat.append(name)
             progress("predict depth", done / len(sizes))
+    ordered = sorted(sizes.values(), key=lambda size: size[0] * size[1])
     seconds = time.perf_counter() - start
-    return DepthReport(output, done, (ordered[0], ordered[-1]), tuple(sorted(flat)), seconds)
+    return DepthReport(output, len(sizes), (ordered[0], ordered[-1]), tuple(flat), seconds)
 
 
 def _sizes(scene: Scene, folder: Path, max_size: int, progress: Progress) -> dict[str, Size]:
@@ -141,23 +131,6 @@ def _sizes(scene: Scene, folder: Path, max_size: int, progress: Progress) -> dic
             sizes[name] = max(round(width * factor), 1), max(round(height * factor), 1)
             progress("check images", len(sizes) / len(lenses))
     return sizes
-
-
-def _check_memory(largest: Size, batch: int) -> None:
-    """Refuse a batch that does not fit into memory, whatever the network itself needs."""
-    pixels = largest[0] * largest[1]
-    what = f"photographs of {pixels / 1e6:.1f} megapixels at a time"
-    fix = "Pass a smaller --max-size."
-    check_memory(batch, pixels * BYTES_A_PIXEL, what, fix=fix)
-
-
-def _batches(sizes: Mapping[str, Size], batch: int) -> Iterator[tuple[list[str], Size]]:
-    """Names that go through the network together, all of the same size."""
-    ordered = sorted(sizes, key=lambda name: (sizes[name], name))
-    for size, group in groupby(ordered, lambda name: sizes[name]):
-        names = list(group)
-        for start in range(0, len(names), batch):
-            yield names[start : start + batch], size
 
 
 def _load(path: Path, size: Size) -> UInt8[np.ndarray, "H W 3"]:

@@ -104,56 +104,54 @@ class DepthNetwork:
         return f"CPU, {torch.get_num_threads()} threads"
 
     @torch.inference_mode()
-    def __call__(
-        self, images: Sequence[UInt8[np.ndarray, "H W 3"]]
-    ) -> list[Float32[np.ndarray, "H W"]]:
-        """Predict for photographs of one size (sRGB), at their size.
+    def __call__(self, image: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W"]:
+        """Predict for a photograph (sRGB), at its size.
 
         Predictions are resized to the photograph bilinearly, so that no value lies outside those
         predicted, and without the padding that some networks ask for.
 
         Raises:
-            ParameterError: The batch does not fit into memory.
+            ParameterError: The photograph does not fit into memory.
             SceneFormatError: The network does not run on such an image.
         """
-        size = images[0].shape[:2]
-        values, frame = self._prepare(images)
+        size = image.shape[:2]
+        values, frame = self._prepare(image)
         try:
             outputs = self._network(pixel_values=values.to(self._device))
         except (RuntimeError, ValueError) as error:
             raise _failed(error, values) from error
         if getattr(outputs, "field_of_view", None) is not None:  # Depth Pro's scale depends on it
-            depths = self._processor.post_process_depth_estimation(
-                outputs, target_sizes=[size] * len(images)
-            )
-            return [each["predicted_depth"].float().cpu().numpy() for each in depths]
-        depth = outputs.predicted_depth[:, None].float()
-        if frame is not None:
-            rows = slice(frame.top, frame.top + frame.height)
-            columns = slice(frame.left, frame.left + frame.width)
-            depth = _scaled(depth, (frame.full_height, frame.full_width))[:, :, rows, columns]
-        return list(_scaled(depth, size)[:, 0].cpu().numpy())
+            (made,) = self._processor.post_process_depth_estimation(outputs, target_sizes=[size])
+            depth = made["predicted_depth"].float()
+        else:
+            depth = outputs.predicted_depth[:, None].float()
+            if frame is not None:
+                rows = slice(frame.top, frame.top + frame.height)
+                columns = slice(frame.left, frame.left + frame.width)
+                depth = _scaled(depth, (frame.full_height, frame.full_width))[:, :, rows, columns]
+            depth = _scaled(depth, size)[0, 0]
+        return np.asarray(depth.cpu().numpy())
 
     def _prepare(
-        self, images: Sequence[UInt8[np.ndarray, "H W 3"]]
-    ) -> tuple[Float[Tensor, "B 3 h w"], _Frame | None]:
-        """The network's input, and where the photographs lie in it; None: they fill it."""
-        processor, height, width = self._processor, *images[0].shape[:2]
+        self, image: UInt8[np.ndarray, "H W 3"]
+    ) -> tuple[Float[Tensor, "1 3 h w"], _Frame | None]:
+        """The network's input, and where the photograph lies in it; None: it fills it."""
+        processor, height, width = self._processor, *image.shape[:2]
         divisor = getattr(processor, "size_divisor", None)
         pads = bool(getattr(processor, "do_pad", False))
         if pads and divisor:  # done here: the processor does not report how much
-            return _padded(self._process(images, do_pad=False), divisor)
-        values = self._process(images)
+            return _padded(self._process(image, do_pad=False), divisor)
+        values = self._process(image)
         if pads and self._network.config.model_type == "zoedepth":
             top, left = (int(math.sqrt(side / 2) * _ZOE_MARGIN) for side in (height, width))
             return values, _Frame(height + 2 * top, width + 2 * left, top, left, height, width)
         return values, None
 
     def _process(
-        self, images: Sequence[UInt8[np.ndarray, "H W 3"]], **options: bool
-    ) -> Float[Tensor, "B 3 h w"]:
+        self, image: UInt8[np.ndarray, "H W 3"], **options: bool
+    ) -> Float[Tensor, "1 3 h w"]:
         made = self._processor(
-            images=list(images), return_tensors="pt", input_data_format="channels_last", **options
+            images=[image], return_tensors="pt", input_data_format="channels_last", **options
         )
         return torch.as_tensor(made["pixel_values"])
 
@@ -263,13 +261,13 @@ def _load(model: str) -> tuple[Any, Any]:
     return processor, network
 
 
-def _failed(error: Exception, values: Float[Tensor, "B 3 h w"]) -> SplatseedError:
+def _failed(error: Exception, values: Float[Tensor, "1 3 h w"]) -> SplatseedError:
     """The error for a network that failed."""
-    batch, _, height, width = values.shape
+    height, width = values.shape[2:]
     # PyTorch's memory errors on the CPU contain "allocate".
     if isinstance(error, torch.cuda.OutOfMemoryError) or "allocate" in str(error):
         return ParameterError(
-            f"enough memory for {batch} images of {width} x {height} at once",
+            f"enough memory for an image of {width} x {height}",
             found=_one_line(error).partition(". ")[0],
             fix="Pass a smaller --max-size, or another --device.",
         )
@@ -317,8 +315,8 @@ def _silent() -> Iterator[None]:
 
 
 def _padded(
-    values: Float[Tensor, "B 3 h w"], divisor: int
-) -> tuple[Float[Tensor, "B 3 H W"], _Frame]:
+    values: Float[Tensor, "1 3 h w"], divisor: int
+) -> tuple[Float[Tensor, "1 3 H W"], _Frame]:
     """Zero-padded on both sides to multiples of ``divisor``."""
     height, width = values.shape[2:]
     down, right = (-side % divisor for side in (height, width))
@@ -327,5 +325,5 @@ def _padded(
     return pad(values, (left, right - left, top, down - top)), frame
 
 
-def _scaled(depth: Float[Tensor, "B 1 h w"], size: Sequence[int]) -> Float[Tensor, "B 1 H W"]:
+def _scaled(depth: Float[Tensor, "1 1 h w"], size: Sequence[int]) -> Float[Tensor, "1 1 H W"]:
     return interpolate(depth, size=tuple(size), mode="bilinear", align_corners=False)
