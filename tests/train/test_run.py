@@ -7,7 +7,6 @@ import dataclasses
 import json
 import os
 import signal
-from pathlib import Path
 
 import numba
 import numpy as np
@@ -20,15 +19,11 @@ from splatseed.evaluate import evaluate_views
 from splatseed.scene import Split
 from splatseed.splat.ply import read_gaussians
 from splatseed.train import device, run as run_module, trainer
-from splatseed.train.parameters import add_to_mean, gaussians_of
+from splatseed.train.parameters import add_to_mean, gaussians_of, length_units
 from splatseed.train.run import RunOptions, prepare_run
 from splatseed.train.settings import TrainSettings
 
 RESUME = RunOptions(resume=True)
-
-
-def _score(render, views):
-    return evaluate_views(render, views)
 
 
 def _bytes(run):
@@ -80,14 +75,13 @@ def test_the_scenes_own_lists_are_followed(room, tmp_path):
         room.replace(listed=split), tmp_path / "run", TrainSettings(max_steps=1), RunOptions()
     )
     assert [view.name for view in run.trainer.train_views] == names[3:]
-    assert run.train()
-    run.finish(_score)
-    metrics = json.loads((tmp_path / "run/metrics.json").read_text())
-    assert [each["name"] for each in metrics["per_image"]] == names[1:3]
+    assert [view.name for view in run.trainer.test_views] == names[1:3]
 
 
-@pytest.mark.parametrize("strategy", ["default", "grow", "mcmc", "none"])
-@pytest.mark.parametrize("stop", [17, 55])  # while Gaussians are added; while the mean is taken
+# While Gaussians are added, and while the mean is taken.
+@pytest.mark.parametrize(
+    ("strategy", "stop"), [*((s, 17) for s in SMALL), ("grow", 55), ("none", 55)]
+)
 def test_going_on_equals_never_having_stopped(begin, strategy, stop):
     settings = {"strategy": strategy, "cap_max": 700}
     straight = begin("straight", **settings)
@@ -151,20 +145,13 @@ def test_the_callers_random_numbers_are_left_alone(begin):
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_default_strategy_grows_and_stops_at_half(begin):
-    run = begin(max_steps=80)
-    run.train()
-    counts = {record.step: record.num_gaussians for record in run.state.records}
-    assert counts[40] > counts[1]
-    assert counts[41] == counts[80]
-
-
-def test_default_strategy_keeps_to_its_cap(begin):
-    free = begin("free", max_steps=60)
+def test_default_strategy_grows_stops_at_half_and_keeps_to_its_cap(begin):
+    free, capped = begin("free", max_steps=80), begin("capped", max_steps=60, cap_max=300)
     free.train()
-    capped = begin("capped", max_steps=60, cap_max=300)
+    counts = {record.step: record.num_gaussians for record in free.state.records}
+    assert counts[40] > max(400, counts[1])
+    assert counts[41] == counts[80]
     capped.train()
-    assert max(record.num_gaussians for record in free.state.records) > 400
     assert 290 < max(record.num_gaussians for record in capped.state.records) <= 300
 
 
@@ -186,10 +173,13 @@ def test_a_run_ends_with_the_mean_of_its_last_fifth(begin, monkeypatch):
         assert not torch.equal(got, seen[-1][name].to(torch.float64))
 
 
-def test_3dgs_conventions_end_with_the_last_step(begin):
-    run = begin(strategy="none-3dgs", max_steps=20)
+def test_3dgs_conventions_end_with_the_last_step_and_have_one_length_unit(begin):
+    run = begin(strategy="default-3dgs", max_steps=60, cap_max=3000)
+    count = len(run.state.params["means"])
     run.train()
     assert not run.state.mean
+    assert length_units(run.state.params).tolist() == pytest.approx([1.1])
+    assert len(run.state.params["means"]) > count
 
 
 def test_opacities_are_reset_on_request(begin):
@@ -206,21 +196,12 @@ def test_mcmc_stays_within_its_cap(begin):
     assert run.state.records[0].num_gaussians <= run.state.records[-1].num_gaussians <= 600
 
 
-def test_more_seeds_than_the_cap_are_thinned_out_and_reported(room, tmp_path):
-    notes = []
-    run = prepare_run(
-        room, tmp_path / "run", TrainSettings(cap_max=100, max_steps=5), note=notes.append
-    )
-    assert len(run.state.params["means"]) == 70
-    assert any("there may be 100 Gaussians" in note for note in notes)
-
-
 def test_results_are_whole_and_in_the_scenes_world(begin, room):
     run = begin(max_steps=20)
     seeds_in_world = run._frame.points_to_world(gaussians_of(run.state.params).means)
     assert np.allclose(seeds_in_world, room.points.xyz, atol=1e-4)
     run.train()
-    result, folder = run.finish(_score), run.folder
+    result, folder = run.finish(evaluate_views), run.folder
     assert json.loads(folder.metrics.read_text()) == result.to_dict()
     assert [test.step for test in result.curve] == list(range(1, 21))
     last, end = result.curve[-1], result.scores
@@ -249,7 +230,7 @@ def test_an_earlier_run_is_neither_replaced_nor_repeated_by_accident(begin, room
     with pytest.raises(OutputError, match=r"unfinished run.*--resume"):
         begin(max_steps=3)
     run.train()
-    run.finish(_score)
+    run.finish(evaluate_views)
     with pytest.raises(OutputError, match=r"found a finished run\. Pass --overwrite"):
         begin(max_steps=3)
     with pytest.raises(OutputError, match="a finished one"):
@@ -290,55 +271,41 @@ def test_a_run_goes_on_with_its_own_settings_and_seeds(begin, room, tmp_path):
         prepare_run(room, tmp_path / "run", TrainSettings(), RESUME)
 
 
-def test_a_run_goes_on_with_what_it_knew_of_its_seeds(room, tmp_path):
+def test_a_run_begins_with_what_it_knows_of_its_seeds(room, tmp_path):
     count = len(room.points)
     known = room.points.replace(
         sizes=np.full(count, 0.02), normals=np.tile([0.0, 0, 1], (count, 1))
     )
     asked = TrainSettings(max_steps=8, data_factor=2, seed_sizes=True, seed_normals=True)
-    runs = {}
-    for name in ("straight", "stopped"):
-        runs[name] = prepare_run(room.replace(points=known), tmp_path / name, asked)
-    first = gaussians_of(runs["straight"].state.params)
-    size = 0.02 * runs["straight"]._frame.scale
-    assert np.allclose(np.exp(first.scales), [size, size, 0.1 * size], rtol=1e-4)
-    assert runs["straight"].train()
-    assert not runs["stopped"].train(_stop_after(3))
+    run = prepare_run(room.replace(points=known), tmp_path / "run", asked)
+    size = 0.02 * run._frame.scale
+    scales = np.exp(gaussians_of(run.state.params).scales)
+    assert np.allclose(scales, [size, size, 0.1 * size], rtol=1e-4)
     with pytest.raises(ParameterError, match="other points"):
-        prepare_run(room, tmp_path / "stopped", asked, RESUME)
-    resumed = prepare_run(room.replace(points=known), tmp_path / "stopped", TrainSettings(), RESUME)
-    assert resumed.settings == asked
-    assert resumed.train()
-    assert _bytes(resumed) == _bytes(runs["straight"])
+        prepare_run(room, tmp_path / "run", asked, RESUME)
 
 
-def test_a_run_killed_before_its_first_checkpoint_starts_again(begin):
-    begin(max_steps=30)
-    assert begin(options=RESUME, max_steps=30).state.step == 0
-
-
-def test_a_disk_that_is_full_at_the_end_costs_nothing(begin, monkeypatch):
+def test_a_disk_that_is_full_among_the_results_costs_nothing(begin, monkeypatch):
     """The first test view's record leaves a checkpoint, and so does the last step."""
     run = begin(max_steps=30)
-    write, seen = Path.write_text, []
+    seen = []
     run.train(lambda step: seen.append(run.folder.checkpoint.is_file()) if step == 20 else None)
     assert seen == [True]
     whole = _bytes(run)
 
-    def disk_full(path, *words, **options):
-        if "metrics" in path.name:
-            raise OSError(28, "No space left on device")
-        return write(path, *words, **options)
+    def disk_full(path, _picture):
+        raise OutputError(f"{path}", found="No space left on device", fix="Free some.")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_text", disk_full)
+        patch.setattr(run_module, "write_picture", disk_full)
         with pytest.raises(OutputError, match=r"No space left.*as of step 30 is kept.*--resume"):
-            run.finish(_score)
+            run.finish(evaluate_views)
+    assert not run.folder.metrics.exists()
     resumed = begin(options=RESUME, max_steps=30)
     assert resumed.state.step == 30
     assert resumed.train()
     assert _bytes(resumed) == whole
-    resumed.finish(_score)
+    resumed.finish(evaluate_views)
     assert not resumed.folder.checkpoint.exists()
     assert resumed.folder.metrics.is_file()
 
@@ -360,7 +327,7 @@ def test_a_failing_checkpoint_leaves_the_last_one(begin, monkeypatch):
 
 def test_what_does_not_fit_the_memory_is_refused_with_what_would(begin, monkeypatch, tmp_path):
     monkeypatch.setattr(device, "free_bytes", lambda _: 100 * device.BYTES_EACH)
-    with pytest.raises(PointCloudError, match="--cap-max 100"):
+    with pytest.raises(PointCloudError, match="--budget 100"):
         begin()
     assert not (tmp_path / "run").exists()
 
@@ -384,8 +351,8 @@ def test_memory_holds_growth_and_the_run_says_so(begin, monkeypatch, strategy):
     assert held.train()
     most = begun + (grown - begun) // 2
     assert begun < max(r.num_gaussians for r in held.state.records) <= most
-    assert held.finish(_score).held_by_memory_at == most
-    assert free.finish(_score).held_by_memory_at is None
+    assert held.finish(evaluate_views).held_by_memory_at == most
+    assert free.finish(evaluate_views).held_by_memory_at is None
 
 
 def test_a_gpu_that_is_not_there_is_not_replaced_in_silence(begin, monkeypatch):
@@ -409,30 +376,12 @@ def test_a_distorted_lens_is_refused_before_seeds_are_made(room, tmp_path, monke
         prepare_run(room.replace(images=tuple(bent)), tmp_path / "run", TrainSettings())
 
 
-def test_a_disk_that_is_full_among_the_results_leaves_an_unfinished_run(begin, monkeypatch):
-    run = begin(max_steps=30)
-    run.train()
-
-    def disk_full(path, _picture):
-        raise OutputError(f"{path}", found="No space left on device", fix="Free some.")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(run_module, "write_picture", disk_full)
-        with pytest.raises(OutputError, match=r"No space left.*--resume"):
-            run.finish(_score)
-    assert run.folder.checkpoint.is_file()
-    assert not run.folder.metrics.exists()
-    run.finish(_score)
-    assert run.folder.metrics.is_file()
-
-
-def test_a_run_keeps_a_checkpoint_before_its_first_step(begin, monkeypatch):
+def test_a_run_that_ends_before_its_first_step_starts_again(begin, monkeypatch):
     run = begin(max_steps=30)
     before = _bytes(run)
+    assert begin(options=RESUME, max_steps=30).state.step == 0  # killed before it trained
     monkeypatch.delattr(trainer.Trainer, "_advance")  # so that the first step fails
     with pytest.raises(AttributeError):
         run.train()
     assert run.folder.checkpoint.is_file()
-    resumed = begin(options=RESUME, max_steps=30)
-    assert resumed.state.step == 0
-    assert _bytes(resumed) == before
+    assert _bytes(begin(options=RESUME, max_steps=30)) == before

@@ -27,7 +27,7 @@ from splatseed.train.folder import RunFolder
 from splatseed.train.seeds import seeds_digest
 from splatseed.train.settings import AS_IT_IS, Reading, TrainSettings
 
-OPTIONS = {"seeding": "seeds"}
+OPTIONS = {"seeding": "seeds", "cap_max": "budget"}
 """Command-line names of settings, where they differ."""
 
 

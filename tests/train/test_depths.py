@@ -6,24 +6,20 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, strategies as st
 
 from splatseed.camera import Intrinsics
 from splatseed.depth.stereo.depths import find_stereo
 from splatseed.io import load_scene
-from splatseed.progress import silent
 from splatseed.scene import Image
 from splatseed.splat.gaussians import TrainingFrame
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.depths import PER_RENDERED, known_depths, stereo_size
 from splatseed.train.run import prepare_run
-from splatseed.train.seeds import seeded
 from splatseed.train.settings import TrainSettings
 
 FRAME = TrainingFrame(np.array([1.0, 2.0, 3.0]), 0.25)
 GROW = TrainSettings(strategy="grow", max_steps=60)
-CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -50,28 +46,31 @@ def test_depths_are_those_of_the_surfaces_in_training_units(capture, scene):
         truth = truths[name][np.ix_(rows, columns)]
         errors.append((np.abs(world / truth - 1))[world > 0])
     errors = np.concatenate(errors)
+    assert depths.keys() <= {image.name for image in scene.split(8)[0]}  # no test view's
     assert len(errors) > 2000
     assert np.median(errors) < 0.02
     assert "--placing none" in notes[0]
 
 
-def test_test_views_are_not_looked_at(scene):
-    train, test = scene.split(8)
-    names = known_depths(scene, FRAME.scale, GROW, "cpu")[0].keys()
-    assert names <= {image.name for image in train}
-    assert not names & {image.name for image in test}
-
-
-@pytest.mark.parametrize(
-    "settings", [{"strategy": "default"}, {"strategy": "grow", "placing": "none"}]
-)
+@pytest.mark.parametrize("settings", [{"strategy": "default"}, {"placing": "none"}])
 def test_nobody_looks_where_there_is_no_use(scene, settings):
-    assert known_depths(scene, FRAME.scale, TrainSettings(**settings), "cpu")[0] == {}
-
-
-def test_a_single_photograph_has_no_depth(scene):
+    asked = TrainSettings(**{"strategy": "grow", **settings})
+    assert known_depths(scene, FRAME.scale, asked, "cpu") == ({}, 0.0)
     one = scene.replace(images=scene.images[:2])  # the first is a test view
-    assert known_depths(one, FRAME.scale, GROW, "cpu")[0] == {}
+    assert known_depths(one, FRAME.scale, GROW, "cpu") == ({}, 0.0)
+
+
+def test_maps_are_kept_for_the_next_run_with_the_time_they_took(scene, tmp_path, monkeypatch):
+    kept = tmp_path / "bench" / "depths.npz"
+    first, seconds = known_depths(scene, FRAME.scale, GROW, "cpu", kept=kept)
+    with monkeypatch.context() as patch:
+        patch.setattr("splatseed.train.depths.stereo_depths", None)
+        again, same = known_depths(scene, FRAME.scale, GROW, "cpu", kept=kept)
+    assert same == seconds > 0
+    assert first.keys() == again.keys()
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+    kept.write_bytes(b"damaged")
+    assert known_depths(scene, FRAME.scale, GROW, "cpu", kept=kept)[0].keys() == first.keys()
 
 
 def test_photographs_are_compared_once_for_seeds_and_growth(scene, tmp_path, monkeypatch):
@@ -86,13 +85,6 @@ def test_photographs_are_compared_once_for_seeds_and_growth(scene, tmp_path, mon
     run = prepare_run(scene, tmp_path / "run", settings)
     assert len(calls) == 1
     assert len(run.state.strategy.depths) > 10
-
-
-def test_seeding_hands_on_what_stereo_found(scene):
-    asked = TrainSettings(strategy="grow", max_steps=60, seeding="auto")
-    stereo = seeded(scene, asked, "cpu", lambda _: None, silent)[1]
-    assert stereo is not None
-    assert [view.name for view in stereo.views] == [image.name for image in scene.split(8)[0]]
 
 
 @given(
@@ -120,11 +112,5 @@ def test_comparing_takes_a_part_of_training_unless_it_is_at_the_trained_size(
     assert compared <= 1.05 * PER_RENDERED[device] * rendered or size <= least
 
 
-def test_a_short_run_of_many_photographs_compares_them_at_the_trained_size(scene):
-    short = TrainSettings(strategy="grow", max_steps=1, data_factor=2)
-    full = known_depths(scene, FRAME.scale, GROW, "cpu")[0]
-    half = known_depths(scene, FRAME.scale, short, "cpu")[0]
-    for name, depth in half.items():
-        assert depth.shape == tuple(n // 2 for n in full[name].shape)
-    assert half
-    assert stereo_size([], short, "cpu") == 800
+def test_without_photographs_the_size_is_stereos_own():
+    assert stereo_size([], GROW, "cpu") == 800
