@@ -49,7 +49,7 @@ def test_depths_are_those_of_the_surfaces_in_training_units(capture, scene):
     assert depths.keys() <= {image.name for image in scene.split(8)[0]}  # no test view's
     assert len(errors) > 2000
     assert np.median(errors) < 0.02
-    assert "--placing none" in notes[0]
+    assert "only splits" in notes[0]
 
 
 @pytest.mark.parametrize("settings", [{"strategy": "default"}, {"placing": "none"}])
