@@ -131,9 +131,9 @@ def test_orientations_between_those_spread_are_tried(made):
     some = Rotation.random(1000, random_state=0).as_matrix()
     farthest = max(some, key=lambda each: degrees_between(spread, each).min())
     assert degrees_between(spread, farthest).min() > 13
-    marks = coarse.Unit.of(made.marks).similarity.points(made.marks)
+    marks = coarse.to_unit_size(made.marks).points(made.marks)
     turned = made.dense @ farthest.T
-    starts = coarse.find_starts(coarse.Unit.of(turned).similarity.points(turned), marks, 5)
+    starts = coarse.find_starts(coarse.to_unit_size(turned).points(turned), marks, 5)
     assert degrees_between(starts.rotation, farthest).min() < 8
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from splatseed.progress import silent
 from splatseed.seeding.clouds import judging as module
-from splatseed.seeding.clouds.judging import FreeRays, find_evidence, find_surfaces
+from splatseed.seeding.clouds.judging import find_evidence, find_surfaces, free_rays
 from splatseed.views.view import View
 
 W, H, F = 64, 48, 60.0
@@ -67,12 +67,12 @@ def test_rays_are_free_up_to_what_stereo_knows(wall):
     surfaces, cell = find_surfaces(VIEWS, wall, silent)
     known = np.full((H // 4, W // 4), 4.0, np.float32)
     nothing, nobody = np.full_like(known, np.inf), [np.empty((0, 3))] * 4
-    rays = FreeRays.of(VIEWS, nobody, [known, known, nothing, nothing])
+    rays = free_rays(VIEWS, nobody, [known, known, nothing, nothing])
     xyz = np.concatenate([wall, ghost])
     evidence = find_evidence(VIEWS, xyz, surfaces, cell, rays, silent)
     assert evidence.through[-1] == 2
     assert evidence.through[:-1].max() == 0
     assert evidence.confirmed[-1] == 0
     assert evidence.confirmed[:-1].max() == 2
-    nearer = FreeRays.of(VIEWS, [ghost.astype(float), *nobody[1:]], [known] * 4)
-    assert nearer.depths[0].min() == 2.0
+    nearer = free_rays(VIEWS, [ghost.astype(float), *nobody[1:]], [known] * 4)
+    assert nearer[0].min() == 2.0

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from splatseed.errors import PointCloudError
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
-from splatseed.seeding.alignment.coarse import Unit, find_starts
+from splatseed.seeding.alignment.coarse import find_starts, to_unit_size
 from splatseed.seeding.alignment.icp import Fitted, Surface, fit, polish
 from splatseed.seeding.alignment.marks import LEAST_MARKS, MOST_MARKS, Marks, find_marks
 from splatseed.seeding.clouds.voxels import normals_of, sample_cloud
@@ -156,9 +156,8 @@ def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> C
     marks = find_marks(scene)
     sample = sample_cloud(paths, progress)
     progress("align", 0.0)
-    unit_of_marks, unit_of_cloud = Unit.of(marks.xyz), Unit.of(sample.xyz)
-    small = marks.through(unit_of_marks.similarity)
-    cloud = unit_of_cloud.similarity.points(sample.xyz)
+    unit_of_marks, unit_of_cloud = to_unit_size(marks.xyz), to_unit_size(sample.xyz)
+    small, cloud = marks.through(unit_of_marks), unit_of_cloud.points(sample.xyz)
     tree = cKDTree(cloud, balanced_tree=False)
     surface = Surface(cloud, normals_of(cloud, tree), tree)
     first, *others = _candidates(surface, small.xyz, progress)
@@ -173,10 +172,10 @@ def align(scene: Scene, paths: Sequence[Path], progress: Progress = silent) -> C
     error = _error(best.fitted, small.xyz)
     _check(best, None if told else rival, error)
     # The offset in double precision, then to unit size.
-    centred = Similarity(1.0, np.eye(3), -sample.offset).then(unit_of_cloud.similarity)
+    centred = Similarity(1.0, np.eye(3), -sample.offset).then(unit_of_cloud)
     to_unit = centred.then(best.fitted.cloud_from_scene.inverse)
-    to_scene = to_unit.then(unit_of_marks.similarity.inverse)
-    extent, residuals = unit_of_marks.extent, best.fitted.residuals
+    to_scene = to_unit.then(unit_of_marks.inverse)
+    extent, residuals = 1 / unit_of_marks.scale, best.fitted.residuals
     return CloudAlignment(
         to_scene, best.share, float(np.median(residuals[residuals < CLOSE])) * extent,
         error * extent, np.degrees(best.fitted.turn), np.degrees(sensitivity), extent,

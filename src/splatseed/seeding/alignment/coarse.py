@@ -1,6 +1,6 @@
 """Coarse alignment: every orientation and shift, at several scales, by correlation on a grid.
 
-Notation: both clouds are first brought to root mean square size 1 around 0 (``Unit``). A start
+Notation: both clouds are first brought to root mean square size 1 around 0. A start
 takes a *mark* (a point of the scene) to the cloud's frame: x -> s R x + t. Its *reward* is the mean
 over the marks of max(``FAR`` - d / s, 0), with d the distance to the cloud: in the scene's units,
 as otherwise shrinking all marks to one point of the cloud would be best. For each rotation and
@@ -16,7 +16,6 @@ Fast, Low-Discrepancy Sampling of SO(3)", CVPR 2022).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
@@ -42,32 +41,15 @@ FAR = 0.3
 INNER = 0.95
 
 
-@dataclass(frozen=True, eq=False)
-class Unit:
-    """A cloud's place and size, robustly.
-
-    Args:
-        center: float64 [3].
-        extent: Root mean square distance from it.
-    """
-
-    center: Float64[np.ndarray, " 3"]
-    extent: float
-
-    @classmethod
-    def of(cls, xyz: Float64[np.ndarray, "N 3"]) -> Unit:
-        """That of some points; the farthest twentieth does not count."""
-        center = np.median(xyz, axis=0)
-        for _ in range(3):
-            distance = np.linalg.norm(xyz - center, axis=1)
-            inner = xyz[distance <= np.quantile(distance, INNER)]
-            center = inner.mean(axis=0)
-        return cls(center, float(np.sqrt(np.mean(np.sum((inner - center) ** 2, axis=1)))))
-
-    @property
-    def similarity(self) -> Similarity:
-        """From the cloud's own frame to unit size around 0."""
-        return Similarity(1 / self.extent, np.eye(3), -self.center / self.extent)
+def to_unit_size(xyz: Float64[np.ndarray, "N 3"]) -> Similarity:
+    """From a cloud's own frame to unit size around 0; the farthest twentieth does not count."""
+    center = np.median(xyz, axis=0)
+    for _ in range(3):
+        distance = np.linalg.norm(xyz - center, axis=1)
+        inner = xyz[distance <= np.quantile(distance, INNER)]
+        center = inner.mean(axis=0)
+    extent = float(np.sqrt(np.mean(np.sum((inner - center) ** 2, axis=1))))
+    return Similarity(1 / extent, np.eye(3), -center / extent)
 
 
 class Starts(NamedTuple):

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
@@ -98,50 +98,43 @@ NO_VIEW = np.float32(0.0)
 Surface = Float32[np.ndarray, "rows cols"]
 
 
-@dataclass(frozen=True, eq=False)
-class FreeRays:
-    """How far rays are known to be free, in each view."""
+def free_rays(
+    views: Sequence[View],
+    seen: Sequence[Float64[np.ndarray, "M 3"]],
+    known: Sequence[Surface] | None = None,
+) -> tuple[Surface, ...]:
+    """How far rays are known to be free: in each view, the least depth per cell; infinite if none.
 
-    depths: tuple[Surface, ...]
-    """For each view, the least depth per cell of about ``RAY_CELL`` pixels; infinite where none is
-    known."""
-
-    @classmethod
-    def of(
-        cls,
-        views: Sequence[View],
-        seen: Sequence[Float64[np.ndarray, "M 3"]],
-        depths: Sequence[Surface] | None = None,
-    ) -> FreeRays:
-        """The free rays of views, from points that each sees for certain and stereo's depths."""
-        if depths is None:
-            shapes = [(-(-v.height // RAY_CELL), -(-v.width // RAY_CELL)) for v in views]
-            depths = [np.full(shape, np.inf, np.float32) for shape in shapes]
-        known = zip(views, seen, depths, strict=True)
-        return cls(tuple(_nearest(view, xyz, depth) for view, xyz, depth in known))
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """The evidence for and against N points.
-
-    Args:
-        seen: In how many views each is visible, uint16 [N].
-        rgb: Robust mean of its samples, uint8 [N, 3]; mid grey without any.
-        agreement: Of its samples, 0 to 1, float32 [N]; NaN for fewer than two.
-        through: How many views see through it, uint16 [N].
-        confirmed: How many views confirm it, uint16 [N].
+    Of the points that each sees for certain, and of what stereo knows of each; cells are those of
+    stereo's maps, else of ``RAY_CELL`` pixels.
     """
+    nearest = []
+    for v, (view, xyz) in enumerate(zip(views, seen, strict=True)):
+        shape = -(-view.height // RAY_CELL), -(-view.width // RAY_CELL)
+        depths = np.array(np.full(shape, np.inf) if known is None else known[v], np.float32)
+        rows, cols, depth = _cells(view, xyz, depths.shape)
+        np.minimum.at(depths, (rows, cols), depth.astype(np.float32))
+        nearest.append(depths)
+    return tuple(nearest)
+
+
+class Evidence(NamedTuple):
+    """The evidence for and against N points."""
 
     seen: UInt16[np.ndarray, " N"]
+    """In how many views each is visible."""
     rgb: UInt8[np.ndarray, "N 3"]
+    """Robust mean of its samples; mid grey without any."""
     agreement: Float32[np.ndarray, " N"]
+    """Of its samples, 0 to 1; NaN for fewer than two."""
     through: UInt16[np.ndarray, " N"]
+    """How many views see through it."""
     confirmed: UInt16[np.ndarray, " N"]
+    """How many views confirm it."""
 
     def select(self, which: Bool[np.ndarray, " N"]) -> Evidence:
         """That on some of the points."""
-        return Evidence(*(getattr(self, field.name)[which] for field in fields(Evidence)))
+        return Evidence(*(values[which] for values in self))
 
 
 def find_surfaces(
@@ -168,7 +161,7 @@ def find_evidence(
     xyz: Float32[np.ndarray, "N 3"],
     surfaces: Sequence[Surface],
     cell: int,
-    rays: FreeRays | None,
+    rays: Sequence[Surface] | None,
     progress: Progress,
 ) -> Evidence:
     """Hold points against photographs; ``surfaces`` and ``cell`` are those of ``find_surfaces``.
@@ -192,7 +185,7 @@ def find_evidence(
         samples = np.zeros((len(block), CLOSEST, 3), np.uint8)
         every = np.ones((1, 1), np.bool_)
         for v, view in enumerate(views):
-            free = np.empty((0, 0), np.float32) if rays is None else rays.depths[v]
+            free = np.empty((0, 0), np.float32) if rays is None else rays[v]
             _observe(
                 block, grid_from_world(view, 1), np.sqrt(abs(view.K[0, 0] * view.K[1, 1])),
                 view.width, view.height, surfaces[v], behind, free, view.photograph,
@@ -220,14 +213,6 @@ def surface_agreement(
         total += int(np.count_nonzero(known))
         close += int(np.count_nonzero(np.abs(depth[known] / there[known] - 1.0) <= FITS))
     return (close / total if total else 0.0), total
-
-
-def _nearest(view: View, xyz: Float64[np.ndarray, "M 3"], known: Surface) -> Surface:
-    """The least depth per cell, of points and of what is known."""
-    nearest = np.array(known, np.float32)
-    rows, cols, depth = _cells(view, xyz, nearest.shape)
-    np.minimum.at(nearest, (rows, cols), depth.astype(np.float32))
-    return nearest
 
 
 def _cells(
@@ -333,25 +318,21 @@ AGAIN = 0.002
 """Share of voxels that go from which on the others are judged once more."""
 
 
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """The verdict on a cloud's voxels.
-
-    Args:
-        kept: Those that stay, rising, int64 [K].
-        evidence: On these.
-        fit: Of the scene's own points seen where the cloud has a surface, the share at its depth.
-        asked: The number of these points.
-        hidden: Voxels that no photograph sees.
-        reasons: How many others went, by reason.
-    """
+class Judged(NamedTuple):
+    """The verdict on a cloud's voxels."""
 
     kept: Int64[np.ndarray, " K"]
+    """Those that stay, rising."""
     evidence: Evidence
+    """On these."""
     fit: float
+    """Of the scene's own points seen where the cloud has a surface, the share at its depth."""
     asked: int
+    """The number of these points."""
     hidden: int
+    """Voxels that no photograph sees."""
     reasons: dict[str, int]
+    """How many others went, by reason."""
 
 
 def judge(
@@ -362,7 +343,7 @@ def judge(
     progress: Progress,
     *,
     clean: bool = True,
-    rays: FreeRays | None = None,
+    rays: Sequence[Surface] | None = None,
 ) -> Judged:
     """Judge the voxels of a cloud.
 

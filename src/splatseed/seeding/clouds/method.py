@@ -28,7 +28,7 @@ from splatseed.upsample.method import NewPoints, Traits, check_fields, require
 from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
-    from splatseed.seeding.clouds.judging import FreeRays, Judged
+    from splatseed.seeding.clouds.judging import Judged, Surface
     from splatseed.seeding.clouds.voxels import MemoryPlan, Streamed
     from splatseed.views.view import View
 
@@ -201,20 +201,20 @@ def _free_rays(
     seen: Sequence[Float64[np.ndarray, "M 3"]],
     rng: np.random.Generator,
     progress: Progress,
-) -> FreeRays | None:
+) -> Sequence[Surface] | None:
     """Where rays are known to be free: up to tracked points, and up to what stereo confirms."""
-    from splatseed.seeding.clouds.judging import FreeRays  # noqa: PLC0415  (loads Numba)
+    from splatseed.seeding.clouds.judging import free_rays  # noqa: PLC0415  (loads Numba)
 
     certain = seen if scene.tracks is not None else [np.empty((0, 3))] * len(views)
     if not scene.has_photographs or len(views) < 2:
-        return FreeRays.of(views, certain) if scene.tracks is not None else None
+        return free_rays(views, certain) if scene.tracks is not None else None
     from splatseed.depth.stereo.depths import find_stereo, known_visibility  # noqa: PLC0415  (loads Numba)
     from splatseed.depth.stereo.settings import StereoSettings  # noqa: PLC0415  (loads with its use)
 
     seed, visibility = int(rng.integers(1 << 32)), known_visibility(scene)
     stereo = find_stereo(views, images, visibility, StereoSettings(), seed, progress)
     maps = [stereo.map(i).depth for i in range(len(views))]
-    return FreeRays.of(views, certain, [np.nan_to_num(depth, nan=np.inf) for depth in maps])
+    return free_rays(views, certain, [np.nan_to_num(depth, nan=np.inf) for depth in maps])
 
 
 def _check_in_view(streamed: Streamed, scene: Scene) -> None:
