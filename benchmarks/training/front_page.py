@@ -50,8 +50,7 @@ from splatseed.seeding.poses import random_start
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.run import TrainingRun
 from splatseed.train.settings import Seeding, StrategyName
-from splatseed.views import View
-from splatseed.views.view import user_cache_dir
+from splatseed.views.view import View, user_cache_dir
 
 __all__ = ["train_all"]
 

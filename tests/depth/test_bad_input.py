@@ -20,13 +20,13 @@ def upsample(scene, **options):
     return ss.upsample(scene, "depth", ratio=2, **options)
 
 
-def test_a_cloud_alone_will_not_do(exact):
-    with pytest.raises(SceneNotFoundError, match=r"cloud of points alone.*--depth DIR"):
-        upsample(exact.points)
-
-
 def test_maps_must_be_named(exact):
-    for scene in (exact.replace(depths=None), exact.replace(depths={}), exact.replace(images=())):
+    for scene in (
+        exact.points,
+        exact.replace(depths=None),
+        exact.replace(depths={}),
+        exact.replace(images=()),
+    ):
         with pytest.raises(SceneNotFoundError, match=r"maps of none of them.*--depth DIR"):
             upsample(scene)
 

@@ -9,7 +9,6 @@ looked at.
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
@@ -34,7 +33,7 @@ MAX_SIZE = 800
 
 
 @dataclass(frozen=True)
-class PhotographMethod(ABC):
+class PhotographMethod:
     """The base of the three methods."""
 
     max_size: int = MAX_SIZE
@@ -53,26 +52,6 @@ class PhotographMethod(ABC):
         for field, most in (("spacing", 256), ("cell", 256), ("grid", MOST_GRID)):
             value = getattr(self, field, 1)
             require(1 <= value <= most, f"{self.name}.{field} from 1 to {most}", value)
-
-    def __call__(
-        self,
-        scene: Scene,
-        num_new: int,  # noqa: ARG002  (the photographs determine the number)
-        rng: np.random.Generator,
-        progress: Progress,
-    ) -> NewPoints:
-        """Make seeds from a scene's photographs."""
-        if scene.source is None and not scene.images:
-            raise SceneNotFoundError(
-                f"a scene with photographs for the method {self.name}",
-                found="a cloud of points alone",
-                fix="Load the scene they were made from.",
-            )
-        return self.seeds(scene, rng, progress)
-
-    @abstractmethod
-    def seeds(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
-        """The new points of a scene."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +81,14 @@ class Stereo(PhotographMethod):
         stereo = self._compare(scene, images, views, np.random.default_rng(seed), progress, only)
         return tuple(stereo.map(i) for i in only)
 
-    def seeds(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
-        """The new points of a scene."""
+    def __call__(
+        self,
+        scene: Scene,
+        num_new: int,  # noqa: ARG002  (the photographs determine the number)
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        """Make the new points of a scene."""
         return self.seeds_and_stereo(scene, rng, progress)[0]
 
     def seeds_and_stereo(
@@ -161,8 +146,14 @@ class Cover(PhotographMethod):
 
     name: ClassVar[str] = "cover"
 
-    def seeds(self, scene: Scene, rng: np.random.Generator, progress: Progress) -> NewPoints:
-        """The new points of a scene, which needs some already: their depths are carried on."""
+    def __call__(
+        self,
+        scene: Scene,
+        num_new: int,  # noqa: ARG002  (the photographs determine the number)
+        rng: np.random.Generator,
+        progress: Progress,
+    ) -> NewPoints:
+        """Make the new points of a scene, which needs some already: their depths are carried on."""
         originals = scene.points.originals
         if not originals.finite.any():
             raise PointCloudError(

@@ -1,24 +1,5 @@
 """Photographs at a size, with their cameras: the input of depth, stereo, seeding and training.
 
-``view`` reads a scene's images as pinhole views, ``photographs`` their pixels.
+``view`` reads a scene's images as pinhole views, ``visibility`` tells which points each sees, and
+``pairs`` which to compare.
 """
-
-from splatseed.views.view import (
-    View,
-    check_lens,
-    load_photograph,
-    load_split,
-    load_views,
-    poses_of,
-    user_cache_dir,
-)
-
-__all__ = [
-    "View",
-    "check_lens",
-    "load_photograph",
-    "load_split",
-    "load_views",
-    "poses_of",
-    "user_cache_dir",
-]

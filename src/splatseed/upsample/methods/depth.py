@@ -14,7 +14,6 @@ from typing import ClassVar, Self
 import numpy as np
 
 from splatseed.depth.settings import Settings
-from splatseed.errors import SceneNotFoundError
 from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints, Traits, check_fields, require
@@ -79,10 +78,4 @@ class Depth(Settings):
         """Lift ``num_new`` pixels."""
         from splatseed.depth.lifting import lift  # noqa: PLC0415  (its kernels load with its use)
 
-        if scene.source is None and not scene.images:
-            raise SceneNotFoundError(
-                "a scene with images and depth maps for the method depth",
-                found="a cloud of points alone",
-                fix="Load the scene, and name its maps with --depth DIR.",
-            )
         return NewPoints(*lift(scene, num_new, self, rng, progress))
