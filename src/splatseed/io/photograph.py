@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.io.files import odd_kind, open_file, other_spelling, read_file
+from splatseed.io.files import guarded, odd_kind, open_file, other_spelling, read_file
 from splatseed.literal import agreeing, told
 from splatseed.scene import Image, Scene
 
@@ -30,7 +30,8 @@ _WIDE_GREY = ("I", "F")
 """Pillow's modes for one channel of more than 8 bits, which its own conversion clips at 255."""
 _INKS = ("CMYK", "LAB")
 """Pillow's modes that are not RGB or grey; it would convert inks by a rule of thumb."""
-_DECODER_FAILURES = (OSError, ValueError, SyntaxError)
+_COPY_AGAIN = "Copy or export the image again."
+_WHOLE = "an image, neither cut short nor damaged"
 _MAX_OPENED = 32  # files whose size is compared
 
 
@@ -69,7 +70,8 @@ def photograph_bytes(path: Path) -> bytes:
             else "Put it there, or drop it from the model.",
         ) from None
     except OSError as error:
-        raise _unusable(path, error.strerror or type(error).__name__) from None
+        found = error.strerror or type(error).__name__
+        raise SceneFormatError(f"{path} to be an image", found=found, fix=_COPY_AGAIN) from None
 
 
 def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
@@ -78,12 +80,10 @@ def open_photograph(path: Path, encoded: bytes) -> PilImage.Image:
     Raises:
         SceneFormatError: It is no image.
     """
-    from PIL import Image as PilImage, UnidentifiedImageError  # noqa: PLC0415  (slow to import)
+    from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
-    try:
+    with guarded(path, "an image", fix=_COPY_AGAIN):
         return PilImage.open(BytesIO(encoded))
-    except (UnidentifiedImageError, PilImage.DecompressionBombError, OSError, ValueError) as error:
-        raise _unusable(path, told(error)) from None
 
 
 def decode_photograph(path: Path, encoded: bytes) -> PilImage.Image:
@@ -102,15 +102,13 @@ def decode_photograph(path: Path, encoded: bytes) -> PilImage.Image:
         )
     if photograph.mode.startswith(_WIDE_GREY):
         return _eight_bits(path, photograph).convert("RGB")
-    try:
+    with guarded(path, _WHOLE, fix=_COPY_AGAIN):
         if "A" in photograph.getbands() or "transparency" in photograph.info:
             from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
             black = PilImage.new("RGBA", photograph.size, (0, 0, 0, 255))
             return PilImage.alpha_composite(black, photograph.convert("RGBA")).convert("RGB")
         return photograph.convert("RGB")
-    except _DECODER_FAILURES as error:
-        raise _damaged(path, error) from None
 
 
 def check_photograph(path: Path) -> tuple[int, int]:
@@ -123,10 +121,8 @@ def check_photograph(path: Path) -> tuple[int, int]:
     photograph = open_photograph(path, photograph_bytes(path))
     size = photograph.size
     photograph.draft(None, (size[0] // _CHECK_SCALE, size[1] // _CHECK_SCALE))
-    try:
+    with guarded(path, _WHOLE, fix=_COPY_AGAIN):
         photograph.load()
-    except _DECODER_FAILURES as error:
-        raise _damaged(path, error) from None
     return size
 
 
@@ -134,10 +130,8 @@ def _eight_bits(path: Path, photograph: PilImage.Image) -> PilImage.Image:
     """Grey of 16 bits or of floats, as 8 bits."""
     from PIL import Image as PilImage  # noqa: PLC0415  (slow to import)
 
-    try:
+    with guarded(path, _WHOLE, fix=_COPY_AGAIN):
         values = np.asarray(photograph)
-    except _DECODER_FAILURES as error:
-        raise _damaged(path, error) from None
     most = 1.0 if photograph.mode == "F" else 65535.0
     # 32-bit integers can have any range; some versions of Pillow open 16-bit PNGs as such.
     known = photograph.mode != "I" or photograph.format == "PNG"
@@ -152,16 +146,6 @@ def _eight_bits(path: Path, photograph: PilImage.Image) -> PilImage.Image:
     if transparent is not None:
         grey[values == transparent] = 0
     return PilImage.fromarray(grey)
-
-
-def _damaged(path: Path, error: Exception) -> SceneFormatError:
-    return _unusable(path, f"an image cut short or damaged ({told(error)})")
-
-
-def _unusable(path: Path, found: str) -> SceneFormatError:
-    return SceneFormatError(
-        f"{path} to be an image", found=found, fix="Copy or export the image again."
-    )
 
 
 def image_warnings(images: Sequence[Image], image_dir: Path | None, root: Path) -> list[str]:
