@@ -148,13 +148,6 @@ def test_depth_too_late_is_none(capture):
     assert list(scene.depths) == [f"{times[0]:.6f}.png", f"{times[3]:.6f}.png"]
 
 
-def test_capture_without_depth(capture):
-    (capture / "depth.txt").unlink()
-    scene = load_tum(capture)
-    assert len(scene.images) == 4
-    assert scene.depths is None
-
-
 @pytest.mark.parametrize("name", ["rgb.txt", "groundtruth.txt"])
 def test_nothing_to_load(capture, name):
     (capture / name).write_text("# nothing\n")
@@ -345,15 +338,11 @@ def test_frames_must_fit_the_camera(room: Path) -> None:
         load_rgbd(room)
 
 
-@pytest.mark.parametrize(
-    ("name", "frames", "scale"), [("replica/room0", 20, 6553.5), ("7scenes_redkitchen", 143, 1e3)]
-)
-def test_depth_of_one_real_frame_agrees_with_the_next(
-    scenes: Path, name: str, frames: int, scale: float
-) -> None:
+def test_depth_of_one_real_frame_agrees_with_the_next(scenes: Path) -> None:
     """Points unprojected from one frame's depth meet the other's: poses and axes are right."""
+    name, scale = "7scenes_redkitchen", 1e3  # Replica's is checked below
     scene = load_rgbd(scenes / name)
-    assert len(scene.images) == frames
+    assert len(scene.images) == 143
     assert scene.warnings == ()
     first, second = scene.images[0].camera, scene.images[1].camera
 

@@ -313,9 +313,7 @@ def safe_parts(name: str) -> tuple[str, ...]:
     return tuple(part for part in pure.parts if part not in {"..", pure.anchor})
 
 
-def write_description(
-    folder: Path, kind: DepthKind, scale: float = 1.0, **more: object
-) -> DepthDescription:
+def write_description(folder: Path, kind: DepthKind, scale: float = 1.0, **more: object) -> None:
     """Write a ``depths.json`` into a folder of maps.
 
     Args:
@@ -328,7 +326,6 @@ def write_description(
         OSError: It cannot be written.
     """
     write_json(folder / DESCRIPTION, {"kind": kind, "scale": scale, **more})
-    return DepthDescription(kind, scale)
 
 
 @dataclass(frozen=True)

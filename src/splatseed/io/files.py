@@ -186,7 +186,10 @@ def guarded(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[Non
 
 def read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     """Shape, whether column by column, and type of the array at the start of a ``.npy``."""
-    if npy_format.read_magic(file) == (1, 0):
+    magic = file.read(npy_format.MAGIC_LEN)
+    if not magic.startswith(npy_format.MAGIC_PREFIX):
+        raise ValueError(f"no NumPy array, but {beginning(magic)}")
+    if magic.endswith(b"\x01\x00"):
         return npy_format.read_array_header_1_0(file)
     return npy_format.read_array_header_2_0(file)
 
