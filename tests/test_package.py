@@ -342,8 +342,8 @@ def test_dependencies_are_those_that_are_imported():
         needed -= {"fused_ssim"} if path.name == "trainer.py" else set()  # taken where it is there
         part = path.relative_to(SOURCE).parts[0]
         trains = part in {"render", "splat", "evaluate.py", "train", "view", "commands"}
-        # These load torch, and gsplat's kernels, for those rooms.
-        trains = trains or path.name in {"torch_device.py", "gsplat_kernels.py"}
+        # It loads torch, and gsplat's kernels, for those rooms.
+        trains = trains or path.name == "torch_device.py"
         allowed = base | more if trains else base
         allowed = base | names["depth"] if part == "monocular" else allowed
         allowed = base | names["cluster"] if path.name.startswith("ray_") else allowed

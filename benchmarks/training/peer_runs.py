@@ -23,7 +23,7 @@ from torch import Tensor
 from splatseed import Scene, load_scene
 from splatseed.errors import SceneFormatError
 from splatseed.evaluate import Render, evaluate_views
-from splatseed.process.allocator import keep_freed_memory
+from splatseed.process.memory import keep_freed_memory
 from splatseed.render import mcmc_on_cpu
 from splatseed.train import TrainSettings, prepare_run
 from splatseed.train.device import Capacity

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import platform
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -100,3 +103,29 @@ def test_a_container_has_less_than_its_machine(monkeypatch, tmp_path):
 def test_an_unknown_amount_refuses_nothing(free):
     free(None)
     assert number_of_new(None, "mls", 10, None, 10**9) == 10**9 - 10
+
+
+FAULTS = """
+import resource
+from splatseed.process.memory import keep_freed_memory
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    bytearray(64 << 20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+faults()
+freed = faults()
+keep_freed_memory()
+faults()
+print(freed, faults())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's option")
+def test_what_is_freed_is_used_again():
+    # A process of its own: the option holds until it ends.
+    command = [sys.executable, "-c", FAULTS]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    freed, kept = map(int, printed.split())
+    assert kept < freed / 10

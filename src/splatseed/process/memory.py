@@ -1,4 +1,4 @@
-"""Free memory, and refusing early what cannot fit into it.
+"""Memory: how much is free, how much was taken, and refusing early what cannot fit.
 
 Promise: where the system does not tell how much is free, nothing is refused. An estimate counts
 only what is certainly held at once, so what is refused would have failed; what is admitted may
@@ -7,12 +7,16 @@ still fail.
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 from splatseed.errors import ParameterError
 
 CGROUP = Path("/sys/fs/cgroup")
+STATUS = Path("/proc/self/status")
 SUFFIXES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
@@ -107,3 +111,37 @@ def _of_container() -> int | None:
         return None
     files = next((int(line.split()[1]) for line in lines if line.startswith("inactive_file ")), 0)
     return max(int(limit) - used + files, 0) if limit.isdigit() else None
+
+
+def peak_bytes() -> int | None:
+    """The peak memory of this process so far, in bytes; None where the system does not tell.
+
+    On Linux, since the program was loaded: getrusage also counts the process that started it.
+    """
+    try:
+        lines = STATUS.read_text("ascii", "replace").splitlines()
+        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+    except (OSError, StopIteration):
+        pass
+    try:
+        import resource  # noqa: PLC0415  (not on Windows)
+    except ImportError:
+        return None
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most if sys.platform == "darwin" else most * 1024
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep the memory that a training step frees for the next one, in this process.
+
+    It returns large blocks to the system at once, and every step then waits for the system to clear
+    the pages again. Results stay the same. While Gaussians are added, blocks of earlier sizes lie
+    idle: a run that grew from 30,000 to 250,000 took 8 % more memory at its peak.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    with suppress(OSError, AttributeError):  # another C library
+        mallopt = ctypes.CDLL("libc.so.6").mallopt
+        trim_threshold, mmap_threshold = -1, -3  # of mallopt(3)
+        for option in (trim_threshold, mmap_threshold):
+            any(mallopt(option, size) for size in (1 << 30, 1 << 25))  # older versions: 32 MiB

@@ -1,4 +1,4 @@
-"""The PyTorch device that a user's choice stands for, and its free memory.
+"""The PyTorch device that a user's choice stands for, its free memory, and gsplat's kernels.
 
 Promise: a requested GPU is used, or there is an error: it is never silently replaced. PyTorch is
 imported only when a device is picked.
@@ -6,16 +6,34 @@ imported only when a device is picked.
 
 from __future__ import annotations
 
+import io
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from contextlib import redirect_stdout
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from splatseed.errors import ParameterError
+from filelock import FileLock
+
+from splatseed.errors import MissingDependencyError, ParameterError
 from splatseed.process.memory import free_memory
+from splatseed.progress import Progress, silent
+from splatseed.requirements import require
 
 if TYPE_CHECKING:  # PyTorch may be absent, and takes a while to load
     import torch
 
 
 DeviceName: TypeAlias = Literal["auto", "cpu", "cuda"]
+
+BACKEND = "gsplat.cuda._backend"
+"""gsplat's module that loads or builds its kernels when it is imported."""
+BUILDING = "building gsplat's kernels, some minutes, once"
 
 
 def pick_torch_device(choice: DeviceName, option: str) -> torch.device:
@@ -50,3 +68,101 @@ def free_bytes(device: torch.device) -> int | None:
         kept = torch.cuda.memory_reserved(device) - torch.cuda.max_memory_allocated(device)
         return max(0, torch.cuda.mem_get_info(device)[0] + kept)
     return free_memory()
+
+
+def load_kernels(option: str, progress: Progress = silent) -> None:
+    """Make sure that gsplat can render on CUDA; builds its kernels the first time.
+
+    gsplat 1.5.3 compiles them when they are first called. Left to itself it says "disabled" without
+    a toolkit and fails at the first render; two processes that build at once delete each other's
+    files: here they wait for each other at a lock.
+
+    Args:
+        option: The option that chooses the CPU instead, for errors.
+        progress: Called with the stage of building.
+
+    Raises:
+        MissingDependencyError: gsplat is absent, or has no compiled kernels and they cannot be
+            built here.
+    """
+    if _are_loaded():
+        return
+    require("gsplat")
+    _find_tools()
+    missing = [] if find_spec("gsplat.csrc") else _missing_tools()  # csrc: they came compiled
+    if missing:
+        raise _cannot_build(f"no {', no '.join(missing)}", option)
+    root = _build_root()
+    root.mkdir(parents=True, exist_ok=True)
+    with FileLock(root / "gsplat_cuda.splatseed.lock"):
+        if not any(root.rglob("gsplat_cuda.so")):
+            progress(BUILDING, 0.0)
+        try:
+            with redirect_stdout(io.StringIO()):  # gsplat's own line belongs to no output of ours
+                import_module(BACKEND)
+        except (ImportError, OSError, RuntimeError) as error:
+            lines = [line for line in str(error).splitlines() if "error" in line.lower()]
+            told = (lines or [type(error).__name__])[0].strip()[:200]
+            raise _cannot_build(f"{told} (nvcc {_nvcc_release()})", option) from error
+    if not _are_loaded():
+        raise _cannot_build("kernels that gsplat could not load", option)
+
+
+def _are_loaded() -> bool:
+    return getattr(sys.modules.get(BACKEND), "_C", None) is not None
+
+
+def _find_tools() -> None:
+    """Let programs of this environment be found, ninja above all, which gsplat brings.
+
+    They are not on the path of a venv's command that is called without activating the venv.
+    """
+    here = sysconfig.get_path("scripts")
+    if here not in os.environ.get("PATH", "").split(os.pathsep):
+        os.environ["PATH"] = os.pathsep.join([os.environ.get("PATH", ""), here])
+
+
+def _missing_tools() -> list[str]:
+    """What a build needs and does not find."""
+    compiler = os.environ.get("CXX", "cl" if os.name == "nt" else "g++")
+    tools = {"nvcc": _nvcc(), compiler: shutil.which(compiler), "ninja": shutil.which("ninja")}
+    return [name for name, path in tools.items() if path is None]
+
+
+def _nvcc() -> str | None:
+    """Where gsplat finds nvcc: in CUDA's folder, else on the path."""
+    from torch.utils import cpp_extension  # noqa: PLC0415  (slow to import, for builds only)
+
+    home = cpp_extension.CUDA_HOME or os.environ.get("CUDA_HOME")
+    beside = Path(home, "bin", "nvcc.exe" if os.name == "nt" else "nvcc") if home else None
+    return str(beside) if beside and beside.is_file() else shutil.which("nvcc")
+
+
+def _nvcc_release() -> str:
+    """The release of the toolkit, such as 12.8; ``?`` if nvcc does not say."""
+    command = [_nvcc() or "nvcc", "--version"]
+    try:
+        said = subprocess.run(command, capture_output=True, text=True, check=True)  # noqa: S603  (as found)
+    except (OSError, subprocess.CalledProcessError):
+        return "?"
+    return said.stdout.partition("release ")[2].partition(",")[0] or "?"
+
+
+def _build_root() -> Path:
+    """The folder in which PyTorch builds extensions."""
+    from torch.utils import cpp_extension  # noqa: PLC0415  (slow to import, for builds only)
+
+    return Path(os.environ.get("TORCH_EXTENSIONS_DIR") or cpp_extension.get_default_build_root())
+
+
+def _cannot_build(found: str, option: str) -> MissingDependencyError:
+    import torch  # noqa: PLC0415  (see the promise)
+
+    version = torch.version.cuda
+    toolkit = f"the CUDA toolkit {version}" if version else "the CUDA toolkit of PyTorch's release"
+    return MissingDependencyError(
+        "gsplat's compiled kernels, or nvcc, a C++ compiler and ninja to build them",
+        found=found,
+        fix=f"Install {toolkit}, which PyTorch was built with, and g++ (ninja comes with gsplat), "
+        f"or pass {option} cpu.",
+    )

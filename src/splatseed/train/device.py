@@ -13,8 +13,7 @@ from contextlib import contextmanager
 import torch
 
 from splatseed.errors import PointCloudError
-from splatseed.process.gsplat_kernels import load_kernels
-from splatseed.process.torch_device import free_bytes, pick_torch_device
+from splatseed.process.torch_device import free_bytes, load_kernels, pick_torch_device
 from splatseed.progress import Progress, silent
 from splatseed.train.settings import BYTES_EACH, Backend
 

@@ -22,7 +22,7 @@ from splatseed.bench.running.kept import read_result
 from splatseed.bench.running.seeds import make_seeds, scene_of
 from splatseed.cli import main
 from splatseed.io import load_scene, write_scene
-from splatseed.process.peak import peak_bytes
+from splatseed.process.memory import peak_bytes
 from splatseed.synthetic import make_capture
 from splatseed.train.seeds import seeds_digest
 

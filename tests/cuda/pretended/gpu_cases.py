@@ -29,7 +29,7 @@ from splatseed.errors import MissingDependencyError, PointCloudError
 from splatseed.evaluate import evaluate_views
 from splatseed.splat.metrics import l1_and_ssim_by_convolution, ssim_of_all
 from splatseed.io import load_scene
-from splatseed.process import gsplat_kernels
+from splatseed.process import torch_device
 from splatseed.splat import rendering
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
@@ -172,7 +172,7 @@ def test_memory_that_ends_before_the_first_step_leaves_no_folder(room, tmp_path,
 
 
 def test_without_a_toolkit_one_error_comes_before_any_work(room, tmp_path, monkeypatch):
-    monkeypatch.delitem(sys.modules, gsplat_kernels.BACKEND)
+    monkeypatch.delitem(sys.modules, torch_device.BACKEND)
     monkeypatch.setenv("PATH", str(tmp_path))
     for name in ("CUDA_HOME", "CUDA_PATH", "CXX"):
         monkeypatch.delenv(name, raising=False)

@@ -32,7 +32,7 @@ from splatseed.bench.running.twins import find_twin, fingerprint, note_training
 from splatseed.errors import SceneFormatError, SplatseedError
 from splatseed.io.staging import check_output
 from splatseed.process.interruption import interruption
-from splatseed.process.peak import peak_bytes
+from splatseed.process.memory import peak_bytes
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
