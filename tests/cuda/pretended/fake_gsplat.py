@@ -20,26 +20,14 @@ class _C(Projection):
 
     @staticmethod
     def rasterize_to_pixels_3dgs_fwd(
-        means2d,
-        conics,
-        colors,
-        opacities,
-        backgrounds,
-        masks,
-        width,
-        height,
-        tile_size,
-        offsets,
+        means2d, conics, colors, opacities, backgrounds, masks, width, height, tile_size, offsets,
         flatten_ids,
-    ):
+    ):  # fmt: skip
         assert masks is None
         check_input(
-            means2d=means2d,
-            conics=conics,
-            colors=colors,
-            opacities=opacities,
+            means2d=means2d, conics=conics, colors=colors, opacities=opacities,
             backgrounds=backgrounds,
-        )
+        )  # fmt: skip
         check_input(torch.int32, offsets=offsets, flatten_ids=flatten_ids)
         dims = tuple(offsets.shape[:-2])
         with torch.no_grad():
@@ -61,32 +49,13 @@ class _C(Projection):
 
     @staticmethod
     def rasterize_to_pixels_3dgs_bwd(
-        means2d,
-        conics,
-        colors,
-        opacities,
-        backgrounds,
-        masks,
-        width,
-        height,
-        tile_size,
-        offsets,
-        flatten_ids,
-        render_alphas,
-        last_ids,
-        v_colors,
-        v_alphas,
-        absgrad,
-    ):
+        means2d, conics, colors, opacities, backgrounds, masks, width, height, tile_size, offsets,
+        flatten_ids, render_alphas, last_ids, v_colors, v_alphas, absgrad,
+    ):  # fmt: skip
         check_input(
-            means2d=means2d,
-            conics=conics,
-            colors=colors,
-            opacities=opacities,
-            v_colors=v_colors,
-            v_alphas=v_alphas,
-            render_alphas=render_alphas,
-        )
+            means2d=means2d, conics=conics, colors=colors, opacities=opacities, v_colors=v_colors,
+            v_alphas=v_alphas, render_alphas=render_alphas,
+        )  # fmt: skip
         leaves = [x.clone().requires_grad_() for x in _flat(means2d, conics, colors, opacities)]
         with torch.enable_grad():
             img, al = _blend(

@@ -37,22 +37,9 @@ def _project(means, quats, scales, viewmats, Ks, width, height, eps2d, camera="p
 class Projection:
     @staticmethod
     def projection_ewa_3dgs_fused_fwd(
-        means,
-        covars,
-        quats,
-        scales,
-        opacities,
-        viewmats,
-        Ks,
-        width,
-        height,
-        eps2d,
-        near,
-        far,
-        radius_clip,
-        calc_compensations,
-        camera_model,
-    ):
+        means, covars, quats, scales, opacities, viewmats, Ks, width, height, eps2d, near, far,
+        radius_clip, calc_compensations, camera_model,
+    ):  # fmt: skip
         assert covars is None
         assert camera_model == 0
         check_input(
@@ -89,36 +76,13 @@ class Projection:
 
     @staticmethod
     def projection_ewa_3dgs_fused_bwd(
-        means,
-        covars,
-        quats,
-        scales,
-        viewmats,
-        Ks,
-        width,
-        height,
-        eps2d,
-        camera_model,
-        radii,
-        conics,
-        compensations,
-        v_means2d,
-        v_depths,
-        v_conics,
-        v_compensations,
-        viewmats_grad,
-    ):
+        means, covars, quats, scales, viewmats, Ks, width, height, eps2d, camera_model, radii,
+        conics, compensations, v_means2d, v_depths, v_conics, v_compensations, viewmats_grad,
+    ):  # fmt: skip
         check_input(
-            means=means,
-            quats=quats,
-            scales=scales,
-            viewmats=viewmats,
-            Ks=Ks,
-            conics=conics,
-            v_means2d=v_means2d,
-            v_depths=v_depths,
-            v_conics=v_conics,
-        )
+            means=means, quats=quats, scales=scales, viewmats=viewmats, Ks=Ks, conics=conics,
+            v_means2d=v_means2d, v_depths=v_depths, v_conics=v_conics,
+        )  # fmt: skip
         check_input(torch.int32, radii=radii)
         leaves = [elem(x).clone().requires_grad_() for x in (means, quats, scales, viewmats)]
         ok = (elem(radii) > 0).all(-1)
@@ -150,43 +114,10 @@ class Projection:
         )
 
     @staticmethod
-    def projection_ewa_3dgs_packed_fwd(
-        means,
-        covars,
-        quats,
-        scales,
-        opacities,
-        viewmats,
-        Ks,
-        width,
-        height,
-        eps2d,
-        near,
-        far,
-        radius_clip,
-        calc_compensations,
-        camera_model,
-    ):
+    def projection_ewa_3dgs_packed_fwd(means, *given):
         assert means.dim() == 2
         radii, means2d, depths, conics, comp = map(
-            elem,
-            Projection.projection_ewa_3dgs_fused_fwd(
-                means,
-                covars,
-                quats,
-                scales,
-                opacities,
-                viewmats,
-                Ks,
-                width,
-                height,
-                eps2d,
-                near,
-                far,
-                radius_clip,
-                calc_compensations,
-                camera_model,
-            ),
+            elem, Projection.projection_ewa_3dgs_fused_fwd(means, *given)
         )
         cam, gs = torch.where((radii > 0).all(-1))
         indptr = torch.zeros(1, dtype=torch.int32)
