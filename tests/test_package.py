@@ -107,7 +107,7 @@ def test_what_to_install_is_for_this_python_and_for_the_whole_extra(monkeypatch,
     start = r"'/my venv/python' -m pip install"
     with pytest.raises(MissingDependencyError, match="the package torch; found no torch") as caught:
         require("torch")
-    wanted = "'torch>=2.4' 'gsplat>=1.5.3,<1.6' 'torchmetrics>=1.4'"
+    wanted = "'torch>=2.4' 'gsplat>=1.5.3,<1.6' 'torchmetrics>=1.4' 'pandas>=2.2'"
     assert caught.value.fix.startswith(f"Install it (extra train): {start} {wanted}.")
     tested.touch()
     upgraded = install_command("pycolmap", upgrade=True)
@@ -341,7 +341,7 @@ def test_dependencies_are_those_that_are_imported():
         needed = imported - set(sys.stdlib_module_names) - {"splatseed", "pycolmap"}
         needed -= {"fused_ssim"} if path.name == "trainer.py" else set()  # taken where it is there
         part = path.relative_to(SOURCE).parts[0]
-        trains = part in {"render", "splat", "evaluate.py", "train", "view", "commands"}
+        trains = part in {"render", "splat", "evaluate.py", "train", "view", "bench", "commands"}
         # It loads torch, and gsplat's kernels, for those rooms.
         trains = trains or path.name == "torch_device.py"
         allowed = base | more if trains else base

@@ -14,6 +14,7 @@ INSTALL = {
     "torch": "torch>=2.4",
     "gsplat": "gsplat>=1.5.3,<1.6",
     "torchmetrics": "torchmetrics>=1.4",
+    "pandas": "pandas>=2.2",
     "pycolmap": "pycolmap>=4.0",
     "tensorboard": "tensorboard>=2.14",
     "transformers": "transformers>=5.18",
@@ -28,7 +29,7 @@ INSTALL = {
 }
 """What to ask pip for, as in pyproject.toml: splatseed's extras can only be installed from its
 folder."""
-_TRAIN = ("torch", "gsplat", "torchmetrics")
+_TRAIN = ("torch", "gsplat", "torchmetrics", "pandas")
 _EXTRA = {
     **dict.fromkeys(_TRAIN, "train"),
     "transformers": "depth",

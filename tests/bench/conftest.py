@@ -11,7 +11,7 @@ import shutil
 
 import pytest
 
-from splatseed.bench.planning.plan import Plan, PlannedScene
+from splatseed.bench.plan import Plan, PlannedScene
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.settings import TrainSettings
 

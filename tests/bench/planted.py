@@ -1,19 +1,14 @@
-"""Ledgers' rows with known gains in them."""
+"""Runs with known gains in them."""
 
 from __future__ import annotations
 
+import json
 import math
 
 import numpy as np
 
-from splatseed.bench.planning.records import (
-    SFM,
-    SHARED,
-    Arm,
-    RunResult,
-    RunRow,
-    RunSpec,
-)
+from splatseed.bench.plan import SFM, SHARED, Arm, RunResult, RunSpec
+from splatseed.bench.runs import ERROR, RESULT, Run, begin, run_folder
 from splatseed.scores import CurvePoint, EvalResult, ViewScore
 from splatseed.train.settings import TrainSettings
 
@@ -41,18 +36,21 @@ def result(psnr, *, steps=1000, points=10, num_gaussians=5000, early=0.0, **chan
         "train_seconds": 20.0,
         "peak_bytes": 5 * 10**8,
         "device": "CPU",
+        "wall_seconds": 25.0,
     }
     return RunResult(**{**values, **changes})
 
 
-def spec(scene, method, ratio, *, strategy="none", repeat=0, profile="default", **changes):
+def spec(
+    scene, method, ratio, *, strategy="none", repeat=0, profile="default", budget="", **changes
+):
     values = {"max_steps": 1000, "backend": "cpu", "data_factor": 4, **changes}
     own = {name: values.pop(name) for name in set(values) - set(SHARED)}
-    arm, training = Arm(method, profile, ratio, strategy), TrainSettings(**values)
+    arm, training = Arm(method, profile, ratio, strategy, budget), TrainSettings(**values)
     return RunSpec(scene, f"{scene}0123", arm, repeat, training, **{"version": "0.1.0", **own})
 
 
-def rows(
+def runs(
     scenes=SCENES, gains=GAINS, strategies=("none",), repeats=3, noise=NOISE, seed=0, **changes
 ):
     """All runs of a plan, done; every scene has its level, every repeat its own, every run
@@ -67,6 +65,19 @@ def rows(
                     psnr = level[repeat] + gain + noise * rng.standard_normal()
                     count = 5000 if strategy == "mcmc" else int(5000 * math.sqrt(ratio))
                     made = result(float(psnr), num_gaussians=count, early=0.1 if gain > 0 else 0.0)
-                    run = spec(scene, method, ratio, strategy=strategy, repeat=repeat, **changes)
-                    finished.append(RunRow(run, "done", made, started=0.0, finished=25.0))
+                    told = {"strategy": strategy, "repeat": repeat, **changes}
+                    finished.append(Run(spec(scene, method, ratio, **told), made))
     return finished
+
+
+def write_bench(bench, planned, words=("--scenes", "<A>", "b c")):
+    """A benchmark's folder with these runs."""
+    begin(bench, "bench", [run.spec for run in planned], words)
+    for run in planned:
+        told = {"spec": run.spec.to_dict()}
+        if run.result or run.error:
+            told |= {"result": run.result.to_dict()} if run.result else {"error": run.error}
+            folder = run_folder(bench, run.spec)
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / (RESULT if run.result else ERROR)).write_text(json.dumps(told), "utf-8")
+    return bench

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from splatseed.bench.running.folder import make_bench_folder
+from splatseed.bench.runs import begin
 from splatseed.io.staging import MANIFEST
 from splatseed.train.folder import RunFolder
 
@@ -17,10 +17,8 @@ def _run_folder(path):
 
 
 def _bench(path):
-    path.mkdir()
-    make_bench_folder(path)
-    for name in ("ledger.sqlite", "plan.toml"):
-        (path / name).touch()
+    begin(path, "bench", [], [])
+    (path / "plan.toml").touch()
 
 
 def _notes(path):

@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from splatseed.cli import COMPLETION, VERBS
-from splatseed.commands.bench.options import parse_plan
-from splatseed.commands.bench.report import CompareOptions, ReportOptions
+from splatseed.commands.bench import CompareOptions, ReportOptions, parse_plan
 from splatseed.commands.options import parse_options
 from splatseed.commands.upsample import full_options
 from splatseed.errors import SceneNotFoundError

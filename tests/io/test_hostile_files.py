@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import splatseed
-from splatseed.bench.planning.plan_file import read_plan
+from splatseed.bench.plan_file import read_plan
 from splatseed.commands.train import parse
 from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
 from splatseed.io import files, load_originals, load_scene, write_scene

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from splatseed.bench.planning.digest import scene_digest
+from splatseed.bench.scenes import scene_digest
 from splatseed.io import load_scene, write_scene
 from splatseed.seeding.photographs import photographed
 

@@ -10,8 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from splatseed.cli import VERBS, main
-from splatseed.commands import train, view
-from splatseed.commands.bench import machine
+from splatseed.commands import bench, train, view
 from splatseed.process.interruption import Interruption, exit_code, interruption
 
 
@@ -86,15 +85,15 @@ def test_what_trains_in_processes_exits_with_it(
     class Stopped:
         """Runs that are told to stop while they are under way."""
 
-        def __init__(self, *_):
+        def __init__(self, *_, **__):
             pass
 
-        def run(self, _keys):
+        def run(self, *_):
             with interruption():
                 os.kill(os.getpid(), number)
-            return False
+            raise KeyboardInterrupt
 
-    monkeypatch.setattr(machine, "LocalExecutor", Stopped)
+    monkeypatch.setattr(bench, "ProcessTasks", Stopped)
     named = [room_path if word == "demo" else word for word in words]
     run = splatseed(*named, "-o", tmp_path / "out")
     assert (run.code, "Traceback" in run.err) == (code, False)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import shutil
 import sys
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import fmean
@@ -17,54 +15,39 @@ from typing import Annotated, Any
 
 import tyro
 
-from splatseed.bench.analysis.statistics import LEVEL
-from splatseed.bench.planning.estimate import Estimator
-from splatseed.bench.planning.plan import Plan, PlannedScene, plan_runs
-from splatseed.bench.planning.records import SFM, Arm, RunResult, RunSpec
-from splatseed.bench.planning.scenes import SceneFacts, survey
-from splatseed.bench.running.environment import describe_environment, package_version
-from splatseed.bench.running.folder import TUNING, check_bench_folder, make_bench_folder
-from splatseed.bench.running.job import JobOptions
-from splatseed.bench.running.ledger import LEDGER, Ledger
-from splatseed.bench.tuning.halving import (
-    LAST_REPEATS,
+from splatseed.bench.job import JobOptions
+from splatseed.bench.plan import SFM, Arm, Plan, PlannedScene, RunResult, RunSpec, plan_runs
+from splatseed.bench.runs import begin, check_bench_folder, estimate, package_version, read_run
+from splatseed.bench.scenes import SceneFacts, survey
+from splatseed.bench.statistics import LEVEL
+from splatseed.bench.tuning import (
+    Results,
     Rung,
     Verdict,
     best_arms,
-    check_time,
+    is_baseline,
+    make_validation_scene,
+    most_grown,
     plan_rungs,
+    steps_to_grow,
     verdict,
 )
-from splatseed.bench.tuning.reach import most_grown, steps_to_grow
-from splatseed.bench.tuning.validation import make_validation_scene
-from splatseed.commands.bench.display import run_display, spoken_time
-from splatseed.commands.bench.machine import Machine, open_machine
-from splatseed.commands.bench.options import Options as BenchOptions
+from splatseed.commands import bench
 from splatseed.commands.options import check_least, parse_options
 from splatseed.console import OUT, print_commands, print_note, print_table, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SplatseedError
 from splatseed.io.files import read_text
-from splatseed.io.staging import atomic_file
+from splatseed.io.staging import write_json
 from splatseed.literal import quoted, visible
 from splatseed.process.interruption import exit_code
 from splatseed.seeding.upsampling import parse_budget
-from splatseed.train.settings import Backend, StrategyName, TrainSettings
+from splatseed.train.settings import StrategyName, TrainSettings
 
-SCENE = "scene"
-MINUTE = 60.0
-EQUAL = 0.99
+_TEST_EVERY = 8
+_LONG_SIDE = 400
+"""Most pixels of photographs' longer side: they are reduced by a whole factor."""
+_EQUAL = 0.99
 """Least part of the most Gaussians that counts as as many."""
-METHODS = (SFM, "mls", "stereo", "cover", "auto")
-STRATEGIES: tuple[StrategyName, ...] = ("default", "grow", "mcmc")
-TEST_EVERY = 8
-
-
-def _number(kind: type, default: str) -> Any:
-    return tyro.conf.arg(
-        constructor=kind,
-        metavar=kind.__name__.upper(),
-        help_behavior_hint=f"(default: {default})",
-    )
 
 
 @dataclass(frozen=True)
@@ -80,129 +63,23 @@ class Options:
     """The scene, with photographs."""
     minutes: float = 10.0
     """Approximate time to take; more of it trains longer, and tells smaller differences apart."""
-    output: Annotated[
-        Path | None,
-        tyro.conf.arg(
-            aliases=["-o"],
-            constructor=Path,
-            metavar="DIR",
-            help_behavior_hint="(default: tune_ and the scene's name, here)",
-        ),
-    ] = None
-    """The folder of its runs."""
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="DIR")] = None
+    """The folder of its runs; tune_ and the scene's name, here, by default."""
     budget: str = "0.25rho"
     """Gaussians at the end: a number, or per pixel of a photograph at the training size."""
     max_steps: int = 7000
     """Steps that you plan to train. Runs take no more, unless that is too few to tell: the first of
     three rounds takes 100, or what growing to the budget needs, and each next twice as many."""
-    long_side: int = 400
-    """Reduce photographs by a whole factor until their longer side has at most this many pixels."""
-    methods: tuple[str, ...] = METHODS
+    methods: tuple[str, ...] = (SFM, "mls", "stereo", "cover", "auto")
     """Seeds to try, sfm among them."""
-    strategies: tuple[StrategyName, ...] = STRATEGIES
+    strategies: tuple[StrategyName, ...] = ("default", "grow", "mcmc")
     """Strategies to try, default among them."""
-    jobs: Annotated[int | None, _number(int, "one per GPU, else 1")] = None
-    """Runs at a time."""
-    threads: Annotated[int | None, _number(int, "an equal share of the cores")] = None
-    """Threads of each run on the CPU."""
-    backend: Backend = "auto"
-    """Where to train; auto takes a GPU if PyTorch sees one."""
-
-
-@dataclass(frozen=True)
-class _Study:
-    """A scene under tuning: everything that its rungs share."""
-
-    options: Options
-    folder: Path
-    facts: SceneFacts
-    machine: Machine
-    ledger: Ledger
-
-    @property
-    def budget(self) -> str:
-        """The budget asked for, or what growth from the scene's own points can reach if less."""
-        return self.options.budget if self._most == self._asked_for else str(self._most)
-
-    @property
-    def least_steps(self) -> int:
-        """The fewest steps in which every arm can reach the budget."""
-        if "grow" not in self.options.strategies:
-            return 0
-        return steps_to_grow(self._most / max(1, self.facts.num_points))
-
-    @property
-    def _most(self) -> int:
-        """The number of Gaussians that every arm gets."""
-        if "grow" not in self.options.strategies:
-            return self._asked_for
-        return min(self._asked_for, most_grown(self.facts.num_points, self.options.max_steps))
-
-    @property
-    def _asked_for(self) -> int:
-        """The number of Gaussians that the user's budget comes to."""
-        factor = max(1, -(-self.facts.long_side // self.options.long_side))
-        return parse_budget(self.options.budget, self.facts.pixels_at(factor))
-
-    def specs(self, rung: Rung, arms: Collection[Arm] | None = None) -> list[RunSpec]:
-        """The runs of a rung, for these arms or for all."""
-        options = self.options
-        plan = Plan(
-            scenes=(PlannedScene(self.facts.path, self.facts.name),),
-            methods=options.methods,
-            ratios=(),
-            budgets=(self.budget,),
-            strategies=options.strategies,
-            repeats=rung.repeats,
-            training=TrainSettings(max_steps=rung.steps, test_every=TEST_EVERY),
-            long_side=options.long_side,
-        )
-        backend = self.machine.backend
-        runs = plan_runs(plan, [self.facts], backend, package_version("splatseed"))
-        return [spec for spec in runs if arms is None or spec.arm in arms]
-
-    def results(self, specs: Sequence[RunSpec]) -> dict[Arm, dict[int, RunResult]]:
-        """Results of the finished ones among some runs, by arm and repeat."""
-        keys = {spec.key for spec in specs}
-        results: dict[Arm, dict[int, RunResult]] = defaultdict(dict)
-        for row in self.ledger.rows():
-            if row.spec.key in keys and row.result and math.isfinite(row.result.psnr):
-                results[row.spec.arm][row.spec.repeat] = row.result
-        return dict(results)
 
 
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "tune", arguments)
-    _check(options)
-    folder = options.output or Path(f"tune_{options.scene.resolve().name}")
-    check_bench_folder(folder, [options.scene], tunes=True)
-    asked = BenchOptions(jobs=options.jobs, threads=options.threads)
-    with open_machine(asked, options.backend) as machine:
-        with _kept_if_begun(folder):
-            study = _open(options, folder, machine, arguments)
-            rungs = _rungs(study)
-        _announce(study, rungs)
-        ended = _climb(study, rungs)
-    _report(study, rungs, ended=ended)
-    if not ended:
-        sys.exit(exit_code())
-
-
-@contextmanager
-def _kept_if_begun(folder: Path) -> Iterator[None]:
-    """Remove the folder again if the block refuses to begin in it."""
-    before = folder.exists()
-    try:
-        yield
-    except SplatseedError:
-        if not before:
-            shutil.rmtree(folder, ignore_errors=True)
-        raise
-
-
-def _check(options: Options) -> None:
-    check_least(options, 1, "max_steps", "long_side", "jobs", "threads")
+    check_least(options, 1, "max_steps")
     if not 0 < options.minutes < math.inf:
         raise ParameterError("--minutes above 0", found=f"{options.minutes}", fix="Try 10.")
     for name, needed in (("methods", SFM), ("strategies", "default")):
@@ -212,192 +89,213 @@ def _check(options: Options) -> None:
                 found=" ".join(getattr(options, name)),
                 fix="Add it.",
             )
+    folder = options.output or Path(f"tune_{options.scene.resolve().name}")
+    check_bench_folder(folder, "tune", [options.scene])
+    with bench.open_machine(bench.Options(), "auto") as machine:
+        new = not folder.exists()
+        try:
+            tuning = _open(options, folder, machine, arguments)
+        except SplatseedError:
+            if new:  # nothing was begun
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
+        tuning.announce()
+        ended = tuning.climb()
+    tuning.report(ended=ended)
+    if not ended:
+        sys.exit(exit_code())
 
 
-def _open(options: Options, folder: Path, machine: Machine, arguments: Sequence[str]) -> _Study:
+def _open(
+    options: Options, folder: Path, machine: bench.Machine, arguments: Sequence[str]
+) -> _Tuning:
     with stage_display() as clock:
         clock("read", 0.0)
-        make_bench_folder(folder)
-        path = make_validation_scene(options.scene, folder / SCENE, TEST_EVERY)
+        path = make_validation_scene(options.scene, folder / "scene", _TEST_EVERY)
         facts = survey(path, options.scene.resolve().name, progress=clock)
-    ledger = Ledger.open(folder / LEDGER)
-    ledger.note_session(describe_environment(["tune", *arguments]))
-    return _Study(options, folder, facts, machine, ledger)
+    factor = max(1, -(-facts.long_side // _LONG_SIDE))
+    most = asked_for = parse_budget(options.budget, facts.pixels_at(factor))
+    least_steps = 0
+    if "grow" in options.strategies:
+        most = min(asked_for, most_grown(facts.num_points, options.max_steps))
+        least_steps = steps_to_grow(most / max(1, facts.num_points))
+    budget = options.budget if most == asked_for else str(most)
+    tuning = _Tuning(options, folder, facts, machine, budget, [])
+    tuning.plan(least_steps)
+    begin(folder, "tune", tuning.specs(tuning.rungs[0]), arguments)
+    return tuning
 
 
-def _rungs(study: _Study) -> tuple[Rung, ...]:
-    """The rungs that were planned when the folder was begun, or new ones."""
-    path, asked = study.folder / TUNING, _asked(study.options)
-    if path.is_file():
-        try:
-            kept = json.loads(read_text(path))
-            rungs = tuple(Rung(**each) for each in kept["rungs"])
-        except (OSError, ValueError, KeyError, TypeError):
-            raise SceneFormatError(
-                f"{path} as splatseed tune writes it", found="something else", fix="Remove it."
-            ) from None
-        if kept["asked"] != asked:
-            raise ParameterError(
-                f"the options that {study.folder} was begun with",
-                found="others",
-                fix="Repeat those, or name another folder with -o.",
+@dataclass(frozen=True)
+class _Tuning:
+    """A scene under tuning: everything that its rungs share, and the rungs."""
+
+    options: Options
+    folder: Path
+    facts: SceneFacts
+    machine: bench.Machine
+    budget: str
+    rungs: list[Rung]
+
+    def specs(self, rung: Rung, arms: Collection[Arm] | None = None) -> list[RunSpec]:
+        """The runs of a rung, for these arms or for all."""
+        plan = Plan(
+            scenes=(PlannedScene(self.facts.path, self.facts.name),),
+            methods=self.options.methods,
+            ratios=(),
+            budgets=(self.budget,),
+            strategies=self.options.strategies,
+            repeats=rung.repeats,
+            training=TrainSettings(max_steps=rung.steps, test_every=_TEST_EVERY),
+            long_side=_LONG_SIDE,
+        )
+        version = package_version("splatseed")
+        runs = plan_runs(plan, [self.facts], self.machine.backend, version)
+        return [spec for spec in runs if arms is None or spec.arm in arms]
+
+    def results(self, rung: Rung) -> Results:
+        """Results of a rung's finished runs, by arm and repeat."""
+        results: dict[Arm, dict[int, RunResult]] = defaultdict(dict)
+        for run in (read_run(self.folder, spec) for spec in self.specs(rung)):
+            if run.result and math.isfinite(run.result.psnr):
+                results[run.spec.arm][run.spec.repeat] = run.result
+        return dict(results)
+
+    def plan(self, least_steps: int) -> None:
+        """Take the rungs that were planned when the folder was begun, or plan new ones."""
+        path, asked = self.folder / "tune.json", _asked(self.options)
+        if path.is_file():
+            try:
+                kept = json.loads(read_text(path))
+                self.rungs.extend(Rung(**each) for each in kept["rungs"])
+            except (OSError, ValueError, KeyError, TypeError):
+                raise SceneFormatError(
+                    f"{path} as splatseed tune writes it", found="something else", fix="Remove it."
+                ) from None
+            if kept["asked"] != asked:
+                raise ParameterError(
+                    f"the options that {self.folder} was begun with",
+                    found="others",
+                    fix="Repeat those, or name another folder with -o.",
+                )
+            return
+        num_arms = len({spec.arm for spec in self.specs(Rung(100, 0, 1))})
+        seconds, most = self.options.minutes * 60, self.options.max_steps
+        self.rungs.extend(plan_rungs(num_arms, seconds, most, self.seconds, least_steps))
+        write_json(path, {"asked": asked, "rungs": list(map(asdict, self.rungs))})
+
+    def seconds(self, rungs: Sequence[Rung]) -> float:
+        """Estimated seconds of rungs, if their arms take the mean time of all."""
+        total = 0.0
+        for rung in rungs:
+            specs = self.specs(rung)
+            share = rung.arms / len({spec.arm for spec in specs})
+            total += share * sum(estimate(specs, [self.facts], (), self.machine.threads))
+        return total / self.machine.jobs
+
+    def announce(self) -> None:
+        """Print what will be done."""
+        facts, minutes = self.facts, bench.spoken_time(self.seconds(self.rungs))
+        steps = ", then ".join(f"{rung.arms} arms for {rung.steps:,} steps" for rung in self.rungs)
+        OUT.print(
+            f"{visible(facts.name)}: {facts.num_images} views that are not for the test, every "
+            f"{_TEST_EVERY}th held out; {facts.num_points:,} points\n  -> {steps}, the last twice\n"
+            f"  -> about {minutes} in all (--minutes); {self.machine.words}\n"
+            f"  -> {visible(self.folder)}",
+            soft_wrap=True,
+        )
+        if self.budget != self.options.budget:
+            print_note(
+                f"All arms have {int(self.budget):,} Gaussians at most: growth from "
+                f"{facts.num_points:,} points reaches no more."
             )
-        return rungs
-    estimator = _estimator(study)
 
-    def cost(rungs: Sequence[Rung]) -> float:
-        return sum(_seconds(study, rung, estimator) for rung in rungs)
+    def climb(self) -> bool:
+        """Run the rungs in order; whether all were finished."""
+        arms: Collection[Arm] | None = None
+        for i, rung in enumerate(self.rungs):
+            specs = self.specs(rung, arms)
+            OUT.print(f"\n{rung.steps:,} steps, {len({spec.arm for spec in specs})} arms")
+            runs = [read_run(self.folder, spec) for spec in specs]
+            if not bench.carry_out(self.folder, runs, [self.facts], self.machine, JobOptions()):
+                return False
+            if i + 1 < len(self.rungs):
+                arms = best_arms(self.results(rung), self.rungs[i + 1].arms)
+        return True
 
-    num_arms = len({spec.arm for spec in study.specs(Rung(100, 0, 1))})
-    seconds = study.options.minutes * MINUTE
-    rungs = plan_rungs(num_arms, seconds, study.options.max_steps, cost, study.least_steps)
-    check_time(cost(rungs), seconds)
-    content = {"asked": asked, "rungs": [asdict(each) for each in rungs]}
-    with atomic_file(path) as partial:
-        partial.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
-    return rungs
+    def report(self, *, ended: bool) -> None:
+        """Print the verdict of the longest finished runs, and the command that follows from it."""
+        results: Results = {}
+        said = None
+        for rung in reversed(self.rungs):  # the highest with two or more finished arms
+            results = self.results(rung)
+            said = verdict(results, rung.steps)
+            if said is not None:
+                break
+        if said is None:
+            print_note("Nothing can be said yet: repeat the command to continue.")
+            return
+        if not ended:
+            print_note(
+                "Stopped before the last run: this is so far. Repeat the command to continue."
+            )
+        numbers = {
+            arm: round(fmean(r.num_gaussians for r in results[arm].values()))
+            for arm, _ in said.ranking
+        }
+        rows = [
+            (arm.label, arm.strategy, f"{numbers[arm]:,}", f"{psnr:.2f}")
+            for arm, psnr in said.ranking
+        ]
+        title = f"{said.views} validation views, {said.steps:,} steps"
+        print_table(title, ("seeds", "strategy", "Gaussians", "PSNR, dB"), rows)
+        most = max(numbers.values())
+        few = [f"{arm.label} + {arm.strategy}" for arm in numbers if numbers[arm] < _EQUAL * most]
+        if few:
+            print_note(f"Compare with care: {', '.join(few)} ended with fewer Gaussians.")
+        OUT.print(sentence(said), soft_wrap=True)
+        print_commands("next", self._commands(said))
+
+    def _commands(self, said: Verdict) -> list[tuple[str, str]]:
+        """The winner's commands, for the whole scene and the planned steps."""
+        arm, options = said.winner, self.options
+        rung = Rung(options.max_steps, 0, 1)
+        spec = next(each for each in self.specs(rung) if each.arm == arm)
+        scene, name = options.scene, options.scene.resolve().name
+        seeded = f"{name}_{arm.method}"
+        commands = []
+        if arm.method != SFM:
+            points = max(spec.most_seeds or 0, self.facts.num_points)
+            looks = "hold_out" in spec.parameters
+            number = f"--{arm.method}.hold-out {_TEST_EVERY}" if looks else f"--num-points {points}"
+            seeding = (
+                f"splatseed upsample {quoted(scene)} --method {arm.method} {number} "
+                f"--budget {spec.most_seeds} -o {quoted(seeded)}"
+            )
+            commands.append(("seeds", seeding))
+        training = (
+            f"splatseed train {quoted(scene if arm.method == SFM else seeded)} --seeds scene "
+            f"--strategy {arm.strategy} --budget {spec.training.cap_max} "
+            f"--max-steps {options.max_steps} --data-factor {spec.training.data_factor} "
+            f"-o {quoted(f'run_{seeded}_{arm.strategy}')}"
+        )
+        return [*commands, ("training", training)]
 
 
 def _asked(options: Options) -> dict[str, Any]:
     """The options that decide on the rungs."""
-    told = ("minutes", "budget", "max_steps", "long_side", "methods", "strategies")
+    told = ("minutes", "budget", "max_steps", "methods", "strategies")
     values = {name: getattr(options, name) for name in told}
     return {name: list(v) if isinstance(v, tuple) else v for name, v in values.items()}
 
 
-def _estimator(study: _Study) -> Estimator:
-    return Estimator([study.facts], study.ledger.rows(), study.machine.threads)
-
-
-def _seconds(study: _Study, rung: Rung, estimator: Estimator) -> float:
-    """Seconds of a rung, if its arms take the mean time of all."""
-    specs = study.specs(rung)
-    share = rung.arms / len({spec.arm for spec in specs})
-    return share * sum(estimator.of_all(specs).values()) / study.machine.jobs
-
-
-def _announce(study: _Study, rungs: Sequence[Rung]) -> None:
-    estimator = _estimator(study)
-    seconds = sum(_seconds(study, rung, estimator) for rung in rungs)
-    steps = ", then ".join(f"{rung.arms} arms for {rung.steps:,} steps" for rung in rungs)
-    facts = study.facts
-    OUT.print(
-        f"{visible(facts.name)}: {facts.num_images} views that are not for the test, every "
-        f"{TEST_EVERY}th held out; {facts.num_points:,} points\n  -> {steps}, the last twice\n  -> "
-        f"about {spoken_time(seconds)} in all (--minutes); {study.machine.words}\n"
-        f"  -> {visible(study.folder)}",
-        soft_wrap=True,
-    )
-    if study.budget != study.options.budget:
-        print_note(
-            f"All arms have {int(study.budget):,} Gaussians at most: growth from "
-            f"{facts.num_points:,} points reaches no more."
-        )
-
-
-def _climb(study: _Study, rungs: Sequence[Rung]) -> bool:
-    """Run the rungs in order; whether all were finished."""
-    arms: Collection[Arm] | None = None
-    for i, rung in enumerate(rungs):
-        specs = study.specs(rung, arms)
-        OUT.print(f"\n{rung.steps:,} steps, {len({spec.arm for spec in specs})} arms")
-        if not _do(study, specs):
-            return False
-        if i + 1 < len(rungs):
-            arms = best_arms(study.results(specs), rungs[i + 1].arms)
-    return True
-
-
-def _do(study: _Study, specs: Sequence[RunSpec]) -> bool:
-    """Do the unfinished ones among some runs."""
-    study.ledger.add(specs)
-    keys = frozenset(spec.key for spec in specs)
-    done = {row.spec.key for row in study.ledger.rows() if row.status in {"done", "failed"}}
-    left = [spec for spec in specs if spec.key not in done]
-    if not left:
-        return True
-    estimator = _estimator(study)
-    expected = estimator.of_all(left)
-    with run_display(expected, len(specs) - len(left), study.machine.jobs) as display:
-        return study.machine.run(study.ledger, study.folder, keys, JobOptions(), display)
-
-
-def _report(study: _Study, rungs: Sequence[Rung], *, ended: bool) -> None:
-    """Print the verdict of the longest finished runs, and the command that follows from it."""
-    said = _verdict(study, rungs)
-    if said is None:
-        print_note("Nothing can be said yet: repeat the command to continue.")
-        return
-    if not ended:
-        print_note("Stopped before the last run: this is so far. Repeat the command to continue.")
-    counts = _counts(study, said)
-    rows = [
-        (arm.label, arm.strategy, f"{counts[arm]:,}", f"{psnr:.2f}") for arm, psnr in said.ranking
-    ]
-    views = f"{said.views} validation views, {said.steps:,} steps"
-    print_table(views, ("seeds", "strategy", "Gaussians", "PSNR, dB"), rows)
-    most = max(counts.values())
-    if few := [arm.label + " + " + arm.strategy for arm in counts if counts[arm] < EQUAL * most]:
-        print_note(f"Compare with care: {', '.join(few)} ended with fewer Gaussians.")
-    OUT.print(_sentence(said), soft_wrap=True)
-    print_commands("next", _commands(study, said))
-
-
-def _verdict(study: _Study, rungs: Sequence[Rung]) -> Verdict | None:
-    """The verdict of the highest rung with two or more finished arms."""
-    for rung in reversed(rungs):
-        results = study.results(study.specs(rung))
-        said = verdict(results, rung.steps)
-        if said is not None:
-            return said
-    return None
-
-
-def _counts(study: _Study, said: Verdict) -> dict[Arm, int]:
-    """The mean number of Gaussians with which each arm of the verdict's rung ended."""
-    most = max(LAST_REPEATS, said.repeats)
-    results = study.results(study.specs(Rung(said.steps, 0, most)))
-    return {
-        arm: round(fmean(r.num_gaussians for r in results[arm].values())) for arm, _ in said.ranking
-    }
-
-
-def _sentence(said: Verdict) -> str:
+def sentence(said: Verdict) -> str:
+    """A verdict in words."""
     arm, gain = said.winner, said.gain
-    name = f"{arm.label} + {arm.strategy}"
-    if (arm.method, arm.strategy) == (SFM, "default"):
+    if is_baseline(arm):
         return "The scene's own points with strategy default are best: leave them as they are."
     over = "views and repeats" if said.repeats > 1 else "views"
     spread = f" ± {gain.se:.2f} (standard error over {over})" if not math.isnan(gain.se) else ""
-    sure = gain.p <= LEVEL
-    doubt = "" if sure else " That is within noise: sfm + default may do as well."
+    doubt = " That is within noise: sfm + default may do as well." if not gain.p <= LEVEL else ""
+    name = f"{arm.label} + {arm.strategy}"
     return f"Best is {name}: {gain.mean:+.2f} dB{spread} over sfm + default.{doubt}"
-
-
-def _commands(study: _Study, said: Verdict) -> list[tuple[str, str]]:
-    """The winner's commands, for the whole scene and the planned steps."""
-    options, arm = study.options, said.winner
-    spec = next(each for each in study.specs(Rung(said.steps, 0, 1)) if each.arm == arm)
-    spec = dataclasses.replace(
-        spec, training=dataclasses.replace(spec.training, max_steps=options.max_steps)
-    )
-    scene, name = options.scene, options.scene.resolve().name
-    seeded = f"{name}_{arm.method}"
-    commands = []
-    if arm.method != SFM:
-        hold = f" --{arm.method}.hold-out {TEST_EVERY}" if "hold_out" in spec.parameters else ""
-        number = (
-            "" if hold else f" --num-points {max(spec.most_seeds or 0, study.facts.num_points)}"
-        )
-        seeding = (
-            f"splatseed upsample {quoted(scene)} --method {arm.method}{hold}{number} "
-            f"--budget {spec.most_seeds} -o {quoted(seeded)}"
-        )
-        commands.append(("seeds", seeding))
-    source = quoted(scene) if arm.method == SFM else quoted(seeded)
-    training = (
-        f"splatseed train {source} --seeds scene --strategy {arm.strategy} --budget "
-        f"{spec.training.cap_max} --max-steps {options.max_steps} --data-factor "
-        f"{spec.training.data_factor} -o {quoted(f'run_{seeded}_{arm.strategy}')}"
-    )
-    return [*commands, ("training", training)]

@@ -1,1 +1,0 @@
-"""The analysis of finished runs: studies, statistics, gains, and their tables."""

@@ -1,0 +1,296 @@
+"""Figures: PSNR over steps and seconds, gains by scene and ratio, arms at equal cost.
+
+Notation: a colour is a method, a mark's shape a ratio, and in figures of arms a line's dashes a
+strategy, in all figures the same; a dashed line or a hollow mark is the profile "paper". The
+baseline is thick and black. Promise: bars and bands say in the caption what they are; equal data
+give equal bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from splatseed.bench.comparisons import Arm, baseline_of, compared_arms, gains
+from splatseed.bench.plan import SFM, RunResult
+from splatseed.bench.statistics import Difference
+from splatseed.bench.study import Study, Variant
+from splatseed.train.settings import StrategyName
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLORS = {
+    "sfm": "#222222", "linear": "#0072B2", "triangle": "#56B4E9", "spline": "#E69F00",
+    "mls": "#D55E00", "voronoi": "#009E73", "depth": "#CC79A7", "random": "#999999",
+    "cover": "#B8860B", "stereo": "#1B7837", "auto": "#7B4FA3",
+}  # fmt: skip
+"""Colours that the colour-blind can tell apart (Okabe and Ito)."""
+_MARKS = {2.0: "v", 4.0: "s", 8.0: "o", 16.0: "^", 32.0: "D"}
+"""Marks by ratio; other ratios have a cross."""
+_DASHES = {"default": "-", "mcmc": "--", "grow": "-.", "none": ":"}
+_MANY = 8
+"""More curves than this in one picture cannot be told apart."""
+_LATE = 0.2
+"""Curves are scaled to what is after this share: before it, all rise equally steeply."""
+
+Style = Mapping[str, Any]
+
+
+class Plot(NamedTuple):
+    """A figure: its file's name without suffix, what it shows, and its PNG."""
+
+    name: str
+    caption: str
+    png: bytes
+
+
+def shown_seeds(study: Study, seeds: Sequence[str]) -> tuple[str, ...]:
+    """All variants, or if they are too many the highest ratio of each method and profile."""
+    if len(seeds) <= _MANY:
+        return tuple(seeds)
+    return tuple({study.variants[label].family: label for label in seeds}.values())
+
+
+def _left_out(shown: Sequence[str], seeds: Sequence[str]) -> str:
+    return "" if len(shown) == len(seeds) else " Of each method, the highest ratio."
+
+
+def _new_figure(width: float, height: float) -> Figure:
+    """An empty figure, its size in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415  (slow to import)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (loads with its use)
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
+    """A figure of ``count`` panels, up to three per row."""
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = _new_figure(max(3.6 * columns, 5.0), 2.9 * rows + 0.4)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in panels[count:]:
+        axes.remove()
+    return figure, list(panels[:count])
+
+
+def _plot(name: str, caption: str, figure: Figure, named: Mapping[str, Style]) -> Plot:
+    """The finished figure, with names above its panels at the left."""
+    from matplotlib.lines import Line2D  # noqa: PLC0415  (slow to import)
+
+    if named:
+        handles = [Line2D([], [], label=name, **style) for name, style in named.items()]
+        columns = min(4, len(handles))
+        figure.legend(handles=handles, loc="outside upper left", ncols=columns,
+                      fontsize="small", frameon=False)  # fmt: skip
+    out = BytesIO()
+    # Without the version of the library, so that the same data give the same bytes.
+    figure.savefig(out, dpi=120, format="png", metadata={"Software": None})
+    return Plot(name, caption, out.getvalue())
+
+
+def _style(variant: Variant, *, line: bool = True, mark: bool = True) -> dict[str, Any]:
+    color, paper = COLORS.get(variant.method, "#8C564B"), variant.profile == "paper"
+    style = {"color": color, "linestyle": ("--" if paper else "-") if line else "none"}
+    if not mark or (line and variant.method == SFM):
+        return style
+    shape, hollow = _MARKS.get(variant.ratio, "P"), "white" if paper else color
+    return {**style, "marker": shape, "markersize": 5.0, "markerfacecolor": hollow}
+
+
+def curve_figure(study: Study, strategy: StrategyName, by: str) -> Plot | None:
+    """Test PSNR over "steps" or "seconds", a panel per scene; None where there are no curves."""
+    seeds = study.seeded_under(strategy)
+    shown = (SFM, *shown_seeds(study, seeds))
+    styles = {label: _style(study.variants.get(label, Variant(SFM))) for label in shown}
+    arms = {label: Arm(strategy, label) for label in shown}
+    figure = _draw_curves(study, study.scenes_under(strategy), arms, styles, by)
+    if figure is None:
+        return None
+    caption = (
+        f"Test PSNR (dB) over {by}, strategy {strategy}: mean over repeats, and a band from the "
+        f"lowest to the highest.{_left_out(shown[1:], seeds)}"
+    )
+    return _plot(f"psnr_{by}_{strategy}", caption, figure, styles)
+
+
+def seconds_figure(study: Study) -> Plot | None:
+    """Test PSNR of all arms over seconds of seeding and training; None without curves."""
+    base, compared = baseline_of(study), compared_arms(study)
+    if base is None or len(compared) < 2:
+        return None
+    arms = [base, *(each.arm for each in compared if each.arm != base)][:_MANY]
+    styles = {arm.label: _arm_style(study, arm) for arm in arms}
+    by_label = {arm.label: arm for arm in arms}
+    figure = _draw_curves(study, study.scenes, by_label, styles, "seconds")
+    if figure is None:
+        return None
+    left = len(compared) - len(arms)
+    more = f" Of {len(compared)} arms, those with the highest mean gain." if left else ""
+    caption = (
+        "Test PSNR (dB) over wall seconds, those of making the seeds included; mean over repeats, "
+        f"and a band from the lowest to the highest. The thick line is {base.label}.{more}"
+    )
+    return _plot("psnr_seconds_arms", caption, figure, styles)
+
+
+def _arm_style(study: Study, arm: Arm) -> dict[str, Any]:
+    plain_name = arm.strategy.removesuffix("-3dgs")
+    dashes = _DASHES.get(plain_name, "-") if plain_name == arm.strategy else (0, (1, 3))
+    return {**_style(study.variants[arm.seeds], mark=False), "linestyle": dashes}
+
+
+def _draw_curves(
+    study: Study,
+    scenes: Sequence[str],
+    arms: Mapping[str, Arm],
+    styles: Mapping[str, Style],
+    by: str,
+) -> Figure | None:
+    """A panel per scene with curves of PSNR by name; the first arm is the baseline."""
+    drawn = {}
+    for scene in scenes:
+        runs = {name: study.results(arm.strategy, scene, arm.seeds) for name, arm in arms.items()}
+        curves = {name: _curve(list(each.values()), by) for name, each in runs.items()}
+        if known := {name: curve for name, curve in curves.items() if curve is not None}:
+            drawn[scene] = known
+    if not drawn:
+        return None
+    figure, panels = _panels(len(drawn))
+    baseline = next(iter(arms))
+    for (scene, each), axes in zip(drawn.items(), panels, strict=True):
+        end = each.get(baseline, next(iter(each.values())))[0][-1]
+        late = []
+        for name, (x, psnr) in each.items():
+            first = name == baseline
+            axes.plot(x, psnr.mean(axis=0), **styles[name], linewidth=2.2 if first else 1.3,
+                      markevery=max(len(x) // 5, 1), zorder=3 if first else 2)  # fmt: skip
+            if len(psnr) > 1:
+                low, high = psnr.min(axis=0), psnr.max(axis=0)
+                axes.fill_between(x, low, high, color=styles[name]["color"], alpha=0.15)
+            late.append(psnr[:, x >= min(_LATE * end, x[-1])].ravel())
+        values = np.concatenate(late)
+        margin = 0.05 * np.ptp(values) + 0.01
+        axes.set_ylim(values.min() - margin, values.max() + margin)
+        axes.set_title(scene, parse_math=False)
+        axes.set_xlabel(by if by == "steps" else "seconds, seeding included")
+        axes.set_ylabel("PSNR, dB")
+        axes.grid(visible=True, alpha=0.25)
+    return figure
+
+
+def _curve(runs: Sequence[RunResult], by: str) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mean abscissa [K] and PSNR [R, K] over the tests that all repeats took."""
+    curves = [{p.step: p for p in run.curve if math.isfinite(p.psnr)} for run in runs]
+    steps = sorted(set.intersection(*map(set, curves))) if curves else []
+    if not steps:
+        return None
+    psnr = np.array([[curve[step].psnr for step in steps] for curve in curves])
+    seconds = [[run.upsample_seconds + curve[step].seconds for step in steps]
+               for run, curve in zip(runs, curves, strict=True)]  # fmt: skip
+    return (np.mean(seconds, axis=0) if by == "seconds" else np.array(steps, float)), psnr
+
+
+def scene_figure(study: Study, strategy: StrategyName) -> Plot | None:
+    """The gain on each scene with its 95% interval; None where nothing can be compared."""
+    gained = gains(study, strategy)
+    if not gained.on_scene:
+        return None
+    seeds = shown_seeds(study, gained.seeds)
+    styles = {label: _style(study.variants[label], line=False) for label in seeds}
+    names = [*gained.scenes, "mean, these scenes"]
+    figure = _new_figure(7.2, 1.1 + 0.15 * len(names) * (len(seeds) + 1.5))
+    axes = figure.subplots()
+    for row, name in enumerate(names):
+        for i, label in enumerate(seeds):
+            known = gained.on_scene.get((name, label))
+            gain = known if name in gained.scenes else gained.on_these[label]
+            if gain is not None:  # close enough to leave a gap to the next scene's
+                place = row + 0.8 * ((i + 0.5) / len(seeds) - 0.5)
+                axes.errorbar(gain.mean, place, xerr=_interval(gain), **styles[label])
+    axes.axhline(len(gained.scenes) - 0.5, color="#bbbbbb", linewidth=0.8)
+    _finish_rows(axes, names, SFM)
+    caption = (
+        f"Gain over sfm on each scene, strategy {strategy}: mean over repeats and 95% interval (of "
+        f"each comparison alone, not adjusted for their number).{_left_out(seeds, gained.seeds)}"
+    )
+    return _plot(f"gain_by_scene_{strategy}", caption, figure, styles)
+
+
+def _interval(gain: Difference) -> list[list[float]] | None:
+    low, high = gain.interval()
+    return None if math.isnan(low) else [[gain.mean - low], [high - gain.mean]]
+
+
+def _finish_rows(axes: Axes, names: Sequence[str], base: str) -> None:
+    """Names at the left, one per row, and a line at no gain."""
+    axes.axvline(0.0, color=COLORS["sfm"], linewidth=1)
+    axes.set_yticks(range(len(names)), names, parse_math=False)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlabel(f"gain over {base}, dB")
+    axes.grid(visible=True, axis="x", alpha=0.25)
+
+
+def ratio_figure(study: Study) -> Plot | None:
+    """Mean gain over the ratio, one panel per strategy; None if there is only one ratio."""
+    with_ratio = [v for v in study.variants.values() if v.ratio and v.method != SFM]
+    ratios = sorted({variant.ratio for variant in with_ratio})
+    if len(ratios) < 2:
+        return None
+    families: dict[str, list[Variant]] = {}
+    for variant in with_ratio:
+        families.setdefault(variant.family, []).append(variant)
+    figure, panels = _panels(len(study.strategies))
+    for strategy, axes in zip(study.strategies, panels, strict=True):
+        on_these = gains(study, strategy).on_these
+        for family in families.values():
+            known = [(v, on_these[v.label]) for v in family if v.label in on_these]
+            means = [gain.mean for _, gain in known]
+            axes.plot([v.ratio for v, _ in known], means, **_style(family[0], mark=False))
+            for variant, gain in known:
+                style = _style(variant, line=False)
+                axes.errorbar(variant.ratio, gain.mean, yerr=_interval(gain), **style)
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(ratios, [f"{ratio:g}x" for ratio in ratios])
+        axes.set_xticks([], minor=True)
+        axes.axhline(0.0, color=COLORS["sfm"], linewidth=1)
+        axes.set_title(f"strategy {strategy}")
+        axes.set_xlabel("points, per original")
+        axes.set_ylabel("gain over sfm, dB")
+        axes.grid(visible=True, alpha=0.25)
+    styles = {name: _style(each[0], mark=False) for name, each in families.items()}
+    caption = (
+        "Mean gain over sfm (dB) on these scenes by ratio, with 95% interval of training again."
+    )
+    return _plot("gain_by_ratio", caption, figure, styles)
+
+
+def arm_figure(study: Study) -> Plot | None:
+    """Each arm's mean gain over the baseline with its 95% interval; None where there is one arm."""
+    base, compared = baseline_of(study), compared_arms(study)
+    others = [each for each in compared if each.arm != base]
+    if base is None or not others:
+        return None
+    figure = _new_figure(7.2, 1.2 + 0.24 * len(others))
+    axes = figure.subplots()
+    for row, each in enumerate(others):
+        style = _style(study.variants[each.arm.seeds], line=False, mark=False)
+        axes.errorbar(each.gain.mean, row, xerr=_interval(each.gain), marker="o", **style)
+    _finish_rows(axes, [each.arm.label for each in others], base.label)
+    alone = all(len(each.scenes) == 1 for each in others)
+    of = "repeats and 95% interval for this scene trained again" if alone else (
+        "scenes and 95% interval for scenes like these"
+    )  # fmt: skip
+    caption = (
+        f"Gain over {base.label} of every arm: mean over {of} (of each comparison alone, not "
+        "adjusted for their number)."
+    )
+    return _plot("gain_arms", caption, figure, {})

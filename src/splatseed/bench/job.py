@@ -1,0 +1,407 @@
+"""One run of the benchmark: its seeds, its training, its scores, and the folder that keeps them.
+
+Notation: ``BENCH/runs/KEY`` is a run's folder; ``BENCH/seeds``, ``depths`` and ``covisible`` hold
+what several runs share. Promise: a run's folder appears whole or not at all, and is small: models
+are kept only on request. Seeds are the points that ``splatseed upsample`` would write for the same
+scene, method, ratio, budget and seed; their time is that of upsampling and thinning, without the
+compilation of kernels. Files that differ from the planned ones are an error.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+import socket
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from splatseed.bench.plan import CLOUD, SFM, WITH_CLOUD, RunResult, RunSpec, plain
+from splatseed.bench.runs import ERROR, RESULT, Run, package_version, run_folder
+from splatseed.bench.scenes import cloud_digest, depth_digest, open_scene, scene_digest
+from splatseed.errors import (
+    OutputError,
+    ParameterError,
+    PointCloudError,
+    SceneFormatError,
+    SceneNotFoundError,
+    SplatseedError,
+)
+from splatseed.io.files import ARCHIVE_FAILURES
+from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_json
+from splatseed.kernels.compilation import watched
+from splatseed.pointcloud import PointCloud
+from splatseed.process.peak import peak_bytes
+from splatseed.process.tasks import Report, Tasks
+from splatseed.progress import Progress, silent
+from splatseed.scene import Scene
+from splatseed.scores import EvalResult
+from splatseed.seeding.advice import DEFAULT_METHOD
+from splatseed.seeding.clouds.method import Cloud
+from splatseed.seeding.upsampling import CELL, thin_to, upsample
+from splatseed.train.depths import stereo_size
+from splatseed.upsample import Upsampler, chooses_number, configure
+from splatseed.views.view import user_cache_dir
+
+if TYPE_CHECKING:  # PyTorch, which takes a while
+    from splatseed.train.run import TrainingRun
+
+TRAIN = "train"
+"""The stage of training, as progress calls it."""
+_PICTURES = 3
+"""Test views that are kept as pictures."""
+
+
+@dataclass(frozen=True)
+class JobOptions:
+    """Options that do not affect the result: whether to keep models, and to measure LPIPS."""
+
+    keep_models: bool = False
+    lpips: bool = False
+
+
+def do_runs(
+    bench: Path,
+    specs: Sequence[RunSpec],
+    tasks: Tasks,
+    options: JobOptions,
+    away: bool = False,
+    report: Report | None = None,
+) -> Iterator[Run]:
+    """Carry out runs; gives each as it ends. A failure is recorded, and ends no other run.
+
+    Args:
+        bench: The benchmark's folder.
+        specs: The runs, none of them finished.
+        tasks: Who carries them out.
+        options: Options of the runs.
+        away: Whether that is elsewhere, so that the folders come back as bytes.
+        report: Told how far each is, by its place in ``specs``.
+
+    Raises:
+        OutputError: The folder cannot be written.
+        KeyboardInterrupt: The user stopped them.
+    """
+    function = run_away if away else run_job
+    calls = [(spec, options) if away else (spec, bench, options) for spec in specs]
+    try:
+        for ended in tasks.run(function, calls, report):
+            spec, value = specs[ended.index], ended.value
+            if ended.error is not None:
+                yield Run(spec, error=_keep_error(bench, spec, ended.error))
+                continue
+            if away:
+                value, files = value
+                _keep_files(bench, spec, files)
+            yield Run(spec, value)
+    except KeyboardInterrupt:
+        for partial in (bench / "runs").glob(".*.partial-*"):  # of processes that were killed
+            shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _keep_error(bench: Path, spec: RunSpec, error: Exception) -> str:
+    """Record why a run failed; in one line."""
+    ours = isinstance(error, SplatseedError)
+    line = " ".join((str(error) if ours else f"{type(error).__name__}: {error}").split())
+    told = "".join(traceback.format_exception(error))
+    content = {"spec": spec.to_dict(), "error": line, "traceback": told}
+    text = json.dumps(content, indent=2) + "\n"
+    with suppress(OutputError):  # as where the folder holds the user's files: the line tells
+        _keep_files(bench, spec, {ERROR: text.encode("utf-8", "backslashreplace")})
+    return line
+
+
+def _keep_files(bench: Path, spec: RunSpec, files: Mapping[str, bytes]) -> None:
+    with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:
+        for name, content in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+
+
+def run_job(
+    spec: RunSpec, bench: Path, options: JobOptions, progress: Progress = silent
+) -> RunResult:
+    """Carry out a run, and make its folder.
+
+    Args:
+        spec: The run.
+        bench: The benchmark's folder.
+        options: What else to do.
+        progress: Told the stages, training among them.
+
+    Raises:
+        SplatseedError: The run cannot be done.
+        KeyboardInterrupt: The user stopped it.
+    """
+    from splatseed.splat.metrics import load_lpips  # noqa: PLC0415  (PyTorch)
+    from splatseed.train.run import RunOptions, prepare_run  # noqa: PLC0415  (PyTorch)
+
+    begun = time.perf_counter()
+    with output_folder(run_folder(bench, spec), kind="bench", overwrite=True) as folder:
+        progress("read", 0.0)
+        scene = open_unchanged([spec])
+        lpips = load_lpips() if options.lpips else None
+        seeds, seeding = make_seeds(scene, spec, progress, bench)
+        work = folder / "work"
+        every = spec.training.test_every
+        size = stereo_size(scene.split(every)[0], spec.settings, spec.settings.backend)
+        # What stereo knows, for growth, is found once for all runs of a repeat, and its time counts
+        # in each; not where seeds by auto have paid for it, as splatseed train shares the two.
+        ways = RunOptions(
+            cache_dir=user_cache_dir(),
+            depths=bench / "depths" / f"{spec.scene_digest}_{every}_{size}_{spec.repeat}.npz",
+            seeding_knew=plain(spec.arm.method) == DEFAULT_METHOD and not _is_full(scene, spec),
+        )
+        seeded = scene.replace(points=seeds)
+        run = prepare_run(seeded, work, spec.settings, ways, progress=progress)
+        if not run.train(lambda step: progress(TRAIN, step / spec.training.max_steps)):
+            raise KeyboardInterrupt
+        trained = run.finish(_scorer(spec, bench, lpips, progress), progress)
+        result = RunResult(
+            scores=trained.scores,
+            curve=tuple(point for point in trained.curve if math.isfinite(point.psnr)),
+            num_seeds=trained.num_seeds,
+            upsample_seconds=seeding,
+            train_seconds=trained.train_seconds,
+            peak_bytes=peak_bytes(),
+            device=run.device,
+            peak_gpu_bytes=run.peak_gpu_bytes,
+            wall_seconds=round(time.perf_counter() - begun, 3),
+        )
+        _keep(run, folder, models=options.keep_models)
+        content = {"key": spec.key, "spec": spec.to_dict(), "result": result.to_dict()}
+        write_json(folder / RESULT, content)
+    return result
+
+
+def run_away(spec: RunSpec, options: JobOptions) -> tuple[RunResult, dict[str, bytes]]:
+    """Carry out a run on a node of a cluster, and return the files of its folder by name.
+
+    Raises:
+        SplatseedError: The run cannot be done, or the node lacks the scene or this version.
+    """
+    host, here = socket.gethostname(), package_version("splatseed")
+    if here != spec.version:
+        raise ParameterError(
+            f"splatseed {spec.version} on the node {host}",
+            found=here or "none",
+            fix="Install the same version on every node.",
+        )
+    if not Path(spec.scene_path).exists():
+        raise SceneNotFoundError(
+            f"the scene {spec.scene_path} on the node {host}",
+            found="no such folder",
+            fix="Every node must have the scenes at the same path: share the disk, or copy them.",
+        )
+    with tempfile.TemporaryDirectory(prefix="splatseed-", ignore_cleanup_errors=True) as temporary:
+        result = run_job(spec, Path(temporary), options)
+        folder = run_folder(Path(temporary), spec)
+        paths = [path for path in folder.rglob("*") if path.is_file() and path.name != MANIFEST]
+        return result, {path.relative_to(folder).as_posix(): path.read_bytes() for path in paths}
+
+
+def _keep(run: TrainingRun, folder: Path, *, models: bool) -> None:
+    """Move what is kept out of the folder of training, and remove the rest.
+
+    The pictures are of views spread evenly over the test views, so the same ones for every arm.
+    """
+    files = [run.folder.metrics, run.folder.config, run.folder.curve_csv]
+    files += [run.folder.gaussians] if models else []
+    pictures = sorted(run.folder.renders.iterdir())
+    count = min(_PICTURES, len(pictures))
+    files += [pictures[(2 * i + 1) * len(pictures) // (2 * count)] for i in range(count)]
+    (folder / run.folder.renders.name).mkdir()
+    for path in files:
+        shutil.move(path, folder / path.relative_to(run.folder.path))
+    shutil.rmtree(run.folder.path)
+
+
+def _scorer(spec: RunSpec, bench: Path, lpips: Any, progress: Progress) -> Callable[..., Any]:
+    """Scores test views, also over the pixels that two training views see.
+
+    These are computed once per scene; it is opened anew for that, so that an arm's depth maps make
+    no difference.
+    """
+    from splatseed.evaluate import evaluate_views  # noqa: PLC0415  (PyTorch)
+    from splatseed.splat.covisible import (  # noqa: PLC0415  (PyTorch)
+        find_covisible,
+        pixel_masks,
+        read_covisible,
+        write_covisible,
+    )
+
+    every = spec.training.test_every
+
+    def score(render: Any, views: Sequence[Any]) -> EvalResult:
+        kept = bench / "covisible" / f"{spec.scene_digest}_{every}.npz"
+        grids = read_covisible(kept)
+        if grids is None:
+            scene = open_scene(Path(spec.scene_path), images=spec.images)
+            grids = find_covisible(scene, every, progress)
+            write_covisible(kept, grids)
+        seen = pixel_masks(grids, views)
+        return evaluate_views(render, views, lpips=lpips, covisible=seen, progress=progress)
+
+    return score
+
+
+def open_unchanged(specs: Sequence[RunSpec]) -> Scene:
+    """The scene of some runs before upsampling, with depth maps if any of them needs these.
+
+    Args:
+        specs: Runs on one scene, at least one.
+
+    Raises:
+        SceneNotFoundError: It, or its depth maps, are not where the runs say.
+        SceneFormatError: It cannot be read, or differs from the plan: changed since, or different
+            on this node.
+    """
+    spec = next((each for each in specs if each.depth_path), specs[0])
+    depth = Path(spec.depth_path) if spec.depth_path else None
+    scene = open_scene(Path(spec.scene_path), images=spec.images, depth=depth)
+    folder = scene.source.image_dir if scene.source else None
+    same = folder is not None and scene_digest(scene, folder) == spec.scene_digest
+    if same and spec.depth_digest and scene.depths is not None:
+        same = depth_digest(scene.depths) == spec.depth_digest
+    if same and spec.cloud_digest:
+        same = cloud_digest(Path(spec.cloud_path)) == spec.cloud_digest
+    if not same:
+        raise SceneFormatError(
+            f"the files of {spec.scene_path} as they were when the benchmark was planned",
+            found="other points, cameras, photographs, depth maps or scan",
+            fix="Start the benchmark again, which plans anew; or put them back.",
+        )
+    return scene
+
+
+def make_seeds(
+    scene: Scene, spec: RunSpec, progress: Progress = silent, bench: Path | None = None
+) -> tuple[PointCloud, float]:
+    """The points that a run trains from, and the seconds that new ones took.
+
+    Args:
+        scene: The scene as opened by ``open_unchanged``.
+        spec: The run.
+        progress: Told the stages of upsampling.
+        bench: The benchmark's folder, where points made from photographs are kept, which took a
+            minute or more and which budgets and strategies thin; made anew when left out. Their
+            seconds count in each of these runs.
+
+    Raises:
+        SplatseedError: As ``splatseed.upsample``.
+    """
+    arm, most, seed = spec.arm, spec.most_seeds, spec.repeat
+    if arm.method == SFM and most is None:
+        return scene.points, 0.0
+    method, numbers = _asked(scene, spec)
+    looks = arm.method != SFM and chooses_number(plain(arm.method))
+    if bench is None or not looks or _is_full(scene, spec):
+        seeds, seconds = _timed(
+            lambda: upsample(scene, method, **numbers, budget=most, seed=seed, progress=progress)
+        )
+        return seeds.select(seeds.distinct), seconds
+    path = bench / "seeds" / f"{_seeds_key(spec)}.npz"
+    made = _read_seeds(path)
+    if made is None:
+        made = _timed(lambda: upsample(scene, method, **numbers, seed=seed, progress=progress))
+        _write_seeds(path, *made)
+    seeds, seconds = whole, _ = made
+    if most is not None:
+        held = getattr(method, "hold_out", 0)
+        seeds, more = _timed(lambda: thin_to(scene, whole, most, CELL, held, seed, progress))
+        seconds += more
+    return seeds.select(seeds.distinct), seconds
+
+
+def _timed(make: Callable[[], PointCloud]) -> tuple[PointCloud, float]:
+    """Points, and the seconds that making them took without compiling kernels."""
+    compiling, running = 0.0, list[float]()
+
+    def watch(begins: bool) -> None:
+        nonlocal compiling
+        if begins:
+            running.append(time.perf_counter())
+        elif len(running) == 1:  # else it is nested in another, which counts it
+            compiling += time.perf_counter() - running.pop()
+        else:
+            running.pop()
+
+    with watched(watch):
+        start = time.perf_counter()
+        cloud = make()
+        return cloud, max(time.perf_counter() - start - compiling, 0.0)
+
+
+def _num_original(scene: Scene) -> int:
+    return int(np.count_nonzero(scene.points.originals.distinct))
+
+
+def _is_full(scene: Scene, spec: RunSpec) -> bool:
+    """Whether ``auto`` makes no points, as the originals fill the budget."""
+    most = spec.most_seeds
+    return spec.arm.method == DEFAULT_METHOD and most is not None and _num_original(scene) >= most
+
+
+def _asked(scene: Scene, spec: RunSpec) -> tuple[Upsampler, dict[str, Any]]:
+    """The method of a run, and how many points it should make or what comes before it.
+
+    Under a budget, a method without a ratio fills the room that the originals leave.
+    """
+    arm, most = spec.arm, spec.most_seeds
+    if arm.method == SFM:  # no points are to be made: any method would do
+        return configure("linear"), {"ratio": 1.0}
+    if arm.method == CLOUD:
+        return Cloud(**spec.parameters).of(spec.cloud_path), {}
+    if arm.method in WITH_CLOUD:
+        begin = f"{CLOUD}."
+        own = {name: v for name, v in spec.parameters.items() if not name.startswith(begin)}
+        cloud = {n.removeprefix(begin): v for n, v in spec.parameters.items() if n not in own}
+        extra = Cloud(**cloud).of(spec.cloud_path)
+        return configure(plain(arm.method), arm.profile, **own), {"extra_method": extra}
+    method = configure(arm.method, arm.profile, **spec.parameters)
+    if chooses_number(arm.method):
+        return method, {}
+    if arm.ratio or most is None:
+        return method, {"ratio": arm.ratio}
+    return method, {"num_points": most} if most > _num_original(scene) else {"ratio": 1.0}
+
+
+def _seeds_key(spec: RunSpec) -> str:
+    """The fingerprint of everything that determines a method's points before thinning."""
+    arm = spec.arm
+    told: Mapping[str, Any] = {
+        "scene": [spec.scene_digest, spec.depth_digest, spec.cloud_digest],
+        "arm": [arm.method, arm.profile, arm.ratio, spec.repeat],
+        "parameters": dict(spec.parameters),
+        "version": spec.version,
+    }
+    text = json.dumps(told, sort_keys=True)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _write_seeds(path: Path, cloud: PointCloud, seconds: float) -> None:
+    arrays: dict[str, Any] = {"xyz": cloud.xyz, "rgb": cloud.rgb, "source": cloud.source}
+    arrays |= cloud.attributes
+    with atomic_file(path) as partial, partial.open("wb") as file:
+        np.savez(file, seconds=np.float64(seconds), **arrays)
+
+
+def _read_seeds(path: Path) -> tuple[PointCloud, float] | None:
+    """The points that ``_write_seeds`` stored; None if nothing can be read."""
+    try:
+        with np.load(path, allow_pickle=False) as kept:
+            arrays = {name: kept[name] for name in kept.files}
+            seconds = float(arrays.pop("seconds"))
+            return PointCloud(**arrays), seconds
+    except (*ARCHIVE_FAILURES, PointCloudError):
+        return None

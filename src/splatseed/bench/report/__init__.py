@@ -1,1 +1,0 @@
-"""The report: figures, pictures and the page that holds them."""

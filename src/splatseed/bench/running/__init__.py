@@ -1,1 +1,0 @@
-"""While a benchmark runs: the ledger, the executors, and one run from its seeds to its result."""

@@ -1,0 +1,247 @@
+"""The folder of a benchmark, whose runs are folders: reading them, and carrying out what is left.
+
+Notation: ``BENCH`` holds ``plan.toml``, ``planned.json`` with the calls of the command and the runs
+of the last plan, and ``runs/KEY`` for each run that ended: ``result.json`` if it is finished,
+``error.json`` if it failed; ``scenes/demo`` if a plan asks for it. Promise: the folders are the
+record: a run with a ``result.json`` is finished and never repeated, anything else is started anew;
+a folder that is not a benchmark's is never written to.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shlex
+import socket
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from splatseed.bench.plan import RunResult, RunSpec, rule_of_thumb
+from splatseed.bench.scenes import SceneFacts
+from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.io.files import read_text
+from splatseed.io.staging import MANIFEST, check_apart, check_output, read_manifest, write_json
+from splatseed.literal import counted
+
+RESULT, ERROR = "result.json", "error.json"
+_PLANNED = "planned.json"
+DEMO_FACTS = SceneFacts(
+    "demo",
+    "demo:",
+    "not made yet",
+    num_points=11_364,
+    num_images=40,
+    pixels=400 * 300,
+    long_side=400,
+    depth_digest="not made yet",
+)
+"""Facts about the synthetic room before it is made; the number of points is approximate."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of a benchmark: finished if it has a result, failed if it has an error, else to do."""
+
+    spec: RunSpec
+    result: RunResult | None = None
+    error: str = ""
+
+
+def run_folder(bench: Path, spec: RunSpec) -> Path:
+    """Where a run is kept."""
+    return bench / "runs" / spec.key
+
+
+def read_run(bench: Path, spec: RunSpec) -> Run:
+    """A run as its folder tells of it."""
+    return _read(run_folder(bench, spec), spec)
+
+
+def _read(folder: Path, spec: RunSpec | None = None) -> Run:
+    """What a run's folder tells; of an unfinished run whose specification is given, that.
+
+    Raises:
+        SceneFormatError: It is not of the layout that this version writes.
+    """
+    for name in (RESULT, ERROR):
+        with suppress(FileNotFoundError, NotADirectoryError):
+            text = read_text(folder / name)
+            try:
+                content = json.loads(text)
+                own = spec or RunSpec.from_dict(content["spec"])
+                if name == ERROR:
+                    return Run(own, error=str(content["error"]))
+                return Run(own, RunResult.from_dict(content["result"]))
+            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                raise SceneFormatError(
+                    f"{folder / name} as this version of splatseed writes it",
+                    found=f"another layout ({type(error).__name__}: {error})",
+                    fix="Remove that folder to have its run repeated, or begin a new benchmark.",
+                ) from None
+    assert spec is not None  # noqa: S101  (folders are listed by these files)
+    return Run(spec)
+
+
+def read_runs(bench: Path) -> list[Run]:
+    """All runs of a benchmark: those of the last plan, in its order, then others that have ended.
+
+    Raises:
+        SceneNotFoundError: There is no benchmark.
+        SceneFormatError: A file is not of the layout that this version writes.
+    """
+    kind = read_manifest(bench).get("command")
+    if kind not in {"bench", "tune"}:
+        raise SceneNotFoundError(
+            f"a benchmark at {bench}",
+            found=kind or "none",
+            fix="Name the folder that splatseed bench wrote.",
+        )
+    runs = [read_run(bench, RunSpec.from_dict(each)) for each in _planned(bench)["runs"]]
+    known = {run_folder(bench, run.spec).name for run in runs}
+    ended = {path.parent for name in (RESULT, ERROR) for path in bench.glob(f"runs/*/{name}")}
+    return [*runs, *(_read(each) for each in sorted(ended) if each.name not in known)]
+
+
+def counts(runs: Sequence[Run]) -> str:
+    """How many runs there are of each kind, in words."""
+    done, failed = (sum(map(bool, kind)) for kind in
+                    ([run.result for run in runs], [run.error for run in runs]))  # fmt: skip
+    left = len(runs) - done - failed
+    kinds = {"done": done, "failed": failed, "to do": left if done or failed else 0}
+    return ", ".join(
+        [counted(len(runs), "run"), *(f"{n:,} {kind}" for kind, n in kinds.items() if n)]
+    )
+
+
+def check_bench_folder(folder: Path, verb: str, protect: Sequence[Path]) -> None:
+    """Refuse a folder that this verb did not write, before any work is done.
+
+    Args:
+        folder: The folder, which need not be there.
+        verb: "bench" or "tune".
+        protect: Scenes, which the folder must lie apart from.
+
+    Raises:
+        OutputError: It is another's, or lies in a scene or around one.
+    """
+    kind = read_manifest(folder).get("command")
+    if kind == verb:
+        check_apart(folder, protect)
+    elif kind is None:
+        check_output(folder, kind=verb, protect=protect)
+    else:
+        raise OutputError(
+            f"the folder of splatseed {verb}, or a new one, at {folder}",
+            found=f"what splatseed {kind} wrote",
+            fix="Choose another folder.",
+        )
+
+
+def begin(bench: Path, verb: str, specs: Iterable[RunSpec], words: Sequence[str]) -> None:
+    """Make the folder unless it exists, and record a call of the command and its runs.
+
+    Args:
+        bench: The folder.
+        verb: "bench" or "tune".
+        specs: The runs.
+        words: What followed the verb on the command line.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    if not (bench / MANIFEST).is_file():
+        write_json(bench / MANIFEST, {"command": verb})
+    calls = [*read_calls(bench), _describe_call(verb, words)]
+    planned = [spec.to_dict() for spec in specs]
+    write_json(bench / _PLANNED, {"calls": calls, "runs": planned})
+
+
+def read_calls(bench: Path) -> list[dict[str, Any]]:
+    """The recorded calls of the command, oldest first: words, time, machine, and versions."""
+    return _planned(bench)["calls"]
+
+
+def _planned(bench: Path) -> dict[str, list[Any]]:
+    with suppress(OSError, ValueError):
+        return dict(json.loads(read_text(bench / _PLANNED)))
+    return {"calls": [], "runs": []}
+
+
+def _describe_call(verb: str, words: Sequence[str]) -> dict[str, Any]:
+    packages = ("splatseed", "torch", "gsplat", "torchmetrics", "numpy", "scipy", "numba", "ray")
+    cpu = platform.processor() or platform.machine()
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/cpuinfo").read_text("utf-8", "replace").splitlines()
+        named = next(line for line in lines if line.startswith("model name"))
+        cpu = named.partition(":")[2].strip()
+    return {
+        "command": shlex.join(["splatseed", verb, *words]),
+        "started": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
+        "folder": str(Path.cwd()),
+        "host": socket.gethostname(),
+        "system": platform.platform(),
+        "cpu": cpu,
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "versions": {name: known for name in packages if (known := package_version(name))},
+    }
+
+
+def package_version(package: str) -> str:
+    """An installed package's version; empty if it is not installed or runs from its source."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def make_demo_scene(folder: Path) -> Path:
+    """The synthetic room of ``splatseed demo`` in a folder, made unless it exists; its place.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    path = folder / "demo"
+    if path.is_dir():
+        return path
+    from splatseed.synthetic import make_capture, write_capture  # noqa: PLC0415  (Numba)
+
+    return write_capture(make_capture(), path)
+
+
+def estimate(
+    specs: Sequence[RunSpec], scenes: Iterable[SceneFacts], runs: Iterable[Run], threads: int
+) -> list[float]:
+    """Seconds of each of some runs: by the pace of finished ones, else by a rule of thumb.
+
+    Args:
+        specs: The runs.
+        scenes: Facts about their scenes.
+        runs: Runs of which some may be finished.
+        threads: Threads of each run, on the CPU.
+    """
+    facts = {scene.digest: scene for scene in scenes}
+    paces: dict[tuple[str, ...], list[float]] = {}
+    for run in runs:
+        if run.result is not None and run.spec.scene_digest in facts:
+            modelled = rule_of_thumb(run.spec, facts[run.spec.scene_digest], threads)
+            for known in _likeness(run.spec):
+                paces.setdefault(known, []).append(run.result.wall_seconds / modelled)
+    seconds = []
+    for spec in specs:
+        pace = next((paces[each] for each in _likeness(spec) if each in paces), [1.0])
+        seconds.append(median(pace) * rule_of_thumb(spec, facts[spec.scene_digest], threads))
+    return seconds
+
+
+def _likeness(spec: RunSpec) -> tuple[tuple[str, ...], ...]:
+    """What a run has in common with others, the most telling first."""
+    scene, strategy = spec.scene_digest, spec.arm.strategy
+    return (scene, strategy, spec.arm.method), (scene, strategy), (strategy,), ()

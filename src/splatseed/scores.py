@@ -1,0 +1,177 @@
+"""Scores: how well test views were rendered, during a run and at its end.
+
+Notation: PSNR in dB, SSIM and LPIPS without unit; seconds are wall time. Promise: results have
+these types from evaluation through training to a benchmark's ledger; means are means over images of
+per-image values; what was not measured is None, with the reason beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Self
+
+NOT_ASKED = "not asked for"
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """One view's scores.
+
+    Args:
+        name: The image's name in its scene.
+        psnr: Peak signal-to-noise ratio in dB; higher is better, infinite for equal images.
+        ssim: Structural similarity, 1 for equal images.
+        lpips: Perceptual distance, 0 for equal images; None if not measured.
+        seconds: Time to render it.
+        covisible_psnr: PSNR over the pixels that at least two training views see; None if unknown,
+            or if there are none.
+        covisible_share: The share of such pixels; None if unknown.
+    """
+
+    name: str
+    psnr: float
+    ssim: float
+    lpips: float | None
+    seconds: float
+    covisible_psnr: float | None = None
+    covisible_share: float | None = None
+
+
+@dataclass(frozen=True)
+class EvalResult:
+    """Scores over test views.
+
+    Args:
+        per_image: One score per view, in the views' order; at least one.
+        lpips_net: The network of LPIPS; None if not measured.
+        lpips_reason: Why LPIPS was not measured; empty if it was.
+        num_gaussians: How many Gaussians were rendered; None if the renderer is a black box.
+        model_bytes: Bytes of their parameters as float32; None likewise.
+    """
+
+    per_image: tuple[ViewScore, ...]
+    lpips_net: str | None = None
+    lpips_reason: str = NOT_ASKED
+    num_gaussians: int | None = None
+    model_bytes: int | None = None
+
+    @property
+    def psnr(self) -> float:
+        """Mean of the images' PSNR in dB, not the PSNR of the mean error."""
+        return _mean(score.psnr for score in self.per_image)
+
+    @property
+    def ssim(self) -> float:
+        """Mean SSIM."""
+        return _mean(score.ssim for score in self.per_image)
+
+    @property
+    def lpips(self) -> float | None:
+        """Mean LPIPS; None where it was not measured."""
+        return _mean_known(score.lpips for score in self.per_image)
+
+    @property
+    def covisible_psnr(self) -> float | None:
+        """Mean over the images with such pixels; None if there are none, or it was not measured."""
+        return _mean_known(score.covisible_psnr for score in self.per_image)
+
+    @property
+    def covisible_share(self) -> float | None:
+        """Mean share of the pixels that at least two training views see; None if not known."""
+        return _mean_known(score.covisible_share for score in self.per_image)
+
+    @property
+    def render_seconds(self) -> float:
+        """Mean time to render a view."""
+        return _mean(score.seconds for score in self.per_image)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as plain values; infinity, which JSON lacks, becomes None."""
+        means = ("psnr", "ssim", "lpips", "covisible_psnr", "covisible_share", "render_seconds")
+        return {
+            **_finite({name: getattr(self, name) for name in means}),
+            **{key: value for key, value in asdict(self).items() if key != "per_image"},
+            "per_image": [_finite(asdict(score)) for score in self.per_image],
+        }
+
+    def to_json(self) -> str:
+        """The result as JSON text."""
+        return json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n"
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """The inverse of ``to_dict``; means are recomputed, and unknown keys ignored."""
+        views = ({**each, "psnr": _or_infinite(each["psnr"])} for each in values["per_image"])
+        own = {each.name: values[each.name] for each in fields(cls) if each.name in values}
+        return cls(**{**own, "per_image": tuple(ViewScore(**view) for view in views)})
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """Scores of the test views during training.
+
+    Args:
+        step: Steps done.
+        seconds: Seconds of training so far.
+        psnr: Mean PSNR in dB.
+        num_gaussians: Number of Gaussians.
+        ssim: Mean SSIM; None in results of versions that did not measure it.
+    """
+
+    step: int
+    seconds: float
+    psnr: float
+    num_gaussians: int
+    ssim: float | None = None
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The result of a training run.
+
+    Args:
+        scores: Scores of the test views at the end.
+        curve: Scores of the test views during training, in order of steps.
+        steps: Steps done.
+        train_seconds: Wall time of the training steps, and of finding the depth that growth needs.
+        num_seeds: Points that training began with.
+        held_by_memory_at: Gaussians at which a lack of memory ended growth; None if it did not.
+    """
+
+    scores: EvalResult
+    curve: tuple[CurvePoint, ...]
+    steps: int
+    train_seconds: float
+    num_seeds: int
+    held_by_memory_at: int | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``metrics.json``: the scores' values and the others side by side."""
+        others = {key: getattr(self, key) for key in ("steps", "train_seconds", "num_seeds")}
+        tests = [_finite(asdict(point)) for point in self.curve]
+        held = {"held_by_memory_at": self.held_by_memory_at}
+        return {**self.scores.to_dict(), **others, **held, "tests": tests}
+
+
+def _or_infinite(psnr: float | None) -> float:
+    return math.inf if psnr is None else psnr
+
+
+def _mean(values: Iterable[float] | Sequence[float]) -> float:
+    listed = list(values)
+    return math.fsum(listed) / len(listed) if all(map(math.isfinite, listed)) else sum(listed)
+
+
+def _mean_known(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return _mean(known) if known else None
+
+
+def _finite(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in values.items()
+    }

@@ -1,0 +1,223 @@
+"""One run: its seeds, its result, its folder; runs that fail, die, or are elsewhere."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import tempfile
+
+import numpy as np
+import pytest
+from PIL import Image as PilImage
+
+pytest.importorskip("torch", reason="training needs PyTorch")
+pytest.importorskip("gsplat", reason="training needs gsplat's strategies")
+
+from splatseed.bench import job
+from splatseed.bench.job import (
+    JobOptions,
+    do_runs,
+    make_seeds,
+    open_unchanged,
+    run_away,
+    run_job,
+)
+from splatseed.bench.plan import plan_runs
+from splatseed.bench.runs import package_version, read_run, read_runs, run_folder
+from splatseed.bench.scenes import survey
+from splatseed.cli import main
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene, write_scene
+from splatseed.io.ply import write_ply
+from splatseed.process.tasks import HereTasks, ProcessTasks
+from splatseed.splat.covisible import read_covisible
+from splatseed.synthetic import make_capture
+from splatseed.train.seeds import seeds_digest
+
+
+@pytest.fixture
+def specs(small_plan, room_path):
+    """By method."""
+    plan = dataclasses.replace(
+        small_plan,
+        methods=("sfm", "linear", "depth"),
+        repeats=1,
+        training=dataclasses.replace(small_plan.training, max_steps=4),
+    )
+    facts = survey(room_path, "room", with_depth=True)
+    runs = plan_runs(plan, [facts], "cpu", package_version("splatseed"))
+    return {run.arm.method: run for run in runs}
+
+
+def test_a_result_says_what_was_measured_and_a_little_is_kept(specs, tmp_path):
+    spec = specs["linear"]
+    result = run_job(spec, tmp_path, JobOptions())
+    kept = run_folder(tmp_path, spec)
+    metrics = json.loads((kept / "metrics.json").read_text())
+    assert result.psnr == metrics["psnr"]
+    assert result.psnr == pytest.approx(np.mean([each.psnr for each in result.scores.per_image]))
+    assert [point.step for point in result.curve] == [1, 2, 3, 4]
+    assert result.num_seeds == 2 * len(load_scene(spec.scene_path).points)
+    assert result.scores.model_bytes == 4 * (3 + 3 + 4 + 1 + 3) * result.num_gaussians
+    assert 0 < result.upsample_seconds < result.wall_seconds
+    assert result.peak_bytes > 50e6
+    assert read_run(tmp_path, spec).result == result
+    pictures = sorted((kept / "renders").iterdir())
+    assert [PilImage.open(path).size for path in pictures] == [(3 * 64 + 8, 48)] * 3
+    names = {path.name for path in kept.iterdir()}
+    assert names == {"metrics.json", "config.json", "curve.csv", "result.json", "renders",
+                     "splatseed.json"}  # fmt: skip
+    seen = read_covisible(next((tmp_path / "covisible").iterdir()))
+    assert set(seen) == {view.name for view in result.scores.per_image}
+    assert 0.3 < result.scores.covisible_share <= 1
+    run_job(spec, tmp_path, JobOptions(keep_models=True))
+    assert (kept / "point_cloud.ply").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("method", ["sfm", "linear", "depth"])
+def test_seeds_are_those_that_the_command_writes(specs, own_room, tmp_path, method):
+    """Also where the cloud has points that are not finite, or twice at one place."""
+    scene = load_scene(own_room)
+    xyz = scene.points.xyz.copy()
+    xyz[3], xyz[5] = np.nan, xyz[6]
+    spoilt = tmp_path / "spoilt"
+    write_scene(scene, spoilt)
+    for path in (spoilt / "sparse" / "0").glob("points3D.*"):
+        path.unlink()
+    write_ply(spoilt / "sparse" / "0" / "points3D.ply", scene.points.replace(xyz=xyz))
+    digest = survey(spoilt, "room").digest
+    spec = dataclasses.replace(specs[method], scene_path=str(spoilt), scene_digest=digest)
+    seeds, seconds = make_seeds(open_unchanged([spec]), spec)
+    ratio = "1" if method == "sfm" else "2"
+    words = ["--method", "linear"] if method == "sfm" else ["--method", method]
+    words += ["--depth", str(spec.depth_path), "--depth.hold-out", "4"] * (method == "depth")
+    main(["upsample", str(spoilt), "-o", str(tmp_path / "out"), "--ratio", ratio, *words])
+    written = load_scene(tmp_path / "out").points
+    assert seeds_digest(seeds) == seeds_digest(written)
+    assert len(seeds) == int(ratio) * (len(xyz) - 2)
+    assert (seconds == 0.0) == (method == "sfm")
+
+
+@pytest.mark.parametrize("method", ["cloud", "cloud+cover"])
+def test_seeds_from_a_scan_are_those_that_the_command_writes(
+    small_plan, room_path, tmp_path, method
+):
+    scan, out = tmp_path / "scan.npz", tmp_path / "out"
+    surfaces = make_capture(0, 3, 32, 32).surfaces
+    np.savez(scan, xyz=surfaces.sample(20_000, np.random.default_rng(2)))
+    plan = dataclasses.replace(small_plan, methods=(method,), repeats=1)
+    (spec,) = plan_runs(plan, [survey(room_path, "room", cloud=scan)], "cpu", "1")
+    first, seconds = make_seeds(open_unchanged([spec]), spec, bench=tmp_path)
+    again, known = make_seeds(open_unchanged([spec]), spec, bench=tmp_path)
+    assert seeds_digest(first) == seeds_digest(again)
+    assert min(seconds, known) > 0
+    words = ["--method", method.removeprefix("cloud+"), "--cloud.hold-out", "4"]
+    words += ["--cover.hold-out", "4"] * (method != "cloud")
+    main(["upsample", str(room_path), "--cloud", str(scan), "-o", str(out), *words])
+    written = load_scene(out).points
+    np.testing.assert_array_equal(first.xyz, written.xyz)
+    np.testing.assert_array_equal(first.rgb, written.rgb)
+
+
+def _budgeted(small_plan, room_path, method, budget, strategy="none"):
+    plan = dataclasses.replace(
+        small_plan, methods=(method,), ratios=(), budgets=(budget,), repeats=1,
+        strategies=(strategy,),
+    )  # fmt: skip
+    (spec,) = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
+    return spec
+
+
+def test_seeds_are_thinned_to_the_budget_or_fill_it(small_plan, room_path):
+    for method, budget, strategy, number in (
+        ("sfm", 60, "none", 60), ("linear", 60, "none", 60), ("auto", 60, "none", 60),
+        ("linear", 9000, "default", 6300),  # what default begins with, of 9,000
+    ):  # fmt: skip
+        spec = _budgeted(small_plan, room_path, method, budget, strategy)
+        seeds, _ = make_seeds(open_unchanged([spec]), spec)
+        assert len(seeds) == spec.most_seeds == number
+
+
+def test_points_of_photographs_are_made_once_for_all_budgets(
+    small_plan, room_path, tmp_path, monkeypatch
+):
+    """And are those that a run without the kept ones begins with."""
+    spec = _budgeted(small_plan, room_path, "auto", 3000)
+    scene = open_unchanged([spec])
+    plain, _ = make_seeds(scene, spec)
+    first, seconds = make_seeds(scene, spec, bench=tmp_path)
+    assert seeds_digest(first) == seeds_digest(plain)
+    monkeypatch.setattr(job, "upsample", lambda *_, **__: pytest.fail("made again"))
+    again, later = make_seeds(scene, spec, bench=tmp_path)
+    assert seeds_digest(again) == seeds_digest(plain)
+    assert later > 0.3 * seconds
+
+
+def test_a_scene_that_has_changed_fails_its_run_alone_and_is_recorded(specs, own_room, tmp_path):
+    broken = dataclasses.replace(specs["sfm"], scene_path=str(own_room))
+    photograph = next((own_room / "images").iterdir())
+    photograph.write_bytes(photograph.read_bytes() + b"\0")
+    todo = [broken, specs["linear"]]
+    failed, done = do_runs(tmp_path, todo, HereTasks(), JobOptions())
+    assert "as they were when the benchmark was planned" in failed.error
+    assert "\n" not in failed.error
+    assert done.result is not None
+    assert read_run(tmp_path, broken) == failed
+    error = json.loads((run_folder(tmp_path, broken) / "error.json").read_text())
+    assert "open_unchanged" in error["traceback"]
+    (done,) = do_runs(tmp_path, [specs["sfm"]], HereTasks(), JobOptions())
+    assert read_run(tmp_path, broken).result == done.result  # which takes the error's place
+    with pytest.raises(SceneNotFoundError):
+        read_runs(tmp_path)  # never begun by a command
+
+
+def test_files_of_the_users_are_left_alone(specs, tmp_path):
+    mine = run_folder(tmp_path, specs["sfm"]) / "thesis.txt"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("keep")
+    (failed,) = do_runs(tmp_path, [specs["sfm"]], HereTasks(), JobOptions())
+    assert mine.parent.name in failed.error
+    assert [path.name for path in mine.parent.iterdir()] == ["thesis.txt"]
+
+
+def test_leftovers_of_a_killed_attempt_go(specs, tmp_path):
+    target = run_folder(tmp_path, specs["sfm"])
+    left = target.with_name(f".{target.name}.partial-0123abcd")
+    left.mkdir(parents=True)
+    (left / "half").write_text("half")
+    os.utime(left, (0, 0))
+    run_job(specs["sfm"], tmp_path, JobOptions())
+    assert [path.name for path in target.parent.iterdir()] == [target.name]
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_fails_its_run_alone(specs, tmp_path, monkeypatch):
+    """In its own process each; the folder of one run tells it to kill itself."""
+    monkeypatch.setattr(job, "run_job", _killed)
+    tasks = ProcessTasks([{}], fresh=True)
+    runs = list(do_runs(tmp_path, [specs["sfm"], specs["linear"]], tasks, JobOptions()))
+    assert sorted(run.spec.arm.method for run in runs) == ["linear", "sfm"]
+    assert all("SIGKILL" in run.error for run in runs)
+
+
+def _killed(*_, **__):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_run_elsewhere_comes_back_as_files_and_leaves_nothing(specs, tmp_path, monkeypatch):
+    nodes = tmp_path / "nodes"
+    nodes.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(nodes))
+    (run,) = do_runs(tmp_path, [specs["sfm"]], HereTasks(), JobOptions(), away=True)
+    assert read_run(tmp_path, specs["sfm"]) == run
+    assert list(nodes.iterdir()) == []
+    assert len(list((run_folder(tmp_path, specs["sfm"]) / "renders").iterdir())) == 3
+    far = dataclasses.replace(specs["sfm"], scene_path="elsewhere/room")
+    with pytest.raises(SceneNotFoundError, match="elsewhere/room"):
+        run_away(far, JobOptions())
+    with pytest.raises(ParameterError, match=r"0\.0\.1"):
+        run_away(dataclasses.replace(specs["sfm"], version="0.0.1"), JobOptions())
+    with pytest.raises(SceneFormatError):
+        run_away(dataclasses.replace(specs["sfm"], scene_digest="x"), JobOptions())

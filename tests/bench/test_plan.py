@@ -1,0 +1,361 @@
+"""Plans: what is in them, what files say, which runs they are, and when two runs are the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+import tomllib
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from splatseed.bench.plan import (
+    DEMO,
+    SFM,
+    SHARED,
+    Arm,
+    Plan,
+    PlannedScene,
+    RunResult,
+    RunSpec,
+    plan_runs,
+    rule_of_thumb,
+)
+from splatseed.bench.plan_file import KINDS, _laptop, plan_text, preset_plan, read_plan
+from splatseed.bench.scenes import SceneFacts, survey
+from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene, write_scene
+from splatseed.scores import CurvePoint, EvalResult, ViewScore
+from splatseed.train.settings import StrategyName, TrainSettings
+
+TEXTS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20)
+RATIOS = st.floats(1, 1e6, exclude_min=True)
+
+
+def _written(plan, tmp_path):
+    path = tmp_path / "plan.toml"
+    path.write_text(plan_text(plan), "utf-8")
+    return read_plan(path)
+
+
+def _some(strategy):
+    return st.lists(strategy, min_size=1, max_size=3, unique=True).map(tuple)
+
+
+PLANS = st.builds(
+    Plan,
+    methods=_some(st.sampled_from(["sfm", "linear", "mls", "depth", "cloud+auto"])),
+    ratios=_some(RATIOS),
+    strategies=_some(st.sampled_from(get_args(StrategyName))),
+    profiles=_some(st.sampled_from(["default", "paper"])),
+    repeats=st.integers(1, 9),
+    training=st.builds(
+        TrainSettings,
+        cap_max=st.none() | st.integers(2, 10**9),
+        seed_sizes=st.booleans(),
+        backend=st.sampled_from(["auto", "cpu"]),
+    ),
+    lpips=st.booleans(),
+    scenes=st.lists(
+        st.builds(
+            PlannedScene,
+            path=TEXTS.map(lambda text: f"/{text}"),
+            name=TEXTS,
+            images=st.just("") | TEXTS,
+            depth=st.just("") | TEXTS.map(lambda text: f"/{text}"),
+            cloud=st.just("") | TEXTS.map(lambda text: f"/{text}"),
+        ),
+        max_size=3,
+        unique_by=lambda scene: scene.name,
+    ).map(tuple),
+    parameters=st.just({}) | st.just({"mls": {"k": 12}, "depth": {"align": False}}),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(PLANS)
+def test_a_plan_survives_its_file(tmp_path_factory, plan):
+    again = _written(plan, tmp_path_factory.mktemp("plan"))
+    assert dataclasses.replace(again, scenes=()) == dataclasses.replace(plan, scenes=())
+    for a, b in zip(again.scenes, plan.scenes, strict=True):
+        assert (a.name, a.images, bool(a.depth)) == (b.name, b.images, bool(b.depth))
+        assert (Path(a.path), Path(a.depth)) == (Path(b.path), Path(b.depth))
+        assert (bool(a.cloud), Path(a.cloud)) == (bool(b.cloud), Path(b.cloud))
+
+
+def test_a_file_has_a_key_for_each_field():
+    own = {each.name for each in dataclasses.fields(Plan)} - {"training"}
+    assert set(KINDS) == own | set(SHARED)
+    text = plan_text(Plan(training=TrainSettings(cap_max=5), long_side=400))
+    assert set(tomllib.loads(text)) == set(KINDS) - {"scenes", "parameters"}
+
+
+def test_paths_in_a_file_are_beside_it(tmp_path):
+    (tmp_path / "plan.toml").write_text(
+        '[[scenes]]\npath = "garden"\ndepth = "d"\n[[scenes]]\npath = "demo:"\n'
+    )
+    garden, demo = read_plan(tmp_path / "plan.toml").scenes
+    assert (garden.path, garden.depth) == (str(tmp_path / "garden"), str(tmp_path / "d"))
+    assert (garden.label, demo.label, demo.path) == ("garden", "demo", DEMO)
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("repeats = ", "TOML"),
+        ("reapeats = 3", "reapeats"),
+        ('repeats = "3"', "repeats"),
+        ("repeats = true", "repeats"),
+        ("repeats = 0", "repeats"),
+        ("ratios = [true]", "ratios"),
+        ("ratios = [0.5]", "ratios"),
+        ("ratios = []", "ratios"),
+        ("ratios = [4, 4.0]", "ratios"),
+        ('methods = ["sfm", "magic"]', "magic"),
+        ('methods = "sfm"', "methods"),
+        ('strategies = ["mcmcm"]', "mcmcm"),
+        ('backend = "gpu"', "gpu"),
+        ("max_steps = 0", "max-steps"),
+        ("scenes = [1]", "scenes"),
+        ("[[scenes]]\nname = 'x'", "path"),
+        ("[[scenes]]\npath = 'x'\nfolder = 'y'", "scenes.folder"),
+        ("[[scenes]]\npath = 'a/x'\n[[scenes]]\npath = 'b/x'", "x twice"),
+        ("[parameters.mls]\nneighbours = 3", "neighbours"),
+        ("[parameters.mls]\nk = -3", "mls.k"),
+        ("[parameters]\nmls = 3", "parameters.mls"),
+        ("[parameters.magic]\nk = 1", "magic"),
+    ],
+)
+def test_bad_files_are_refused_by_key(tmp_path, text, key):
+    (tmp_path / "plan.toml").write_text(text)
+    with pytest.raises(SceneFormatError, match=re.escape(key)) as error:
+        read_plan(tmp_path / "plan.toml")
+    assert "plan.toml" in str(error.value)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(SceneNotFoundError, match=r"none\.toml"):
+        read_plan(tmp_path / "none.toml")
+
+
+def test_arms_are_all_combinations_and_the_original_cloud_once():
+    plan = Plan(methods=("linear", "sfm", "random"), ratios=(4, 8), profiles=("default", "paper"))
+    assert [arm.label for arm in plan.arms("none")] == [
+        "sfm", "linear 4x", "linear 8x", "linear 4x (paper)", "linear 8x (paper)",
+        "random 4x", "random 8x",  # whose profiles are the same
+    ]  # fmt: skip
+    assert plan.arms("mcmc")[0] == Arm(SFM, "default", 1, "mcmc")
+
+
+def test_runs_repeat_only_when_all_have_been_run(small_plan, room_path):
+    plan = dataclasses.replace(small_plan, strategies=("none", "default"), repeats=3)
+    facts = survey(room_path, "room")
+    runs = plan_runs(plan, [facts, dataclasses.replace(facts, name="other")], "cpu", "1")
+    assert [run.repeat for run in runs] == [0] * 8 + [1] * 8 + [2] * 8
+    assert len({run.key for run in runs}) == 24
+    assert runs[0].arm.method == SFM
+    assert {run.settings.seed for run in runs} == {0, 1, 2}
+
+
+def test_depth_needs_maps_and_never_sees_the_test_photographs(small_plan, room_path, tmp_path):
+    plan = dataclasses.replace(small_plan, methods=("sfm", "depth"), repeats=1)
+    without = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
+    assert [run.arm.method for run in without] == [SFM]
+    facts = survey(room_path, "room", with_depth=True)
+    assert facts.depth_path == str(room_path)
+    _, depth = plan_runs(plan, [facts], "cpu", "1")
+    assert depth.parameters == {"hold_out": plan.training.test_every}
+    assert depth.depth_digest == facts.depth_digest
+    with pytest.raises(SceneNotFoundError, match="folder of depth maps"):
+        survey(room_path, "room", depth=tmp_path / "none", with_depth=True)
+
+
+def test_a_scan_is_part_of_what_its_methods_depend_on(small_plan, room_path, tmp_path):
+    methods = ("sfm", "cloud", "cloud+cover")
+    scan = tmp_path / "scan.xyz"
+    scan.write_text("1 2 3\n" * 9)
+    plan = dataclasses.replace(small_plan, methods=methods, repeats=1)
+    plain = plan_runs(plan, [survey(room_path, "room")], "cpu", "1")
+    assert [run.arm.method for run in plain] == [SFM]
+    facts = survey(room_path, "room", cloud=scan)
+    sfm, *others = runs = plan_runs(plan, [facts], "cpu", "1")
+    assert [run.arm.label for run in runs] == list(methods)
+    assert sfm.key == plain[0].key
+    assert {run.cloud_path for run in others} == {str(scan)}
+    every = plan.training.test_every
+    assert [run.parameters for run in others] == [
+        {"hold_out": every}, {"hold_out": every, "cloud.hold_out": every},
+    ]  # fmt: skip
+    scan.write_text("1 2 4\n" * 9)
+    changed = plan_runs(plan, [survey(room_path, "room", cloud=scan)], "cpu", "1")
+    assert [run.key == old.key for run, old in zip(changed, runs, strict=True)] == [
+        True,
+        False,
+        False,
+    ]
+    assert rule_of_thumb(others[0], facts, 2) > 0
+    (tmp_path / "scan.laz").write_bytes(b"no scan")
+    with pytest.raises(SceneFormatError, match=r"scan\.laz"):
+        survey(room_path, "room", cloud=tmp_path / "scan.laz")
+
+
+def test_a_stray_camera_is_named_before_anything_is_run(room_path, tmp_path):
+    scene = load_scene(room_path)
+    first, *others = scene.images
+    far = dataclasses.replace(first, translation=first.translation + np.array([0, 0, 1e4]))
+    write_scene(scene.replace(images=(far, *others)), tmp_path / "stray")
+    (said,) = survey(tmp_path / "stray", "stray").warnings
+    assert first.name in said
+    assert survey(room_path, "room").warnings == ()
+
+
+def test_a_scene_is_known_by_its_content(room_path, own_room):
+    before = survey(room_path, "room", with_depth=True)
+    copy = survey(own_room, "room", with_depth=True)
+    assert copy.path != before.path
+    assert (copy.digest, copy.depth_digest) == (before.digest, before.depth_digest)
+    photograph = next((own_room / "images").iterdir())
+    photograph.write_bytes(photograph.read_bytes() + b"\0")
+    assert survey(own_room, "room").digest != before.digest
+    depth = sorted((own_room / "depths").glob("*.png"))
+    depth[0].write_bytes(depth[1].read_bytes())
+    after = survey(own_room, "room", with_depth=True)
+    assert after.depth_digest != before.depth_digest
+
+
+def test_another_folder_of_photographs_can_be_named(own_room):
+    (own_room / "images").rename(own_room / "images_4")
+    (own_room / "images").mkdir()
+    facts = survey(own_room, "room", images="images_4")
+    assert facts.images == "images_4"
+    with pytest.raises(SceneNotFoundError, match="images_2"):
+        survey(own_room, "room", images="images_2")
+
+
+def test_what_would_fail_every_run_is_found_before(own_room):
+    missing = own_room / "images" / "view_003.png"
+    missing.unlink()
+    with pytest.raises(SceneNotFoundError, match=r"view_003\.png"):
+        survey(own_room, "room")
+    for each in (own_room / "sparse" / "0").iterdir():
+        if not each.name.startswith("points3D"):
+            each.unlink()
+    with pytest.raises(SceneNotFoundError, match="photographs in"):
+        survey(own_room, "room")
+
+
+def test_the_published_results_tell_of_the_laptop_preset():
+    told = (Path(__file__).parents[2] / "docs" / "results" / "README.md").read_text("utf-8")
+    plan = _laptop(Path())
+    assert "--preset laptop --data DIR" in told
+    assert plan.repeats == 2
+    assert f"{plan.training.max_steps:,} steps, twice" in told
+    assert f"at most {plan.long_side} pixels a side" in told
+    assert f"at most {plan.budgets[0].removesuffix('rho')} per pixel" in told
+
+
+FERN = SceneFacts("fern", "ab12", "ab12", 6000, 20, 800 * 600, 800)
+BONSAI = SceneFacts("bonsai", "cd34", "cd34", 110_000, 292, 800 * 533, 800)
+
+
+def test_a_budget_is_the_same_number_for_every_arm_of_a_scene():
+    plan = Plan(
+        methods=("sfm", "mls", "auto"), ratios=(), budgets=("0.25RHO", 20000.0),
+        strategies=("default", "grow"), repeats=1, long_side=400,
+    )  # fmt: skip
+    assert plan.budgets == ("0.25rho", "20000")
+    runs = plan_runs(plan, [FERN, BONSAI], "cpu", "1")
+    assert len(runs) == len({run.key for run in runs}) == 2 * 3 * 2 * 2
+    numbers = {(run.scene, run.arm.budget): run.settings.cap for run in runs}
+    assert numbers == {
+        ("fern", "0.25rho"): 30_000, ("fern", "20000"): 20_000,
+        ("bonsai", "0.25rho"): 26_600, ("bonsai", "20000"): 20_000,
+    }  # fmt: skip
+    assert {run.training.data_factor for run in runs} == {2}  # 533 rows become 266
+    seeds = {(r.arm.strategy, r.most_seeds) for r in runs if r.scene == "fern"}
+    assert seeds == {("default", 21_000), ("default", 14_000), ("grow", 30_000), ("grow", 20_000)}
+
+
+def test_presets_leave_out_scenes_that_are_not_there(tmp_path):
+    for name in ("fern", "fox", "bonsai"):
+        (tmp_path / name).mkdir()
+    plan, missing = preset_plan("laptop", tmp_path)
+    assert [scene.label for scene in plan.scenes] == ["fern", "fox", "bonsai"]
+    assert missing == ("treehill",)
+
+
+def test_budgets_are_told_as_everywhere_else():
+    assert Plan(ratios=(), budgets=("50k", "0.5M", " 1 rho")).budgets == ("50000", "500000", "1rho")
+    with pytest.raises(ParameterError, match=r"Did you mean 0\.25rho\?"):
+        Plan(budgets=("0.25",))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"budgets": ("many",)}, {"budgets": ("-1rho",)}, {"budgets": (0.5,)}, {"budgets": (1,)},
+     {"ratios": ()}, {"budgets": (100, "100")}, {"long_side": 3},
+     {"budgets": (100,), "training": TrainSettings(cap_max=9)},
+     {"long_side": 400, "training": TrainSettings(data_factor=2)}],
+)  # fmt: skip
+def test_budgets_out_of_range_are_refused(wrong):
+    with pytest.raises(ParameterError):
+        Plan(**wrong)
+
+
+ARM = Arm("mls", "default", 8, "none")
+SPEC = RunSpec(
+    "room", "ab12", ARM, repeat=0, training=TrainSettings(max_steps=100, backend="cpu"),
+    parameters={"k": 12}, version="1",
+)  # fmt: skip
+
+
+def test_specs_and_results_survive_json():
+    assert RunSpec.from_dict(json.loads(json.dumps(SPEC.to_dict()))) == SPEC
+    views = (ViewScore("a.png", math.inf, 0.8, None, 0.01, 22.0, 0.9),)
+    scores = EvalResult(views, num_gaussians=8, model_bytes=1888)
+    result = RunResult(scores, (CurvePoint(5, 0.1, 20.0, 7, 0.7),), 7, 0.2, 1.5, 10**9, "CPU")
+    assert RunResult.from_dict(json.loads(json.dumps(result.to_dict()))) == result
+
+
+def test_where_a_scene_lies_and_how_a_ratio_is_written_are_no_part_of_the_key():
+    there = {"scene_path": "/a", "depth_path": "/b", "images": "images_4", "cloud_path": "/c"}
+    assert dataclasses.replace(SPEC, **there).key == SPEC.key
+    assert dataclasses.replace(SPEC, arm=Arm("mls", "default", 8.0, "none")).key == SPEC.key
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"scene": "x"}, {"scene_digest": "x"}, {"repeat": 1}, {"version": "2"},
+     {"parameters": {"k": 13}}, {"depth_digest": "x"}, {"cloud_digest": "x"},
+     {"arm": Arm("mls", "default", 4, "none")}, {"arm": Arm("mls", "paper", 8, "none")},
+     {"arm": Arm("mls", "default", 8, "mcmc")}, {"arm": Arm("linear", "default", 8, "none")},
+     *({"training": dataclasses.replace(SPEC.training, **each)} for each in (
+         {"max_steps": 101}, {"data_factor": 2}, {"test_every": 4}, {"cap_max": 9},
+         {"sh_degree": 0}, {"backend": "cuda"}, {"seed_sizes": True},
+     ))],
+)  # fmt: skip
+def test_all_else_is(change):
+    assert dataclasses.replace(SPEC, **change).key != SPEC.key
+
+
+def test_more_work_takes_longer_by_the_rule_of_thumb():
+    facts = SceneFacts("room", "", "ab12", 10_000, 80, 800 * 600, 800)
+
+    def seconds(threads=2, arm=ARM, **changes):
+        training = dataclasses.replace(SPEC.training, **changes)
+        spec = dataclasses.replace(SPEC, training=training, arm=arm)
+        return rule_of_thumb(spec, facts, threads)
+
+    sfm = Arm(SFM, "default", 1, "none")
+    for less in ({"max_steps": 50}, {"data_factor": 2}, {"arm": sfm}, {"threads": 8},
+                 {"cap_max": 9}):  # fmt: skip
+        assert seconds(**less) < seconds()
+    assert seconds(arm=Arm("mls", "default", 8, "default")) > seconds()
+    assert seconds(arm=Arm("stereo", "default", 0, "none")) > seconds(
+        arm=Arm("mls", "default", 3, "none")
+    )

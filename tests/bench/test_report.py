@@ -1,0 +1,419 @@
+"""Reports of benchmarks whole, partial, failed and empty; figures; and the page in a browser."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from html.parser import HTMLParser
+from io import BytesIO
+
+import numpy as np
+import pytest
+from PIL import Image
+
+pytest.importorskip("pandas", reason="reports need pandas")
+
+from splatseed.bench import pictures as pictures_module
+from splatseed.bench.comparisons import gains
+from splatseed.bench.figures import (
+    arm_figure,
+    curve_figure,
+    ratio_figure,
+    scene_figure,
+    seconds_figure,
+    shown_seeds,
+)
+from splatseed.bench.pictures import compared_views, safe_name
+from splatseed.bench.plan import SFM
+from splatseed.bench.report import REPORT, summary, write_report
+from splatseed.bench.runs import Run, read_runs, run_folder
+from splatseed.bench.scenes import scene_digest
+from splatseed.bench.study import studies
+from splatseed.cli import main
+from splatseed.errors import OutputError, SceneFormatError, SceneNotFoundError
+from splatseed.io import load_scene
+from splatseed.splat.pictures import beside_photograph, write_picture
+from splatseed.synthetic import make_capture, write_capture
+
+from .browser import CHROMIUM, chromium
+from .planted import GAINS, result, runs, spec, write_bench
+
+GONE = {"scene_path": "gone"}
+
+
+class Outline(HTMLParser):
+    """Tags that are opened and not closed, ids, and addresses."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.ids, self.addresses, self.words = [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        told = dict(attrs)
+        self.ids += [told["id"]] if "id" in told else []
+        self.addresses += [told[name] for name in ("src", "href") if name in told]
+        if tag not in {"meta", "img", "input", "br", "link"}:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data)
+
+
+def outline(bench):
+    page = Outline((bench / REPORT).read_text("utf-8"))
+    assert not page.open
+    assert len(set(page.ids)) == len(page.ids)
+    assert all(each.startswith(("data:", "#")) for each in page.addresses)
+    assert {each[1:] for each in page.addresses if each[0] == "#"} <= set(page.ids)
+    return page
+
+
+def text_of(bench):
+    return " ".join(" ".join(outline(bench).words).split())
+
+
+def test_a_whole_benchmark(tmp_path):
+    strategies = ("default", "none", "default-3dgs")
+    bench = write_bench(tmp_path / "b", runs(strategies=strategies, **GONE))
+    report = write_report(bench)
+    ids = {"summary", "scores", "gains", "convergence_none", "cost", "guidelines", "setup"}
+    assert ids <= set(outline(bench).ids)
+    names = {path.name for path in (bench / "tables").iterdir()}
+    assert {f"{name}.{kind}" for name in ("table1_none", "table2_default", "table3_none",
+            "gains_none", "mean_gains", "convergence_default", "gain_by_strategy", "arms",
+            "equal_count", "winners_none", "gains_default-3dgs")
+            for kind in ("csv", "md", "tex", "html")} <= names  # fmt: skip
+    figures = {path.name for path in (bench / "figures").iterdir()}
+    assert {"psnr_steps_none.png", "psnr_seconds_default.png", "gain_by_scene_none.png",
+            "gain_by_ratio.png", "gain_arms.png", "psnr_seconds_arms.png"} <= figures  # fmt: skip
+    assert (report.tables * 4, report.figures) == (len(names) - 1, len(figures) - 1)
+    said = " ".join(report.summary)
+    assert "mls 8x most (+0.50 dB, ± 0.01 by the repeats of all variants)" in said
+    assert "comes out best" in said
+    said = text_of(bench)
+    assert "At equal cost" not in said  # nobody asked for it
+    assert "The arms end with 5,000 to 14,142 Gaussians" in said
+    assert "splatseed bench --scenes '<A>' 'b c'" in said
+
+
+def test_a_partial_benchmark_says_what_is_missing(tmp_path):
+    planned = [Run(each.spec) if i % 5 == 2 else each for i, each in enumerate(runs(**GONE))]
+    planned[0] = Run(planned[0].spec, error="expected a <b>cat</b>; found a dog")
+    report = write_report(write_bench(tmp_path / "b", planned))
+    assert "60 runs, 47 done, 1 failed, 12 to do" in report.notes[0]
+    said = text_of(tmp_path / "b")
+    assert "Failed runs: 1" in said
+    assert "expected a <b>cat</b>; found a dog" in said  # as text: tags were escaped
+    assert "Runs still missing: 12" in said
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        {"repeats": 1},
+        {"scenes": ("fox",)},
+        {"scenes": ("fox",), "repeats": 1},
+        {"gains": {(SFM, 1): 0.0}},
+        {"gains": {("mls", 8): 0.1}},
+        {"gains": {(SFM, 1): 0.0, ("mls", 8): 0.0}, "noise": 0.0},
+    ],
+)
+def test_little_is_enough(tmp_path, planted):
+    write_report(write_bench(tmp_path / "b", runs(**planted, **GONE)))
+    assert "1,000 steps" in text_of(tmp_path / "b")
+
+
+def test_an_empty_benchmark(tmp_path):
+    report = write_report(write_bench(tmp_path / "b", []))
+    assert report.summary == ("No run is done yet.",)
+    assert "0 runs" in text_of(tmp_path / "b")
+
+
+def test_infinite_and_curveless_runs(tmp_path):
+    odd = [Run(spec("fox", "mls", 8, repeat=7, **GONE), result(math.inf)),
+           Run(spec("fox", SFM, 1, repeat=8, **GONE), result(25.0, curve=()))]  # fmt: skip
+    write_report(write_bench(tmp_path / "b", [*runs(**GONE), *odd]))
+    assert "fox, mls 8x, none, 7" in text_of(tmp_path / "b")
+
+
+def test_sets_of_runs_have_their_own_files_and_links(tmp_path):
+    more = runs(max_steps=2000, scenes=("fox",), **GONE)
+    bench = write_bench(tmp_path / "b", [*runs(**GONE), *more])
+    said = write_report(bench).summary
+    first, second = (each for each in said if each.startswith("Set "))
+    assert (said[0], second.startswith("Set 2: 2,000 steps")) == (first, True)
+    assert "set2_gains" in outline(bench).ids
+    assert (bench / "tables" / "set2_gains_none.csv").is_file()
+    assert "Set 2: 2,000 steps" in text_of(bench)
+
+
+def test_one_run_each_claims_nothing():
+    (study,) = studies(runs(repeats=1))
+    said = " ".join(summary(study, "none"))
+    assert "no gain can be claimed" in said
+    assert "better" not in said
+
+
+def test_the_answer_is_no_where_there_is_no_gain():
+    null = dict.fromkeys(GAINS, 0.0)
+    answers = [summary(studies(runs(gains=null, seed=s))[0], "none")[0] for s in range(8)]
+    assert sum("no gain beyond noise was found among 4 variants" in each for each in answers) >= 7
+
+
+def test_losses_are_told():
+    (study,) = studies(runs())
+    assert "Beyond noise, random 8x loses." in summary(study, "none")[0]
+
+
+def test_an_earlier_report_is_replaced_and_others_files_are_not(tmp_path):
+    bench = write_bench(tmp_path / "b", runs(scenes=("fox",), repeats=2, **GONE))
+    write_report(bench)
+    first = (bench / REPORT).read_bytes()
+    write_report(bench)
+    assert (bench / REPORT).read_bytes() == first
+    (bench / "tables" / "mine.txt").write_text("mine", "utf-8")
+    with pytest.raises(OutputError, match=r"mine\.txt"):
+        write_report(bench)
+    assert (bench / "tables" / "mine.txt").read_text("utf-8") == "mine"
+
+
+def test_bad_folders_are_one_error(tmp_path, capsys):
+    with pytest.raises(SceneNotFoundError, match="a benchmark at"):
+        write_report(tmp_path)
+    bench = write_bench(tmp_path / "b", runs(scenes=("fox",), repeats=1))
+    run_file = next(bench.glob("runs/*/result.json"))
+    run_file.write_text("{}")
+    with pytest.raises(SceneFormatError, match=r"result\.json"):
+        write_report(bench)
+    with pytest.raises(SystemExit) as stop:
+        main(["bench", "report", str(tmp_path / "nowhere")])
+    assert stop.value.code == 2
+    assert "nowhere" in capsys.readouterr().err
+
+
+def test_the_commands_say_what_they_found(tmp_path, capsys):
+    bench = write_bench(tmp_path / "b", runs(scenes=("fox",), **GONE))
+    main(["bench", "report", str(bench)])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "1 scene: yes, 3 of 4 variants gain more than noise" in said
+    assert "over repeats and 95% interval for this scene trained again" in text_of(bench)
+    assert str(bench / REPORT) in said
+    better = {**GAINS, ("mls", 8): 0.8}
+    other = write_bench(tmp_path / "c", runs(scenes=("fox", "fern"), gains=better, seed=1))
+    words = ["bench", "compare", str(bench), str(other), "-o", str(tmp_path / "out")]
+    main(words)
+    said = capsys.readouterr().out
+    for expected in ("Changes from A to B", "All settings are the same", "What only one"):
+        assert expected in said
+    assert (tmp_path / "out" / "changes.csv").is_file()
+    for wrong in (words, [*words[:3], str(write_bench(tmp_path / "d", []))]):
+        with pytest.raises(SystemExit) as stop:
+            main(wrong)
+        assert stop.value.code == 2
+
+
+def count_of(plot, color):
+    """How many pixels of a figure have a colour."""
+    pixels = np.asarray(Image.open(BytesIO(plot.png)).convert("RGB")).astype(int)
+    return int((np.abs(pixels - np.array(color)).max(axis=2) < 12).sum())
+
+
+@pytest.mark.parametrize("draw", [
+    lambda s: curve_figure(s, "none", "steps"), lambda s: curve_figure(s, "none", "seconds"),
+    lambda s: scene_figure(s, "none"), ratio_figure, arm_figure, seconds_figure,
+])  # fmt: skip
+def test_what_is_there_is_drawn(draw):
+    some = {(SFM, 1): 0.0, ("linear", 4): 0.1, ("linear", 8): 0.1}
+    for gains_, drawn in (({**some, ("mls", 8): 0.4}, True), (some, False)):
+        planned = runs(scenes=("fox",), gains=gains_, strategies=("default", "none"))
+        (study,) = studies(planned)
+        assert (count_of(draw(study), (0xD5, 0x5E, 0x00)) > 20) == drawn  # the colour of mls
+
+
+def test_there_is_no_figure_of_nothing():
+    (alone,) = studies(runs(gains={(SFM, 1): 0.0}))
+    assert scene_figure(alone, "none") is None
+    assert arm_figure(alone) is None
+    assert ratio_figure(studies(runs(gains={(SFM, 1): 0.0, ("mls", 8): 0.1}))[0]) is None
+    bare = [dataclasses.replace(r, result=dataclasses.replace(r.result, curve=())) for r in runs()]
+    assert curve_figure(studies(bare)[0], "none", "steps") is None
+
+
+def test_of_many_variants_the_highest_ratios_are_shown():
+    many = {(m, r): 0.1 for m in ("linear", "mls", "spline") for r in (2, 4, 8)}
+    (study,) = studies(runs(scenes=("fox",), gains={(SFM, 1): 0.0, **many}, repeats=1))
+    assert shown_seeds(study, study.seeded) == ("linear 8x", "spline 8x", "mls 8x")
+    assert shown_seeds(study, study.seeded[:8]) == study.seeded[:8]
+
+
+def test_curves_of_unlike_tests_meet_where_both_were_taken():
+    planned = runs(scenes=("fox",), repeats=2)
+    shorter = dataclasses.replace(planned[0].result, curve=planned[0].result.curve[::2])
+    planned[0] = dataclasses.replace(planned[0], result=shorter)
+    assert curve_figure(studies(planned)[0], "none", "steps") is not None
+
+
+CAPTURE = {"gains": {(SFM, 1): 0.0, ("linear", 2): 0.2, ("mls", 3): 0.5}, "repeats": 2}
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """A made-up scene in files, with its fingerprint."""
+    made = make_capture(num_views=4, width=64, height=48)
+    path = write_capture(made, tmp_path_factory.mktemp("scenes") / "room")
+    scene = load_scene(path)
+    return path, scene_digest(scene, scene.source.image_dir)
+
+
+def with_capture(bench, capture, **changes):
+    """A benchmark of runs on the capture, with the pictures that runs keep."""
+    path, digest = capture
+    finished = [
+        dataclasses.replace(
+            run, spec=dataclasses.replace(run.spec, scene_digest=digest, scene_path=str(path))
+        )
+        for run in runs(scenes=("room",), **{**CAPTURE, **changes})
+    ]
+    rng = np.random.default_rng(0)
+    truth = rng.integers(0, 255, (30, 40, 3), np.uint8)
+    for run in finished:
+        folder = run_folder(bench, run.spec) / "renders"
+        folder.mkdir(parents=True)
+        for name in ("view0.png", "view1.png"):
+            noise = 40 * rng.standard_normal(truth.shape)
+            render = np.clip(truth + noise, 0, 255).astype(np.float32) / 255
+            write_picture(folder / name, beside_photograph(truth, render))
+    return write_bench(bench, finished)
+
+
+@pytest.mark.parametrize(
+    ("gain", "told"), [(0.0, "level with sfm (+0.00 dB"), (-0.1, "though it loses (-0.10 dB")]
+)
+def test_only_seeds_that_gain_are_called_the_best(gain, told, tmp_path, capture):
+    gains = {(SFM, 1): 0.0, ("mls", 3): gain}
+    bench = with_capture(tmp_path / "b", capture, gains=gains, noise=0.0)
+    write_report(bench)
+    assert f"mls 3x, the best of the others on this scene, {told}" in text_of(bench)
+
+
+def test_seeds_and_views_are_shown(tmp_path, capture):
+    bench = with_capture(tmp_path / "b", capture)
+    report = write_report(bench)
+    assert not report.notes
+    assert len(list((bench / "figures").glob("clouds_room_*.png"))) == 1
+    assert safe_name("../a b") == ".._a_b"
+    said = text_of(bench)
+    assert "room: what training begins with." in said
+    assert "test view view0: mls 3x, the best on this scene (+" in said
+    assert "texture" in said
+    kept = json.loads((bench / "descriptors.json").read_text("utf-8"))
+    assert list(kept) == [capture[1]]
+
+
+def test_what_is_kept_is_not_made_again(tmp_path, capture, monkeypatch):
+    bench = with_capture(tmp_path / "b", capture)
+    write_report(bench)
+    first = (bench / REPORT).read_bytes()
+    monkeypatch.setattr(pictures_module, "open_unchanged", pytest.fail)
+    write_report(bench)
+    assert (bench / REPORT).read_bytes() == first
+
+
+def test_a_changed_scene_costs_its_pictures_alone(tmp_path, capture):
+    path, digest = capture
+    bench = with_capture(tmp_path / "b", (path, digest[::-1]))
+    report = write_report(bench)
+    assert "expected the files of" in report.notes[0]
+    assert "test view view0" in text_of(bench)
+
+
+def test_views_are_those_of_baseline_and_best(tmp_path, capture):
+    bench = with_capture(tmp_path / "b", capture)
+    (study,) = studies(read_runs(bench))
+    first, second = compared_views(study, "none", bench)
+    assert (first.name, second.name, first.best) == ("view0", "view1", "mls 3x")
+    assert first.gain == gains(study, "none").on_scene["room", first.best].mean
+    assert list(first.pictures) == ["sfm", "mls 3x", "photograph", "error of sfm",
+                                    "error of mls 3x"]  # fmt: skip
+    assert first.shape == pytest.approx(40 / 30)
+    for picture in bench.glob("runs/*/renders/view0.png"):
+        picture.write_bytes(b"damaged")
+    assert [each.name for each in compared_views(study, "none", bench)] == ["view1"]
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory, capture):
+    """A report in a browser."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed (Debian: apt-get install chromium)")
+    bench = with_capture(tmp_path_factory.mktemp("bench") / "b", capture)
+    write_report(bench)
+    with chromium(tmp_path_factory.mktemp("profile")) as page:
+        yield page, bench / REPORT
+
+
+@pytest.mark.parametrize(("width", "dark"), [(1200, False), (390, False), (320, True)])
+def test_the_page_opens_alone_and_fits(opened, width, dark):
+    page, path = opened
+    page.open(path, width, dark=dark)
+    assert [url for url in page.requests if not url.startswith("data:")] == [
+        path.resolve().as_uri()
+    ]
+    assert not page.errors
+    assert page.run("document.documentElement.scrollWidth") == width
+    assert page.run("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+    # No text runs out of its own block, except where the block scrolls.
+    wide = "[...document.querySelectorAll('h1,h2,h3,p,figcaption,summary')]"
+    assert page.run(f"{wide}.filter(e => e.scrollWidth > e.clientWidth + 1).length") == 0
+
+
+def test_the_slider_slides(opened):
+    page, path = opened
+    page.open(path, 1200)
+    at = "document.querySelector('.stage').style.getPropertyValue('--at')"
+    assert page.run(at) == "50%"
+    page.run("document.querySelector('.compare').scrollIntoView({behavior: 'instant'})")
+    frame = page.run(
+        "(r => [r.left, r.top, r.width, r.height])"
+        "(document.querySelector('.stage').getBoundingClientRect())"
+    )
+    left, top, width, height = frame
+    page.drag(left + 0.25 * width, top + 0.5 * height)
+    assert page.run(at) == "25%"
+    page.run(
+        "(r => { r.value = 80; r.dispatchEvent(new Event('input')); })"
+        "(document.querySelector('.compare input'))"
+    )
+    assert page.run(at) == "80%"
+
+
+def test_any_two_pictures_can_be_compared(opened):
+    page, path = opened
+    page.open(path, 1200)
+    shown = (
+        "['left', 'right'].map(c =>"
+        " document.querySelector('.stage').querySelector('.' + c)?.alt.split(',')[0])"
+    )
+    assert page.run(shown) == ["sfm", "mls 3x"]
+    choose = (
+        "(s => { s.selectedIndex = %d; s.dispatchEvent(new Event('change')); })"
+        "(document.querySelectorAll('.compare select')[%d])"
+    )
+    page.run(choose % (2, 0))
+    assert page.run(shown) == ["photograph", "mls 3x"]
+    page.run(choose % (2, 1))
+    assert page.run(shown) == [None, "photograph"]
+    page.run(choose % (3, 0))
+    assert page.run(shown) == ["error of sfm", "photograph"]
+
+
+def test_links_lead_to_sections(opened):
+    page, path = opened
+    page.open(path, 390)
+    page.run("document.querySelector('nav a[href=\"#cost\"]').click()")
+    assert page.run("location.hash") == "#cost"
