@@ -199,7 +199,7 @@ def test_it_names_the_winner_and_goes_on_where_it_was_stopped(
     assert "\n2 validation views" in out
     assert "splatseed train" in out
     assert "Stopped" not in out
-    assert "--cap-max 70 --max-steps 32" in out
+    assert "--budget 70 --max-steps 32" in out
     main(words)
     assert here["done"] == 8  # nothing is done twice
     with pytest.raises(SystemExit):
