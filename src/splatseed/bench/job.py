@@ -40,7 +40,7 @@ from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_json
 from splatseed.kernels.compilation import watched
 from splatseed.pointcloud import PointCloud
-from splatseed.process.peak import peak_bytes
+from splatseed.process.memory import peak_bytes
 from splatseed.process.tasks import Report, Tasks
 from splatseed.progress import Progress, silent
 from splatseed.scene import Scene
