@@ -47,21 +47,19 @@ PAUSED_POLL = 0.05
 ENDED = "The training has ended: look at the run with splatseed view."
 
 
-def free_port(host: str, port: int, option: str = "--port", of_host: str = "--host") -> int:
+def free_port(host: str, port: int) -> int:
     """A port that can be listened on: the one asked for, or any free port for 0.
 
     Args:
         host: The address to listen on.
         port: The port.
-        option: The option by which the user names the port.
-        of_host: The option by which the user names the host, or a word for a host that is given.
 
     Raises:
         ParameterError: The port is taken or out of range, or the host is not this machine's.
     """
     if not 0 <= port <= MOST_PORT:
         raise ParameterError(
-            f"{option} from 0 to {MOST_PORT}",
+            f"--port from 0 to {MOST_PORT}",
             found=f"{port}",
             fix="Pass another (0: any free one).",
         )
@@ -72,10 +70,9 @@ def free_port(host: str, port: int, option: str = "--port", of_host: str = "--ho
             return int(probe.getsockname()[1])
     except OSError as error:
         raise ParameterError(
-            f"to listen on {of_host} {host}, {option} {port}",
+            f"to listen on --host {host}, --port {port}",
             found=error.strerror or str(error),
-            fix=f"Pass another {option} (0: any free one); "
-            f"{of_host} 127.0.0.1 is this machine alone.",
+            fix="Pass another --port (0: any free one); --host 127.0.0.1 is this machine alone.",
         ) from None
 
 
