@@ -46,7 +46,7 @@ def test_a_point_ahead_is_uncertain_along_the_rays():
     np.testing.assert_allclose(sensitivity[0], [[aside, 0], [0, aside], [0, 0]], atol=1e-6)
 
 
-def test_the_sway_is_what_triangulation_does():
+def test_the_sensitivity_is_what_triangulation_does():
     """Of a point aside, by turned cameras: the least squares of its pixels tell the same."""
     turned = tuple(
         dataclasses.replace(im, quat=np.array([1.0, 0.1 * i, -0.05 * i, 0.08 * i]))

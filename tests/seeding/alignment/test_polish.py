@@ -79,7 +79,7 @@ def test_the_stated_error_is_the_error(corner, rng, monkeypatch):
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.6
 
 
-def test_the_sway_is_how_the_alignment_follows_marks_that_sway(corner, rng):
+def test_the_sensitivity_is_how_the_alignment_follows_marks_that_move(corner, rng):
     xyz, _ = marks_on(corner, rng)
     spin = np.array([0.0, 0.0, 1.0])
     sensitivity = np.zeros((len(xyz), 3, 2))
