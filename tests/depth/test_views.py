@@ -84,13 +84,6 @@ def test_a_view_confirms_hides_or_looks_through(unit):
     np.testing.assert_array_equal(support.seen_through, THROUGH)
 
 
-def test_views_are_counted_up_to_the_number_asked_for():
-    copies = [reduced(c, wall(c)) for c in (camera_at(0.1 * i) for i in range(5))]
-    for needed in (1, 2, 4):
-        support = find_support(POINTS[:1], copies[0], copies[1:], Settings(min_agreeing=needed))
-        assert support.agreeing[0] == needed
-
-
 def test_a_view_of_another_color_confirms_nothing():
     camera = camera_at(0.0)
     own = reduced(camera, wall(camera))

@@ -169,9 +169,3 @@ def test_a_point_midway_to_its_neighbor_mixes_both_equally(wavy):
     expected = (wavy.rgb.astype(float) + wavy.rgb[distance.argmin(axis=1)]) / 2
     assert np.abs(rgb - expected).max() <= 1.0
     assert np.isfinite(xyz).all()
-
-
-def test_one_color_stays_that_color(wavy):
-    plain = wavy.replace(rgb=np.full_like(wavy.rgb, 255))
-    rgb, _ = colors_at(plain, lambda prepared, _: prepared.xyz + 0.01)
-    assert (rgb == 255).all()
