@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import inspect
 import json
 import re
 import shutil
@@ -168,26 +167,6 @@ def test_presets_leave_out_what_is_not_there(bench, own_room, tmp_path):
     assert "images_2" in err
 
 
-def test_captures_of_replica_are_left_out_with_what_they_lack(bench, own_room, tmp_path):
-    data = tmp_path / "replica"
-    shutil.copytree(own_room, data / "room0")
-    (data / "office1").mkdir()
-    words = ("--preset", "replica", "--data", data, "--dry-run", "--repeats", 1)
-    code, out, _ = bench(*words)
-    assert code == 0
-    assert "# office1 is left out: expected sparse/0, " in out
-    assert "# 13 runs" in out  # sfm, and 6 methods at 2 ratios: the room has depth maps
-    (own_room / "depths").rename(tmp_path / "maps")
-    shutil.rmtree(data / "room0" / "depths")
-    code, out, _ = bench(*words)
-    assert "# 11 runs" in out
-    assert "# without depth maps, and so without the method depth: room0 (--depth DIR)" in out
-    (tmp_path / "captures").mkdir()
-    (tmp_path / "maps").rename(tmp_path / "captures" / "room0")
-    code, out, _ = bench(*words, "--depth", tmp_path / "captures")
-    assert "# 13 runs" in out
-
-
 def test_the_quick_preset_makes_its_own_scene(bench, tmp_path, monkeypatch):
     made = []
 
@@ -217,12 +196,6 @@ def test_a_dry_run_of_the_quick_preset_loads_nothing_heavy():
     loaded = set(run.stdout.splitlines()[-1].split())
     assert "# 12 runs" in run.stdout
     assert not {"torch", "matplotlib", "splatseed.synthetic"} & loaded
-
-
-def test_what_is_said_of_the_room_before_it_is_made_is_so():
-    made = {k: each.default for k, each in inspect.signature(make_capture).parameters.items()}
-    said = runs_module.DEMO_FACTS
-    assert (said.num_images, said.pixels) == (made["num_views"], made["width"] * made["height"])
 
 
 @pytest.mark.parametrize(
@@ -268,14 +241,6 @@ def test_bad_words_are_refused_and_nothing_is_written(
     assert (code, out) == (2, "")
     assert said.replace("ROOM", str(room_path)) in " ".join(err.split())
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_help_does_not_wait_for_pytorch():
-    code = (
-        "import sys, splatseed.commands.bench\n"
-        "assert 'torch' not in sys.modules and 'gsplat' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize(("budget", "full"), [("50", True), ("100k", False)])

@@ -18,12 +18,10 @@ pytest.importorskip("pandas", reason="tables need pandas")
 from splatseed.bench.comparisons import (
     DATASETS,
     baseline_of,
-    clear_best,
     compare,
     compared_arms,
     dataset_of,
     gains,
-    mean_gains,
     paper_dataset,
     psnr_at,
     reach,
@@ -46,7 +44,6 @@ from splatseed.bench.study_tables import (
     quality_table,
     scene_arm_table,
     seconds_table,
-    strategy_table,
 )
 from splatseed.bench.tables import (
     Number,
@@ -131,14 +128,6 @@ def test_a_planted_best_is_marked_and_noise_is_not():
     assert sum(bold) <= 3
 
 
-def test_two_equal_bests_are_not_told_apart():
-    same = {(SFM, 1): 0.0, ("mls", 4): 0.5, ("mls", 8): 0.5}
-    (table,) = psnr_tables(one(runs(scenes=("fox",), gains=same)), "none")
-    marks = [(c.bold, c.mark) for c in table.rows[0][2:]]
-    assert sorted(marks) == [(False, ""), (True, "")]
-    assert not clear_best(one(runs(scenes=("fox",), gains=same)), "none", "fox")
-
-
 def test_the_cloud_as_it_is_can_be_best():
     worse = {(SFM, 1): 0.0, ("mls", 4): -0.5, ("random", 8): -0.9}
     (table,) = psnr_tables(one(runs(scenes=("fox",), gains=worse)), "none")
@@ -170,29 +159,12 @@ def test_one_repeat_says_so():
     assert gains(study, "none").on_like[MLS8].verdict == "better"  # the scenes agree
 
 
-def test_a_single_run_makes_tables_all_the_same():
-    study = one(runs(scenes=("fox",), gains={(SFM, 1): 0.0}, repeats=1))
-    (table,) = psnr_tables(study, "none")
-    assert table.header == ("scene", "sfm")
-    for make in (gain_table, cost_table, convergence_table):
-        assert to_csv(make(study, "none"))
-    for make in (strategy_table, equal_count_table, mean_gain_table):
-        assert to_markdown(make(study))
-
-
 def test_runs_without_a_baseline_gain_nothing():
     study = one([r for r in runs() if r.spec.arm.method != SFM or r.spec.scene != "fox"])
     assert gains(study, "none").scenes == ("bonsai", "room0", "treehill")
     (own,) = [table for table in psnr_tables(study, "none") if "scenes" in table.name]
     assert not column(own, "sfm")["fox"]
     assert column(own, "mls 8x")["fox"].value is not None
-
-
-def test_infinite_scores_are_set_aside():
-    perfect = Run(spec("fox", "mls", 8, repeat=3), result(math.inf))
-    study = one([*runs(), perfect])
-    assert study.not_finite == ("fox, mls 8x, none, 3",)
-    assert 3 not in study.results("none", "fox", MLS8)
 
 
 def test_runs_of_other_settings_are_never_paired():
@@ -285,18 +257,6 @@ def test_equal_counts_are_looked_up():
     none = equal_count_table(one(runs(strategies=("none",))))
     assert not none.rows
     assert "None qualifies" in none.notes[0]
-
-
-def test_gains_by_strategy():
-    table = strategy_table(one(runs(strategies=("default", "none"))))
-    assert column(table, "default")["linear 8x"].value == pytest.approx(0.3, abs=0.05)
-
-
-def test_the_fair_mean_is_of_variants_that_all_scenes_have():
-    means = mean_gains({"a": {MLS8: 1.0, "depth 4x": 9.0}, "b": {MLS8: 0.5}})
-    assert (means.over_all, means.best, means.per_scene) == (0.75, "mls 8x", 0.75)
-    assert mean_gains({"a": {MLS8: 1.0}, "b": {}}) is None
-    assert mean_gains({}) is None
 
 
 ODD = Table(
@@ -534,34 +494,10 @@ def test_no_change_is_claimed_at_most_at_the_stated_rate():
     assert claimed <= 7
 
 
-def test_equal_benchmarks_have_equal_runs():
-    comparison = compare(runs(), runs())
-    assert comparison.same_runs == len(runs())
-    assert not comparison.settings
-    assert {each.mean for each in comparison.changes.values()} == {0.0}
-
-
-def test_what_only_one_has():
-    some = [r for r in runs() if r.spec.scene != "fox" and r.spec.arm.label != "mls 4x"]
-    comparison = compare(some, [r for r in runs() if r.spec.arm.label != "random 8x"])
-    assert ("none", MLS8, "fox") in comparison.only_b
-    assert {label for _, label, _ in comparison.only_a} == {"random 8x"}
-    shown = comparison_tables(comparison)[2].rows
-    assert ("A", "none", "bonsai", "random 8x") in shown
-    assert ("B", "none", "fox", "mls 4x") in shown
-
-
 def test_single_runs_claim_nothing():
     comparison = compare(runs(repeats=1), runs(repeats=1, seed=1))
     assert {each.verdict for each in comparison.changes.values()} == {"unknown"}
     assert comparison_tables(comparison)[1].rows[0][2].text == "(1 run)"
-
-
-def test_of_several_sets_those_that_fit_are_compared():
-    both = [*runs(max_steps=2000, scenes=("fox",)), *runs()]
-    comparison = compare(both, runs(max_steps=2000, seed=3))
-    assert not comparison.settings
-    assert {scene for _, _, scene in comparison.changes} == {"fox"}
 
 
 def test_changed_files_and_nothing_finished():

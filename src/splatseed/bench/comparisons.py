@@ -171,14 +171,9 @@ class Reached(NamedTuple):
 
 
 def reach(result: RunResult, target: float) -> Reached | None:
-    """When a run's test PSNR first is at least ``target``.
+    """When a run's test PSNR first is at least ``target``, dB; None if it never is.
 
-    Args:
-        result: The run.
-        target: PSNR in dB.
-
-    Returns:
-        None if it never is. A run above it at its first test has reached it there at the latest.
+    A run above it at its first test has reached it there at the latest.
     """
     before = None
     for point in result.curve:
@@ -194,14 +189,9 @@ def reach(result: RunResult, target: float) -> Reached | None:
 
 
 def psnr_at(result: RunResult, seconds: float) -> float:
-    """A run's test PSNR ``seconds`` after it began to make seeds, dB.
+    """A run's test PSNR so many seconds after it began to make seeds, dB.
 
-    Args:
-        result: The run.
-        seconds: Of seeding and training.
-
-    Returns:
-        NaN before its first test; its last PSNR once it has ended.
+    NaN before its first test; its last PSNR once it has ended.
     """
     times = [result.upsample_seconds + point.seconds for point in result.curve]
     if not times or seconds < times[0]:
@@ -211,17 +201,12 @@ def psnr_at(result: RunResult, seconds: float) -> float:
     return float(np.interp(seconds, times, [point.psnr for point in result.curve]))
 
 
-@dataclass(frozen=True)
-class Speed:
-    """How soon a variant reaches the baseline's last PSNR, and the baseline itself.
+class Speed(NamedTuple):
+    """How soon a variant reaches the baseline's last PSNR: in ``reached`` of ``pairs`` of runs.
 
-    Args:
-        pairs: Pairs of runs that can be compared.
-        reached: Pairs whose variant reaches the target.
-        means: Means over scenes of steps and seconds of the variant's runs that reach it, and of
-            base_steps and base_seconds, the baseline's first time; NaN if there are none.
-        log_steps: Mean difference of the logarithm of steps, if all reach it; else None.
-        log_seconds: The same for seconds.
+    ``means``: means over scenes of steps and seconds of those that reach it, and of base_steps and
+    base_seconds, the baseline's first time; NaN if there are none. ``log_steps``, ``log_seconds``:
+    mean differences of the logarithms, if all reach it.
     """
 
     pairs: int
@@ -251,7 +236,7 @@ def speeds(study: Study, strategy: StrategyName) -> dict[str, Speed]:
     known = [adjusted([getattr(each, log) for each in told.values()])
              for log in ("log_steps", "log_seconds")]  # fmt: skip
     return {
-        label: replace(each, log_steps=steps, log_seconds=seconds)
+        label: each._replace(log_steps=steps, log_seconds=seconds)
         for (label, each), steps, seconds in zip(told.items(), *known, strict=True)
     }
 
@@ -401,18 +386,13 @@ def _seconds_to(own: RunResult, target: float) -> float:
     return own.seconds if own.psnr >= target else math.nan
 
 
-@dataclass(frozen=True)
-class AdviceScore:
+class AdviceScore(NamedTuple):
     """How good the advice is, scene by scene: leave-one-out.
 
-    Args:
-        strategy: The arms' strategy.
-        advised: The advised method by scene; the threshold is fitted on the other scenes only.
-        psnr: Mean PSNR by scene and method, dB.
-        left_out: Scenes that lack a necessary run.
+    ``advised``: the advised method by scene, its threshold fitted on the other scenes only;
+    ``psnr``: mean PSNR by scene and method, dB; ``left_out``: scenes that lack a necessary run.
     """
 
-    strategy: StrategyName
     advised: Mapping[str, str]
     psnr: Mapping[str, Mapping[str, float]]
     left_out: tuple[str, ...]
@@ -453,7 +433,7 @@ def score_advice(study: Study, strategy: StrategyName) -> AdviceScore:
         return max(_ROOMS, key=lambda room: (round(served[room], 6), room == ROOM))
 
     advised = {s: followed(s, fitted([other for other in known if other != s])) for s in known}
-    return AdviceScore(strategy, advised, known, tuple(s for s in psnr if s not in known))
+    return AdviceScore(advised, known, tuple(s for s in psnr if s not in known))
 
 
 def _by_method(study: Study, strategy: StrategyName, scene: str) -> dict[str, float]:
@@ -535,11 +515,7 @@ def paper_dataset(key: str) -> PaperDataset:
 
 
 def dataset_of(scene: str) -> PaperDataset | None:
-    """The paper's dataset that has a scene of this name; None if neither has.
-
-    Args:
-        scene: The scene's name.
-    """
+    """The paper's dataset that has a scene of this name; None if neither has."""
     datasets = (paper_dataset(key) for key in DATASETS)
     return next((each for each in datasets if scene in each.psnr), None)
 

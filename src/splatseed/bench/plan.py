@@ -300,8 +300,6 @@ class Plan:
         ):  # fmt: skip
             if not fits:
                 raise ParameterError(expected, found=f"{found}", fix=SEE)
-        for scene in self.scenes:
-            _check_text(scene)
         for method in self.parameters:
             _check_choices("parameters", (method,), tuple(METHODS))
             configure(method, **self.parameters[method])
@@ -434,16 +432,6 @@ def _check_distinct(name: str, given: Sequence[object]) -> None:
     if twice is not None:
         fix = "Give names to scenes in a plan (see --dry-run)." if name == "scenes" else "Drop one."
         raise ParameterError(f"{name} that differ", found=f"{twice} twice", fix=fix)
-
-
-def _check_text(scene: PlannedScene) -> None:
-    """A plan is a text file, which cannot hold file names that are not text."""
-    try:
-        f"{scene.path}{scene.name}{scene.images}{scene.depth}{scene.cloud}".encode()
-    except UnicodeEncodeError:
-        raise ParameterError(
-            "scenes whose paths are valid text", found=ascii(scene.path), fix="Rename the folder."
-        ) from None
 
 
 _GROWTH = 3.0

@@ -335,12 +335,7 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
 
 def _local_machine(jobs: int | None, backend: Backend) -> Machine:
     chosen: Backend = "cpu"
-    driver = (
-        os.name == "nt"
-        or which("nvidia-smi") is not None
-        or Path("/proc/driver/nvidia").exists()
-        or which("rocminfo") is not None
-    )
+    driver = which("nvidia-smi") or which("rocminfo") or Path("/proc/driver/nvidia").exists()
     if backend == "cuda" or (backend == "auto" and driver):  # else PyTorch sees no GPU
         from splatseed.train.device import pick_device  # noqa: PLC0415  (PyTorch, which takes seconds)
 
@@ -479,8 +474,8 @@ def _run(asked: Asked, bench: Path, machine: Machine, arguments: Sequence[str]) 
     with stage_display() as clock:
         prepared = _prepare(asked, machine, bench / "scenes", clock)
     begin(bench, "bench", prepared.specs, arguments)
-    with atomic_file(bench / PLAN) as partial:
-        partial.write_text(plan_text(prepared.plan), "utf-8")
+    with atomic_file(bench / PLAN) as partial:  # names that are no text are escaped
+        partial.write_text(plan_text(prepared.plan), "utf-8", "backslashreplace")
     runs = [read_run(bench, spec) for spec in prepared.specs]
     for note in prepared.notes:
         print_note(note)
