@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image as PilImage
 
-from splatseed.commands.depth.next_steps import number_for
+from splatseed.commands.next_steps import number_for
 from splatseed.depth.alignment import align
 from splatseed.io import find_depths, load_scene
 from splatseed.io.depth_maps import depth_folder

@@ -12,21 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import numpy as np
 import tyro
 
-from splatseed.commands.options import parse_options
-from splatseed.commands.upsample.checks import check_options
+from splatseed.commands.options import check_least, parse_options
 from splatseed.commands.upsample.cloud import CLOUD, Bringing, bring_clouds, settle_cloud
 from splatseed.commands.upsample.output import (
     PICTURES,
-    summarise,
-    write_previews,
-)
-from splatseed.commands.upsample.plan_line import (
+    check_start,
     found_how,
     method_words,
     number_words,
     parameters_of,
+    summarise,
+    write_previews,
+    write_start,
 )
-from splatseed.commands.upsample.start import check_start, write_start
 from splatseed.commands.upsample.tiled import Tiling, find_source, run_tiled
 from splatseed.console import (
     OUT,
@@ -40,7 +38,7 @@ from splatseed.io import WriteReport, find_depths, load_originals, write_scene
 from splatseed.io.clouds import open_cloud
 from splatseed.io.depth_search import with_own_depths
 from splatseed.io.staging import check_output
-from splatseed.literal import counted, visible
+from splatseed.literal import counted, quoted, visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
 from splatseed.process.memory import bytes_of
 from splatseed.scene import Scene
@@ -61,6 +59,12 @@ from splatseed.upsample import (
 
 if TYPE_CHECKING:
     from splatseed.seeding.clouds.method import Cloud, GivenClouds
+
+
+FILES = (".ply", ".las", ".laz", ".e57", ".pcd", ".xyz", ".pts", ".npz", ".bin", ".txt")
+"""Suffixes by which somebody means a file of points."""
+COVERING = ("auto", "cover")
+"""Methods that leave no gaps for --cover."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +201,7 @@ def _with_methods(methods: Mapping[str, Upsampler]) -> type[Options]:
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options, methods = parse(arguments)
-    check_options(options)
+    _check_options(options)
     planned_size(1, options.ratio, None if options.ratio is None else options.num_points)
     given = (options.scene, options.depth_maps, options.cloud_transform, *options.cloud_files)
     inputs = [path for path in given if path is not None]
@@ -211,6 +215,36 @@ def run(arguments: list[str]) -> None:
         run_tiled(options, methods, source, _provenance)
         return
     _run_in_memory(options, methods)
+
+
+def _check_options(options: Options) -> None:
+    """Refuse options out of their range, and those that another makes pointless.
+
+    Raises:
+        ParameterError: There is such an option.
+    """
+    check_least(options, 1, "num_points", "jobs", "tile_points")
+    check_least(options, 0, "seed")
+    if options.output.suffix.lower() in FILES and not options.output.is_dir():
+        raise ParameterError(
+            "a folder after -o, as a whole scene is written",
+            found=f"{options.output}, the name of a file",
+            fix=f"Pass -o {quoted(options.output.with_suffix(''))}: the points lie there as a .ply "
+            "too.",
+        )
+    if options.address is not None and options.executor != "ray":
+        raise ParameterError("--executor ray with --address", found="local", fix="Add it.")
+    if options.cover_cell is None:
+        return
+    if options.cover_cell < 1:
+        found = f"{options.cover_cell}"
+        raise ParameterError("--cover of 1 or more", found=found, fix="Try --cover 8.")
+    if options.method in COVERING:
+        raise ParameterError(
+            f"--{options.method}.cell for method {options.method}, which covers by itself",
+            found=f"--cover {options.cover_cell}",
+            fix=f"Say --{options.method}.cell {options.cover_cell} instead.",
+        )
 
 
 def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:

@@ -1,21 +1,34 @@
-"""What ``splatseed upsample`` prints and draws at its end."""
+"""What ``splatseed upsample`` says it will do, and what it prints, draws and writes at its end."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from splatseed.commands.upsample.trainers import tell_training
+from splatseed.commands.next_steps import tell_training
 from splatseed.console import StageClock, print_note, print_pairs
+from splatseed.errors import OutputError, ParameterError
 from splatseed.io import WriteReport
+from splatseed.io.staging import check_parents
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import silent
+from splatseed.progress import Progress, silent
 from splatseed.scene import Image, Scene
-from splatseed.seeding.photographs import MAX_SIZE, Stereo, photographed, read_views
+from splatseed.seeding.photographs import (
+    MAX_SIZE,
+    Stereo,
+    begins_from_points,
+    has_points,
+    photographed,
+    read_views,
+)
 from splatseed.seeding.upsampling import CELL
-from splatseed.upsample import Upsampler
+from splatseed.splat.ply import write_gaussians
+from splatseed.train.seeds import gaussians_of_scene
+from splatseed.train.settings import TrainSettings
+from splatseed.upsample import Profile, Upsampler, configure
 from splatseed.upsample.registry import origin_name
 
 PAIR, ORIGINS, CELLS, MAPS = PICTURES = (
@@ -26,6 +39,109 @@ PAIR, ORIGINS, CELLS, MAPS = PICTURES = (
 )
 PHOTOGRAPHS_SHOWN = 4
 """Photographs whose cells and maps are drawn."""
+TOLD_ELSEWHERE = {"files", "transform", "memory", "alone"}
+"""Parameters of a cloud that other lines tell."""
+
+
+def parameters_of(method: Upsampler) -> dict[str, object]:
+    """The parameters of a method by name; a cloud's files are told elsewhere."""
+    given = dataclasses.asdict(method)  # type: ignore[call-overload]  # a method is a dataclass
+    return {name: value for name, value in given.items() if name not in TOLD_ELSEWHERE}
+
+
+def method_words(name: str, method: Upsampler, profile: Profile) -> str:
+    """A method with what the user changed about it.
+
+    Example:
+        >>> method_words("mls", configure("mls", "paper", k=12), "paper")
+        'mls (profile paper, k=12)'
+    """
+    plain = parameters_of(configure(name, profile))
+    changed = [f"{k}={v}" for k, v in parameters_of(method).items() if v != plain[k]]
+    words = [] if profile == "default" else [f"profile {profile}"]
+    told = ", ".join([*words, *changed])
+    return f"{name} ({told})" if told else name
+
+
+def number_words(total: int | None, most: int | None, changed_by: Sequence[str] = ()) -> str:
+    """How many points there will be.
+
+    Args:
+        total: Points in all; None if the photographs determine the number.
+        most: The budget, if there is one.
+        changed_by: Options that add points to the method's, or drop some of them.
+
+    Example:
+        >>> number_words(None, 50_000), number_words(800, 1000)
+        ('at most 50,000 points', '800 points')
+    """
+    if most is not None and (total is None or total > most):
+        return f"at most {most:,} points"
+    if total is None:
+        return "as many points as the photographs need"
+    before = f" before {' and '.join(changed_by)}" if changed_by else ""
+    return f"{total:,} points{before}"
+
+
+def found_how(scene: Scene, method: Upsampler) -> str:
+    """How a method that compares photographs finds depth without enough points; else empty.
+
+    Args:
+        scene: The scene.
+        method: The method that makes its points.
+    """
+    if not isinstance(method, Stereo) or begins_from_points(scene):
+        return ""
+    points = "too few" if has_points(scene) else "no"
+    where = "" if scene.depths is None else ", around its depth maps"
+    return f": {points} points, so depth is found by comparing photographs{where}"
+
+
+def check_start(path: Path, output: Path, *, overwrite: bool) -> None:
+    """Refuse an unusable name for the initial Gaussians before any work is done.
+
+    Args:
+        path: The .ply.
+        output: The scene folder that is written beside it.
+        overwrite: Whether an existing file may be replaced.
+
+    Raises:
+        ParameterError: It is not named .ply.
+        OutputError: It is taken, or lies in the output folder.
+    """
+    if path.suffix.lower() != ".ply":
+        raise ParameterError("--gaussians FILE.ply", found=str(path), fix="Name a .ply file.")
+    check_parents(path)
+    target, folder = path.resolve(), output.resolve()
+    if folder == target or folder in target.parents:
+        raise OutputError(
+            "a file outside the scene that is written, for the initial Gaussians",
+            found=f"{path} in {output}, where some trainers read any .ply as points",
+            fix="Name a file beside the folder.",
+        )
+    if path.exists() and not overwrite:
+        raise OutputError(
+            f"no file at {path}", found="one", fix="Choose another name, or pass --overwrite."
+        )
+
+
+def write_start(path: Path, scene: Scene, method: Upsampler, progress: Progress) -> None:
+    """Write the Gaussians that training from a scene's points would start with.
+
+    Args:
+        path: The .ply.
+        scene: The scene with the seeds as its points; the Gaussians are in its world.
+        method: The method that made them; photographs that it held out are not used.
+        progress: Told how far it is.
+
+    Raises:
+        SceneNotFoundError: The scene has no photographs, which bound the size of a Gaussian.
+        OutputError: The file cannot be written.
+    """
+    images = photographed(scene, getattr(method, "hold_out", 0))
+    views = read_views(scene, images, MAX_SIZE, progress)
+    settings = TrainSettings(strategy="grow", seed_colors=True)
+    write_gaussians(path, gaussians_of_scene(scene.points, views, settings))
 
 
 def write_previews(

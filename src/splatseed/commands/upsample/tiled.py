@@ -11,8 +11,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from splatseed.commands.upsample.plan_line import method_words
-from splatseed.commands.upsample.trainers import tell_training
+from splatseed.commands.next_steps import tell_training
+from splatseed.commands.upsample.output import method_words
 from splatseed.console import (
     OUT,
     StageClock,

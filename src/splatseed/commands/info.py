@@ -1,37 +1,47 @@
-"""``splatseed info``: the contents of a scene, and its problems."""
+"""``splatseed info``: the contents of a scene, its problems, and what to do with it.
+
+Notation of ``--json``: lengths are in scene units; five numbers are percentiles 5, 25, 50, 75, 95.
+Promise: with ``--json`` standard output is one JSON object alone; a number that JSON does not know
+is null; keys are only ever added.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
 
-from splatseed.commands.depth.next_steps import number_for, use
-from splatseed.commands.info.advice import advice_commands, advice_rows
-from splatseed.commands.info.as_json import print_json
-from splatseed.commands.info.poses import Poses, look_at_poses
+from splatseed.commands.next_steps import (
+    Planned,
+    advice_commands,
+    advice_rows,
+    number_for,
+    use,
+)
 from splatseed.commands.options import parse_options
-from splatseed.commands.planned import Planned
 from splatseed.console import (
     OUT,
     StageClock,
     print_commands,
     print_note,
     print_pairs,
+    print_table,
     stage_display,
 )
 from splatseed.depthmap import DepthKind
-from splatseed.errors import ParameterError
+from splatseed.errors import ParameterError, SplatseedError
 from splatseed.io import find_depths, load_scene
 from splatseed.io.seeds import was_upsampled
 from splatseed.io.staging import check_parents
 from splatseed.literal import quoted, visible
+from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.seeding.advice import advice_for
 from splatseed.seeding.diagnostics import (
@@ -46,13 +56,19 @@ from splatseed.seeding.diagnostics import (
     track_statistics,
     untrainable,
 )
+from splatseed.seeding.photographs import has_points, photographed
 from splatseed.train.schedule import FULL_RUN
 
 if TYPE_CHECKING:  # Numba, which takes a while to load, comes with it
     from splatseed.depth.alignment import Alignment
+    from splatseed.seeding.poses import PoseError
 
 KINDS_SHOWN = 3
 """Kinds of cameras listed; collections of photographs from the web have one per photograph."""
+IMAGES_SHOWN = 12
+"""Images whose depth is listed."""
+REFINE = "--refine-poses"
+"""What problems of poses name that it can mend."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +97,26 @@ class Options:
     """Print one JSON object instead, for scripts."""
 
 
+@dataclass(frozen=True)
+class _Poses:
+    """What the photographs tell of their poses.
+
+    Args:
+        agreement: Share of the pixels looked at whose depth others confirm.
+        error: By how much the photographs miss each other; None if that could not be told.
+        problem: Why they cannot be compared, or should not be as they are; empty if they can.
+    """
+
+    agreement: float
+    error: PoseError | None
+    problem: str
+
+    @property
+    def refine(self) -> bool:
+        """Whether they should be refined first."""
+        return REFINE in self.problem
+
+
 def run(arguments: list[str]) -> None:
     """Run the verb with these arguments."""
     options = parse_options(Options, "info", arguments)
@@ -94,23 +130,21 @@ def run(arguments: list[str]) -> None:
         problems = find_problems(scene, cloud, None if was_upsampled(scene) else regions)
         alignments = _alignments(options, scene, clock)
         known = _known_depths(options, scene, clock)
-        poses = look_at_poses(scene, clock)
+        poses = _look_at_poses(scene, clock)
         doubts = [poses.problem] if poses and poses.problem else []
         problems = (*problems, *_unfit_maps(scene, alignments or {}), *doubts)
     if options.json:
-        print_json(scene, cloud, tracks, regions, poses, alignments, problems)
+        _print_json(scene, cloud, tracks, regions, poses, alignments, problems)
         return
     rows = [*_source_rows(scene), *_cloud_rows(cloud), *_track_rows(tracks), *_region_rows(regions)]
-    rows += poses.rows() if poses else []
+    rows += _pose_rows(poses)
     usable = scene
     if alignments and len(scene.points) and all(each.rejected for each in alignments.values()):
         usable = scene.replace(depths=None)  # nothing follows from maps that cannot be used
     rows += _advice_rows(options, usable, regions)
     print_pairs(str(options.scene), rows)
     if alignments is not None:
-        from splatseed.commands.info.depth_numbers import print_depth  # noqa: PLC0415  (loads Numba)
-
-        print_depth(str(options.depth or "depth"), scene, alignments)
+        _print_depth(str(options.depth or "depth"), scene, alignments)
     OUT.print("\nproblems" if problems else "\nno problems found", style="bold" if problems else "")
     for problem in problems:
         OUT.print(f"  - {problem}", soft_wrap=True)
@@ -160,6 +194,21 @@ def _alignments(options: Options, scene: Scene, clock: StageClock) -> dict[str, 
     return alignments
 
 
+def _look_at_poses(scene: Scene, progress: Progress) -> _Poses | None:
+    """Compare a few photographs of a scene without points; None with points or without any."""
+    if has_points(scene) or not scene.has_photographs:
+        return None
+    from splatseed.seeding.poses import check_poses, pose_error  # noqa: PLC0415  (loads Numba)
+
+    try:
+        images = photographed(scene)
+        agreement = check_poses(scene, images, progress)
+    except SplatseedError as refused:
+        return _Poses(0.0, None, f"The photographs cannot be compared: {refused}")
+    error = pose_error(scene, images, progress)
+    return _Poses(agreement, error, error.warning if error else "")
+
+
 def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
     if alignments and not len(scene.points):
         unit = "only maps in the scene's unit can be used, with --depth.no-align"
@@ -170,7 +219,7 @@ def _unfit_maps(scene: Scene, alignments: Mapping[str, Alignment]) -> list[str]:
 
 
 def _next_commands(
-    options: Options, scene: Scene, known: int, poses: Poses | None
+    options: Options, scene: Scene, known: int, poses: _Poses | None
 ) -> list[tuple[str, str]]:
     """What to do next with the scene, or what there is to choose from."""
     if scene.depths is not None and options.depth and len(scene.points) and not is_distorted(scene):
@@ -179,7 +228,9 @@ def _next_commands(
         how = f"{_reading(options)}{number}"
         return [("", use(options.scene, options.depth, how)[1])]
     advised, refine = [], poses is not None and poses.refine
-    if len(scene.points) or ((poses is None or poses.usable) and scene.has_photographs):
+    if len(scene.points) or (
+        (poses is None or poses.refine or not poses.problem) and scene.has_photographs
+    ):
         planned = Planned.of(scene, options.budget, options.max_steps)
         advice = advice_for(scene, planned.most_seeds, strategy=planned.strategy)
         advised = advice_commands(options.scene, scene, advice, planned, refine=refine)
@@ -256,16 +307,24 @@ def _track_rows(tracks: TrackStatistics | None) -> list[tuple[str, str]]:
     if tracks is None:
         return [("tracks", "none")]
     unknown = math.isnan(tracks.mean_error)
-    error = "unknown" if unknown else _spread(tracks.mean_error, tracks.error, ".3f")
+    error = "unknown" if unknown else _spread_of(tracks.mean_error, tracks.error, ".3f")
     return [
-        ("track length, images", _spread(tracks.mean_length, tracks.length, ".3g")),
+        ("track length, images", _spread_of(tracks.mean_length, tracks.length, ".3g")),
         ("reprojection error, px", error),
     ]
 
 
-def _spread(mean: float, percentiles: tuple[float, ...], style: str) -> str:
+def _spread_of(mean: float, percentiles: tuple[float, ...], style: str) -> str:
     spread = " ".join(f"{x:{style}}" for x in percentiles)
     return f"mean {mean:{style}}, 5/25/50/75/95% {spread}"
+
+
+def _pose_rows(poses: _Poses | None) -> list[tuple[str, str]]:
+    if poses is None or (poses.error is None and poses.problem):
+        return []
+    miss = "cannot be told" if poses.error is None else f"{poses.error}"
+    agree = f"at {poses.agreement:.0%} of the pixels looked at"
+    return [("photographs agree", agree), ("they miss by", miss)]
 
 
 def _advice_rows(
@@ -283,10 +342,119 @@ def _advice_rows(
 def _region_rows(regions: EmptyRegions | None) -> list[tuple[str, str]]:
     if regions is None:
         return []
-    grid = f" (of cells, {EMPTY_CELLS} along the longer side)"
-    return [
-        (
-            "image area without points",
-            f"{regions.mean:.0%} on average, {regions.worst:.0%} in {regions.worst_name}{grid}",
-        )
-    ]
+    worst = f"{regions.worst:.0%} in {regions.worst_name}"
+    grid = f"(of cells, {EMPTY_CELLS} along the longer side)"
+    return [("image area without points", f"{regions.mean:.0%} on average, {worst} {grid}")]
+
+
+def _print_json(
+    scene: Scene,
+    cloud: CloudStatistics,
+    tracks: TrackStatistics | None,
+    regions: EmptyRegions | None,
+    poses: _Poses | None,
+    alignments: Mapping[str, Alignment] | None,
+    problems: Sequence[str],
+) -> None:
+    """Print the facts that ``info`` shows."""
+    train, test = scene.split()
+    source = scene.source
+    facts = {
+        "format": source.format if source else None,
+        "root": str(source.root) if source else None,
+        "images": len(scene.images),
+        "train_images": len(train),
+        "test_images": len(test),
+        "photographs": scene.has_photographs,
+        "cameras": [
+            {"id": c.camera_id, "model": c.model, "width": c.width, "height": c.height}
+            for c in scene.intrinsics
+        ],
+        "depth_maps": 0 if scene.depths is None else len(scene.depths),
+        "points": asdict(cloud),
+        "tracks": None if tracks is None else asdict(tracks),
+        "empty": None if regions is None else asdict(regions),
+        "poses": None if poses is None else asdict(poses),
+        "depth": None if alignments is None else {k: asdict(a) for k, a in alignments.items()},
+        "problems": list(problems),
+    }
+    print(json.dumps(_finite(facts), indent=2, allow_nan=False), file=OUT.file)
+
+
+def _finite(value: Any) -> Any:
+    """The value, with null for numbers that are not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): _finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(each) for each in value]
+    if isinstance(value, float) or hasattr(value, "item"):
+        number = float(value)
+        return number if math.isfinite(number) else None
+    return value
+
+
+def _print_depth(title: str, scene: Scene, alignments: Mapping[str, Alignment]) -> None:
+    """Print a summary of the depth maps and a table of images, the worst first."""
+    maps = f"{len(alignments):,} of {len(scene.images):,} images"
+    kind: DepthKind = "z"
+    known = [image.name for image in scene.images if image.name in alignments]
+    if known and scene.depths is not None:
+        first = scene.depths.read(known[0])
+        kind = first.kind
+        maps = f"{maps}, the first {first.width} x {first.height}, kind {kind}"
+    if not len(scene.points):  # nothing to compare with
+        print_pairs(title, [("maps", maps)])
+        return
+    used = [each for each in alignments.values() if each.rejected is None]
+    counts = _spread((each.num_points for each in alignments.values()), ".0f")
+    rows = [("maps", maps), ("left out", f"{len(alignments) - len(used):,}")]
+    rows.append(("SfM points per image", counts))
+    if used:
+        rows.append(("scale", _spread((each.scale for each in used), ".4g")))
+        if kind == "inverse":
+            rows.append(("shift", _spread((each.shift for each in used), ".4g")))
+        rows.append(("residual", _spread((each.residual for each in used), ".2%")))
+    print_pairs(title, rows)
+    ordered = sorted(alignments, key=lambda name: _badness(name, alignments[name]))
+    listed = ordered[:IMAGES_SHOWN]
+    header = ["image", "points", "scale", *(["shift"] if kind == "inverse" else []), "residual"]
+    some = "" if len(listed) == len(ordered) else f", the {len(listed)} worst; --json has all"
+    table = [_row(name, alignments[name], len(header)) for name in listed]
+    print_table(f"depth against SfM points{some}", header, table)
+    _print_rejections(alignments, listed)
+
+
+def _spread(values: Iterable[float], style: str) -> str:
+    known = np.array([value for value in values if not math.isnan(value)])
+    if not known.size:
+        return "unknown"
+    low, median, high = np.percentile(known, [5, 50, 95])
+    return f"median {median:{style}}, 5/95% {low:{style}} {high:{style}}"
+
+
+def _badness(name: str, alignment: Alignment) -> tuple[bool, float, str]:
+    """Sort key: images left out first, then the largest residuals."""
+    residual = -math.inf if math.isnan(alignment.residual) else -alignment.residual
+    return alignment.rejected is None, residual, name
+
+
+def _row(name: str, alignment: Alignment, columns: int) -> list[str]:
+    numbers = [_number(alignment.scale, ".4g")]
+    if columns == 5:
+        numbers.append(_number(alignment.shift, ".4g") if numbers != ["-"] else "-")
+    return [name, f"{alignment.num_points:,}", *numbers, _number(alignment.residual, ".2%")]
+
+
+def _number(value: float, style: str) -> str:
+    return "-" if math.isnan(value) else f"{value:{style}}"
+
+
+def _print_rejections(alignments: Mapping[str, Alignment], listed: Sequence[str]) -> None:
+    rejected = [(name, alignments[name].rejected) for name in listed]
+    sentences = [f"{name}: {reason}" for name, reason in rejected if reason is not None]
+    if not sentences:
+        return
+    OUT.print("\nleft out", style="bold")
+    more = sum(a.rejected is not None for a in alignments.values()) - len(sentences)
+    for sentence in [*sentences, *([f"and {more:,} more"] if more else [])]:
+        OUT.print(f"  - {sentence}", soft_wrap=True)

@@ -1,0 +1,279 @@
+"""``splatseed depth``: a depth map per photograph, by a network or from the photographs alone.
+
+Promise: an option that would have no effect is refused, not ignored.
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+from splatseed.commands.next_steps import Planned, after_network, after_stereo, look
+from splatseed.commands.options import check_least, parse_options
+from splatseed.console import (
+    OUT,
+    StageClock,
+    print_commands,
+    print_note,
+    print_pairs,
+    stage_display,
+)
+from splatseed.depth.stereo.settings import LEAST_SIZE, MOST_GRID
+from splatseed.depthmap import DepthKind
+from splatseed.errors import ParameterError
+from splatseed.io import load_scene
+from splatseed.io.dense import (
+    DenseReport,
+    check_dense_scene,
+    write_dense_maps,
+    write_dense_workspace,
+)
+from splatseed.io.photograph import warnings_but_lens
+from splatseed.io.staging import check_output
+from splatseed.literal import quoted, visible
+from splatseed.monocular import DepthReport, estimate_depths
+from splatseed.process.torch_device import DeviceName
+from splatseed.requirements import require
+from splatseed.scene import Scene
+from splatseed.seeding.diagnostics import is_distorted
+from splatseed.train.schedule import FULL_RUN
+
+if TYPE_CHECKING:  # kernels and PyTorch load with their use
+    from splatseed.depth.stereo import StereoMap
+    from splatseed.monocular.network import DepthNetwork
+
+NAMES_SHOWN = 5
+MAX_SIZE = 1600
+"""For a network."""
+PICTURE = "preview_maps.png"
+PACKAGES = ("splatseed", "transformers", "torch", "numba", "numpy", "pillow", "scipy")
+OF_NETWORK = ("device", "depth_kind")
+OF_STEREO = ("colmap", "grid", "preview")
+MIN_PIXELS = 3
+"""Photographs that must confirm a point fused by COLMAP. Its default of 5 suits unconfirmed maps;
+our pixels are confirmed already, and few views see the borders."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Make a depth map for every photograph: by a network, or from the photographs alone.
+
+    Nothing is downloaded.
+    """
+
+    scene: Annotated[Path, tyro.conf.Positional]
+    """A scene with photographs."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The folder of maps to write: one float32 .npy per image."""
+    model: Annotated[str | None, tyro.conf.arg(metavar="NAME|PATH")] = None
+    """A network: a folder in transformers' format, or an id that Hugging Face's cache holds."""
+    stereo: bool = False
+    """Match the photographs with each other instead: no network, on the CPU; normals and confidence
+    too."""
+    colmap: bool = False
+    """With --stereo: write a COLMAP dense workspace, which colmap stereo_fusion turns into a
+    cloud."""
+    grid: int | None = None
+    """With --stereo: one pixel of the map per block of GRID x GRID pixels of the photograph; 4 by
+    default."""
+    preview: bool = False
+    """With --stereo: also write preview_maps.png, some photographs beside their maps."""
+    device: DeviceName = "auto"
+    """Where to run the network; auto takes a usable GPU if there is one."""
+    max_size: int | None = None
+    """Photographs with a longer side are reduced to this many pixels, and so are their maps; by
+    default 1600, or 800 with --stereo."""
+    depth_kind: DepthKind | None = None
+    """What the network predicts: planar depth, distance along the ray, or inverse depth; by default
+    what its config.json says."""
+    overwrite: bool = False
+    """Replace an output folder that splatseed wrote before."""
+
+
+def run(arguments: list[str]) -> None:
+    """Run the verb with these arguments."""
+    options = parse_options(Options, "depth", arguments)
+    _check(options)
+    check_output(options.output, kind="depth", overwrite=options.overwrite, protect=[options.scene])
+    if options.stereo:
+        _run_stereo(options)
+    else:
+        _run_network(options)
+
+
+def _check(options: Options) -> None:
+    """Check that the options name one source of depth, and none that belongs to the other."""
+    if options.stereo == (options.model is not None):
+        raise ParameterError(
+            "either --model or --stereo",
+            found="both" if options.stereo else "neither",
+            fix="Name a network with --model, or match the photographs themselves with --stereo.",
+        )
+    check_least(options, 1, "grid")
+    check_least(options, LEAST_SIZE if options.stereo else 1, "max_size")
+    if (options.grid or 1) > MOST_GRID:
+        found = f"{options.grid}"
+        raise ParameterError(f"--grid from 1 to {MOST_GRID}", found=found, fix="Try 4.")
+    foreign = OF_NETWORK if options.stereo else OF_STEREO
+    idle = [name for name in foreign if getattr(options, name) != getattr(Options, name)]
+    if idle:
+        raise ParameterError(
+            "options of " + ("--stereo" if options.stereo else "--model"),
+            found=", ".join(f"--{name.replace('_', '-')}" for name in idle),
+            fix="Leave them out" + ("." if options.stereo else ", or add --stereo."),
+        )
+
+
+def _provenance(options: Options) -> dict[str, object]:
+    """How maps were made, for ``splatseed.json``."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    given = {name: value for name, value in asdict(options).items() if value is not None}
+    return {"command": "depth", "options": given, "versions": versions}
+
+
+def _run_network(options: Options) -> None:
+    max_size = options.max_size or MAX_SIZE
+    options = replace(options, max_size=max_size)
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = load_scene(options.scene, require_points=False)
+        clock("load network", 0.0)
+        require("torch", "transformers")
+        from splatseed.monocular.network import load_network  # noqa: PLC0415  (imports PyTorch)
+
+        network = load_network(str(options.model), kind=options.depth_kind, device=options.device)
+        meaning = network.meaning
+        said = {"kind": meaning.kind, "kind_because": meaning.reason, "device": network.device}
+        report = estimate_depths(
+            scene,
+            network,
+            options.output,
+            max_size=max_size,
+            overwrite=options.overwrite,
+            provenance={**_provenance(options), **said},
+            progress=clock,
+        )
+    _summarise_network(options, scene, network, report)
+
+
+def _summarise_network(
+    options: Options, scene: Scene, network: DepthNetwork, report: DepthReport
+) -> None:
+    small, large = (f"{width} x {height}" for width, height in report.sizes)
+    each = report.seconds / report.num_images
+    rows = [
+        ("network", str(options.model)),
+        ("run by", network.device),
+        ("predicts", f"{network.meaning.kind} ({network.meaning.reason})"),
+        ("maps", f"{report.num_images:,} of {large if small == large else f'{small} to {large}'}"),
+        ("seconds", f"{report.seconds:.1f}, {each:.2f} per image"),
+        ("output", str(report.path)),
+    ]
+    print_pairs("splatseed depth", rows)
+    for warning in scene.warnings:
+        print_note(warning)
+    if report.flat:
+        flat = _some(report.flat)
+        print_note(f"the network predicted no depth (a constant map, or none) for: {flat}")
+    known = report.num_images * math.prod(report.sizes[0])
+    most = Planned.of(scene, None, FULL_RUN).most_seeds
+    print_commands("next", after_network(options.scene, scene, report.path, known, most))
+
+
+def _some(names: Sequence[str]) -> str:
+    more = len(names) - NAMES_SHOWN
+    return ", ".join(names[:NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+def _run_stereo(options: Options) -> None:
+    from splatseed.depth.stereo import stereo_depths  # noqa: PLC0415  (loads little)
+
+    start = time.perf_counter()
+    with stage_display() as clock:
+        clock("read", 0.0)
+        scene = load_scene(options.scene, require_points=False)
+        if options.colmap:
+            check_dense_scene(scene, undistorts=True)
+        given = {name: getattr(options, name) for name in ("max_size", "grid")}
+        given = {name: value for name, value in given.items() if value is not None}
+        maps = stereo_depths(scene, progress=clock, **given)
+        report = _write(scene, maps, options, clock)
+        if options.preview:
+            from splatseed.view.maps import preview_maps  # noqa: PLC0415  (Pillow)
+
+            clock("preview", 0.0)
+            preview_maps(scene, maps, options.output / PICTURE)
+    _summarise_stereo(options, scene, maps, report, time.perf_counter() - start)
+
+
+def _write(
+    scene: Scene, maps: Sequence[StereoMap], options: Options, clock: StageClock
+) -> DenseReport:
+    how: dict[str, Any] = {
+        "overwrite": options.overwrite,
+        "provenance": _provenance(options),
+        "progress": clock,
+    }
+    if not options.colmap:
+        return write_dense_maps(scene, maps, options.output, **how)
+    from splatseed.views.undistortion import undistort  # noqa: PLC0415  (Numba)
+
+    return write_dense_workspace(scene, maps, options.output, undistort=undistort, **how)
+
+
+def _summarise_stereo(
+    options: Options,
+    scene: Scene,
+    maps: Sequence[StereoMap],
+    report: DenseReport,
+    seconds: float,
+) -> None:
+    ordered = sorted((each.depth.shape for each in maps), key=math.prod)
+    ends = dict.fromkeys((ordered[0], ordered[-1]))
+    sizes = " to ".join(f"{width} x {height}" for height, width in ends)
+    OUT.print(
+        f"{report.num_maps:,} depth maps of {sizes}: {report.share_known:.0%} of their "
+        f"pixels confirmed by other views, in {seconds:.1f} s, written to {visible(report.path)}",
+        soft_wrap=True,
+    )
+    if options.preview:
+        OUT.print(f"pictures: {visible(options.output / PICTURE)}", soft_wrap=True)
+    for warning in warnings_but_lens(scene):
+        print_note(warning)
+    if report.empty:
+        print_note(f"no other view confirms any pixel of: {_some(report.empty)}")
+    if is_distorted(scene) and not options.colmap:
+        print_note(
+            "the cameras have lens distortion, and these maps belong to the undistorted "
+            "photographs: --colmap writes both, as a scene to continue with"
+        )
+    confirmed = sum(np.count_nonzero(np.isfinite(each.depth)) for each in maps)
+    print_commands("next", _after_stereo(options, scene, report.path, int(confirmed)))
+
+
+def _after_stereo(
+    options: Options, scene: Scene, written: Path, confirmed: int
+) -> list[tuple[str, str]]:
+    if not options.colmap:
+        most = Planned.of(scene, None, FULL_RUN).most_seeds
+        return after_stereo(options.scene, scene, written, confirmed, most)
+    fused = quoted(written / "fused.ply")
+    fuse = (
+        f"colmap stereo_fusion --workspace_path {quoted(written)} --output_path {fused}"
+        f" --StereoFusion.min_num_pixels {MIN_PIXELS}"
+    )
+    # The workspace is itself a scene, without distortion.
+    return [look(written, written), ("fuse", fuse)]

@@ -1,0 +1,243 @@
+"""The commands that verbs print as the next, each of which works on the scene it is printed for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from splatseed.console import print_commands, print_note
+from splatseed.lens import undistort_command, undistorted
+from splatseed.literal import quoted
+from splatseed.scene import Scene, SceneFormat
+from splatseed.seeding.advice import (
+    AS_IT_IS,
+    SEEDED,
+    Advice,
+)
+from splatseed.seeding.diagnostics import is_distorted, untrainable
+from splatseed.train.schedule import FULL_RUN
+from splatseed.train.seeds import most_seeds
+from splatseed.train.settings import BUDGET, TrainSettings
+
+RATIO = 16
+PER_POINT = 8
+"""Pixels of known depth per new point. Beyond that, lifting runs out of pixels that are free and
+away from depth discontinuities: on stereo's maps of a kitchen with 14% known, one in 8.2 was."""
+COLMAP_ONLY = frozenset({"gsplat", "graphdeco", "LichtFeld"})
+PINHOLE_ONLY = frozenset({"splatseed", "graphdeco", "OpenSplat", "LichtFeld"})
+"""Trainers that do not deal with lens distortion themselves, as far as we know."""
+COMMON_LENSES = frozenset({"SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"})
+"""The distortion that the others know."""
+
+
+@dataclass(frozen=True)
+class Planned:
+    """How a scene will be trained.
+
+    Args:
+        budget: Most Gaussians at the end.
+        max_steps: Training steps.
+        strategy: The strategy that ``splatseed train`` chooses for these steps.
+        most_seeds: Most seeds with which training begins.
+        flags: The options of ``splatseed train`` that differ from its defaults.
+        tuning: Those of ``splatseed tune`` that plan the same.
+    """
+
+    budget: int
+    max_steps: int
+    strategy: str
+    most_seeds: int
+    flags: str = ""
+    tuning: str = ""
+
+    @classmethod
+    def of(cls, scene: Scene, budget: str | None, max_steps: int) -> Planned:
+        """A scene's plan, from the options.
+
+        Raises:
+            ParameterError: One of them is out of its range.
+        """
+        sizes = [image.intrinsics.width * image.intrinsics.height for image in scene.images]
+        pixels = round(float(np.median(sizes))) if sizes else BUDGET
+        number = max(2, min(BUDGET, pixels))
+        if budget is not None:
+            from splatseed.seeding.upsampling import points_within  # noqa: PLC0415  (loads Numba)
+
+            number = max(2, points_within(scene, budget))
+        settings = TrainSettings(strategy="auto", max_steps=max_steps, cap_max=number)
+        flags = "" if budget is None else f"--budget {number} "
+        flags += "" if max_steps == FULL_RUN else f"--max-steps {max_steps} "
+        # A trial's photographs are smaller, and so is its number of Gaussians.
+        tuning = "" if budget is None else f" --budget {number / pixels:.3g}rho"
+        tuning += "" if max_steps == FULL_RUN else f" --max-steps {max_steps}"
+        most = most_seeds(settings, number)
+        return cls(number, max_steps, settings.densification, most, flags, tuning)
+
+
+def advice_rows(advice: Advice, planned: Planned) -> list[tuple[str, str]]:
+    """The advice as a table's rows: what, why, and for which training."""
+    layout = [("cameras stand", stand)] if (stand := advice.measured.layout) else []
+    why = [("why" if i == 0 else "", reason) for i, reason in enumerate(advice.reasons)]
+    plan = (
+        f"{planned.budget:,} Gaussians at most, {planned.max_steps:,} steps, strategy "
+        f"{planned.strategy}"
+    )
+    return [*layout, ("planned", plan), ("advice", advice.sentence), *why]
+
+
+def advice_commands(
+    path: Path, scene: Scene, advice: Advice, planned: Planned, *, refine: bool = False
+) -> list[tuple[str, str]]:
+    """The commands that follow the advice, each of which works on this scene.
+
+    Args:
+        path: Where the scene lies.
+        scene: The scene.
+        advice: The advice.
+        planned: How it will be trained.
+        refine: Whether its poses should be refined.
+    """
+    trains, first = not untrainable(scene), []
+    if trains and is_distorted(scene):
+        first, path = [("undistort", undistort_command(path))], undistorted(path)
+    source = quoted(path)
+    training = f"--budget {planned.budget} --max-steps {planned.max_steps} -o RUN"
+    if advice.method == SEEDED:
+        train = f"splatseed train {source} {planned.flags}-o RUN"
+    elif advice.method == AS_IT_IS:
+        train = f"splatseed train {source} --seeds scene {training}"
+    else:
+        how = f"--method {advice.method} --ratio 4"
+        how = f"--budget {planned.most_seeds}" if advice.method == "auto" else how
+        how = f"{how} --refine-poses" if refine else how
+        first.append(("seeds", f"splatseed upsample {source} {how} -o OUT"))
+        train = f"splatseed train OUT {training}"
+    if not trains:
+        return first or [("look", f"splatseed view {source}")]
+    tune = ("or ask by experiment", f"splatseed tune {source} --minutes 30{planned.tuning}")
+    tunes = advice.method in (AS_IT_IS, "auto") and len(scene.points)
+    return [*first, ("train", train), *([tune] if tunes else [])]
+
+
+def after_stereo(
+    path: Path, scene: Scene, maps: Path, confirmed: int, most: int
+) -> list[tuple[str, str]]:
+    """What to do with stereo's maps, which need no alignment.
+
+    Args:
+        path: Where the scene lies.
+        scene: The scene.
+        maps: The folder of the maps.
+        confirmed: Number of pixels with a depth, of all maps.
+        most: Most seeds with which training can begin.
+    """
+    if is_distorted(scene):  # seeds are lifted along the rays of a pinhole camera
+        return [look(path, maps)]
+    number = number_for(len(scene.points), confirmed, most)
+    aligned = "" if len(scene.points) else "--depth.no-align "
+    return [look(path, maps), use(path, maps, aligned + number)]
+
+
+def after_network(
+    path: Path, scene: Scene, maps: Path, known: int, most: int
+) -> list[tuple[str, str]]:
+    """What to do with a network's maps, which must be aligned to points; arguments as above."""
+    if is_distorted(scene):
+        return [look(path, maps), ("for seeds, begin with", undistort_command(path))]
+    if len(scene.points):
+        return [look(path, maps), use(path, maps, number_for(len(scene.points), known, most))]
+    photographs = scene.source.image_dir if scene.source else None
+    images = "IMAGES" if photographs is None else quoted(photographs)
+    made = Path("SCENE")
+    points = f"splatseed sfm {images} --poses-from {quoted(path)} -o {made}"
+    return [look(path, maps), ("points to align to", points), use(made, maps, f"--ratio {RATIO}")]
+
+
+def look(path: Path, maps: Path) -> tuple[str, str]:
+    """The command that shows the maps."""
+    info = f"splatseed info {quoted(path)} --depth {quoted(maps)} --picture depth.png"
+    return "look", info
+
+
+def number_for(points: int, known: int, most: int) -> str:
+    """The option for as many points as maps can give and training can begin with.
+
+    Of a scene with points, at most ``RATIO`` times as many.
+
+    Args:
+        points: Points of the scene.
+        known: Number of pixels with a depth, of all maps.
+        most: Most seeds with which training can begin.
+    """
+    number = max(points + 1, min(most, points + known // PER_POINT))
+    return f"--ratio {RATIO}" if 0 < RATIO * points <= number else f"--num-points {number}"
+
+
+def use(path: Path, maps: Path, how: str) -> tuple[str, str]:
+    """The command that makes seeds of the maps."""
+    seeds = f"splatseed upsample {quoted(path)} --method depth --depth {quoted(maps)}"
+    return "use", f"{seeds} {how} -o OUT"
+
+
+def tell_training(read_from: Path, scene: Scene, output: Path, layout: SceneFormat) -> None:
+    """Print the commands that train a scene that was written, and what some of them need first.
+
+    Args:
+        read_from: Where the scene was read.
+        scene: The scene as it was read.
+        output: The scene folder that was written.
+        layout: Its layout.
+    """
+    if not scene.images:  # writing it said so
+        return
+    if missing := untrainable(scene):
+        print_note(missing)
+        return
+    if not is_distorted(scene):
+        print_commands("train it with", training_commands(output, layout))
+        return
+    lenses = {image.intrinsics.model for image in scene.images if image.intrinsics.has_distortion}
+    known = lenses <= COMMON_LENSES
+    if known:
+        print_commands("train it with", training_commands(output, layout, distorted=True))
+    print_note(
+        f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
+        f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."
+    )
+
+
+def training_commands(
+    path: Path, written_format: SceneFormat, *, distorted: bool = False
+) -> list[tuple[str, str]]:
+    """(trainer, command) for every trainer that reads the scene at ``path`` unchanged.
+
+    Args:
+        path: The scene folder that was written.
+        written_format: "colmap" or "transforms": gsplat's examples and graphdeco's code read only
+            the former, and LichtFeld Studio is made for it.
+        distorted: Whether cameras have lens distortion, with which only some trainers deal.
+
+    Example:
+        >>> dict(training_commands(Path("/data/out"), "colmap"))["graphdeco"]
+        'python train.py -s /data/out -m /data/out-graphdeco --eval'
+    """
+    # Other trainers are run from their own checkouts, so a relative path would miss.
+    full = path.resolve()
+    scene = quoted(full)
+    result = [quoted(f"{full}-{name}") for name in ("gsplat", "graphdeco", "lichtfeld")]
+    gsplat = f"--data_dir {scene} --data_factor 1 --result_dir {result[0]}"
+    colmap = written_format != "transforms"
+    layout = " colmap --colmap-path sparse/0 --downscale-factor 1" if colmap else ""
+    commands = {
+        "splatseed": f"splatseed train {quoted(path)} -o {quoted(f'{path}-run')}",
+        "gsplat": f"python examples/simple_trainer.py default {gsplat}",
+        "graphdeco": f"python train.py -s {scene} -m {result[1]} --eval",
+        "nerfstudio": f"ns-train splatfacto --data {scene}{layout}",
+        "Brush": f"brush {scene} --with-viewer",
+        "OpenSplat": f"./opensplat {scene} -n 30000",
+        "LichtFeld": f"./build/LichtFeld-Studio -d {scene} -o {result[2]}",
+    }
+    unable = (frozenset() if colmap else COLMAP_ONLY) | (PINHOLE_ONLY if distorted else frozenset())
+    return [(name, command) for name, command in commands.items() if name not in unable]
