@@ -30,10 +30,6 @@ def test_a_stage_lasts_until_the_next_begins(monkeypatch):
     assert clock.seconds() == {"read": 1.0 + 6.0, "fit": 3.0}
 
 
-def test_a_clock_that_never_ran_has_no_stages():
-    assert StageClock().seconds() == {}
-
-
 def test_nothing_is_drawn_where_nobody_looks(capsys):
     with stage_display() as clock:
         clock("read", 0.5)
@@ -127,24 +123,6 @@ def test_text_is_printed_as_it_is_on_one_line(text, capsys):
     lines = [line for line in out.splitlines() if text in line]
     assert len(lines) == 6
     assert "\x1b" not in out
-
-
-def test_columns_line_up(capsys):
-    print_pairs("title", [("a", "first"), ("much longer", "second"), ("", "third")])
-    lines = capsys.readouterr().out.splitlines()[2:]
-    assert [
-        line.index(word) for line, word in zip(lines, ("first", "second", "third"), strict=True)
-    ] == [
-        15,
-        15,
-        15,
-    ]
-
-
-def test_numbers_are_aligned_to_the_right(capsys):
-    print_table("title", ("name", "value"), [("a", "1"), ("b", "1000")])
-    lines = capsys.readouterr().out.splitlines()[2:]
-    assert len({len(line.rstrip()) for line in lines}) == 1
 
 
 def test_a_table_in_a_file_cuts_no_name_short(capsys):

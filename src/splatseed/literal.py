@@ -56,11 +56,11 @@ def quoted(path: Path | str) -> str:
     return "$'" + "".join(map(_ansi_c, text)) + "'"
 
 
-def told(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """What the exception of a library says about a file, in words for its user.
 
     Example:
-        >>> told(KeyError("scale")), told(ValueError("File is not a zip file"))
+        >>> describe_error(KeyError("scale")), describe_error(ValueError("File is not a zip file"))
         ("no 'scale'", 'File is not a zip file')
     """
     kind = type(error).__name__

@@ -112,25 +112,12 @@ def test_a_damaged_scene(spoil, says, own_room, tmp_path, splatseed):
         _assert_refused(splatseed("info", own_room), says)
 
 
-def test_no_scene_at_all(tmp_path, splatseed):
-    for path in (tmp_path / "nowhere", tmp_path, __file__):
-        _assert_refused(splatseed("info", path), path)
-        _assert_refused(splatseed("upsample", path, "-o", tmp_path / "out"), path)
-
-
 @pytest.mark.parametrize("method", ["linear", "triangle", "spline", "mls", "voronoi"])
 def test_one_point_is_too_few(method, tmp_path, splatseed):
     write_ply(tmp_path / "one.ply", _cloud([[1, 2, 3]]))
     words = ("upsample", tmp_path / "one.ply", "-o", tmp_path / "deep/out", "--method", method)
     _assert_refused(splatseed(*words), "point")
     assert _names(tmp_path) == ["one.ply"]
-
-
-def test_only_nan_points_are_too_few(tmp_path, splatseed):
-    write_ply(tmp_path / "nan.ply", _cloud(np.full((50, 3), np.nan)))
-    words = ("upsample", tmp_path / "nan.ply", "-o", tmp_path / "out", "--method", "random")
-    _assert_refused(splatseed(*words), "finite")
-    assert splatseed("info", tmp_path / "nan.ply").code == 0
 
 
 def _cloud(xyz):
@@ -192,12 +179,6 @@ def test_the_input_is_no_place_for_the_output(place, words, own_room, tmp_path, 
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_the_scene_around_a_named_model_is_protected_too(own_room, splatseed):
-    run = splatseed("upsample", own_room / "sparse/0", "-o", own_room / "up")
-    _assert_refused(run, "apart from the input")
-    assert not (own_room / "up").exists()
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere; simulated below")
 def test_no_permission_to_write(room, tmp_path, splatseed):
     locked = tmp_path / "locked"
@@ -246,10 +227,6 @@ def _fail_halfway(monkeypatch, error):
         raise error
 
     monkeypatch.setattr(colmap_binary, "write_points3d", write)
-
-
-def test_sfm_output_rules_are_the_same(own_room, splatseed):
-    _assert_refused(splatseed("sfm", own_room / "images", "-o", own_room), "apart from the input")
 
 
 def test_memory_that_ran_out_is_said_so_whatever_the_error_says(splatseed, monkeypatch):

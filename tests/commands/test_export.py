@@ -105,12 +105,6 @@ def test_the_command_that_scores_a_run_has_its_scene_and_size(named, run_of, spl
     assert f"{out} --scene '/data/my scene' --data-factor 2 --test-every 5" in said
 
 
-def test_the_command_that_scores_a_run_leaves_defaults_out(run_of, splatseed, tmp_path):
-    folder = run_of(scene="/data/room", data_factor=1, test_every=8)
-    said = splatseed("export", folder, "-o", tmp_path / "out.spz").out
-    assert said.rstrip().endswith("--scene /data/room")
-
-
 def test_what_a_bare_file_cannot_tell_is_left_as_a_word(model, splatseed, tmp_path):
     run = splatseed("export", model, "-o", tmp_path / "out.spz")
     assert run.out.rstrip().endswith("--scene SCENE --data-factor N")

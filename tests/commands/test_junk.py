@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 import warnings
 import zipfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 pytest.importorskip("torch")
@@ -19,7 +17,6 @@ import torch
 from splatseed.errors import OutputError, SceneFormatError
 from splatseed.io.staging import atomic_file, output_folder
 from splatseed.splat.metrics import load_lpips
-from splatseed.train.schedule import Schedule
 from splatseed.train.settings import TrainSettings
 from splatseed.train.state import load_checkpoint, make_strategy
 
@@ -32,30 +29,6 @@ def _refused(run, *says):
     assert "Traceback" not in run.err
     for each in says:
         assert each in run.err
-
-
-def _checkpoint(content, path):
-    torch.save(content, path)
-    settings = TrainSettings(strategy="none", backend="cpu")
-    schedule = settings.schedule
-    assert isinstance(schedule, Schedule)
-    return load_checkpoint(path, make_strategy(settings, CPU), schedule, CPU)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        {"format": 2},
-        {"format": 2, "params": {"means": torch.zeros(3, 3)}},
-        {"format": 2, "params": 7},
-        {"format": 1},
-        [1, 2],
-        torch.zeros(3),
-    ],
-)
-def test_a_checkpoint_of_wrong_parts(content, tmp_path):
-    with pytest.raises(SceneFormatError, match="to be a checkpoint"):
-        _checkpoint(content, tmp_path / "checkpoint.pt")
 
 
 def _spoiled(data, rng, how):
@@ -111,30 +84,6 @@ def test_a_full_output(room, splatseed, monkeypatch):
         run = splatseed("info", room)
         full.close = lambda: None  # what is left in its buffer cannot be written
     _refused(run, "No space left on device")
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-@pytest.mark.parametrize(
-    "words", [["--help"], ["-V"], ["--tyro-print-completion", "bash"], ["info", "-h"]]
-)
-def test_help_into_a_full_output(words):
-    program = [sys.executable, "-c", "from splatseed.cli import main; main()", *words]
-    with Path("/dev/full").open("w") as full:
-        run = subprocess.run(
-            program, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=120
-        )
-    assert (run.returncode, run.stderr.count("\n")) == (2, 1)
-    assert "No space left on device" in run.stderr
-
-
-def test_numbers_are_no_weights(tmp_path):
-    state = {"features.0.weight": torch.zeros(64, 3, 11, 11), "features.0.bias": torch.zeros(3)}
-    torch.save(state, tmp_path / "weights.pth")
-    with pytest.raises(SceneFormatError, match="LPIPS"):
-        load_lpips("alex", tmp_path / "weights.pth")
-    np.save(tmp_path / "weights.npy", np.zeros(3))
-    with pytest.raises(SceneFormatError, match="LPIPS"):
-        load_lpips("alex", tmp_path / "weights.npy")
 
 
 PYTHON = re.compile(r"<\w+[.\w]* |0x[0-9a-f]{5}|\bb['\"]|\\x|\b\w+Error\b")

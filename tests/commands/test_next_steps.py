@@ -7,15 +7,10 @@ import shlex
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image as PilImage
 
-from splatseed.camera import Intrinsics, quat_from_rotation
+from splatseed.camera import Intrinsics
 from splatseed.io import load_scene, write_scene
-from splatseed.synthetic import make_capture
-
-from ..bent import bend
 
 START, PERIOD = 1305031102.175304, 0.1
 
@@ -38,30 +33,6 @@ def bent(room, tmp_path) -> Path:
     path = tmp_path / "bent"
     write_scene(scene.replace(images=images, intrinsics=(lens,)), path, copy_images=True)
     return path
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory) -> Path:
-    """An RGB-D capture in TUM's layout: without points, and with a lens that distorts."""
-    made = bend(make_capture(0, num_views=6, width=640, height=480))
-    root = tmp_path_factory.mktemp("tum") / "rgbd_dataset_freiburg1_room"
-    poses = []
-    for kind in ("rgb", "depth"):
-        (root / kind).mkdir(parents=True)
-    for i, (image, photograph) in enumerate(zip(made.scene.images, made.images, strict=True)):
-        time = f"{START + i * PERIOD:.6f}"
-        PilImage.fromarray(photograph).save(root / "rgb" / f"{time}.png")
-        depth = np.nan_to_num(np.asarray(made.depths[i])) * 5000
-        PilImage.fromarray(depth.clip(0, 65535).astype(np.uint16)).save(root / f"depth/{time}.png")
-        pose = image.camera.world_from_cam
-        w, x, y, z = quat_from_rotation(pose[:3, :3])
-        poses.append(" ".join(map(str, (time, *pose[:3, 3], x, y, z, w))))
-    times = [line.split()[0] for line in poses]
-    for kind in ("rgb", "depth"):
-        listed = [f"{time} {kind}/{time}.png" for time in times]
-        (root / f"{kind}.txt").write_text("\n".join(listed) + "\n")
-    (root / "groundtruth.txt").write_text("\n".join(poses) + "\n")
-    return root
 
 
 def follow(out: str, splatseed) -> list[str]:
@@ -142,28 +113,6 @@ def test_only_trainers_that_undistort_are_named_for_a_distorted_scene(bent, tmp_
     named = [line.split()[0] for line in after.splitlines() if line.startswith("  ")]
     assert named == ["gsplat", "nerfstudio", "Brush"]
     assert f"splatseed undistort {bent} -o {bent}_undistorted" in after
-
-
-def test_no_trainer_is_named_for_a_lens_that_few_know(capture, tmp_path, splatseed):
-    run = splatseed("upsample", capture, "-o", tmp_path / "out")
-    assert run.code == 0, run.err
-    assert "train it with" not in run.out
-    assert f"splatseed undistort {capture}" in run.out
-
-
-def test_undistorting_is_not_advised_again_afterwards(bent, tmp_path, splatseed):
-    pytest.importorskip("pycolmap", reason="undistorts")
-    run = splatseed("undistort", bent, "-o", tmp_path / "straight")
-    assert run.code == 0, run.err
-    assert "lens distortion" not in run.out + run.err
-
-
-def test_tune_names_the_scene_that_was_given(bent, tmp_path, splatseed):
-    pytest.importorskip("torch", reason="tune trains")
-    run = splatseed("tune", bent, "-o", tmp_path / "tuned")
-    assert run.code == 2
-    assert f"splatseed undistort {bent} -o {bent}_undistorted" in run.err
-    assert not (tmp_path / "tuned").exists()
 
 
 def test_maps_that_give_few_points_are_asked_for_few(room, tmp_path, monkeypatch, splatseed):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import pycolmap
 import pytest
 
-from splatseed.io import load_scene, write_scene
-from splatseed.io.ply import write_ply
+from splatseed.io import load_scene
 
 RUNS = [
     ("bonsai", "mls"),
@@ -32,23 +31,6 @@ def test_colmap_scenes_are_upsampled_and_open(name, method, scenes, tmp_path, sp
     # Duplicates of the input are left out, and told of.
     assert 1.9 * len(before.points) < len(after.points) <= 2 * len(before.points)
     assert ("repeat the position" in run.out) == ("left out" in run.out)
-
-
-def test_a_transforms_scene_made_of_fern(scenes, tmp_path, splatseed):
-    write_scene(load_scene(scenes / "fern"), tmp_path / "nerf", format="transforms")
-    run = splatseed(
-        "upsample", tmp_path / "nerf", "--method", "mls", "--ratio", 2, "-o", tmp_path / "out"
-    )
-    assert run.code == 0
-    assert len(load_scene(tmp_path / "out").points) == 2 * len(load_scene(tmp_path / "nerf").points)
-    assert "ns-train splatfacto" in run.out
-
-
-def test_a_ply_of_fern(scenes, tmp_path, splatseed):
-    write_ply(tmp_path / "fern.ply", load_scene(scenes / "fern").points)
-    run = splatseed("upsample", tmp_path / "fern.ply", "--ratio", 2, "-o", tmp_path / "out")
-    assert run.code == 0
-    assert pycolmap.Reconstruction(tmp_path / "out/sparse/0").num_points3D() > 12_000
 
 
 @pytest.mark.parametrize("name", [name for name, _ in RUNS[1:]])

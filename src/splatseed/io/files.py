@@ -27,7 +27,7 @@ import numpy as np
 from numpy.lib import format as npy_format
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
-from splatseed.literal import beginning, told
+from splatseed.literal import beginning, describe_error
 from splatseed.process.memory import free_memory
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
@@ -178,7 +178,7 @@ def guarded(path: Path, expected: str, *, fix: str = COPY_AGAIN) -> Iterator[Non
         # Packages raise errors of many kinds; a panic of Rust is no Exception, as Ctrl-C is none.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
-        found = told(error)  # type: ignore[arg-type]  # a panic has words, too
+        found = describe_error(error)  # type: ignore[arg-type]  # a panic has words, too
     else:
         return
     raise SceneFormatError(f"{path} to be {expected}", found=found, fix=fix)

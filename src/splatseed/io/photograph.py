@@ -18,7 +18,7 @@ import numpy as np
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import guarded, odd_kind, open_file, other_spelling, read_file
-from splatseed.literal import agreeing, told
+from splatseed.literal import agreeing, describe_error
 from splatseed.scene import Image, Scene
 
 if TYPE_CHECKING:
@@ -203,7 +203,7 @@ def _size_warning(image: Image, image_dir: Path) -> str | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, UnidentifiedImageError, PilImage.DecompressionBombError) as error:
-        return f"{image.name} cannot be read: {told(error)}."
+        return f"{image.name} cannot be read: {describe_error(error)}."
     expected = (image.intrinsics.width, image.intrinsics.height)
     if size == expected:
         return None

@@ -16,7 +16,7 @@ from PIL import Image as PilImage
 from splatseed.errors import SceneFormatError, SceneNotFoundError
 from splatseed.io.files import VIDEO_SUFFIXES, open_file
 from splatseed.io.staging import read_manifest
-from splatseed.literal import quoted, told
+from splatseed.literal import describe_error, quoted
 from splatseed.scene import Image, Scene
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"})
@@ -157,7 +157,7 @@ def _read_photo(image_dir: Path, name: str) -> Photo | None:
     except (OSError, SyntaxError, ValueError, PilImage.DecompressionBombError) as error:
         raise SceneFormatError(
             f"{path} to be a readable image",
-            found=told(error),
+            found=describe_error(error),
             fix="Export it again, or take it out of the folder.",
         ) from error
     return Photo(name, width, height)

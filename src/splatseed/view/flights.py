@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter1d
 from splatseed.errors import OutputError, ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io.files import read_bytes
 from splatseed.io.staging import atomic_file
-from splatseed.literal import counted, told
+from splatseed.literal import counted, describe_error
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
 from splatseed.similarity import Similarity
@@ -172,7 +172,7 @@ def path_of_file(
     except SceneNotFoundError:
         raise
     except (AttributeError, KeyError, TypeError, ValueError, RecursionError) as error:
-        found = told(error)
+        found = describe_error(error)
     if found:
         raise SceneFormatError(
             f"{path} to be a camera path as nerfstudio's viewer writes it: "

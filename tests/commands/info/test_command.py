@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shutil
 import subprocess
 import sys
 
@@ -13,7 +12,7 @@ import pytest
 from PIL import Image as PilImage
 
 from splatseed.io import load_scene, write_scene
-from splatseed.io.colmap.binary import write_cameras, write_points3d
+from splatseed.io.colmap.binary import write_points3d
 from splatseed.io.ply import write_ply
 from splatseed.pointcloud import PointCloud
 
@@ -78,13 +77,6 @@ def test_info_does_not_wait_for_numba(room):
     assert "image area without points" in run.stdout
 
 
-def test_a_transforms_scene(room, tmp_path, splatseed):
-    write_scene(load_scene(room), tmp_path / "nerf", format="transforms")
-    rows = _rows(splatseed("info", tmp_path / "nerf").out)
-    assert (rows["format"], rows["tracks"]) == ("transforms", "none")
-    assert rows["images"] == "12 (10 to train, 2 to test)"
-
-
 def test_poses_without_points_ask_for_triangulation(room, tmp_path, splatseed):
     write_scene(load_scene(room), tmp_path / "nerf", format="transforms")
     for path in (tmp_path / "nerf").glob("*.ply"):
@@ -125,18 +117,6 @@ def test_clouds_of_nothing(xyz, points, finite, tmp_path, splatseed):
     assert "nan" not in run.out
 
 
-def test_one_point_has_no_spacing(tmp_path, splatseed):
-    write_ply(tmp_path / "one.ply", PointCloud(np.ones((1, 3)), np.zeros((1, 3), np.uint8)))
-    rows = _rows(splatseed("info", tmp_path / "one.ply").out)
-    assert (rows["points"], rows["spacing 5/25/50/75/95%"]) == ("1", "none")
-
-
-def test_what_the_reader_found_odd_is_a_problem(own_room, splatseed):
-    shutil.rmtree(own_room / "images")
-    out = splatseed("info", own_room).out
-    assert "images folder is missing" in out.partition("problems")[2]
-
-
 def test_points_that_were_put_into_another_model_are_a_problem(own_room, room, splatseed):
     write_points3d(own_room / "sparse/0/points3D.bin", load_scene(room).points, None)
     out = splatseed("info", own_room).out
@@ -155,10 +135,3 @@ def test_unknown_reprojection_errors_are_called_so(own_room, splatseed):
     unknown = dataclasses.replace(scene.tracks, errors=np.full(len(scene.tracks), -1.0))
     write_points3d(path, scene.points, unknown)
     assert _rows(splatseed("info", own_room).out)["reprojection error, px"] == "unknown"
-
-
-def test_many_kinds_of_cameras_are_counted_not_listed(own_room, splatseed):
-    record = load_scene(own_room).intrinsics[0]
-    kinds = [dataclasses.replace(record, camera_id=i, width=120 + i) for i in range(1, 41)]
-    write_cameras(own_room / "sparse/0/cameras.bin", (record, *kinds[1:]))
-    assert _rows(splatseed("info", own_room).out)["cameras"].endswith("37 more kinds")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import shlex
-import shutil
 
 import numpy as np
 import pytest
@@ -47,13 +46,6 @@ def _pairs(out):
     return {line[0]: line[1].strip() for line in lines if len(line) == 2}
 
 
-def test_the_next_step_reads_the_maps_alike(room, tmp_path, splatseed):
-    rays = _rewrite(room, tmp_path / "rays", lambda _, z: 2 * z)
-    words = ("--depth-kind", "ray", "--depth-scale", 2)
-    run = splatseed("info", room, "--depth", rays, *words)
-    assert f"--depth {rays} --depth-kind ray --depth-scale 2 --ratio 16 -o OUT" in run.out
-
-
 def test_nothing_follows_from_maps_that_do_not_fit(room, splatseed):
     run = splatseed("info", room, "--depth", room / "depths", "--depth-kind", "inverse")
     assert "12 of 12 depth maps cannot be aligned" in run.out
@@ -77,17 +69,6 @@ def test_true_depth_fits(room, splatseed):
         assert float(scale) == pytest.approx(1, abs=0.02)
         assert float(residual.rstrip("%")) == pytest.approx(100 * expected[name].residual, abs=0.01)
     assert f"--method depth --depth {room / 'depths'}" in run.out.splitlines()[-1]
-
-
-def test_scale_and_shift_that_were_planted(tour, tmp_path, splatseed):
-    maps = _rewrite(tour, tmp_path / "maps", lambda i, z: (1 / z - 0.05) / (2 + i), "inverse")
-    rows = _rows(splatseed("info", tour, "--depth", maps).out)
-    assert len(rows) == 12
-    names = sorted(find_depths(load_scene(tour), maps))
-    for name in rows:
-        i = names.index(name)
-        assert float(rows[name][1]) == pytest.approx(2 + i, rel=0.03)
-        assert float(rows[name][2]) == pytest.approx(0.05, abs=0.02)
 
 
 def test_the_worst_are_listed_first_and_the_rest_on_demand(tour, tmp_path, splatseed):
@@ -117,14 +98,6 @@ def test_why_an_image_is_left_out(tour, tmp_path, splatseed):
     assert next(iter(_rows(out))) == names[2]
 
 
-def test_depth_of_another_kind_is_found_out(room, tmp_path, splatseed):
-    maps = _rewrite(room, tmp_path / "maps", lambda _, z: z)
-    run = splatseed("info", room, "--depth", maps, "--depth-kind", "inverse")
-    assert run.code == 0
-    assert "values rise with depth" in run.out
-    assert _pairs(run.out)["left out"] == "12"
-
-
 def test_as_many_points_are_asked_for_as_depth_prints(tour, tmp_path, splatseed):
     few = lambda i, z: np.where(np.arange(z.size).reshape(z.shape) < 200 * (i + 1), z, np.nan)
     maps = _rewrite(tour, tmp_path / "maps", few)
@@ -146,14 +119,6 @@ def test_as_many_points_are_asked_for_as_depth_prints(tour, tmp_path, splatseed)
 )
 def test_no_more_points_are_asked_for_than_there_is_room_for(points, known, most, said):
     assert number_for(points, known, most) == said
-
-
-def test_a_scale_of_the_users_is_taken(room, tmp_path, splatseed):
-    maps = _rewrite(room, tmp_path / "maps", lambda _, z: z * 1000)
-    plain = _pairs(splatseed("info", room, "--depth", maps).out)["scale"]
-    scaled = _pairs(splatseed("info", room, "--depth", maps, "--depth-scale", 1000).out)["scale"]
-    assert float(plain.split()[1].rstrip(",")) == pytest.approx(0.001, rel=0.02)
-    assert float(scaled.split()[1].rstrip(",")) == pytest.approx(1, rel=0.02)
 
 
 def test_a_scenes_own_maps_are_counted(tmp_path, splatseed):
@@ -238,11 +203,3 @@ def test_a_damaged_map_is_named_and_no_picture_left(own_room, tmp_path, splatsee
     assert run.code == 2
     assert path.name in run.err
     assert not (tmp_path / "a.png").exists()
-
-
-def test_depth_is_shown_where_photographs_are_gone(own_room, tmp_path, splatseed):
-    shutil.rmtree(own_room / "images")
-    words = ("--depth", own_room / "depths", "--picture", tmp_path / "a.png")
-    run = splatseed("info", own_room, *words)
-    assert run.code == 0
-    assert (np.asarray(PilImage.open(tmp_path / "a.png"))[40:380, 20:480] == 230).all()

@@ -48,17 +48,6 @@ def test_a_seeded_scene_is_to_be_trained_and_not_seeded_again(seeded, room, spla
     assert isolated[0].split()[-1] == isolated[1].split()[-1]
 
 
-def test_the_next_command_keeps_what_was_asked(seeded, splatseed):
-    out = splatseed("info", seeded, "--budget", 5000, "--max-steps", 900).out
-    assert out.rstrip().endswith("--budget 5000 --max-steps 900 -o RUN")
-
-
-def test_seeds_without_photographs_are_to_be_looked_at(seeded, splatseed):
-    (seeded / "images").unlink()
-    out = splatseed("info", seeded).out
-    assert out.rstrip().endswith(f"splatseed view '{seeded}'")
-
-
 def test_a_run_is_told_from_a_scene(tmp_path, splatseed):
     config = {"splatseed": "1", "scene": "/data/fox"}
     (tmp_path / "run").mkdir()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatseed.camera import rotation_from_quat
-from splatseed.commands.upsample.cloud import Brought
+from splatseed.commands.upsample.cloud import LoadedCloud
 from splatseed.io import load_scene, write_scene
 from splatseed.io.cleaning import recentred
 from splatseed.io.ply import write_ply
@@ -147,8 +147,8 @@ def test_the_files_of_an_alignment_are_listed(splatseed, room, tmp_path, monkeyp
         report={}, residuals=np.zeros(1), extent=1.0, sample=None, rgb=None, marks=None, sentence=""
     )
     monkeypatch.setattr(
-        "splatseed.commands.upsample.command.bring_clouds",
-        lambda *given: Brought(given[1], given[2], found),
+        "splatseed.commands.upsample.command.load_clouds",
+        lambda *given: LoadedCloud(given[1], given[2], found),
     )
     monkeypatch.setattr("splatseed.view.clouds.preview_alignment", lambda *given: given[-1].touch())
     out = tmp_path / "out"
@@ -158,18 +158,6 @@ def test_the_files_of_an_alignment_are_listed(splatseed, room, tmp_path, monkeyp
         assert (out / name).is_file()
         assert str(out / name) in run.out
     assert unlisted_files(out) == []  # so that --overwrite replaces them
-
-
-def test_duplicates_by_the_million_change_nothing(splatseed, room, xyz, tmp_path):
-    count = {}
-    for name, repeats in (("once", 0), ("often", 1_000_000)):
-        path = tmp_path / f"{name}.npz"
-        np.savez(path, xyz=np.concatenate([xyz, np.repeat(xyz[:1], repeats, axis=0)]))
-        run = splatseed("upsample", room, "--cloud", path, "-o", tmp_path / name)
-        assert run.code == 0
-        assert "no colours: colours are those of the photographs" in run.err + run.out
-        count[name] = len(load_scene(tmp_path / name).points)
-    assert abs(count["often"] - count["once"]) <= 2
 
 
 def test_a_cloud_beside_cover(splatseed, room, scan, tmp_path):
@@ -211,10 +199,3 @@ def test_refusals_are_one_line_and_leave_nothing(
     assert says in run.err
     assert len([line for line in run.err.splitlines() if line.startswith("error")]) == 1
     assert not (tmp_path / "out").exists()
-
-
-def test_a_wrong_file_is_told_before_anything_else(splatseed, room, tmp_path):
-    run = splatseed("upsample", room, "--cloud", "none.laz", "-o", tmp_path / "out")
-    assert run.code == 2
-    assert run.out == ""
-    assert run.err.startswith("error: expected a cloud at none.laz; found no such file")

@@ -6,7 +6,6 @@ import json
 import re
 import shlex
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -93,26 +92,12 @@ def test_the_plan_has_the_number_and_what_was_changed(
     assert "as the photographs need" not in run.out
 
 
-def test_a_bad_budget_is_refused_before_anything_is_said(room, tmp_path, splatseed):
-    run = splatseed("upsample", room, "-o", tmp_path / "out", "--budget", "500kk")
-    assert (run.code, run.out) == (2, "")
-    assert "found '500kk'" in run.err
-
-
 def test_without_photographs_the_default_interpolates_and_says_so(own_room, tmp_path, splatseed):
     shutil.rmtree(own_room / "images")
     run = splatseed("upsample", own_room, "-o", tmp_path / "out")
     assert run.code == 0
     assert "-> mls" in run.out
     assert "Without photographs" in run.out + run.err
-
-
-@pytest.mark.parametrize("words", [["--ratio", 4], ["--num-points", 5000]])
-def test_a_number_for_the_default_is_refused_before_any_work(words, room, tmp_path, splatseed):
-    run = splatseed("upsample", room, *words, "-o", tmp_path / "out")
-    assert (run.code, run.out) == (2, "")
-    assert "--budget" in run.err
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_closing_table_has_what_was_asked_for(room, tmp_path, splatseed):
@@ -136,20 +121,6 @@ def test_the_origins_add_up_where_new_points_coincide(tmp_path, splatseed):
     told = re.search(r"points out +([\d,]+) \(([\d,]+) original, ([\d,]+) linear\)", run.out)
     total, *parts = (int(number.replace(",", "")) for number in told.groups())
     assert total == sum(parts)
-
-
-@pytest.mark.parametrize("name", ["more.ply", "MORE.LAZ"])
-def test_the_name_of_a_file_is_not_made_a_folder(name, room, tmp_path, splatseed):
-    run = splatseed("upsample", room, "-o", tmp_path / name)
-    assert (run.code, run.out) == (2, "")
-    assert f"Pass -o {tmp_path / name[:4]}: the points" in " ".join(run.err.split())
-    assert not list(tmp_path.iterdir())
-
-
-def test_results_are_plain_text_and_the_rest_is_silent(room, tmp_path, splatseed):
-    run = splatseed("upsample", room, "-o", tmp_path / "out", "--preview")
-    assert run.err == ""
-    assert not set(run.out) & {"\r", "\x1b"}
 
 
 def test_the_commands_to_train_with_name_what_is_there(room, tmp_path, splatseed):
@@ -231,21 +202,6 @@ def test_the_paper_profile_sets_defaults_and_flags_still_win(profile, room, tmp_
     assert (paper.frame, written["parameters"]["frame"]) == ("world", "local")
 
 
-def test_a_profile_that_changes_nothing_says_so(room, tmp_path, splatseed):
-    words = ["upsample", room, "--profile", "paper", "--method"]
-    told = splatseed(*words, "auto", "-o", tmp_path / "auto").out
-    assert "Profile paper changes nothing for method auto." in told
-    assert "changes nothing" not in splatseed(*words, "mls", "-o", tmp_path / "mls").out
-
-
-def test_the_last_profile_counts(room, tmp_path, splatseed):
-    profiles = ["--profile", "paper", "--profile", "default"]
-    splatseed("upsample", room, "--method", "mls", "-o", tmp_path / "out", *profiles)
-    written = _manifest(tmp_path / "out")
-    assert written["profile"] == "default"
-    assert written["parameters"]["k"] == configure("mls").k
-
-
 def test_a_number_of_points_is_met(room, tmp_path, splatseed):
     run = splatseed(
         "upsample", room, "--method", "mls", "-o", tmp_path / "out", "--num-points", 1234
@@ -289,14 +245,6 @@ def test_a_preview_runs_the_method_asked_for_and_no_other(room, tmp_path, splats
     assert not (out / "preview_methods.png").exists()
 
 
-def test_only_methods_that_begin_with_stereo_show_its_maps(room, tmp_path, splatseed):
-    for method, shown in (("stereo", True), ("cover", False), ("linear", False)):
-        out = tmp_path / method
-        run = splatseed("upsample", room, "--method", method, "-o", out, "--preview")
-        assert (out / "preview_maps.png").is_file() == shown
-        assert (str(out / "preview_maps.png") in run.out) == shown
-
-
 def _assert_drawn(path):
     with PilImage.open(path) as picture:
         pixels = np.asarray(picture.convert("RGB")).astype(int)
@@ -315,26 +263,6 @@ def test_images_are_linked_or_copied(room, tmp_path, splatseed):
         assert file.read_bytes() == (room / "images" / file.name).read_bytes()
 
 
-def test_links_to_folders_beside_the_poses_are_told(room, tmp_path, splatseed):
-    blender = tmp_path / "blender"
-    write_scene(load_scene(room), tmp_path / "json", format="transforms")
-    content = json.loads((tmp_path / "json/transforms.json").read_text())
-    frames = content.pop("frames")
-    for part, some in (("train", frames[:9]), ("test", frames[9:])):
-        (blender / part).mkdir(parents=True)
-        for frame in some:
-            name = frame["file_path"].removeprefix("images/")
-            shutil.copy(room / "images" / name, blender / part / name)
-            frame["file_path"] = f"./{part}/{name}"
-        text = json.dumps({**content, "ply_file_path": "points.ply", "frames": some})
-        (blender / f"transforms_{part}.json").write_text(text)
-    shutil.copy(tmp_path / "json/sparse_pc.ply", blender / "points.ply")
-    run = splatseed("upsample", blender, "--method", "mls", "-o", tmp_path / "out")
-    assert run.code == 0, run.err
-    where = f"{(blender / 'test').resolve()}, {(blender / 'train').resolve()}"
-    assert f"linked, not copied: {where}; --copy-images" in run.out
-
-
 def test_an_earlier_output_is_replaced_when_asked(room, tmp_path, splatseed):
     out = tmp_path / "out"
     for ratio, words in ((2, []), (3, ["--overwrite"])):
@@ -344,20 +272,6 @@ def test_an_earlier_output_is_replaced_when_asked(room, tmp_path, splatseed):
         )
     assert len(load_scene(out).points) == 3 * len(load_scene(room).points)
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.parametrize("name", ["a [bold] b", "ä ö", "it's"])
-def test_odd_names_are_printed_and_quoted(name, room, tmp_path, splatseed):
-    (tmp_path / "in").mkdir()
-    scene = Path(tmp_path / "in" / name)
-    scene.symlink_to(room)
-    run = splatseed("upsample", scene, "-o", tmp_path / name)
-    assert run.code == 0
-    assert str(scene) in run.out
-    assert str(tmp_path / name) in _commands(run.out)["graphdeco"]
-    assert str(tmp_path / name) in shlex.split(
-        splatseed("info", tmp_path / name).out.splitlines()[-1]
-    )
 
 
 def test_photographs_without_points_are_seeded_and_drawn(room, tmp_path, splatseed):

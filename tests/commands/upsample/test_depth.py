@@ -127,12 +127,6 @@ def test_the_output_may_not_lie_in_the_maps(own_room, splatseed):
     assert not (own_room / "depths/out").exists()
 
 
-def test_flags_of_depth_do_nothing_for_other_methods(room, tmp_path, splatseed):
-    run = splatseed("upsample", room, "--depth", room, "-o", tmp_path / "out")
-    assert run.code == 0
-    assert "The flags of depth have no effect with --method auto." in run.out
-
-
 def test_images_left_out_are_told(own_room, tmp_path, splatseed):
     maps = sorted((own_room / "depths").glob("*.png"))
     for path in maps[:3]:

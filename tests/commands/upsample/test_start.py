@@ -40,12 +40,3 @@ def test_bad_places_are_refused_before_anything_is_written(room, tmp_path, splat
         assert said in " ".join(run.err.split())
         assert not out.exists()
     assert taken.read_text() == "mine"
-
-
-def test_a_cloud_without_photographs_is_refused(room, tmp_path, splatseed):
-    out = tmp_path / "out"
-    words = ("--method", "mls", "-o", out, "--gaussians", tmp_path / "start.ply")
-    run = splatseed("upsample", room / "sparse/0/points3D.ply", *words)
-    assert run.code == 2
-    assert "photographs" in run.err
-    assert not out.exists()

@@ -30,11 +30,11 @@ RECENTER = "recenter.json"
 ALIGNMENT = "alignment.json", "preview_alignment.png"
 CLOSE = 0.01
 """Residual at which a point's colour is halfway, in extents."""
-BESIDE = (CLOUD, "auto", "stereo", "cover", "depth")
+WITH_CLOUD = (CLOUD, "auto", "stereo", "cover", "depth")
 """Methods that --cloud can be combined with."""
 
 
-class Bringing(NamedTuple):
+class CloudOptions(NamedTuple):
     """The options about clouds."""
 
     files: tuple[Path, ...] = ()
@@ -56,7 +56,7 @@ class Bringing(NamedTuple):
         }
 
 
-def settle_cloud(options: Any, arguments: Sequence[str]) -> Any:
+def with_cloud_defaults(options: Any, arguments: Sequence[str]) -> Any:
     """The options, with what --cloud changes about those that were not named.
 
     Args:
@@ -74,9 +74,9 @@ def settle_cloud(options: Any, arguments: Sequence[str]) -> Any:
         return options
     named = any(word.partition("=")[0] == "--method" for word in arguments)
     method = options.method if named else CLOUD
-    if method not in BESIDE:
+    if method not in WITH_CLOUD:
         raise ParameterError(
-            f"--method {', '.join(BESIDE[:-1])} or {BESIDE[-1]} with --cloud",
+            f"--method {', '.join(WITH_CLOUD[:-1])} or {WITH_CLOUD[-1]} with --cloud",
             found=method,
             fix="Leave --method out for the cloud's points alone: interpolating needs no scan.",
         )
@@ -90,7 +90,7 @@ def settle_cloud(options: Any, arguments: Sequence[str]) -> Any:
     return dataclasses.replace(options, method=method, format=layout)
 
 
-class Brought(NamedTuple):
+class LoadedCloud(NamedTuple):
     """A scene and the clouds for it."""
 
     scene: Scene
@@ -156,7 +156,9 @@ class Brought(NamedTuple):
             )
 
 
-def bring_clouds(bringing: Bringing, scene: Scene, method: Cloud, progress: Progress) -> Brought:
+def load_clouds(
+    options: CloudOptions, scene: Scene, method: Cloud, progress: Progress
+) -> LoadedCloud:
     """The scene, recentred if so asked, and the method ``cloud`` with its files in its frame.
 
     Raises:
@@ -165,24 +167,24 @@ def bring_clouds(bringing: Bringing, scene: Scene, method: Cloud, progress: Prog
         SceneNotFoundError: A file is missing.
         SceneFormatError: One is damaged.
     """
-    if not bringing.files:
-        return Brought(scene, method)
-    plan = method.of(*bringing.files, memory=bringing.memory).plan(scene)
+    if not options.files:
+        return LoadedCloud(scene, method)
+    plan = method.of(*options.files, memory=options.memory).plan(scene)
     transform = None
-    if bringing.transform is not None:
-        transform = read_cloud_transform(bringing.transform, scene)
+    if options.transform is not None:
+        transform = read_cloud_transform(options.transform, scene)
     offset = None
-    if bringing.recenter:
+    if options.recenter:
         offset = offset_of(scene)
         scene = recentred(scene, offset)
         moved = Similarity(1.0, np.eye(3), -offset)
         transform = moved if transform is None else transform.then(moved)
     check_precision(scene)
     alignment = None
-    if bringing.align:
+    if options.align:
         from splatseed.seeding.alignment.align import align  # noqa: PLC0415  (loads Numba)
 
-        alignment = align(scene, bringing.files, progress)
+        alignment = align(scene, options.files, progress)
         transform = alignment.scene_from_cloud
-    given = method.of(*bringing.files, transform=transform, memory=bringing.memory)
-    return Brought(scene, given, alignment, offset, bringing.files, plan)
+    given = method.of(*options.files, transform=transform, memory=options.memory)
+    return LoadedCloud(scene, given, alignment, offset, options.files, plan)

@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from splatseed.commands.options import check_least, parse_options
-from splatseed.commands.upsample.cloud import CLOUD, Bringing, bring_clouds, settle_cloud
+from splatseed.commands.upsample.cloud import CLOUD, CloudOptions, load_clouds, with_cloud_defaults
 from splatseed.commands.upsample.output import (
     PICTURES,
     check_start,
@@ -152,9 +152,9 @@ class Options:
         return Tiling(self.memory_bytes, self.jobs, self.executor, self.address, self.tile_points)
 
     @property
-    def bringing(self) -> Bringing:
+    def cloud_options(self) -> CloudOptions:
         """The options about clouds."""
-        return Bringing(
+        return CloudOptions(
             self.cloud_files, self.cloud_transform, self.align, self.recenter, self.memory_bytes
         )
 
@@ -167,7 +167,9 @@ def parse(arguments: list[str]) -> tuple[Options, dict[str, Upsampler]]:
         names = [name for name in METHODS if {name, f"--method={name}"} & set(arguments)]
     methods = {name: configure(name, profile) for name in names}
     options: Any = parse_options(_with_methods(methods), "upsample", arguments)
-    return settle_cloud(options, arguments), {name: getattr(options, name) for name in METHODS}
+    return with_cloud_defaults(options, arguments), {
+        name: getattr(options, name) for name in METHODS
+    }
 
 
 def _profile_of(arguments: Sequence[str]) -> Profile:
@@ -263,7 +265,7 @@ def _run_in_memory(options: Options, methods: dict[str, Upsampler]) -> None:
             notes.append(told)
         options = _settle(options, scene, notes)
         plain = cast("Cloud", methods[CLOUD])
-        brought = bring_clouds(options.bringing, scene, plain, clock)
+        brought = load_clouds(options.cloud_options, scene, plain, clock)
         scene, methods = brought.scene, {**methods, CLOUD: brought.method}
         notes += brought.notes
         method = methods[options.method]
@@ -415,7 +417,7 @@ def _provenance(options: Options, method: Upsampler) -> dict[str, object]:
         "method": options.method,
         "profile": options.profile,
         "parameters": parameters_of(method),
-        "cloud": options.bringing.provenance if options.cloud_files else None,
+        "cloud": options.cloud_options.provenance if options.cloud_files else None,
         "depth": None if options.depth_maps is None else str(options.depth_maps.resolve()),
         "ratio": options.ratio,
         "num_points_asked": options.num_points,
