@@ -63,7 +63,7 @@ WORDS = [
     ((*MLS, "--ratio"), "--ratio"),
     ((*MLS, "--ratio", "0.5"), "ratio"),
     ((*MLS, "--ratio", "nan"), "ratio"),
-    ((*MLS, "--ratio", "1e12"), "ratio"),
+    ((*MLS, "--ratio", "1e12"), "4,294,967,296"),
     ((*MLS, "--ratio", "many"), "--ratio"),
     ((*MLS, "--num-points", "10"), "found 10"),
     ((*MLS, "--num-points", "500k"), "--num-points"),
