@@ -10,7 +10,6 @@ from rich.console import Console
 from splatseed import console
 from splatseed.console import (
     StageClock,
-    print_commands,
     print_note,
     print_pairs,
     print_table,
@@ -116,7 +115,7 @@ def test_the_bars_go_away_when_the_work_fails(terminal):
 @pytest.mark.parametrize("text", [LONG, "[bold]no markup[/bold]", "a [3, 4] b", "3 x 4 = 12.5"])
 def test_text_is_printed_as_it_is_on_one_line(text, capsys):
     print_pairs(text, [("label", text)])
-    print_commands(text, [("", text)])
+    print_pairs(text, [("", text)])
     print_note(text)
     print_table(text, ("name", "value"), [("one", "1")])
     out = capsys.readouterr().out

@@ -12,7 +12,7 @@ from hypothesis import given, strategies as st
 
 import splatseed
 from splatseed import console
-from splatseed.console import LiteralConsole, print_commands, print_note, print_pairs, print_table
+from splatseed.console import LiteralConsole, print_note, print_pairs, print_table
 from splatseed.literal import quoted, visible
 
 EVIL = "a\x1b[31mb\x1b]0;title\x07 :fire: [red]c[/red] \u202ereversed\rd\n{e} \\ ' \"f"
@@ -36,7 +36,6 @@ def out(monkeypatch):
         lambda: print_note(EVIL),
         lambda: print_pairs(EVIL, [("what", "")]),
         lambda: print_pairs("", [("what", EVIL)]),
-        lambda: print_commands("", [("what", EVIL)]),
         lambda: print_table("", ("what",), [(EVIL,)]),
     ],
 )

@@ -172,7 +172,7 @@ def _compilation_shown(clock: StageClock) -> AbstractContextManager[None]:
 
 
 def print_pairs(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print a two-column table of names and values, unwrapped so that paths can be copied."""
+    """Print names and their values, or commands, unwrapped so that they can be copied."""
     _print_title(title)
     _print_columns(rows)
 
@@ -193,12 +193,6 @@ def print_table(title: str, header: Sequence[str], rows: Sequence[Sequence[str]]
     _print_title(title)
     # A file has no edge at which names would have to be cut short.
     (OUT if OUT.is_terminal else LiteralConsole(file=OUT.file, width=WIDEST)).print(table)
-
-
-def print_commands(title: str, commands: Sequence[tuple[str, str]]) -> None:
-    """Print commands one per line, unwrapped, so that they can be copied."""
-    _print_title(title)
-    _print_columns(commands)
 
 
 def _print_title(title: str) -> None:

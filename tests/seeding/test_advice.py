@@ -41,13 +41,6 @@ def test_growth_needs_no_seeds_but_where_there_are_no_points():
     assert advise(replace(FERN, num_points=0), 30_000, strategy="grow").method == "auto"
 
 
-def test_where_stereo_finds_little_and_nothing_is_empty_nothing_is_done():
-    full = replace(FERN, empty=0.01)
-    assert advise(replace(full, agreement=0.05), 21_000).method == AS_IT_IS
-    assert advise(replace(full, agreement=0.6), 21_000).method == "auto"
-    assert advise(replace(FERN, agreement=0.05), 21_000).method == "auto"  # there is what to cover
-
-
 def test_what_is_there_decides_the_method():
     assert advise(replace(FERN, depth_maps=True), 21_000).method == "depth"
     assert advise(replace(FERN, photographs=False), 21_000).method == "mls"

@@ -46,7 +46,6 @@ from splatseed.commands.options import check_least, parse_options
 from splatseed.console import (
     ERR,
     OUT,
-    print_commands,
     print_note,
     print_pairs,
     print_table,
@@ -116,8 +115,8 @@ class Options:
     clouds: tuple[Path, ...] = ()
     """For methods cloud and cloud+auto: the scan of each scene, in its frame (docs/scans.md)."""
     preset: PresetName | None = None
-    """A ready-made plan: the paper's data sets, laptop (four real scenes in half an hour on one
-    core), both with --data; or quick, on a synthetic room."""
+    """A ready-made plan: the paper's data sets, laptop (four real scenes, on one core), both
+    with --data; or quick, on a synthetic room."""
     data: Annotated[Path | None, tyro.conf.arg(metavar="DIR")] = None
     """The folder of a preset's scenes."""
     plan: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -637,7 +636,7 @@ def _print_summary(bench: Path, runs: Sequence[Run]) -> None:
     left = sum(run.result is None for run in runs)
     again = [(f"the other {counted(left, 'run')}", f"splatseed bench -o {quoted(bench)}")]
     report = ("tables and pictures", f"splatseed bench report {quoted(bench)}")
-    print_commands("next", [*(again if left else []), report])
+    print_pairs("next", [*(again if left else []), report])
 
 
 def _report(arguments: list[str]) -> None:
@@ -657,7 +656,7 @@ def _report(arguments: list[str]) -> None:
     figures = f"{report.figures} in {options.bench / 'figures'}"
     rows = [("report", str(report.path)), ("tables", kinds), ("figures", figures)]
     print_pairs(str(options.bench), rows)
-    print_commands("next", [("", f"open {quoted(report.path)} in a browser")])
+    print_pairs("next", [("", f"open {quoted(report.path)} in a browser")])
 
 
 def _compare(arguments: list[str]) -> None:

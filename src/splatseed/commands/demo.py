@@ -33,7 +33,6 @@ import tyro
 from splatseed.commands.options import parse_options
 from splatseed.console import (
     StageClock,
-    print_commands,
     print_note,
     print_pairs,
     print_table,
@@ -127,7 +126,7 @@ def run(arguments: list[str]) -> None:
     if trained:
         run_folder = options.output / f"run_{SHOWN}"
         commands.append(("the scores again", f"splatseed evaluate {quoted(run_folder)}"))
-    print_commands("next", commands)
+    print_pairs("next", commands)
 
 
 def _upsample_by(name: str, scene: Scene, ratio: float = RATIO) -> PointCloud:

@@ -23,7 +23,6 @@ from splatseed.commands.options import check_least, parse_options
 from splatseed.console import (
     OUT,
     StageClock,
-    print_commands,
     print_note,
     print_pairs,
     stage_display,
@@ -190,7 +189,7 @@ def _summarise_network(
         print_note(f"the network predicted no depth (a constant map, or none) for: {flat}")
     known = report.num_images * math.prod(report.sizes[0])
     most = Planned.of(scene, None, FULL_RUN).most_seeds
-    print_commands("next", after_network(options.scene, scene, report.path, known, most))
+    print_pairs("next", after_network(options.scene, scene, report.path, known, most))
 
 
 def _some(names: Sequence[str]) -> str:
@@ -261,7 +260,7 @@ def _summarise_stereo(
             "photographs: --colmap writes both, as a scene to continue with"
         )
     confirmed = sum(np.count_nonzero(np.isfinite(each.depth)) for each in maps)
-    print_commands("next", _after_stereo(options, scene, report.path, int(confirmed)))
+    print_pairs("next", _after_stereo(options, scene, report.path, int(confirmed)))
 
 
 def _after_stereo(

@@ -10,7 +10,7 @@ import tyro
 
 from splatseed.commands.models import config_of, model_file
 from splatseed.commands.options import parse_options
-from splatseed.console import print_commands, print_note, print_pairs, stage_display
+from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.errors import OutputError
 from splatseed.export import (
     FORMATS,
@@ -95,7 +95,7 @@ def _summarise(
     print_pairs("splatseed export", rows)
     if name == "splat" and gaussians.shN.size:
         print_note("A .splat has no view-dependent colour: the model's is left out.")
-    print_commands("next", [("score it", _scoring_command(options))])
+    print_pairs("next", [("score it", _scoring_command(options))])
 
 
 def _scoring_command(options: Options) -> str:

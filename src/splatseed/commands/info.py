@@ -29,7 +29,6 @@ from splatseed.commands.options import parse_options
 from splatseed.console import (
     OUT,
     StageClock,
-    print_commands,
     print_note,
     print_pairs,
     print_table,
@@ -153,7 +152,7 @@ def run(arguments: list[str]) -> None:
     if len(scene.points) or scene.images:
         if missing := untrainable(scene):
             print_note(missing)
-        print_commands("next", _next_commands(options, usable, known, poses))
+        print_pairs("next", _next_commands(options, usable, known, poses))
 
 
 def _read(options: Options) -> Scene:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatseed.console import print_commands, print_note
+from splatseed.console import print_note, print_pairs
 from splatseed.lens import undistort_command, undistorted
 from splatseed.literal import quoted
 from splatseed.scene import Scene, SceneFormat
@@ -196,12 +196,12 @@ def tell_training(read_from: Path, scene: Scene, output: Path, layout: SceneForm
         print_note(missing)
         return
     if not is_distorted(scene):
-        print_commands("train it with", training_commands(output, layout))
+        print_pairs("train it with", training_commands(output, layout))
         return
     lenses = {image.intrinsics.model for image in scene.images if image.intrinsics.has_distortion}
     known = lenses <= COMMON_LENSES
     if known:
-        print_commands("train it with", training_commands(output, layout, distorted=True))
+        print_pairs("train it with", training_commands(output, layout, distorted=True))
     print_note(
         f"{'The other trainers' if known else 'Trainers'} need photographs without lens "
         f"distortion: begin with {undistort_command(read_from)}, and upsample that scene."

@@ -16,7 +16,6 @@ from splatseed.commands.options import parse_options
 from splatseed.console import (
     ERR,
     StageClock,
-    print_commands,
     print_note,
     print_pairs,
     stage_display,
@@ -180,7 +179,7 @@ def _summarise(options: Options, report: SfmReport) -> None:
     if report.unregistered:
         print_note(f"without a pose: {name_some(report.unregistered)}")
     command = f"splatseed upsample {quoted(options.output)} -o OUT --preview"
-    print_commands("next", [("", command)])
+    print_pairs("next", [("", command)])
 
 
 def _rows_of(change: Refinement | None) -> list[tuple[str, str]]:

@@ -38,7 +38,6 @@ from splatseed.console import (
     ERR,
     OUT,
     StageClock,
-    print_commands,
     print_note,
     print_pairs,
     stage_display,
@@ -425,7 +424,7 @@ def _summarise(options: Options, result: TrainingResult) -> None:
             f"memory held the run at {held:,} Gaussians; results may differ on another machine. "
             f"Pass --budget {held} for the same result everywhere."
         )
-    print_commands("next", _next_commands(options.output))
+    print_pairs("next", _next_commands(options.output))
 
 
 def _next_commands(output: Path) -> list[tuple[str, str]]:

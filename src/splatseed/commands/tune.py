@@ -34,7 +34,7 @@ from splatseed.bench.tuning import (
 )
 from splatseed.commands import bench
 from splatseed.commands.options import check_least, parse_options
-from splatseed.console import OUT, print_commands, print_note, print_table, stage_display
+from splatseed.console import OUT, print_note, print_pairs, print_table, stage_display
 from splatseed.errors import ParameterError, SceneFormatError, SplatseedError
 from splatseed.io.files import read_text
 from splatseed.io.staging import write_json
@@ -254,7 +254,7 @@ class _Tuning:
         if few:
             print_note(f"Compare with care: {', '.join(few)} ended with fewer Gaussians.")
         OUT.print(sentence(said), soft_wrap=True)
-        print_commands("next", self._commands(said))
+        print_pairs("next", self._commands(said))
 
     def _commands(self, said: Verdict) -> list[tuple[str, str]]:
         """The winner's commands, for the whole scene and the planned steps."""

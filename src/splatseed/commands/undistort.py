@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from splatseed.commands.options import parse_options
-from splatseed.console import print_commands, print_note, print_pairs, stage_display
+from splatseed.console import print_note, print_pairs, stage_display
 from splatseed.io import load_scene
 from splatseed.io.photograph import warnings_but_lens
 from splatseed.io.seeds import was_upsampled
@@ -57,4 +57,4 @@ def run(arguments: list[str]) -> None:
     if not is_distorted(scene):
         print_note("No camera had distortion: the photographs are copies.")
     verb, made = ("train", "RUN") if was_upsampled(scene) else ("upsample", "OUT")
-    print_commands("next", [("", f"splatseed {verb} {quoted(options.output)} -o {made}")])
+    print_pairs("next", [("", f"splatseed {verb} {quoted(options.output)} -o {made}")])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from splatseed.commands.options import parse_options
-from splatseed.console import OUT, print_commands, print_note, print_pairs, stage_display
+from splatseed.console import OUT, print_note, print_pairs, stage_display
 from splatseed.export import SUFFIXES
 from splatseed.io.load import check_there, is_scene
 from splatseed.literal import counted, visible
@@ -130,7 +130,7 @@ def _announce(options: Options, port: int, opened: list[Shown], beside: int | No
         commands.append(
             ("from elsewhere, first", f"ssh -L {port}:localhost:{port} {socket.gethostname()}")
         )
-    print_commands("next", [*commands, ("stop", "Ctrl-C")])
+    print_pairs("next", [*commands, ("stop", "Ctrl-C")])
     OUT.file.flush()
 
 

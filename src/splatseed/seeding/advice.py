@@ -15,14 +15,13 @@ gained 0.02 to 0.05 dB there (seed 0 of both), and -0.05 to 0.09 dB on the test 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
 from splatseed.io.seeds import was_upsampled
 from splatseed.pointcloud import PointCloud
-from splatseed.progress import Progress
 from splatseed.scene import Scene
 from splatseed.upsample import Upsampler
 
@@ -36,10 +35,6 @@ SEEDED = "seeded"
 ROOM = 1.1
 """Least room at which new points are worth making. On validation views fox, with a room of 1.17,
 gained 0.41 dB (two seeds), and scenes with a room of 1.0 lost; nothing was measured between."""
-LOW_AGREEMENT = 0.15
-"""Below this share of pixels with confirmed depth, stereo finds little."""
-FEW_EMPTY = 0.05
-"""Below this share of empty cells in the photographs, there is nothing to cover."""
 SAME_WAY = 0.95
 """Least length of the mean viewing direction at which cameras face one way."""
 INWARD = 0.7
@@ -49,9 +44,6 @@ PLACES_ITSELF = (
     "added before it gained 0.1 dB at most on some of the captures measured, and cost as much on "
     "others."
 )
-VIEWS_LOOKED_AT = 2
-SIDE_LOOKED_AT = 400
-"""Longer side, in pixels, at which stereo is tried: a few seconds per view."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +57,6 @@ class Measured:
         layout: Layout of its cameras; None for fewer than three.
         photographs: Whether they exist.
         depth_maps: Whether each photograph has a depth map.
-        agreement: Share of pixels whose stereo depth other views confirm; None if not tried.
     """
 
     num_points: int
@@ -74,7 +65,6 @@ class Measured:
     layout: Layout | None = None
     photographs: bool = True
     depth_maps: bool = False
-    agreement: float | None = None
 
 
 @dataclass(frozen=True)
@@ -107,17 +97,14 @@ def advice_for(
     *,
     strategy: str = "default",
     empty: float | None = None,
-    progress: Progress | None = None,
 ) -> Advice:
-    """What to do with a scene's points before training.
+    """What to do with a scene's points before training; no photograph is opened.
 
     Args:
         scene: The scene.
         most_seeds: Most seeds with which training can begin under its budget.
         strategy: The strategy of that training.
         empty: Share of the photographs' cells without points, if known.
-        progress: Told how much is done. Given this, stereo is tried on a few photographs, if there
-            is room for new points; else no photograph is opened.
     """
     measured = measure(scene, empty)
     if was_upsampled(scene) and len(scene.points):
@@ -125,11 +112,7 @@ def advice_for(
         new = f"{len(scene.points) - kept:,} of its points and kept {kept:,}"
         made = f"splatseed upsample made {new}."
         return Advice(SEEDED if scene.has_photographs else AS_IT_IS, (made,), measured)
-    said = advise(measured, most_seeds, strategy=strategy)
-    if progress is not None and said.method == DEFAULT_METHOD and measured.num_points:
-        measured = replace(measured, agreement=_stereo_agreement(scene, progress))
-        said = advise(measured, most_seeds, strategy=strategy)
-    return said
+    return advise(measured, most_seeds, strategy=strategy)
 
 
 def method_for(
@@ -179,15 +162,9 @@ def advise(
     reasons = [f"It has {per_pixel}, and room for {has:.1f} times as many seeds."]
     if measured.depth_maps:
         return said("depth", *reasons, "Its depth maps say where the surfaces are.")
-    empty, agreement = measured.empty, measured.agreement
-    if empty is not None:
-        cells = f"{empty:.0%} of the cells of a coarse grid over the pictures"
+    if measured.empty is not None:
+        cells = f"{measured.empty:.0%} of the cells of a coarse grid over the pictures"
         reasons.append(f"No point falls in {cells}.")
-    if agreement is not None:
-        reasons.append(f"Stereo finds a confirmed depth for {agreement:.0%} of the pixels.")
-    little = agreement is not None and agreement < LOW_AGREEMENT
-    if little and empty is not None and empty < FEW_EMPTY:
-        return said(AS_IT_IS, *reasons, "That is too little to add to what there is.")
     return said(DEFAULT_METHOD, *reasons)
 
 
@@ -222,14 +199,3 @@ def camera_layout(scene: Scene) -> Layout | None:
     towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
     inward = (towards * axes).sum(axis=1) > INWARD
     return "around something" if inward.mean() > INWARD else "through a place"
-
-
-def _stereo_agreement(scene: Scene, progress: Progress) -> float:
-    """The share of pixels in a few views whose stereo depth other views confirm, 0 to 1."""
-    from splatseed.seeding.photographs import Stereo, photographed  # noqa: PLC0415  (Numba with use)
-
-    count = len(photographed(scene))
-    some = min(VIEWS_LOOKED_AT, count)
-    only = [(2 * i + 1) * count // (2 * some) for i in range(some)]
-    maps = Stereo(max_size=SIDE_LOOKED_AT).maps(scene, only, 0, progress)
-    return float(np.mean([np.isfinite(each.depth).mean() for each in maps]))
