@@ -9,7 +9,7 @@ Structure-from-Motion left room (fern, fox), ``auto`` gained 0 to 0.5 dB with de
 to 1.5 dB without; where its points alone filled the budget (bonsai, treehill), adding points cost
 up to 0.4 dB. Under strategy ``grow``, which places Gaussians at stereo's depth itself, ``auto``
 gained 0.02 to 0.05 dB there (seed 0 of both), and -0.05 to 0.09 dB on the test views
-(docs/results/tables/arms_by_scene.md); it cost 0.4 dB in the synthetic room.
+(docs/results/tables/arms_by_scene.csv); it cost 0.4 dB in the synthetic room.
 """
 
 from __future__ import annotations
