@@ -15,7 +15,7 @@ from splatseed.console import (
     print_table,
     stage_display,
 )
-from splatseed.kernels import compilation
+from splatseed.runtime import compilation
 
 LONG = "/".join(["a_rather_long_folder_name"] * 9)
 

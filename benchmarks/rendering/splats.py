@@ -20,9 +20,9 @@ from jaxtyping import Bool, Float32, Float64
 from scipy.spatial.transform import Rotation
 
 from splatseed.camera import Camera
-from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.render.binning import RECORD, TILE, depth_order, list_tiles
 from splatseed.render.layout import gather
+from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.splat.gaussians import SH_C0, Gaussians, neighbor_distances
 from splatseed.synthetic.room import Room, build_room, orbit_cameras, render_views, visible
 from splatseed.views.view import View

@@ -20,7 +20,7 @@ from splatseed.depth.stereo.cost import (
     STRIDE,
     UNSEEN,
 )
-from splatseed.kernels.jit import inline
+from splatseed.runtime.jit import inline
 
 __all__ = ["costs_of_planes"]
 

@@ -25,8 +25,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from splatseed.kernels.compilation import watched
 from splatseed.literal import visible
+from splatseed.runtime.compilation import watched
 
 
 class LiteralConsole(Console):

@@ -31,7 +31,7 @@ from splatseed.cli import main
 from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundError
 from splatseed.io import load_scene, write_scene
 from splatseed.io.ply import write_ply
-from splatseed.process.tasks import HereTasks, ProcessTasks
+from splatseed.runtime.tasks import HereTasks, ProcessTasks
 from splatseed.splat.covisible import read_covisible
 from splatseed.synthetic import make_capture
 from splatseed.train.seeds import seeds_digest

@@ -30,7 +30,7 @@ from splatseed.commands.bench import Machine
 from splatseed.commands.tune import sentence
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io import load_scene
-from splatseed.process.tasks import HereTasks
+from splatseed.runtime.tasks import HereTasks
 from splatseed.scores import EvalResult, ViewScore
 from splatseed.synthetic import make_capture, write_capture
 

@@ -13,7 +13,7 @@ from PIL import Image as PilImage
 from splatseed.commands import demo
 from splatseed.errors import MissingDependencyError
 from splatseed.io import load_scene
-from splatseed.kernels.compilation import tell
+from splatseed.runtime.compilation import tell
 from splatseed.scores import CurvePoint, TrainingResult
 from splatseed.upsample import METHODS
 

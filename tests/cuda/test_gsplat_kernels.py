@@ -30,7 +30,7 @@ _C = object() if shutil.which("ninja") else None
 LOAD = """
 import sys
 from splatseed.errors import MissingDependencyError
-from splatseed.process.torch_device import load_kernels
+from splatseed.runtime.torch_device import load_kernels
 stages = []
 try:
     load_kernels("--backend", lambda stage, _: stages.append(stage))

@@ -27,7 +27,7 @@ from splatseed.errors import (
 from splatseed.io import load_scene
 from splatseed.io.rgbd import load_rgbd
 from splatseed.pointcloud import PointCloud
-from splatseed.process import tasks
+from splatseed.runtime import tasks
 from splatseed.scene import Scene, Split
 from splatseed.sfm import Settings, reconstruct, triangulate
 from splatseed.sfm.features import Run

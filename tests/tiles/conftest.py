@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from splatseed.pointcloud import PointCloud
-from splatseed.process.tasks import HereTasks
 from splatseed.progress import silent
+from splatseed.runtime.tasks import HereTasks
 from splatseed.scene import Scene
 from splatseed.tiles import Request, SceneSource, TilePlan, make_tiled, open_work
 

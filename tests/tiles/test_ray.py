@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
 
 from splatseed.errors import OutputError
-from splatseed.process.ray_tasks import RayTasks, Share, ray_cluster
+from splatseed.runtime.ray_tasks import RayTasks, Share, ray_cluster
 from splatseed.upsample import configure, upsample
 
 

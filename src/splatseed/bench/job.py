@@ -38,11 +38,11 @@ from splatseed.errors import (
 )
 from splatseed.io.files import ARCHIVE_FAILURES
 from splatseed.io.staging import MANIFEST, atomic_file, output_folder, write_json
-from splatseed.kernels.compilation import watched
 from splatseed.pointcloud import PointCloud
-from splatseed.process.memory import peak_bytes
-from splatseed.process.tasks import Report, Tasks
 from splatseed.progress import Progress, silent
+from splatseed.runtime.compilation import watched
+from splatseed.runtime.memory import peak_bytes
+from splatseed.runtime.tasks import Report, Tasks
 from splatseed.scene import Scene
 from splatseed.scores import EvalResult
 from splatseed.seeding.advice import DEFAULT_METHOD

@@ -54,12 +54,12 @@ from splatseed.console import (
 from splatseed.errors import ParameterError, SceneNotFoundError
 from splatseed.io.staging import atomic_file, check_output, output_folder
 from splatseed.literal import counted, did_you_mean, quoted, visible
-from splatseed.process.interruption import exit_code
-from splatseed.process.memory import check_memory
-from splatseed.process.tasks import ProcessTasks, Tasks
-from splatseed.process.threads import cores, slot_environment
 from splatseed.progress import Progress
 from splatseed.requirements import require
+from splatseed.runtime.interruption import exit_code
+from splatseed.runtime.memory import check_memory
+from splatseed.runtime.tasks import ProcessTasks, Tasks
+from splatseed.runtime.threads import cores, slot_environment
 from splatseed.train.settings import BYTES_EACH, Backend, StrategyName
 from splatseed.upsample import Profile
 
@@ -316,7 +316,7 @@ def open_machine(options: Options, backend: Backend) -> Iterator[Machine]:
     if options.executor == "local":
         yield _local_machine(options.jobs, backend)
         return
-    from splatseed.process.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
+    from splatseed.runtime.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
 
     with ray_cluster(options.address) as cluster:
         on_gpu = backend == "cuda" or (backend == "auto" and cluster.has_gpus)

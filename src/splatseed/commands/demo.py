@@ -41,11 +41,11 @@ from splatseed.console import (
 from splatseed.errors import MissingDependencyError, OutputError, ParameterError
 from splatseed.io import find_depths, load_scene, write_scene
 from splatseed.io.staging import add_files, atomic_file, output_folder, read_manifest
-from splatseed.kernels.compilation import watched
 from splatseed.literal import quoted
 from splatseed.pointcloud import PointCloud
-from splatseed.process.tasks import Child
 from splatseed.requirements import require
+from splatseed.runtime.compilation import watched
+from splatseed.runtime.tasks import Child
 from splatseed.scene import Scene
 from splatseed.upsample import METHODS, chooses_number, configure, methods_for, upsample
 

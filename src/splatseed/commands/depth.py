@@ -41,8 +41,8 @@ from splatseed.io.photograph import warnings_but_lens
 from splatseed.io.staging import check_output
 from splatseed.literal import quoted, visible
 from splatseed.monocular import DepthReport, estimate_depths
-from splatseed.process.torch_device import DeviceName
 from splatseed.requirements import require
+from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Scene
 from splatseed.seeding.diagnostics import is_distorted
 from splatseed.train.schedule import FULL_RUN

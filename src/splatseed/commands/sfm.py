@@ -25,7 +25,7 @@ from splatseed.io import load_scene
 from splatseed.io.files import is_video
 from splatseed.io.staging import check_output
 from splatseed.literal import counted, quoted, visible
-from splatseed.process.torch_device import DeviceName
+from splatseed.runtime.torch_device import DeviceName
 from splatseed.sfm import (
     MatcherName,
     Refinement,

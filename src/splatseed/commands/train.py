@@ -46,8 +46,8 @@ from splatseed.errors import ParameterError, SceneFormatError, SceneNotFoundErro
 from splatseed.io import load_scene
 from splatseed.io.files import read_text
 from splatseed.literal import did_you_mean, quoted, visible
-from splatseed.process.interruption import exit_code
 from splatseed.requirements import require
+from splatseed.runtime.interruption import exit_code
 from splatseed.scene import Scene
 from splatseed.scores import TrainingResult
 from splatseed.seeding.upsampling import parse_budget

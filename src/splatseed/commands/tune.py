@@ -39,7 +39,7 @@ from splatseed.errors import ParameterError, SceneFormatError, SplatseedError
 from splatseed.io.files import read_text
 from splatseed.io.staging import write_json
 from splatseed.literal import quoted, visible
-from splatseed.process.interruption import exit_code
+from splatseed.runtime.interruption import exit_code
 from splatseed.seeding.upsampling import parse_budget
 from splatseed.train.settings import StrategyName, TrainSettings
 

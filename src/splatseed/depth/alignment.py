@@ -21,8 +21,8 @@ from jaxtyping import Float32, Float64, Int, Int64
 from splatseed.camera import Camera
 from splatseed.depthmap import DepthKind, DepthMap
 from splatseed.errors import SceneFormatError, SceneNotFoundError
-from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.runtime.jit import inline
 from splatseed.scene import Image, Scene
 from splatseed.views.visibility import SeenPoints, camera_points, find_visibility
 

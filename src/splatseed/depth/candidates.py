@@ -25,9 +25,9 @@ from splatseed.depth.comparison import Support, choose_neighbors, find_support, 
 from splatseed.depth.settings import Settings
 from splatseed.depth.views import DepthView
 from splatseed.errors import PointCloudError
-from splatseed.kernels.hashing import scramble
-from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.progress import Progress, in_threads
+from splatseed.runtime.hashing import scramble
+from splatseed.runtime.jit import inline, kernel, parallel_range
 
 SOUND, UNCONFIRMED, NEAR_EDGE, DISTRUSTED = range(4)
 """Tiers, in the order in which they are used up; the last is never used."""

@@ -32,8 +32,8 @@ from scipy.sparse.linalg import spsolve
 from splatseed.depth.alignment import SIGMA_OF_MEDIAN
 from splatseed.depth.settings import Settings
 from splatseed.depth.views import DepthView, Reduced
-from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.progress import Progress, in_threads
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.views.projection import cosine_between, place
 
 SAMPLES = 40

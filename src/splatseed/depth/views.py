@@ -32,7 +32,7 @@ from splatseed.depth.settings import Settings
 from splatseed.depthmap import ASPECT_SLACK, DepthMaps
 from splatseed.errors import SceneFormatError
 from splatseed.io.photograph import decode_photograph, photograph_bytes
-from splatseed.kernels.jit import inline
+from splatseed.runtime.jit import inline
 from splatseed.scene import Image
 from splatseed.views.view import check_lens
 from splatseed.views.visibility import Visibility, camera_points

@@ -26,8 +26,8 @@ from splatseed.export.packing import (
     smallest_three,
 )
 from splatseed.io.files import COPY_AGAIN, guarded, read_bytes
-from splatseed.process.memory import check_memory
 from splatseed.requirements import require
+from splatseed.runtime.memory import check_memory
 from splatseed.splat.gaussians import Gaussians
 
 _MAGIC = b"NGSP"

@@ -28,7 +28,7 @@ from numpy.lib import format as npy_format
 
 from splatseed.errors import SceneFormatError, SceneNotFoundError, SplatseedError
 from splatseed.literal import beginning, describe_error
-from splatseed.process.memory import free_memory
+from splatseed.runtime.memory import free_memory
 
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".3gp"})
 COPY_AGAIN = "Copy the file again, or export it again."

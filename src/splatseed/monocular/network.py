@@ -35,8 +35,8 @@ from splatseed.errors import (
     SplatseedError,
 )
 from splatseed.literal import quoted
-from splatseed.process.torch_device import DeviceName, pick_torch_device
 from splatseed.requirements import require
+from splatseed.runtime.torch_device import DeviceName, pick_torch_device
 
 _EXAMPLE = "depth-anything/Depth-Anything-V2-Small-hf"
 _ID = re.compile(r"\w[\w.-]*/\w[\w.-]*")

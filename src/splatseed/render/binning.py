@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt32
 
-from splatseed.kernels.jit import always_inline, inline, kernel, parallel_range
+from splatseed.runtime.jit import always_inline, inline, kernel, parallel_range
 
 TILE = 8
 """Pixels along a tile's side: four blocks of 4 x 4, one vector each, fit the registers."""

@@ -26,8 +26,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.kernels.jit import always_inline, kernel, parallel_range
-from splatseed.kernels.simd import (
+from splatseed.render.binning import LOWEST, RECORD, TILE
+from splatseed.runtime.jit import always_inline, kernel, parallel_range
+from splatseed.runtime.simd import (
     LANES,
     add,
     aligned,
@@ -47,7 +48,6 @@ from splatseed.kernels.simd import (
     store,
     subtract,
 )
-from splatseed.render.binning import LOWEST, RECORD, TILE
 
 CHANNELS = 4
 """Channels per pass; the fourth takes time only where it is used."""

@@ -21,8 +21,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.kernels.jit import always_inline, kernel, parallel_range
-from splatseed.kernels.simd import (
+from splatseed.render.binning import LOWEST, RECORD, TILE
+from splatseed.render.blending import BLOCKS, CHANNELS, MAX_ALPHA, STOP
+from splatseed.runtime.jit import always_inline, kernel, parallel_range
+from splatseed.runtime.simd import (
     LANES,
     add,
     aligned,
@@ -45,8 +47,6 @@ from splatseed.kernels.simd import (
     store_transposed,
     subtract,
 )
-from splatseed.render.binning import LOWEST, RECORD, TILE
-from splatseed.render.blending import BLOCKS, CHANNELS, MAX_ALPHA, STOP
 
 SUMS = 16
 """Numbers per span, each summed over its pixels:

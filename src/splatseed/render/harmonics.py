@@ -21,9 +21,9 @@ import math
 
 import numpy as np
 
-from splatseed.kernels.jit import always_inline, kernel, parallel_range
-from splatseed.kernels.shuffles import lane, permutation, three_sums, triple
-from splatseed.kernels.simd import (
+from splatseed.runtime.jit import always_inline, kernel, parallel_range
+from splatseed.runtime.shuffles import lane, permutation, three_sums, triple
+from splatseed.runtime.simd import (
     LANES,
     add,
     broadcast,

@@ -15,10 +15,10 @@ import math
 
 import numpy as np
 
-from splatseed.kernels.jit import always_inline, kernel, parallel_range
-from splatseed.kernels.simd import LANES
 from splatseed.render.binning import RECORD, TILE
 from splatseed.render.blending import BLOCKS, CHANNELS
+from splatseed.runtime.jit import always_inline, kernel, parallel_range
+from splatseed.runtime.simd import LANES
 
 NEEDLE = 1.0 - 2.0**-22
 """The largest factor below 1 after which float32 rounding still leaves an ellipse."""

@@ -20,7 +20,7 @@ import math
 
 import numpy as np
 
-from splatseed.kernels.jit import always_inline, kernel, parallel_range
+from splatseed.runtime.jit import always_inline, kernel, parallel_range
 
 MIN_ALPHA = 1.0 / 255.0
 """Smallest opacity that is drawn."""

@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.kernels.hashing import FREE, scramble, slot_of
-from splatseed.kernels.jit import inline, kernel, parallel_range
+from splatseed.runtime.hashing import FREE, scramble, slot_of
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.seeding.coverage import check_points, grid_from_world, project_block
 from splatseed.views.view import View
 

@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
-from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, silent
+from splatseed.runtime.jit import inline
 from splatseed.seeding.coverage import (
     NEARER,
     cell_depths,

@@ -19,8 +19,8 @@ from __future__ import annotations
 import numpy as np
 
 from splatseed.depth.stereo.cost import NOISE, SAMPLES, best_cost, prepare_window
-from splatseed.kernels.jit import always_inline, inline
-from splatseed.kernels.simd import LANES
+from splatseed.runtime.jit import always_inline, inline
+from splatseed.runtime.simd import LANES
 
 REACH = 1.5
 """How far a point may move, in spacings."""

@@ -22,9 +22,9 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from splatseed.depth.stereo.cost import grey_image
 from splatseed.depth.stereo.matching import make_quad_images
-from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.pointcloud import PointCloud
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.scene import Image
 from splatseed.seeding.sliding import slide
 from splatseed.upsample.method import NewPoints

@@ -26,9 +26,9 @@ from splatseed.errors import (
     ReconstructionError,
     SceneFormatError,
 )
-from splatseed.process.torch_device import DeviceName
 from splatseed.progress import Progress
 from splatseed.requirements import install_command
+from splatseed.runtime.torch_device import DeviceName
 from splatseed.scene import Image
 from splatseed.sfm.photos import Photo, name_some
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 from splatseed.errors import ReconstructionError, TaskLostError
-from splatseed.process.tasks import Child
 from splatseed.progress import Progress
+from splatseed.runtime.tasks import Child
 from splatseed.scene import Image
 from splatseed.sfm.features import (
     Run,

@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from splatseed.process.torch_device import free_bytes
 from splatseed.render import rasterization
+from splatseed.runtime.torch_device import free_bytes
 from splatseed.views.view import View
 
 SHARE = 0.25

@@ -26,8 +26,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float32
 
-from splatseed.kernels.jit import always_inline, inline, kernel, parallel_range
-from splatseed.kernels.simd import (
+from splatseed.runtime.jit import always_inline, inline, kernel, parallel_range
+from splatseed.runtime.simd import (
     LANES,
     add,
     broadcast,

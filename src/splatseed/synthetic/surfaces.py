@@ -20,7 +20,7 @@ from typing import Protocol
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
-from splatseed.kernels.jit import inline
+from splatseed.runtime.jit import inline
 
 Vector = Float64[np.ndarray, " 3"]
 Frame = Float64[np.ndarray, "3 3"]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float64
 
-from splatseed.kernels.jit import inline
+from splatseed.runtime.jit import inline
 
 Color = tuple[float, float, float]
 

@@ -23,8 +23,8 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.io.staging import remove, staged
 from splatseed.pointcloud import PointCloud
-from splatseed.process.tasks import Tasks
 from splatseed.progress import Progress, blocks, silent
+from splatseed.runtime.tasks import Tasks
 from splatseed.tiles.cutting import (
     Points,
     Rows,

@@ -25,7 +25,7 @@ from splatseed.errors import OutputError, ParameterError
 from splatseed.io.files import read_text
 from splatseed.io.staging import oserror_as_output_error, staged, write_json
 from splatseed.literal import visible
-from splatseed.process.memory import option_of, words_of
+from splatseed.runtime.memory import option_of, words_of
 from splatseed.upsample.nearest import NearestMethod
 
 PROCESS = 300 << 20

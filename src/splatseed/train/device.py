@@ -13,8 +13,8 @@ from contextlib import contextmanager
 import torch
 
 from splatseed.errors import PointCloudError
-from splatseed.process.torch_device import free_bytes, load_kernels, pick_torch_device
 from splatseed.progress import Progress, silent
+from splatseed.runtime.torch_device import free_bytes, load_kernels, pick_torch_device
 from splatseed.train.settings import BYTES_EACH, Backend
 
 FEWER = 0.8

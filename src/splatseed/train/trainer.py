@@ -19,8 +19,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from splatseed.process.interruption import interruption
-from splatseed.process.memory import keep_freed_memory
+from splatseed.runtime.interruption import interruption
+from splatseed.runtime.memory import keep_freed_memory
 from splatseed.splat.metrics import l1_and_ssim_by_convolution, psnr, ssim_of_all
 from splatseed.splat.rendering import Photographs, photograph_of, render_view
 from splatseed.splat.ssim import l1_and_ssim

@@ -17,8 +17,8 @@ from jaxtyping import Float, Float32, UInt8
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.pointcloud import ATTRIBUTES, ORIGINAL, PointCloud
-from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
+from splatseed.runtime.memory import check_memory
 from splatseed.scene import Scene
 from splatseed.upsample.method import Need, NewPoints, Traits, Upsampler, traits_of
 from splatseed.upsample.registry import METHODS, source_code

@@ -30,8 +30,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay, QhullError
 
 from splatseed.errors import PointCloudError
-from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.progress import Progress
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.neighbors import PreparedCloud
 
 MAX_NEIGHBORS = 58

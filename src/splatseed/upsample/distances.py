@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.kernels.jit import kernel, parallel_range
+from splatseed.runtime.jit import kernel, parallel_range
 
 
 @kernel

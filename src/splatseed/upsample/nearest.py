@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from splatseed.errors import PointCloudError
-from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.progress import Progress
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.scene import Scene
 from splatseed.upsample.method import NewPoints, check_fields
 from splatseed.upsample.neighbors import (

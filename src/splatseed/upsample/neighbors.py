@@ -24,8 +24,8 @@ from scipy.spatial import cKDTree
 
 from splatseed.errors import PointCloudError
 from splatseed.pointcloud import ORIGINAL, PointCloud
-from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, in_threads, silent
+from splatseed.runtime.memory import check_memory
 from splatseed.scene import Scene
 
 SPACING_NEIGHBORS = 6

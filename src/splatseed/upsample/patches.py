@@ -20,8 +20,8 @@ from typing import ClassVar, Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
-from splatseed.kernels.jit import inline, kernel, parallel_range
 from splatseed.progress import Progress, blocks
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.method import NewPoints, require
 from splatseed.upsample.nearest import NearestMethod, RowData, UniformSource, interpolate_colors
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int8
 
-from splatseed.kernels.jit import inline, kernel, parallel_range
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.patches import Patches
 
 CONTROL = 6

@@ -17,8 +17,8 @@ from jaxtyping import UInt8
 from PIL import Image as PillowImage
 
 from splatseed.camera import Camera
-from splatseed.kernels.jit import inline
 from splatseed.pointcloud import GENERATED, ORIGINAL, PointCloud
+from splatseed.runtime.jit import inline
 from splatseed.upsample.registry import SOURCE_CODES
 from splatseed.view.page import PAPER, resized
 

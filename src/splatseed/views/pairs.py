@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from splatseed.kernels.jit import inline, kernel, parallel_range
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.views.projection import cosine_between
 
 LEAST, FULL, WIDE, MOST = 1.0, 4.0, 15.0, 45.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.kernels.jit import always_inline, inline
+from splatseed.runtime.jit import always_inline, inline
 
 
 @inline

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from splatseed.camera import Intrinsics
-from splatseed.kernels.jit import inline
 from splatseed.lens import distort, fold_radius
+from splatseed.runtime.jit import inline
 
 ROWS = 64
 """Rows computed at a time, which bounds the memory of their rays."""

@@ -30,8 +30,8 @@ from splatseed.errors import OutputError, ParameterError, SceneFormatError, Scen
 from splatseed.io.photograph import decode_photograph, open_photograph, photograph_bytes
 from splatseed.io.staging import atomic_file
 from splatseed.lens import undistort_first
-from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, silent
+from splatseed.runtime.memory import check_memory
 from splatseed.scene import Image, Scene
 
 if TYPE_CHECKING:

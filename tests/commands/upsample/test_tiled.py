@@ -10,8 +10,8 @@ import pytest
 
 from splatseed.io.ply import read_ply, write_ply
 from splatseed.pointcloud import PointCloud
-from splatseed.process import tasks, threads
-from splatseed.process.memory import bytes_of
+from splatseed.runtime import tasks, threads
+from splatseed.runtime.memory import bytes_of
 from splatseed.tiles import work
 
 

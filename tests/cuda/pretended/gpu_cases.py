@@ -29,7 +29,7 @@ from splatseed.errors import MissingDependencyError, PointCloudError
 from splatseed.evaluate import evaluate_views
 from splatseed.splat.metrics import l1_and_ssim_by_convolution, ssim_of_all
 from splatseed.io import load_scene
-from splatseed.process import torch_device
+from splatseed.runtime import torch_device
 from splatseed.splat import rendering
 from splatseed.splat.gaussians import initial_gaussians
 from splatseed.synthetic import make_capture, write_capture
@@ -188,7 +188,7 @@ def test_without_a_toolkit_one_error_comes_before_any_work(room, tmp_path, monke
 
 
 def test_memory_counts_what_the_next_render_takes_again(monkeypatch):
-    from splatseed.process.torch_device import free_bytes
+    from splatseed.runtime.torch_device import free_bytes
     from splatseed.train.device import Capacity
 
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (3 << 30, 24 << 30))

@@ -13,7 +13,7 @@ from splatseed.depth.stereo.cost import (
     make_quads,
     prepare_window,
 )
-from splatseed.kernels.simd import LANES
+from splatseed.runtime.simd import LANES
 
 from .references import OFFSETS, best_of, bilinear, cost_in, window_weights
 

@@ -7,7 +7,7 @@ import pytest
 from numba import njit
 
 from splatseed.depth.stereo.cost import grey_image, make_quads, sample
-from splatseed.kernels.simd import LANES, load, store
+from splatseed.runtime.simd import LANES, load, store
 
 from .references import bilinear
 

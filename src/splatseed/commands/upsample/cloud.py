@@ -15,8 +15,8 @@ from splatseed.io.cleaning import check_precision, offset_of, recentred
 from splatseed.io.staging import add_files, write_json
 from splatseed.io.transform_file import read_cloud_transform
 from splatseed.literal import visible
-from splatseed.process.memory import words_of
 from splatseed.progress import Progress
+from splatseed.runtime.memory import words_of
 from splatseed.scene import Scene
 from splatseed.similarity import Similarity
 

@@ -40,7 +40,7 @@ from splatseed.io.depth_search import with_own_depths
 from splatseed.io.staging import check_output
 from splatseed.literal import counted, quoted, visible
 from splatseed.pointcloud import ORIGINAL, PointCloud
-from splatseed.process.memory import bytes_of
+from splatseed.runtime.memory import bytes_of
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.seeding.diagnostics import far_share

@@ -27,8 +27,8 @@ from splatseed.io.colmap.scene import find_model
 from splatseed.io.write import PointStream
 from splatseed.literal import counted, visible
 from splatseed.pointcloud import PointCloud
-from splatseed.process.memory import free_memory, option_of, words_of
 from splatseed.progress import Progress
+from splatseed.runtime.memory import free_memory, option_of, words_of
 from splatseed.scene import Scene
 from splatseed.seeding.advice import DEFAULT_METHOD, method_for
 from splatseed.upsample import BYTES_EACH, Upsampler, planned_size, traits_of
@@ -36,7 +36,7 @@ from splatseed.upsample.registry import source_code
 
 if TYPE_CHECKING:
     from splatseed.commands.upsample.command import Options
-    from splatseed.process.tasks import Tasks
+    from splatseed.runtime.tasks import Tasks
     from splatseed.tiles import Source, Tiled
 
 CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".csv", ".asc", ".pts", ".npz", ".glb")
@@ -256,9 +256,9 @@ def _looks(method: Upsampler) -> bool:
 @contextmanager
 def _tasks(options: Options, choose: Callable[..., int]) -> Iterator[Tasks]:
     """Where tiles are worked on, while the block runs."""
-    from splatseed.process import tasks  # noqa: PLC0415  (processes)
-    from splatseed.process.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
-    from splatseed.process.threads import cores, slot_environment  # noqa: PLC0415  (loads with its use)
+    from splatseed.runtime import tasks  # noqa: PLC0415  (processes)
+    from splatseed.runtime.ray_tasks import RayTasks, ray_cluster  # noqa: PLC0415  (an extra)
+    from splatseed.runtime.threads import cores, slot_environment  # noqa: PLC0415  (loads with its use)
 
     tiling = options.tiling
     if tiling.executor == "ray":

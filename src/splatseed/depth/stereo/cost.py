@@ -34,8 +34,8 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from splatseed.kernels.jit import always_inline, inline
-from splatseed.kernels.simd import (
+from splatseed.runtime.jit import always_inline, inline
+from splatseed.runtime.simd import (
     INDEX,
     LANES,
     VECTOR,

@@ -18,8 +18,8 @@ from jaxtyping import Float32, Float64, Int32, Int64, UInt8
 
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.depth.stereo.matching import other_from_view
-from splatseed.kernels.jit import inline
 from splatseed.progress import Progress, silent
+from splatseed.runtime.jit import inline
 
 SAME = 0.03
 """Relative difference of depth up to which two seeds in a cell count as one."""

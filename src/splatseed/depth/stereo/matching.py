@@ -26,9 +26,9 @@ from splatseed.depth.stereo.cost import grey_image, make_quads
 from splatseed.depth.stereo.maps import StereoResult
 from splatseed.depth.stereo.patchmatch import QuadImages, begin, sweep
 from splatseed.depth.stereo.settings import StereoSettings
-from splatseed.kernels.jit import inline
-from splatseed.process.memory import check_memory
 from splatseed.progress import Progress, in_threads
+from splatseed.runtime.jit import inline
+from splatseed.runtime.memory import check_memory
 from splatseed.views.view import View
 
 NEAREST = 3

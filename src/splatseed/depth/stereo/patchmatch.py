@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from splatseed.depth.stereo.cost import SAMPLES, best_cost, prepare_window
-from splatseed.kernels.hashing import scramble
-from splatseed.kernels.jit import always_inline, inline
-from splatseed.kernels.simd import LANES
+from splatseed.runtime.hashing import scramble
+from splatseed.runtime.jit import always_inline, inline
+from splatseed.runtime.simd import LANES
 
 ARM = 11
 """How far a plane may propagate in one visit, in grid points."""

@@ -33,7 +33,7 @@ from splatseed.io.cloud_file import (
     full_value,
 )
 from splatseed.io.files import guarded, open_file, read_npy_header
-from splatseed.process.memory import check_memory
+from splatseed.runtime.memory import check_memory
 
 POSITIONS = ("world_points", "pts3d", "points3d", "points", "xyz", "point_map", "pointmap")
 COLORS = ("rgb", "colors", "colours", "color", "images", "imgs", "image", "rgb_img")

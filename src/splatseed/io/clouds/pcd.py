@@ -31,8 +31,8 @@ from splatseed.io.cloud_file import (
     positions,
 )
 from splatseed.io.files import COPY_AGAIN, guarded, open_file
-from splatseed.kernels.jit import inline
-from splatseed.process.memory import check_memory
+from splatseed.runtime.jit import inline
+from splatseed.runtime.memory import check_memory
 
 _HEADER_BYTES = 1 << 16
 _KINDS = {"F": "f", "I": "i", "U": "u"}

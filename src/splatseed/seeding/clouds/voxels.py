@@ -24,10 +24,10 @@ from scipy.spatial import cKDTree
 
 from splatseed.errors import ParameterError, PointCloudError
 from splatseed.io.clouds import CloudChunk, CloudFile, open_cloud
-from splatseed.kernels.hashing import scramble
-from splatseed.kernels.jit import inline, kernel, parallel_range
-from splatseed.process.memory import free_memory, option_of, words_of
 from splatseed.progress import Progress
+from splatseed.runtime.hashing import scramble
+from splatseed.runtime.jit import inline, kernel, parallel_range
+from splatseed.runtime.memory import free_memory, option_of, words_of
 from splatseed.seeding.coverage import grid_from_world
 from splatseed.similarity import Similarity
 from splatseed.views.view import View

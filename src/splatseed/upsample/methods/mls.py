@@ -16,7 +16,7 @@ from typing import ClassVar, Self
 import numpy as np
 from jaxtyping import Float32
 
-from splatseed.kernels.jit import inline, kernel, parallel_range
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.patches import Patches, PatchMethod
 
 TERMS = 6

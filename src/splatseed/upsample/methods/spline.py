@@ -18,7 +18,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from splatseed.kernels.jit import inline, kernel, parallel_range
+from splatseed.runtime.jit import inline, kernel, parallel_range
 from splatseed.upsample.method import require
 from splatseed.upsample.patches import Patches, PatchMethod
 from splatseed.upsample.splines import (

@@ -12,8 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress
+from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.upsample.method import NewPoints
 from splatseed.upsample.nearest import NearestMethod, RowData, UniformSource, blended
 from splatseed.upsample.neighbors import Bases, Neighbors, PreparedCloud

@@ -19,8 +19,8 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from jaxtyping import Float64
 
-from splatseed.kernels.jit import kernel, parallel_range
 from splatseed.progress import Progress, blocks
+from splatseed.runtime.jit import kernel, parallel_range
 from splatseed.upsample.cells import MAX_NEIGHBORS, Cells, box_cells, build_cells
 from splatseed.upsample.method import NewPoints, require
 from splatseed.upsample.nearest import NearestMethod, RowData, UniformSource, interpolate_colors

@@ -13,7 +13,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from splatseed.kernels.simd import INDEX, LANES, VECTOR, f32x16
+from splatseed.runtime.simd import INDEX, LANES, VECTOR, f32x16
 
 UNDEFINED = ir.Constant(VECTOR, ir.Undefined)
 I32 = ir.IntType(32)

@@ -8,6 +8,7 @@ still fail.
 from __future__ import annotations
 
 import ctypes
+import math
 import os
 import sys
 from contextlib import suppress
@@ -16,8 +17,7 @@ from pathlib import Path
 from splatseed.errors import ParameterError
 
 CGROUP = Path("/sys/fs/cgroup")
-STATUS = Path("/proc/self/status")
-SUFFIXES = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
+UNITS = {"K": 1 << 10, "M": 1 << 20, "G": 1 << 30, "T": 1 << 40}
 
 
 def check_memory(count: int, bytes_each: int, what: str, *, found: str = "", fix: str) -> None:
@@ -51,29 +51,20 @@ def bytes_of(text: str) -> int:
         ParameterError: It is none.
     """
     plain = text.strip().upper().removesuffix("B").removesuffix("I")
-    number, suffix = (plain[:-1], plain[-1]) if plain[-1:] in SUFFIXES else (plain, "")
-    try:
-        amount = float(number)
-        known = 0 < amount < float("inf")
-    except ValueError:
-        known = False
-    if not known:
-        raise ParameterError(
-            "an amount of memory such as 4G or 500M", found=repr(text), fix="Give such an amount."
-        )
-    return int(amount * SUFFIXES[suffix])
+    number, unit = (plain[:-1], UNITS[plain[-1]]) if plain[-1:] in UNITS else (plain, 1)
+    with suppress(ValueError):
+        if 0 < (amount := float(number)) < float("inf"):
+            return int(amount * unit)
+    raise ParameterError(
+        "an amount of memory such as 4G or 500M", found=repr(text), fix="Give such an amount."
+    )
 
 
 def words_of(amount: int, *, up: bool = False) -> str:
-    """Bytes in words: tenths of GB, or whole MB.
-
-    Args:
-        amount: The bytes.
-        up: Whether to round up.
-    """
+    """Bytes in words: tenths of GB, or whole MB; rounded up on request."""
     unit, name, digits = (1 << 30, "GB", 1) if amount >= 1 << 30 else (1 << 20, "MB", 0)
     scaled = amount / unit * 10**digits
-    rounded = (-int(-scaled // 1) if up else round(scaled)) / 10**digits
+    rounded = (math.ceil(scaled) if up else round(scaled)) / 10**digits
     return f"{rounded:,.{digits}f} {name}"
 
 
@@ -88,29 +79,32 @@ def free_memory() -> int | None:
     return min(known, default=None)
 
 
+def _field(path: str, name: str) -> int | None:
+    """The number behind a name in a file of the system, such as ``VmHWM: 12 kB``."""
+    with suppress(OSError):
+        for line in Path(path).read_text("utf-8", "replace").splitlines():
+            if line.startswith(name):
+                return int(line.split()[1])
+    return None
+
+
 def _of_machine() -> int | None:
-    try:
-        lines = Path("/proc/meminfo").read_text("ascii").splitlines()
-        kilobytes = next(line.split()[1] for line in lines if line.startswith("MemAvailable:"))
-        return int(kilobytes) * 1024
-    except (OSError, StopIteration):
-        pass
-    try:
+    if (kilobytes := _field("/proc/meminfo", "MemAvailable:")) is not None:
+        return kilobytes * 1024
+    with suppress(AttributeError, OSError, ValueError):  # not on Windows
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):  # not on Windows
-        return None
+    return None
 
 
 def _of_container() -> int | None:
     """What a container's limit leaves; cached files count as free, as the system drops them."""
-    try:
-        limit = (CGROUP / "memory.max").read_text("ascii").strip()
-        used = int((CGROUP / "memory.current").read_text("ascii"))
-        lines = (CGROUP / "memory.stat").read_text("ascii").splitlines()
-    except (OSError, ValueError):
-        return None
-    files = next((int(line.split()[1]) for line in lines if line.startswith("inactive_file ")), 0)
-    return max(int(limit) - used + files, 0) if limit.isdigit() else None
+    with suppress(OSError, ValueError):
+        limit, used = (
+            (CGROUP / f"memory.{name}").read_text("ascii").strip() for name in ("max", "current")
+        )
+        files = _field(str(CGROUP / "memory.stat"), "inactive_file ") or 0
+        return max(int(limit) - int(used) + files, 0)  # "max" is no number: no limit
+    return None
 
 
 def peak_bytes() -> int | None:
@@ -118,11 +112,8 @@ def peak_bytes() -> int | None:
 
     On Linux, since the program was loaded: getrusage also counts the process that started it.
     """
-    try:
-        lines = STATUS.read_text("ascii", "replace").splitlines()
-        return 1024 * next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
-    except (OSError, StopIteration):
-        pass
+    if (kilobytes := _field("/proc/self/status", "VmHWM:")) is not None:
+        return kilobytes * 1024
     try:
         import resource  # noqa: PLC0415  (not on Windows)
     except ImportError:
@@ -138,8 +129,6 @@ def keep_freed_memory() -> None:
     the pages again. Results stay the same. While Gaussians are added, blocks of earlier sizes lie
     idle: a run that grew from 30,000 to 250,000 took 8 % more memory at its peak.
     """
-    if not sys.platform.startswith("linux"):
-        return
     with suppress(OSError, AttributeError):  # another C library
         mallopt = ctypes.CDLL("libc.so.6").mallopt
         trim_threshold, mmap_threshold = -1, -3  # of mallopt(3)

@@ -27,14 +27,14 @@ from dataclasses import dataclass
 from typing import IO, Any, TypeAlias, cast
 
 from splatseed.errors import SplatseedError, TaskLostError
-from splatseed.process.interruption import interruption
 from splatseed.progress import Progress, thread_limit
+from splatseed.runtime.interruption import interruption
 
 Function: TypeAlias = Callable[..., Any]
 Report: TypeAlias = Callable[[int, str, float], None]
 """Takes a task's index, its stage, and the fraction of it that is done."""
 
-_PROGRAM = "from splatseed.process.tasks import serve; serve()"
+_PROGRAM = "from splatseed.runtime.tasks import serve; serve()"
 _TRIES = 2
 _POLL_SECONDS = 0.2
 _REPORT_SECONDS = 0.5

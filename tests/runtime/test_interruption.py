@@ -11,7 +11,7 @@ import pytest
 
 from splatseed.cli import VERBS, main
 from splatseed.commands import bench, train, view
-from splatseed.process.interruption import Interruption, exit_code, interruption
+from splatseed.runtime.interruption import Interruption, exit_code, interruption
 
 
 @pytest.fixture(autouse=True)

@@ -16,8 +16,8 @@ from splatseed.depth.stereo.matching import BYTES_A_DEPTH, check_stereo_memory
 from splatseed.errors import ParameterError
 from splatseed.io import load_scene
 from splatseed.pointcloud import PointCloud
-from splatseed.process import memory
-from splatseed.process.tasks import HereTasks
+from splatseed.runtime import memory
+from splatseed.runtime.tasks import HereTasks
 from splatseed.synthetic import make_capture, write_capture
 from splatseed.train.device import BYTES_EACH as BYTES_TRAINED
 from splatseed.upsample import BYTES_EACH, number_of_new, upsample
@@ -106,7 +106,7 @@ def test_an_unknown_amount_refuses_nothing(free):
 
 FAULTS = """
 import resource
-from splatseed.process.memory import keep_freed_memory
+from splatseed.runtime.memory import keep_freed_memory
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

@@ -21,7 +21,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
-from splatseed.kernels.jit import inline
+from splatseed.runtime.jit import inline
 
 LANES = 16
 QUARTER = LANES // 4

@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from splatseed.errors import ParameterError, TaskLostError
-from splatseed.process.interruption import interruption
-from splatseed.process.tasks import Function, Report, Result, Tasks
-from splatseed.process.threads import few_threads
 from splatseed.requirements import require
+from splatseed.runtime.interruption import interruption
+from splatseed.runtime.tasks import Function, Report, Result, Tasks
+from splatseed.runtime.threads import few_threads
 
 LOSSES = 3
 """How often a task is restarted whose node or worker was lost."""

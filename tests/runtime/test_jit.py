@@ -3,23 +3,20 @@ reaches."""
 
 from __future__ import annotations
 
+import importlib
 import os
 import pickle
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-import splatseed
-from splatseed.kernels.sources import reached_files, source_digest
-
-SOURCE = Path(splatseed.__file__).parent
+from splatseed.runtime.jit import reached_files
 
 FILES = {
     "__init__": "",
     "kernels": """
-from splatseed.kernels.jit import inline
+from splatseed.runtime.jit import inline
 
 from tiny.middle import (
     halved,
@@ -31,7 +28,7 @@ def twice_shifted(x):
     return shifted(2.0 * x) + halved(0.0)
 """,
     "middle": """
-from splatseed.kernels.jit import inline
+from splatseed.runtime.jit import inline
 from . import numbers
 from .numbers import SHIFT
 
@@ -95,32 +92,18 @@ def test_a_cache_that_names_what_is_gone_is_passed_over(tiny):
     assert called(tiny) == (7.0, 0)
 
 
-def test_a_file_reaches_what_it_imports_directly_and_by_way_of_others(tiny):
-    reached = reached_files(tiny / "kernels.py", "tiny.kernels")
-    ours = {path.stem for path in reached if path.parent == tiny}
-    assert ours == {"kernels", "middle", "__init__", "numbers"}
-    assert reached - set(tiny.iterdir()) == {
-        SOURCE / f"kernels/{name}.py" for name in ("jit", "sharing", "sources", "compilation")
-    }
-
-
-def test_kernels_reach_the_files_whose_functions_they_call():
-    reached = reached_files(SOURCE / "render" / "harmonics.py", "splatseed.render.harmonics")
-    names = {path.relative_to(SOURCE).as_posix() for path in reached}
-    assert {"kernels/simd.py", "kernels/shuffles.py", "kernels/jit.py"} <= names
-    assert "cli.py" not in names
-
-
-def test_the_digest_is_of_contents_alone(tiny, tmp_path):
-    before = source_digest(tiny / "kernels.py", "tiny.kernels")
-    moved = tiny.rename(tmp_path / "elsewhere").rename(tmp_path / "tiny")
-    assert source_digest(moved / "kernels.py", "tiny.kernels") == before
-    (moved / "middle.py").write_text(FILES["middle"] + "# changed\n")
-    assert source_digest(moved / "kernels.py", "tiny.kernels") != before
-
-
-def test_a_script_reaches_splatseed_only(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text("import numpy\nimport splatseed.kernels.simd as simd\nfrom . import gone\n")
-    names = {path.name for path in reached_files(script, "__main__")}
-    assert names == {"script.py", "simd.py", "jit.py", "sharing.py", "sources.py", "compilation.py"}
+def test_a_file_reaches_what_it_imports_directly_and_by_way_of_others(tiny, monkeypatch):
+    monkeypatch.syspath_prepend(tiny.parent)
+    importlib.import_module("tiny.kernels")
+    importlib.import_module("tiny.aside")
+    ours = {"tiny", "tiny.kernels", "tiny.middle", "tiny.numbers"}
+    jit = {"splatseed.runtime.jit", "splatseed.runtime.compilation"}
+    reached = reached_files("tiny.kernels")
+    assert set(reached) == ours | jit
+    assert reached["tiny.numbers"] == tiny / "numbers.py"
+    importlib.import_module("splatseed.render.harmonics")
+    reached = set(reached_files("splatseed.render.harmonics"))
+    assert jit | {"splatseed.runtime.simd", "splatseed.runtime.shuffles"} <= reached
+    assert "splatseed.cli" not in reached
+    for name in ours | {"tiny.aside"}:
+        del sys.modules[name]

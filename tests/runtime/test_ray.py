@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("ray", reason="Ray is an extra: pip install -e '.[cluster]'")
 
 from splatseed.errors import ParameterError
-from splatseed.process.ray_tasks import RayTasks, Share, ray_cluster
+from splatseed.runtime.ray_tasks import RayTasks, Share, ray_cluster
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:{}", "ray://127.0.0.1:{}", "127.0.0.1:{}0000"])

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 from filelock import FileLock
 
 from splatseed.errors import MissingDependencyError, ParameterError
-from splatseed.process.memory import free_memory
 from splatseed.progress import Progress, silent
 from splatseed.requirements import require
+from splatseed.runtime.memory import free_memory
 
 if TYPE_CHECKING:  # PyTorch may be absent, and takes a while to load
     import torch

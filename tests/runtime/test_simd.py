@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from splatseed.kernels import simd
-from splatseed.kernels.simd import LANES
+from splatseed.runtime import simd
+from splatseed.runtime.simd import LANES
 
 SPECIAL = np.array(
     [0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan, 1e-40, -1e-40, 3e38, 1e-38, 7.5, 7.5, -2, 5, 3],

@@ -16,9 +16,9 @@ import pytest
 
 import splatseed
 from splatseed.errors import OutputError, ParameterError, TaskLostError
-from splatseed.process.tasks import Child, HereTasks, ProcessTasks
-from splatseed.process.threads import slot_environment
 from splatseed.progress import silent
+from splatseed.runtime.tasks import Child, HereTasks, ProcessTasks
+from splatseed.runtime.threads import slot_environment
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="needs signals")
 
@@ -91,8 +91,8 @@ def test_a_death_is_the_failure_of_its_task_alone_after_another_try(tmp_path):
 INTERRUPTED = """
 import sys
 from pathlib import Path
-from splatseed.process.tasks import ProcessTasks
-from tests.process.test_tasks import wait_for_term
+from splatseed.runtime.tasks import ProcessTasks
+from tests.runtime.test_tasks import wait_for_term
 results = ProcessTasks([{}]).run(wait_for_term, [(Path(sys.argv[1]),), (Path(sys.argv[2]),)])
 try:
     for each in results:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatseed.kernels.jit import inline
+from splatseed.runtime.jit import inline
 
 FREE = np.uint64(0)
 """A free slot of a table of keys."""

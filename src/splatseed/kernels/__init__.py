@@ -1,1 +1,0 @@
-"""The base of compiled code: Numba's settings, the key of its cache, vectors of 16 floats."""

@@ -1,1 +1,0 @@
-"""This process and its children: memory, tasks here or on a cluster, and children's interpreter."""

@@ -1,0 +1,1 @@
+"""Where code runs: tasks and memory of processes, PyTorch's device, and compiled kernels."""
